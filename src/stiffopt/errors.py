@@ -1,0 +1,102 @@
+"""The error tree: every error says what was wrong, where, and what to do about it."""
+
+from __future__ import annotations
+
+import os
+
+
+class StiffoptError(Exception):
+    """Root of every error that stiffopt raises on purpose."""
+
+
+class InputError(StiffoptError, ValueError):
+    """Something given to stiffopt, in a file or in a call, is wrong.
+
+    It is a `ValueError` too, which is what a Python caller expects of a bad argument.
+    """
+
+
+class FileError(InputError):
+    """A file cannot be read or written, or says something wrong.
+
+    Parameters
+    ----------
+    path :
+        The file, as the user named it.
+    reason :
+        What is wrong and what was expected, as one sentence.
+    line :
+        Line number, counted from 1, if one line is to blame.
+    key :
+        Dotted key such as ``target.position[0]``, if one key is to blame.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        reason: str,
+        *,
+        line: int | None = None,
+        key: str | None = None,
+    ) -> None:
+        super().__init__(path, reason, line, key)
+        self.path = os.fspath(path)
+        self.reason = reason
+        self.line = line
+        self.key = key
+
+    def __str__(self) -> str:
+        where = self.path if self.line is None else f"{self.path}:{self.line}"
+        return f"{where}: {self.key}: {self.reason}" if self.key else f"{where}: {self.reason}"
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Support pickling, so that the error crosses process boundaries whole."""
+        return _rebuild_file_error, (self.path, self.reason, self.line, self.key)
+
+
+def _rebuild_file_error(path: str, reason: str, line: int | None, key: str | None) -> FileError:
+    return FileError(path, reason, line=line, key=key)
+
+
+class PressureError(InputError):
+    """Pressures are not finite, have the wrong shape or drive the modulus to zero."""
+
+
+class EquilibriumError(StiffoptError):
+    """The arm has no stable equilibrium that is reached continuously from rest.
+
+    It buckles or falls over on the way to the pressures and loads asked for.
+    """
+
+
+class MissingExtraError(StiffoptError):
+    """An optional package is needed that is not installed.
+
+    Parameters
+    ----------
+    package :
+        Name of the missing package, for example ``matplotlib``.
+    extra :
+        Name of stiffopt's extra that brings it, for example ``plot``.
+    """
+
+    def __init__(self, package: str, extra: str) -> None:
+        super().__init__(package, extra)
+        self.package = package
+        self.extra = extra
+
+    def __str__(self) -> str:
+        return (
+            f"this needs {self.package}, which is not installed; "
+            f"run: pip install 'stiffopt[{self.extra}]'"
+        )
+
+
+def shown(value: object) -> str:
+    """Return a value as an error message shows it: text in quotes, and never long."""
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list | tuple):
+        return "a list"
+    text = f"'{value}'" if isinstance(value, str) else repr(value)
+    return text if len(text) <= 60 else f"{text[:56]}...{text[-1]}"

@@ -1,0 +1,266 @@
+"""From channel pressures to the strain and the compliance of a section (eqs 8-10).
+
+A strain law says what a segment does without any load: the strain of its backbone and the
+compliance of its section, both constant along the segment.  Laws use different length
+conventions on paper; here both results are **per reference length**, so that the rest of the
+model need not know.  To add a law, subclass `StrainLaw` and enter it in `STRAIN_LAWS`.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.model.description import Segment
+
+NORM_SMOOTHING = 0.01
+"""Rounding of the cone sqrt(p.p) at zero pressure, in Pa (see `smooth_norm`)."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """What a strain law answers for one segment, per reference length.
+
+    Attributes
+    ----------
+    strain : casadi.SX
+        Backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
+    compliance : casadi.SX
+        Section compliance (6, 6): extra strain per internal wrench, in section axes.
+    """
+
+    strain: ca.SX
+    compliance: ca.SX
+
+
+@dataclass(frozen=True)
+class SectionGeometry:
+    """Area properties of the silicone of a section and the lever arms of its channels.
+
+    Attributes
+    ----------
+    area : float
+        Silicone area A, wall less core less chambers, in m^2.
+    centroid : ndarray
+        Centroid (2,) in section axes, in m; zero for symmetric layouts.
+    second_moment : ndarray
+        ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of eq. 10.
+    channel_force : ndarray
+        Chamber area of each channel (c,), in m^2: axial force per unit pressure.
+    channel_moment : ndarray
+        ``int r dA`` over each channel's chambers (c, 2), in m^3.
+    """
+
+    area: float
+    centroid: NDArray[np.float64]
+    second_moment: NDArray[np.float64]
+    channel_force: NDArray[np.float64]
+    channel_moment: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, segment: Segment) -> "SectionGeometry":
+        """Integrate over the section of a segment (eqs 8 and 10)."""
+        chambers = segment.chambers
+        angles = np.asarray(chambers.angles)
+        centres = chambers.offset * np.stack([np.cos(angles), np.sin(angles)], axis=1)  # (m, 2)
+        hole = np.pi * chambers.radius**2
+        area = np.pi * (segment.outer_radius**2 - segment.inner_radius**2) - len(angles) * hole
+        first_moment = -hole * centres.sum(axis=0)
+        annulus = np.pi / 4 * (segment.outer_radius**4 - segment.inner_radius**4)
+        own = len(angles) * np.pi / 4 * chambers.radius**4
+        about_axis = (annulus - own) * np.eye(2) - hole * centres.T @ centres
+        centroid = first_moment / area
+        members = [[number - 1 for number in channel] for channel in segment.channels]
+        return cls(
+            area=area,
+            centroid=np.where(np.abs(centroid) < 1e-12 * segment.outer_radius, 0.0, centroid),
+            second_moment=_without_rounding(about_axis - area * np.outer(centroid, centroid)),
+            channel_force=np.array([hole * len(chamber) for chamber in members]),
+            channel_moment=np.array([hole * centres[chamber].sum(axis=0) for chamber in members]),
+        )
+
+
+def _without_rounding(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Drop off-diagonal entries that are only rounding, to keep the model's graph sparse."""
+    return np.where(np.abs(matrix) < 1e-12 * np.abs(matrix).max(), 0.0, matrix)
+
+
+def smooth_norm(p: ca.SX) -> ca.SX:
+    """``sqrt(p.p + e^2) - e``: the norm of the pressures without its kink at p = 0."""
+    return ca.sqrt(ca.sumsqr(p) + NORM_SMOOTHING**2) - NORM_SMOOTHING
+
+
+def _bending(second_moment: ca.SX) -> ca.SX:
+    """Turn ``int r r^T dA`` into the matrix that maps (kappa_x, kappa_y) to (M_x, M_y) / E.
+
+    The strain of a fibre at (x, y) is ``y kappa_x - x kappa_y`` and it adds ``(y, -x)`` to
+    the moment.
+    """
+    quarter_turn = ca.DM([[0, 1], [-1, 0]])
+    return quarter_turn @ second_moment @ quarter_turn.T
+
+
+class StrainLaw(ABC):
+    """Free strain and compliance of one segment's section as a function of its pressures."""
+
+    limit: str
+    """What goes wrong where `margin` is not positive, as the end of a sentence."""
+
+    def __init__(self, segment: Segment) -> None:
+        self.segment = segment
+        self.geometry = SectionGeometry.of(segment)
+
+    @abstractmethod
+    def section(self, p: ca.SX) -> Section:
+        """Section for the channel pressures p (c,) of this segment, in Pa."""
+
+    @abstractmethod
+    def margin(self, p: ca.SX) -> ca.SX:
+        """Scalar that is positive where the law holds at pressures p (c,)."""
+
+    def _axial_force(self, p: ca.SX) -> ca.SX:
+        """Force of the pressure on the section, ``f_z = sum P A_c``, in N."""
+        return ca.dot(ca.DM(self.geometry.channel_force), p)
+
+    def _moment_about_centroid(self, p: ca.SX) -> ca.SX:
+        """Moment (M_x, M_y) of the pressure about the section's centroid, in N m."""
+        geometry = self.geometry
+        lever = geometry.channel_moment - np.outer(geometry.channel_force, geometry.centroid)
+        first = ca.DM(lever.T) @ p  # (2,): int r P dA
+        return ca.vertcat(first[1], -first[0])
+
+    def _compliance_about_centroid(
+        self, shear: ca.SX, axial: ca.SX, bending: ca.SX, torsion: ca.SX
+    ) -> ca.SX:
+        """``diag(GA, GA, EA, EI_x, EI_y, GJ)^-1`` with a full bending block (2, 2)."""
+        return ca.diagcat(1 / shear, 1 / shear, 1 / axial, ca.inv_minor(bending), 1 / torsion)
+
+    def _about_axis(self, compliance: ca.SX, centroid: ca.SX) -> ca.SX:
+        """Move a compliance from the centroid to the backbone axis (eq. 16)."""
+        if not self.geometry.centroid.any():
+            return compliance
+        A = lie.adjoint(lie.transform(ca.SX.eye(3), ca.vertcat(centroid, 0)))
+        return ca.sparsify(A @ compliance @ A.T)
+
+
+class PaperLaw(StrainLaw):
+    """The paper's law: linear, per deformed length, with compensation coefficients lambda.
+
+    ``lambda_E = E + slope |p|``, ``lambda_A = a A``, ``lambda_I = i I``; elongation
+    ``f_z l / (E A)``; curvature ``M / (E I)`` per *deformed* length, and the compliance of
+    eq. 17 integrated over deformed length (slip 8 of the notes).  The compensation of the
+    second moment acts about the centroid.
+    """
+
+    limit = "the pressure drives the compensated modulus of this segment to zero"
+
+    def _modulus(self, p: ca.SX) -> ca.SX:
+        modulus = self.segment.material.youngs_modulus
+        compensation = self.segment.compensation
+        if compensation is None or compensation.modulus_per_pressure == 0:
+            return ca.SX(modulus)
+        return modulus + compensation.modulus_per_pressure * smooth_norm(p)
+
+    def margin(self, p: ca.SX) -> ca.SX:
+        """Compensated modulus over a thousandth of the nominal one, less one."""
+        return self._modulus(p) / (1e-3 * self.segment.material.youngs_modulus) - 1
+
+    def section(self, p: ca.SX) -> Section:
+        """Section of eqs 8-10; see `StrainLaw.section`."""
+        compensation = self.segment.compensation
+        scale_area = compensation.area if compensation else 1.0
+        scale_inertia = compensation.inertia if compensation else 1.0
+        geometry = self.geometry
+        area = scale_area * geometry.area
+        inertia = scale_inertia * geometry.second_moment
+        E = self._modulus(p)
+        G = E / (2 * (1 + self.segment.material.poisson_ratio))
+        per_deformed_length = self._about_axis(
+            self._compliance_about_centroid(
+                shear=G * area,
+                axial=E * area,
+                bending=E * _bending(ca.DM(inertia)),
+                torsion=G * np.trace(inertia),
+            ),
+            ca.SX(geometry.centroid),
+        )
+        force, moment = self._axial_force(p), self._moment_about_centroid(p)
+        kappa = ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E
+        c = geometry.centroid
+        stretch = 1 + force / (E * area) + kappa[1] * c[0] - kappa[0] * c[1]
+        strain = stretch * ca.vertcat(0, 0, 1, kappa, 0)
+        return Section(strain, stretch * per_deformed_length)
+
+
+class NeoHookeanLaw(StrainLaw):
+    """Incompressible neo-Hookean section, per reference length.
+
+    With ``mu = E / 3`` and chambers of constant bore (fibre-reinforced), the pressure force N
+    stretches the section by the positive root of ``lambda - lambda^-2 = N / (mu A)``.  The
+    section shrinks by ``a = lambda^-1/2``, the lever arms of the chambers with it.  About that
+    state the section has (per reference length, in shrunk axes)
+
+    * axial stiffness ``E_t A`` with the tangent modulus ``E_t = mu (1 + 2 lambda^-3)``,
+    * bending stiffness ``E_t I a^2``, moment ``a sum P A_c r``,
+    * shear stiffness ``mu A`` and torsional stiffness ``mu J a^2``,
+
+    all exact to first order in curvature.
+    """
+
+    limit = "the pressure compresses this segment beyond the neo-Hookean law's range"
+    _lowest_load = -1.8  # the closed-form root below is real down to -3 / 2^(2/3) = -1.89
+
+    def _shear_modulus(self) -> float:
+        return self.segment.material.youngs_modulus / 3
+
+    def margin(self, p: ca.SX) -> ca.SX:
+        """Distance of the axial load N / (mu A) from the largest compression."""
+        load = self._axial_force(p) / (self._shear_modulus() * self.geometry.area)
+        return load - self._lowest_load
+
+    def section(self, p: ca.SX) -> Section:
+        """Section about the stretched state; see `StrainLaw.section`."""
+        geometry = self.geometry
+        mu = self._shear_modulus()
+        load = self._axial_force(p) / (mu * geometry.area)
+        stretch = neo_hookean_stretch(load)
+        tangent_modulus = mu * (1 + 2 * stretch**-3)
+        shrink = 1 / ca.sqrt(stretch)
+        bending = tangent_modulus * _bending(ca.DM(geometry.second_moment)) / stretch
+        centroid = shrink * ca.SX(geometry.centroid)
+        compliance = self._about_axis(
+            self._compliance_about_centroid(
+                shear=mu * geometry.area,
+                axial=tangent_modulus * geometry.area,
+                bending=bending,
+                torsion=mu * np.trace(geometry.second_moment) / stretch,
+            ),
+            centroid,
+        )
+        omega = ca.inv_minor(bending) @ (shrink * self._moment_about_centroid(p))
+        axis_stretch = stretch + omega[1] * centroid[0] - omega[0] * centroid[1]
+        return Section(ca.vertcat(0, 0, axis_stretch, omega, 0), compliance)
+
+
+def neo_hookean_stretch(load: ca.SX) -> ca.SX:
+    """Stretch of an incompressible neo-Hookean bar: ``lambda - lambda^-2 = load``.
+
+    The one positive root of ``lambda^3 - load lambda^2 - 1 = 0`` by Cardano's formula, real
+    for ``load > -3 / 2^(2/3)``.
+    """
+    third = load / 3
+    half_q = third**3 + 0.5
+    root = half_q + ca.sqrt(third**3 + 0.25)
+    u = root ** (1 / 3)
+    return third + u + third**2 / u
+
+
+STRAIN_LAWS: dict[str, type[StrainLaw]] = {"paper": PaperLaw, "neo-hookean": NeoHookeanLaw}
+
+
+def strain_law(segment: Segment) -> StrainLaw:
+    """Strain law that a segment's description names."""
+    return STRAIN_LAWS[segment.strain_law](segment)

@@ -1,0 +1,378 @@
+"""What an arm is: the schema of the robot file and the description in code, in one.
+
+Everything is in SI: m, rad, Pa, kg. Built in code::
+
+    Segment(length=0.09, outer_radius=0.015, inner_radius=0.0045, ...)
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import math
+import os
+from collections.abc import Sequence
+from functools import cache
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from stiffopt.errors import InputError, shown
+from stiffopt.files import BadKeyError, Items, Schema, Vector, read_file
+from stiffopt.units import (
+    Acceleration,
+    Angle,
+    Density,
+    Length,
+    Mass,
+    Number,
+    Pressure,
+    PressureRate,
+)
+
+__all__ = [
+    "Chambers",
+    "Compensation",
+    "Material",
+    "PressureLimits",
+    "RobotDescription",
+    "Segment",
+    "builtin_robots",
+    "load_description",
+]
+
+_SLACK = 1e-9  # m; two circles that touch may overlap by rounding
+
+
+def _index(value: Any) -> Any:
+    if isinstance(value, bool) or not hasattr(value, "__index__"):
+        raise InputError(f"expected a chamber number, counted from 1, not {shown(value)}")
+    return value.__index__()
+
+
+def one_or_list(value: Any) -> str:
+    """Tell one value for all channels from a list of one per channel."""
+    listed = isinstance(value, Sequence) or hasattr(value, "tolist")
+    scalar = isinstance(value, str) or getattr(value, "ndim", None) == 0
+    return "<list>" if listed and not scalar else "<one>"
+
+
+PerChannelPressure = Annotated[
+    Annotated[Pressure, Tag("<one>")] | Annotated[Items[Pressure], Tag("<list>")],
+    Discriminator(one_or_list),
+]
+"""One pressure for all channels or one per channel, proximal segment first, in Pa."""
+_PositiveRate = Annotated[PressureRate, Field(gt=0)]
+PerChannelRate = Annotated[
+    Annotated[_PositiveRate, Tag("<one>")] | Annotated[Items[_PositiveRate], Tag("<list>")],
+    Discriminator(one_or_list),
+]
+"""One rate for all channels or one per channel, proximal segment first, in Pa/s."""
+
+PositiveLength = Annotated[Length, Field(gt=0)]
+ChamberNumber = Annotated[int, BeforeValidator(_index)]
+
+
+class Chambers(Schema):
+    """Round chambers that run along a segment, their centres on one circle.
+
+    Attributes
+    ----------
+    radius : of each chamber, in m.
+    offset : of the chambers' centres from the axis, in m.
+    angles : of the chambers' centres about the axis from x towards y, in rad.
+    """
+
+    radius: PositiveLength
+    offset: PositiveLength
+    angles: Annotated[Items[Angle], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Chambers:
+        for (i, a), (j, b) in itertools.combinations(enumerate(self.angles, start=1), 2):
+            distance = 2 * self.offset * abs(math.sin((a - b) / 2))
+            if distance < 2 * self.radius - _SLACK:
+                raise BadKeyError("angles", f"chambers {i} and {j} overlap; move them apart")
+        return self
+
+
+class Material(Schema):
+    """The silicone, linear and isotropic.
+
+    Attributes
+    ----------
+    youngs_modulus : E, in Pa.
+    poisson_ratio : 0.5 is incompressible.
+    density : in kg/m^3, or None; needed only where there is gravity.
+    """
+
+    youngs_modulus: Annotated[Pressure, Field(gt=0)]
+    poisson_ratio: Annotated[Number, Field(gt=-1, le=0.5)] = 0.5
+    density: Annotated[Density, Field(gt=0)] | None = None
+
+
+class Compensation(Schema):
+    """The paper's lambda: corrections of E, A and I that are fitted to an arm.
+
+    Attributes
+    ----------
+    modulus_per_pressure : change of E per norm of a segment's pressures, Pa/Pa.
+    area : factor on A.
+    inertia : factor on I.
+    """
+
+    modulus_per_pressure: Number = 0.0
+    area: Annotated[Number, Field(gt=0)] = 1.0
+    inertia: Annotated[Number, Field(gt=0)] = 1.0
+
+
+class Segment(Schema):
+    """One segment of the arm, followed by a rigid connector.
+
+    Attributes
+    ----------
+    length, outer_radius, inner_radius : of the tube at rest, in m.
+    chambers : where the chambers are.
+    channels : for each regulator the chambers it feeds, counted from 1.
+    material : what the tube is made of.
+    compensation : the paper's lambda, or None for none.
+    connector : rigid length after the segment, in m.
+    strain_law : how pressures strain the segment.
+    """
+
+    length: PositiveLength
+    outer_radius: PositiveLength
+    inner_radius: Annotated[Length, Field(ge=0)] = 0.0
+    chambers: Chambers
+    channels: Annotated[
+        Items[Annotated[Items[ChamberNumber], Field(min_length=1)]], Field(min_length=1)
+    ]
+    material: Material
+    compensation: Compensation | None = None
+    connector: Annotated[Length, Field(ge=0)] = 0.0
+    strain_law: Literal["paper", "neo-hookean"] = "paper"
+
+    @property
+    def n_channels(self) -> int:
+        """Number of pressures that act on this segment."""
+        return len(self.channels)
+
+    @model_validator(mode="after")
+    def _check(self) -> Segment:
+        self._check_walls()
+        self._check_channels()
+        if self.strain_law == "neo-hookean":
+            if self.material.poisson_ratio != 0.5:
+                raise BadKeyError(
+                    "material.poisson_ratio",
+                    "the neo-hookean law is incompressible; expected 0.5, "
+                    f"not {self.material.poisson_ratio:g}",
+                )
+            if self.compensation is not None:
+                raise BadKeyError(
+                    "compensation",
+                    "the neo-hookean law takes no compensation; remove it or use the paper's law",
+                )
+        return self
+
+    def _check_walls(self) -> None:
+        def mm(value: float) -> str:
+            return f"{value * 1e3:.6g} mm"
+
+        inner, outer, chambers = self.inner_radius, self.outer_radius, self.chambers
+        if inner >= outer:
+            raise BadKeyError(
+                "inner_radius",
+                f"{mm(inner)} must be less than the outer radius of {mm(outer)}",
+            )
+        if chambers.offset - chambers.radius < inner - _SLACK:
+            raise BadKeyError(
+                "chambers.offset",
+                f"chambers of radius {mm(chambers.radius)} at {mm(chambers.offset)} break through "
+                f"the inner wall at {mm(inner)}; expected offset - radius >= inner_radius",
+            )
+        if chambers.offset + chambers.radius > outer + _SLACK:
+            raise BadKeyError(
+                "chambers.offset",
+                f"chambers of radius {mm(chambers.radius)} at {mm(chambers.offset)} break through "
+                f"the outer wall at {mm(outer)}; expected offset + radius <= outer_radius",
+            )
+
+    def _check_channels(self) -> None:
+        n = len(self.chambers.angles)
+        fed: dict[int, int] = {}
+        for channel, chambers in enumerate(self.channels, start=1):
+            for position, chamber in enumerate(chambers):
+                key = f"channels.{channel - 1}.{position}"
+                if not 1 <= chamber <= n:
+                    raise BadKeyError(
+                        key, f"there is no chamber {chamber}; expected a number from 1 to {n}"
+                    )
+                if chamber in fed:
+                    twice = (
+                        f"twice by channel {channel}"
+                        if fed[chamber] == channel
+                        else f"by channel {fed[chamber]} and by channel {channel}"
+                    )
+                    raise BadKeyError(key, f"chamber {chamber} is fed {twice}; expected one")
+                fed[chamber] = channel
+        for chamber in range(1, n + 1):
+            if chamber not in fed:
+                raise BadKeyError(
+                    "channels", f"chamber {chamber} is fed by no channel; expected one"
+                )
+
+
+class PressureLimits(Schema):
+    """What the regulators may do; one value for all channels or one per channel.
+
+    Attributes
+    ----------
+    min, max : in Pa, gauge.
+    slew : greatest rate of change, in Pa/s, or None where it is not known.
+    """
+
+    min: PerChannelPressure
+    max: PerChannelPressure
+    slew: PerChannelRate | None = None
+
+
+class RobotDescription(Schema):
+    """An arm: its segments from the base to the tip, what it carries and what drives it.
+
+    Attributes
+    ----------
+    name : for people.
+    segments : proximal segment first.
+    tip_mass : mass fixed at the tip, in kg.
+    gravity : acceleration in the base frame, in m/s^2; z runs along the straight arm.
+    pressure : limits of the regulators.
+    """
+
+    name: Annotated[str, Field(min_length=1)]
+    segments: Annotated[Items[Segment], Field(min_length=1, max_length=20)]
+    tip_mass: Annotated[Mass, Field(ge=0)] = 0.0
+    gravity: Vector[Acceleration] = (0.0, 0.0, 0.0)
+    pressure: PressureLimits
+
+    @property
+    def n_segments(self) -> int:
+        """Number of segments."""
+        return len(self.segments)
+
+    @property
+    def n_pressures(self) -> int:
+        """Number of channels of all segments."""
+        return sum(segment.n_channels for segment in self.segments)
+
+    @property
+    def length(self) -> float:
+        """Length at rest with the connectors, in m."""
+        return sum(segment.length + segment.connector for segment in self.segments)
+
+    @property
+    def pressure_min(self) -> tuple[float, ...]:
+        """Lower limit of each channel, in Pa."""
+        return self._per_channel(self.pressure.min)
+
+    @property
+    def pressure_max(self) -> tuple[float, ...]:
+        """Upper limit of each channel, in Pa."""
+        return self._per_channel(self.pressure.max)
+
+    @property
+    def pressure_slew(self) -> tuple[float, ...] | None:
+        """Greatest rate of change of each channel, in Pa/s, or None."""
+        return None if self.pressure.slew is None else self._per_channel(self.pressure.slew)
+
+    def channel_name(self, index: int) -> str:
+        """Return what people call a channel (counted from 0): ``segment 2 channel 1``."""
+        for number, segment in enumerate(self.segments, start=1):
+            if 0 <= index < segment.n_channels:
+                return f"segment {number} channel {index + 1}"
+            index -= segment.n_channels
+        raise InputError(f"there is no such channel; this robot has {self.n_pressures}")
+
+    def check_per_channel(self, key: str, value: object) -> None:
+        """Raise `BadKeyError` if a list of one value per channel has not one per channel."""
+        n = self.n_pressures
+        if isinstance(value, tuple) and len(value) != n:
+            raise BadKeyError(
+                key,
+                f"has {len(value)} values; expected one value or a list of {n}, one for each "
+                "channel of the robot, proximal segment first",
+            )
+
+    def _per_channel(self, value: float | tuple[float, ...]) -> tuple[float, ...]:
+        return value if isinstance(value, tuple) else (value,) * self.n_pressures
+
+    @model_validator(mode="after")
+    def _check(self) -> RobotDescription:
+        for key, value in self.pressure:
+            self.check_per_channel(f"pressure.{key}", value)
+        for index, (low, high) in enumerate(zip(self.pressure_min, self.pressure_max, strict=True)):
+            if low >= high:
+                raise BadKeyError(
+                    "pressure.max",
+                    f"{high * 1e-5:g} bar must be greater than the min of {low * 1e-5:g} bar "
+                    f"({self.channel_name(index)})",
+                )
+        if any(self.gravity):
+            for index, segment in enumerate(self.segments):
+                if segment.material.density is None:
+                    raise BadKeyError(
+                        f"segments.{index}.material",
+                        "there is gravity, so a density is needed; "
+                        "add one such as 'density: 1070 kg/m^3' or remove gravity",
+                    )
+        return self
+
+
+@cache
+def builtin_robots() -> tuple[str, ...]:
+    """Return the names of the robots that come with stiffopt."""
+    folder = files("stiffopt").joinpath("robots")
+    names = (entry.name for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return tuple(sorted(name.removesuffix(".yaml") for name in names))
+
+
+def load_description(
+    name_or_path: str | os.PathLike[str], base: str | os.PathLike[str] | None = None
+) -> RobotDescription:
+    """Return a built-in robot or read a robot file.
+
+    Parameters
+    ----------
+    name_or_path :
+        Text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is a `Path`;
+        any other is the name of a built-in robot.
+    base :
+        Folder from which a relative path starts; by default the current one.
+
+    Raises
+    ------
+    InputError
+        There is no such built-in robot.
+    FileError
+        The file cannot be read or is wrong.
+    """
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise InputError(f"expected a robot's name or path, not {shown(name_or_path)}")
+    text = os.fspath(name_or_path)
+    if not isinstance(name_or_path, str) or _is_path(text):
+        return read_file(Path(base or "") / text, "robot", RobotDescription)
+    if text not in builtin_robots():
+        near = difflib.get_close_matches(text, builtin_robots(), n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise InputError(
+            f"there is no robot '{text}'; {hint}The built-in robots are "
+            f"{', '.join(builtin_robots())}; the path of a robot file ends in .yaml"
+        )
+    with as_file(files("stiffopt").joinpath("robots", f"{text}.yaml")) as path:
+        return read_file(path, "robot", RobotDescription)
+
+
+def _is_path(text: str) -> bool:
+    return text.endswith((".yaml", ".yml")) or "/" in text or os.sep in text

@@ -1,0 +1,218 @@
+"""The arm under gravity and loads: the stable equilibrium reached continuously from rest.
+
+Newton's method on the shooting problem (`stiffopt.model.shooting`), along a path: first the
+weight grows on the unpressurised arm, then pressures and loads grow together.  Steps are halved
+where Newton's method does not contract at once or stability is lost, and where that no longer
+helps the path has ended: the arm buckles or falls over there.
+"""
+
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.shooting import Shooting
+
+Vector = NDArray[np.float64]
+
+_LARGEST_TURN = 0.5  # rad of tip rotation in one continuation step; a longer one is halved
+_SHORTEST_STEP = 1e-4  # of the way from rest; less means that the path has ended
+_CONVERGED = 1e-11  # rad
+_ROUNDING = 1e-9  # rad; corrections below need not shrink
+_MOST_ITERATIONS = 12
+
+
+class Loads(NamedTuple):
+    """Loads on the arm, each as CasADi or NumPy column.
+
+    `tip` and `station` hold a dead wrench in base axes (6,) over a follower wrench in the axes
+    of the loaded point (6,); `gravity` (3,) is in base axes.
+    """
+
+    gravity: Vector
+    tip: Vector
+    station: Vector
+
+
+class State(NamedTuple):
+    """An equilibrium: the tip's orientation (w, x, y, z), from which all else follows."""
+
+    pressures: Vector
+    quaternion: Vector
+    loads: Loads
+
+
+class Equilibrium:
+    """Numerical equilibria of one shooting problem."""
+
+    def __init__(self, shooting: Shooting) -> None:
+        self._shooting = shooting
+        self._functions: dict[tuple[str, float | None], ca.Function] = {}
+        self._rest: dict[bytes, State] = {}
+
+    def arguments(self, state: State) -> tuple[Vector, ...]:
+        """Numbers for the inputs of a `Chain` at an equilibrium."""
+        x = np.concatenate([np.zeros(3), state.pressures, np.zeros(6)])
+        return (state.quaternion, x, *state.loads)
+
+    def _function(self, name: str, at: float | None) -> ca.Function:
+        """The map of Newton's method or the stability condition, for one station."""
+        if (name, at) not in self._functions:
+            chain = self._shooting.chain(at)
+            outputs = (
+                [chain.residual, ca.jacobian(chain.residual, chain.x)[:, :3]]
+                if name == "newton"
+                else [chain.rotational_compliances]
+            )
+            self._functions[name, at] = ca.Function(name, chain.inputs, outputs)
+        return self._functions[name, at]
+
+    def correct(self, guess: State, at: float | None = None) -> State | None:
+        """Newton's method from a nearby state; None if that is not near, or not stable.
+
+        "Near" means that the first correction turns the tip by at most half a radian and the
+        later ones shrink: then the path from the guess to the answer has no fold in between.
+        """
+        newton = self._function("newton", at)
+        state, previous = guess, _LARGEST_TURN
+        for iteration in range(_MOST_ITERATIONS):
+            residual, change = (part.full() for part in newton(*self.arguments(state)))
+            turn = _solve_3x3(change, -residual[:, 0])
+            size = float(np.linalg.norm(turn))
+            bound = previous if iteration < 2 else max(0.5 * previous, _ROUNDING)
+            if not size <= bound:  # NaN too
+                return None
+            q = lie.quaternion_product(state.quaternion, np.concatenate([[1.0], turn / 2]))
+            state = state._replace(quaternion=q / np.linalg.norm(q))
+            if size < _CONVERGED:
+                return state if self.is_stable(state, at) else None
+            previous = size
+        return None
+
+    def is_stable(self, state: State, at: float | None = None) -> bool:
+        """Whether an equilibrium is a minimum of the energy (Jacobi's condition)."""
+        blocks = self._function("stability", at)(*self.arguments(state)).full()
+        if not np.isfinite(blocks).all():
+            return False
+        compliances = blocks.T.reshape(-1, 3, 3)
+        eigenvalues = np.linalg.eigvalsh(compliances + compliances.swapaxes(1, 2))
+        return bool((eigenvalues > 0).all())
+
+    def follow(self, start: State, end: State, at: float | None = None) -> tuple[State, float]:
+        """Equilibrium reached continuously between two sets of pressures and loads.
+
+        Returns the last stable state on the straight way from `start` to `end` (whose
+        quaternion is not used) and the share of the way that it is at; 1.0 means arrived.
+        """
+        state, share, step = start, 0.0, 1.0
+        while share < 1.0:
+            target = min(1.0, share + step)
+            trial = _between(start, end, target)._replace(quaternion=state.quaternion)
+            corrected = self.correct(trial, at)
+            if corrected is None:
+                step /= 2
+                if step < _SHORTEST_STEP:
+                    return state, share
+            else:
+                state, share, step = corrected, target, 2 * step
+        return state, 1.0
+
+    def settle(self, pressures: Vector, loads: Loads, at: float | None = None) -> State:
+        """Equilibrium reached from rest: first the arm's weight, then pressures and loads.
+
+        Raises
+        ------
+        EquilibriumError
+            If the arm buckles or falls over on the way; the message says where.
+        """
+        hanging = self._at_rest(loads.gravity)
+        state, share = self.follow(hanging, State(pressures, hanging.quaternion, loads), at)
+        if share < 1.0:
+            what = "its pressures and load" if loads.tip.any() or loads.station.any() else (
+                "its pressures"
+            )
+            raise EquilibriumError(
+                f"no stable equilibrium: the arm buckles or falls over at {share:.0%} of {what} "
+                f"(raised together from the unpressurised arm under its weight)"
+            )
+        return state
+
+    def _at_rest(self, gravity: Vector) -> State:
+        """The unpressurised arm under its own weight and payload."""
+        key = gravity.tobytes()
+        if key not in self._rest:
+            none = Loads(np.zeros(3), np.zeros(12), np.zeros(12))
+            upright = np.array([1.0, 0.0, 0.0, 0.0])
+            straight = State(np.zeros(self._shooting.description.n_pressures), upright, none)
+            weighted = straight._replace(loads=none._replace(gravity=gravity))
+            state, share = self.follow(straight, weighted)
+            if share < 1.0:
+                raise EquilibriumError(
+                    f"no stable equilibrium: the unpressurised arm buckles or falls over at "
+                    f"{share:.0%} of its own weight and payload; mount it hanging, or make it "
+                    f"shorter, lighter or stiffer"
+                )
+            self._rest[key] = state
+        return self._rest[key]
+
+    def shape(self, state: State, stations: Vector, at: float | None = None) -> Vector:
+        """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium with its load at `at`."""
+        sections = [np.asarray(part) for part in self._shooting.sections(state.pressures)]
+        length = self._shooting.description.length
+        station_at = length if at is None else at
+        tip, station = state.loads.tip, state.loads.station
+        q, r = state.quaternion, np.zeros(3)
+        R = lie.rotation_from_quaternion(q)
+        force = tip[:3] + R @ tip[6:9] + self._shooting.description.tip_mass * state.loads.gravity
+        moment = tip[3:6] + R @ tip[9:]
+        found = {length: (q, r)}
+        for piece in self._shooting.pieces([station_at, *stations]):
+            R = lie.rotation_from_quaternion(q)
+            if abs(piece.distal - station_at) < 1e-12 * length:
+                force = force + station[:3] + R @ station[6:9]
+                moment = moment + station[3:6] + R @ station[9:]
+            if piece.rigid:
+                r = r - piece.length * R[:, 2]
+                moment = moment + piece.length * np.cross(R[:, 2], force)
+            else:
+                strain, compliance = sections[2 * piece.segment : 2 * piece.segment + 2]
+                weight = self._shooting.weight(piece.segment) * state.loads.gravity
+                h = piece.length / piece.steps
+                for _ in range(piece.steps):
+                    y = np.concatenate([q, r, moment])
+                    y = np.asarray(
+                        self._shooting.step[piece.segment](y, strain, compliance, force, weight, h)
+                    )[:, 0]
+                    q, r, moment = y[:4], y[4:7], y[7:]
+                    force = force + h * weight
+            found[piece.distal - piece.length] = (q, r)
+        marks = np.array(sorted(found))
+        origin = found[marks[0]][1]
+        poses = []
+        for s in stations:
+            q, position = found[marks[np.argmin(np.abs(marks - s))]]
+            poses.append(
+                lie.transform(lie.rotation_from_quaternion(q / np.linalg.norm(q)), position - origin)
+            )
+        return np.stack(poses)
+
+
+def _between(start: State, end: State, share: float) -> State:
+    """Pressures and loads at a share of the straight way between two states."""
+
+    def mix(a: Vector, b: Vector) -> Vector:
+        return (1 - share) * a + share * b
+
+    loads = Loads(*(mix(a, b) for a, b in zip(start.loads, end.loads, strict=True)))
+    return State(mix(start.pressures, end.pressures), start.quaternion, loads)
+
+
+def _solve_3x3(matrix: Vector, right: Vector) -> Vector:
+    """Solution of a small system; NaN where it is singular."""
+    try:
+        return np.linalg.solve(matrix, right)
+    except np.linalg.LinAlgError:
+        return np.full(3, np.nan)

@@ -1,0 +1,71 @@
+"""From section strains to poses along the unloaded arm (eqs 6 and 7).
+
+A segment of constant strain is one exponential; the paper's product of five exponentials
+(eq. 7) is the same motion, but is undefined at zero curvature where this one is smooth.
+"""
+
+from dataclasses import dataclass
+
+import casadi as ca
+
+from stiffopt import lie
+from stiffopt.model.actuation import Section, strain_law
+from stiffopt.model.description import RobotDescription
+
+
+@dataclass(frozen=True)
+class Actuation:
+    """Pressures of the whole arm and what they make of each segment.
+
+    Attributes
+    ----------
+    pressures : casadi.SX
+        All channel pressures (n,), proximal segment first, in Pa.
+    sections : tuple of Section
+        One per segment, proximal first.
+    margin : casadi.SX
+        One positive number per segment while its strain law holds.
+    """
+
+    pressures: ca.SX
+    sections: tuple[Section, ...]
+    margin: ca.SX
+
+    @classmethod
+    def of(cls, description: RobotDescription) -> "Actuation":
+        """Symbolic actuation of a robot."""
+        pressures = ca.SX.sym("p", description.n_pressures)
+        laws = [strain_law(segment) for segment in description.segments]
+        offset, sections, margins = 0, [], []
+        for segment, law in zip(description.segments, laws, strict=True):
+            own = pressures[offset : offset + segment.n_channels]
+            offset += segment.n_channels
+            sections.append(law.section(own))
+            margins.append(law.margin(own))
+        return cls(pressures, tuple(sections), ca.vertcat(*margins))
+
+
+def connector(length: float) -> ca.SX:
+    """Pose of the far end of a rigid connector in its near end."""
+    return lie.transform(ca.SX.eye(3), ca.SX([0, 0, length]))
+
+
+def segment_pose(section: Section, arc_length: ca.SX | float) -> ca.SX:
+    """Pose (4, 4) at a reference arc length along a segment, in the segment's base."""
+    return lie.exp(section.strain * arc_length)
+
+
+def body_jacobian(T: ca.SX, variables: ca.SX) -> ca.SX:
+    """Body twist of a moving frame per unit variable: (4, 4), (n,) -> (6, n).
+
+    ``J_i = (T^-1 dT/dx_i)^v``, in the axes of the moving frame, linear part first.
+    """
+    rotation = T[:3, :3]
+    linear = rotation.T @ ca.jacobian(T[:3, 3], variables)
+    columns = [ca.jacobian(rotation[:, k], variables) for k in range(3)]  # each (3, n)
+    angular = ca.vertcat(  # entries (2, 1), (0, 2), (1, 0) of R^T dR
+        rotation[:, 2].T @ columns[1],
+        rotation[:, 0].T @ columns[2],
+        rotation[:, 1].T @ columns[0],
+    )
+    return ca.vertcat(linear, angular)

@@ -1,0 +1,125 @@
+"""Twists and wrenches as screws: an axis in space, a pitch and a magnitude (eqs 1 and 4)."""
+
+from dataclasses import dataclass
+from math import inf
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt import lie
+from stiffopt.errors import InputError
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Screw:
+    """Six coordinates in some frame; subclasses say which half turns about the axis."""
+
+    coordinates: Vector
+
+    def __post_init__(self) -> None:
+        coordinates = np.array(self.coordinates, dtype=float)
+        if coordinates.shape != (6,) or not np.isfinite(coordinates).all():
+            raise InputError(
+                f"a {type(self).__name__.lower()} has six finite coordinates, linear part first; "
+                f"got {coordinates.tolist()}"
+            )
+        coordinates.flags.writeable = False
+        object.__setattr__(self, "coordinates", coordinates)
+
+    def _along_and_about(self) -> tuple[Vector, Vector]:
+        """The vector along the axis, and the other half of the coordinates."""
+        raise NotImplementedError
+
+    @property
+    def pitch(self) -> float:
+        """Advance along the axis per unit about it, in m; infinite without the latter."""
+        along, other = self._along_and_about()
+        square = along @ along
+        return float(along @ other / square) if square > 0 else inf
+
+    @property
+    def axis_direction(self) -> Vector:
+        """Unit vector (3,) along the axis; zero for the zero screw."""
+        along, other = self._along_and_about()
+        vector = along if along.any() else other
+        length = np.linalg.norm(vector)
+        return vector / length if length > 0 else vector
+
+    @property
+    def axis_point(self) -> Vector:
+        """Point (3,) of the axis nearest to the frame's origin, in m."""
+        along, other = self._along_and_about()
+        square = along @ along
+        return np.cross(along, other) / square if square > 0 else np.zeros(3)
+
+    @property
+    def magnitude(self) -> float:
+        """Length of the vector along the axis, or of the other half where that is zero."""
+        along, other = self._along_and_about()
+        return float(np.linalg.norm(along if along.any() else other))
+
+    @classmethod
+    def _from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float) -> tuple[Vector, Vector]:
+        along = np.asarray(direction, dtype=float)
+        return along, np.cross(np.asarray(point, dtype=float), along) + pitch * along
+
+
+class Twist(_Screw):
+    """Infinitesimal motion (v, omega) of eq. (1): ``v = -omega x S0 + h omega``."""
+
+    @property
+    def linear(self) -> Vector:
+        """Velocity or displacement v (3,) of the point at the frame's origin."""
+        return self.coordinates[:3]
+
+    @property
+    def angular(self) -> Vector:
+        """Rotation omega (3,)."""
+        return self.coordinates[3:]
+
+    @classmethod
+    def from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float = 0.0) -> Self:
+        """Twist about an axis through `point`, |direction| its rotation, `pitch` in m."""
+        omega, v = cls._from_axis(point, direction, pitch)
+        return cls(np.concatenate([v, omega]))
+
+    def transformed(self, T_ab: Vector) -> Self:
+        """The same motion with coordinates in frame a, given in frame b (eq. 15)."""
+        return type(self)(lie.adjoint(np.asarray(T_ab)) @ self.coordinates)
+
+    def _along_and_about(self) -> tuple[Vector, Vector]:
+        return self.angular, self.linear
+
+
+class Wrench(_Screw):
+    """Force and moment (F, M) of eq. (4): ``M = S0 x F + h F``."""
+
+    @property
+    def force(self) -> Vector:
+        """Force F (3,) in N."""
+        return self.coordinates[:3]
+
+    @property
+    def moment(self) -> Vector:
+        """Moment M (3,) in N m about the frame's origin."""
+        return self.coordinates[3:]
+
+    @classmethod
+    def from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float = 0.0) -> Self:
+        """Wrench along an axis through `point`, |direction| its force, `pitch` in m."""
+        force, moment = cls._from_axis(point, direction, pitch)
+        return cls(np.concatenate([force, moment]))
+
+    def transformed(self, T_ab: Vector) -> Self:
+        """The same wrench with coordinates in frame a, given in frame b (eq. 5)."""
+        return type(self)(lie.coadjoint(np.asarray(T_ab)) @ self.coordinates)
+
+    def power(self, twist: Twist) -> float:
+        """Work done on a twist in the same frame: ``F.v + M.omega``."""
+        return float(self.coordinates @ twist.coordinates)
+
+    def _along_and_about(self) -> tuple[Vector, Vector]:
+        return self.force, self.moment

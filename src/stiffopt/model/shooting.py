@@ -1,0 +1,329 @@
+"""The rod under load as a shooting problem, symbolically.
+
+Of a dead load the internal force is known everywhere in base axes, and at the tip the internal
+wrench is the applied one; all that is unknown there is the tip's orientation.  So the equations
+of a geometrically exact rod are integrated from the tip to the base,
+
+    q' = -q (0, u) / 2,   r' = -R v,   m' = R v x n + R c x f,   n(tau) = n_tip + f tau,
+    (v, u) = strain(p) + C(p) (R^T n, R^T m),
+
+(tau: reference length from the tip, n and m: force and moment that the distal part exerts,
+f: weight per length, c: centroid), and the right orientation is the one that brings the base
+out upright: **three** unknowns for any number of segments, for dead and follower loads alike.
+Everything else follows from the same map by the implicit function theorem.
+
+The integrator is the eleven-stage Runge-Kutta method of order eight of Cooper and Verner
+(SIAM J. Numer. Anal. 9, 1972).
+
+Stability is Jacobi's condition: the energy is at a minimum if and only if no shorter arm, clamped
+anywhere between tip and base, is at the point of buckling.  At that point a moment at the tip
+turns it without bound, and beyond it turns it the wrong way round: so the rotational compliance
+of every shorter arm must be positive definite.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import ceil, sqrt
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.model.actuation import SectionGeometry
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.kinematics import Actuation
+
+Vector = NDArray[np.float64]
+
+_ROOT = sqrt(21)
+_STAGES: tuple[dict[int, float], ...] = (
+    {},
+    {0: 1 / 2},
+    {0: 1 / 4, 1: 1 / 4},
+    {0: 1 / 7, 1: (-7 - 3 * _ROOT) / 98, 2: (21 + 5 * _ROOT) / 49},
+    {0: (11 + _ROOT) / 84, 2: (18 + 4 * _ROOT) / 63, 3: (21 - _ROOT) / 252},
+    {
+        0: (5 + _ROOT) / 48,
+        2: (9 + _ROOT) / 36,
+        3: (-231 + 14 * _ROOT) / 360,
+        4: (63 - 7 * _ROOT) / 80,
+    },
+    {
+        0: (10 - _ROOT) / 42,
+        2: (-432 + 92 * _ROOT) / 315,
+        3: (633 - 145 * _ROOT) / 90,
+        4: (-504 + 115 * _ROOT) / 70,
+        5: (63 - 13 * _ROOT) / 35,
+    },
+    {0: 1 / 14, 4: (14 - 3 * _ROOT) / 126, 5: (13 - 3 * _ROOT) / 63, 6: 1 / 9},
+    {
+        0: 1 / 32,
+        4: (91 - 21 * _ROOT) / 576,
+        5: 11 / 72,
+        6: (-385 - 75 * _ROOT) / 1152,
+        7: (63 + 13 * _ROOT) / 128,
+    },
+    {
+        0: 1 / 14,
+        4: 1 / 9,
+        5: (-733 - 147 * _ROOT) / 2205,
+        6: (515 + 111 * _ROOT) / 504,
+        7: (-51 - 11 * _ROOT) / 56,
+        8: (132 + 28 * _ROOT) / 245,
+    },
+    {
+        4: (-42 + 7 * _ROOT) / 18,
+        5: (-18 + 28 * _ROOT) / 45,
+        6: (-273 - 53 * _ROOT) / 72,
+        7: (301 + 53 * _ROOT) / 72,
+        8: (28 - 28 * _ROOT) / 45,
+        9: (49 - 7 * _ROOT) / 18,
+    },
+)
+_WEIGHTS: dict[int, float] = {0: 1 / 20, 7: 49 / 180, 8: 16 / 45, 9: 49 / 180, 10: 1 / 20}
+
+STEPS_PER_SEGMENT = 2
+"""Integration steps per segment at resolution 1."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A stretch of arm between two stations, integrated in equal steps from tip to base."""
+
+    segment: int
+    rigid: bool
+    length: float
+    steps: int
+    distal: float  # arc length at rest of its far end, from the base
+
+
+def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
+    """One integration step of length h towards the base: state (10,) -> state (10,)."""
+    start = ca.SX.sym("y", 10)  # q (4), r (3), m (3)
+    strain = ca.SX.sym("strain", 6)
+    compliance = ca.SX.sym("C", sparsity)
+    n, f, h = ca.SX.sym("n", 3), ca.SX.sym("f", 3), ca.SX.sym("h")
+
+    def derivative(state: ca.SX, tau: ca.SX) -> ca.SX:
+        q, m = state[:4], state[7:]
+        R = lie.rotation_from_quaternion(q)
+        force = n + f * tau
+        xi = strain + compliance @ ca.vertcat(R.T @ force, R.T @ m)
+        tangent = R @ xi[:3]
+        moment = ca.cross(tangent, force)
+        if centroid.any():
+            moment += ca.cross(R @ ca.vertcat(*centroid, 0), f)
+        return ca.vertcat(
+            -0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), -tangent, moment
+        )
+
+    slopes: list[ca.SX] = []
+    for row in _STAGES:
+        state = start
+        for j, a in row.items():
+            state = state + h * a * slopes[j]
+        slopes.append(derivative(state, h * sum(row.values())))
+    end = start
+    for j, b in _WEIGHTS.items():
+        end = end + h * b * slopes[j]
+    return ca.Function("step", [start, strain, compliance, n, f, h], [end])
+
+
+def _turn_between(q: ca.MX, dq: ca.MX) -> ca.MX:
+    """Rotation vectors (3, k) in body axes of the changes dq (4, k) of a unit quaternion q."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    left = ca.vertcat(  # vector part of conjugate(q) * dq
+        ca.horzcat(-x, w, z, -y), ca.horzcat(-y, -z, w, x), ca.horzcat(-z, y, -x, w)
+    )
+    return 2 * left @ dq
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Symbolic integration from tip to base, with everything that is read off on the way.
+
+    The shape of the arm at a *station*: a point of the arm that may carry a load, by default
+    its tip.  ``inputs`` are the tip's quaternion (4,), ``x`` (see below), gravity (3,) and the
+    loads at tip and station (12,) of `Loads`; the variables ``x = (delta, p, w)`` hold an
+    infinitesimal turn of the tip (3,), the pressures (n,) and a dead wrench (6,) that is added
+    at the station: what derivatives are taken by.
+    """
+
+    inputs: tuple[ca.MX, ...]
+    residual: ca.MX  # (3,) rotation that the base comes out with
+    nodes: tuple[ca.MX, ...]  # quaternions met from the tip to the base
+    quaternion: ca.MX  # of the station
+    position: ca.MX  # of the station, from the base
+    tip_quaternion: ca.MX
+
+    @property
+    def x(self) -> ca.MX:
+        """Variables (3 + n + 6,): turn of the tip, pressures, added dead wrench."""
+        return self.inputs[1]
+
+    @property
+    def rotation(self) -> ca.MX:
+        """Axes (3, 3) of the station in the base frame."""
+        return lie.rotation_from_quaternion(self.quaternion)
+
+    @property
+    def transform(self) -> ca.MX:
+        """Pose (4, 4) of the station."""
+        return lie.transform(self.rotation, self.position)
+
+    @cached_property
+    def _per_x(self) -> tuple[ca.MX, ca.MX]:
+        """Change of the residual and body twist of the station per x, the tip turning freely."""
+        change = ca.jacobian(ca.vertcat(self.residual, self.quaternion, self.position), self.x)
+        twist = ca.vertcat(
+            self.rotation.T @ change[7:, :], _turn_between(self.quaternion, change[3:7, :])
+        )
+        return change[:3, :], twist
+
+    @cached_property
+    def _turn_per_rest(self) -> ca.MX:
+        """Turn of the tip (3, n + 6) that keeps the base upright, per pressure and wrench."""
+        residual, _ = self._per_x
+        return -_inverse_3x3(residual[:, :3]) @ residual[:, 3:]
+
+    @cached_property
+    def _twist_per_rest(self) -> ca.MX:
+        _, twist = self._per_x
+        return twist[:, 3:] + twist[:, :3] @ self._turn_per_rest
+
+    @property
+    def jacobian(self) -> ca.MX:
+        """Body twist (6, n) of the station per unit pressure."""
+        return self._twist_per_rest[:, :-6]
+
+    @property
+    def compliance(self) -> ca.MX:
+        """Tangent compliance (6, 6) at the station, in its axes, for added dead loads."""
+        return self._twist_per_rest[:, -6:] @ ca.diagcat(self.rotation, self.rotation)
+
+    def total_jacobian(self, values: ca.MX) -> ca.MX:
+        """Derivative (k, n) of values (k,) by the pressures, along the equilibrium."""
+        change = ca.jacobian(values, self.x)
+        return change[:, 3:-6] + change[:, :3] @ self._turn_per_rest[:, :-6]
+
+    @property
+    def rotational_compliances(self) -> ca.MX:
+        """Rotation of the tip per moment at it, side by side (3, 3 k), in tip axes.
+
+        Each is that of the arm clamped at one of the k nodes instead of at the base.
+        """
+        R = lie.rotation_from_quaternion(self.tip_quaternion)
+        blocks = []
+        for node in self.nodes:
+            turn = _turn_between(node, ca.jacobian(node, self.x))
+            blocks.append(-_inverse_3x3(turn[:, :3]) @ turn[:, -3:] @ R)
+        return ca.horzcat(*blocks)
+
+
+def _inverse_3x3(matrix: ca.MX) -> ca.MX:
+    A = ca.SX.sym("A", 3, 3)
+    return ca.Function("inverse", [A], [ca.inv_minor(A)])(matrix)
+
+
+class Shooting:
+    """Symbolic shooting problem of one robot, its weight and payload included.
+
+    Parameters
+    ----------
+    description : RobotDescription
+        The arm; its gravity and tip mass are part of every equilibrium.
+    actuation : Actuation
+        Its strain law, per segment.
+    resolution : int
+        Multiplies the number of integration steps.
+    """
+
+    def __init__(
+        self, description: RobotDescription, actuation: Actuation, resolution: int = 1
+    ) -> None:
+        self.description = description
+        self.steps = STEPS_PER_SEGMENT * resolution
+        self._geometry = [SectionGeometry.of(segment) for segment in description.segments]
+        self.sections = ca.Function(
+            "sections",
+            [actuation.pressures],
+            [
+                part
+                for section in actuation.sections
+                for part in (section.strain, section.compliance)
+            ],
+        )
+        self.step = [
+            _step_function(section.compliance.sparsity(), geometry.centroid)
+            for section, geometry in zip(actuation.sections, self._geometry, strict=True)
+        ]
+
+    def pieces(self, cuts: Sequence[float]) -> list[Piece]:
+        """The arm from tip to base, cut at the given arc lengths."""
+        pieces: list[Piece] = []
+        start = 0.0
+        for index, segment in enumerate(self.description.segments):
+            for length, rigid in ((segment.length, False), (segment.connector, True)):
+                end = start + length
+                marks = [start, *sorted(c for c in cuts if start < c < end), end]
+                for near, far in zip(marks[:-1], marks[1:], strict=True):
+                    if far > near:
+                        steps = max(1, ceil(self.steps * (far - near) / segment.length - 1e-9))
+                        pieces.append(Piece(index, rigid, far - near, steps, far))
+                start = end
+        return pieces[::-1]
+
+    def chain(self, at: float | None = None) -> Chain:
+        """Symbolic shooting map with the station at arc length `at` (None: the tip)."""
+        n_pressures = self.description.n_pressures
+        q, x = ca.MX.sym("q", 4), ca.MX.sym("x", 3 + n_pressures + 6)
+        gravity, tip, station = ca.MX.sym("g", 3), ca.MX.sym("tip", 12), ca.MX.sym("station", 12)
+        delta, p, added = x[:3], x[3:-6], x[-6:]
+        sections = self.sections.call([p])
+
+        turned = lie.quaternion_product(q, ca.vertcat(1, delta / 2))
+        tip_quaternion = orientation = turned / ca.norm_2(turned)
+        R = lie.rotation_from_quaternion(orientation)
+        force = tip[:3] + R @ tip[6:9] + self.description.tip_mass * gravity
+        moment = tip[3:6] + R @ tip[9:]
+        position = ca.MX.zeros(3)
+        length = self.description.length
+        station_at = length if at is None else at
+        station_quaternion, station_position = tip_quaternion, position
+        nodes = []
+        for piece in self.pieces([station_at]):
+            if abs(piece.distal - station_at) < 1e-12 * length:
+                R = lie.rotation_from_quaternion(orientation)
+                force = force + station[:3] + added[:3] + R @ station[6:9]
+                moment = moment + station[3:6] + added[3:] + R @ station[9:]
+                station_quaternion, station_position = orientation, position
+            if piece.rigid:
+                axis = lie.rotation_from_quaternion(orientation)[:, 2]
+                position = position - piece.length * axis
+                moment = moment + piece.length * ca.cross(axis, force)
+                continue
+            strain, compliance = sections[2 * piece.segment : 2 * piece.segment + 2]
+            weight = self.weight(piece.segment) * gravity
+            h = piece.length / piece.steps
+            for _ in range(piece.steps):
+                state = self.step[piece.segment](
+                    ca.vertcat(orientation, position, moment), strain, compliance, force, weight, h
+                )
+                orientation, position, moment = state[:4], state[4:7], state[7:]
+                force = force + h * weight
+                nodes.append(orientation)
+        return Chain(
+            inputs=(q, x, gravity, tip, station),
+            residual=2 * orientation[1:] * ca.sign(orientation[0]),
+            nodes=tuple(nodes),
+            quaternion=station_quaternion,
+            position=station_position - position,
+            tip_quaternion=tip_quaternion,
+        )
+
+    def weight(self, segment: int) -> float:
+        """Mass per reference length of a segment, in kg/m."""
+        density = self.description.segments[segment].material.density or 0.0
+        return density * self._geometry[segment].area

@@ -1,0 +1,273 @@
+"""Quantities with units in files, SI in code.
+
+A quantity in a file is a string, a decimal number and its unit: ``90 mm``. pint knows the units;
+this module asks it for exact decimal factors, so that ``90 mm`` is the float ``0.09``, and refuses
+what pint alone would let pass: an angle without a unit (the radian counts as a dimension here) and
+a moment in joules. The field types at the end carry these rules into pydantic models.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from decimal import Decimal, DecimalException
+from functools import cache, lru_cache
+from numbers import Real
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo
+
+from stiffopt.errors import InputError, shown
+
+if TYPE_CHECKING:
+    import pint
+
+__all__ = [
+    "FROM_FILE",
+    "Acceleration",
+    "Angle",
+    "Density",
+    "Duration",
+    "Force",
+    "Frequency",
+    "Length",
+    "Mass",
+    "Moment",
+    "Number",
+    "Pressure",
+    "PressureRate",
+    "Ratio",
+    "RotationalStiffness",
+    "Speed",
+    "TranslationalStiffness",
+    "finite_number",
+    "format_quantity",
+    "parse_quantity",
+    "read_from_file",
+]
+
+FROM_FILE = {"from_file": True}
+"""The pydantic validation context that says: this comes from a file, units are due."""
+
+_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?")
+_UNIT = re.compile(r"(?=[A-Za-zµμ°%(])(?:[A-Za-zµμ°%²³·*/^() ]|-?\d(?!\d))+")
+_LONGEST = 80  # characters; no quantity that a person writes is longer
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A kind of quantity: its SI unit, an example, and the unit to write it in."""
+
+    unit: str
+    what: str
+    example: str
+    written: str
+
+
+_LENGTH = _Kind("m", "length", "90 mm", "mm")
+_ANGLE = _Kind("rad", "angle", "30 deg", "deg")
+_PRESSURE = _Kind("Pa", "pressure", "1.5 bar", "kPa")
+_PRESSURE_RATE = _Kind("Pa/s", "rate of pressure", "5 bar/s", "kPa/s")
+_MASS = _Kind("kg", "mass", "20 g", "g")
+_DENSITY = _Kind("kg/m^3", "density", "1070 kg/m^3", "kg/m^3")
+_ACCELERATION = _Kind("m/s^2", "acceleration", "9.81 m/s^2", "m/s^2")
+_FORCE = _Kind("N", "force", "0.02 N", "N")
+_MOMENT = _Kind("N*m", "moment", "0.001 N*m", "N*m")
+_TRANSLATIONAL = _Kind("N/m", "translational stiffness", "1.3 N/m", "N/m")
+_ROTATIONAL = _Kind("N*m/rad", "rotational stiffness", "0.2 N*m/rad", "N*m/rad")
+_DURATION = _Kind("s", "duration", "20 ms", "s")
+_FREQUENCY = _Kind("1/s", "frequency", "50 Hz", "Hz")
+_SPEED = _Kind("m/s", "speed", "10 mm/s", "mm/s")
+_RATIO = _Kind("", "ratio", "1 %", "")
+
+_KINDS = (
+    *(_LENGTH, _ANGLE, _PRESSURE, _PRESSURE_RATE, _MASS, _DENSITY, _ACCELERATION, _FORCE),
+    *(_MOMENT, _TRANSLATIONAL, _ROTATIONAL, _DURATION, _FREQUENCY, _SPEED, _RATIO),
+)
+_EXAMPLES = {kind.unit: kind.example for kind in _KINDS}
+
+
+def parse_quantity(text: str, unit: str, what: str = "quantity") -> float:
+    """Return the value in SI of a number with a unit.
+
+    Parameters
+    ----------
+    text :
+        For example ``"90 mm"``.
+    unit :
+        The SI unit of the result, for example ``"m"``; ``""`` for a ratio such as ``"1 %"``.
+    what :
+        What the quantity is, for the error message, for example ``"length"``.
+
+    Returns
+    -------
+    float
+        The float nearest to the exact value: ``"90 mm"`` gives ``0.09``.
+
+    Raises
+    ------
+    InputError
+        Not a string, no unit, a unit that does not measure this, not a finite number.
+    """
+    expected = f"expected {_article(what)} such as '{_EXAMPLES.get(unit, f'1 {unit}'.strip())}'"
+    if isinstance(text, Real) and not isinstance(text, bool):
+        raise InputError(f"bare number {text} has no unit; {expected}")
+    if not isinstance(text, str):
+        raise InputError(f"{shown(text)} is not a quantity; {expected}")
+    stripped = text.strip()
+    number = _NUMBER.match(stripped)
+    if len(stripped) > _LONGEST or number is None:
+        raise InputError(f"{shown(text)} is not a number with a unit; {expected}")
+    unit_text = stripped[number.end() :].strip()
+    if unit_text[:1] in tuple(",._0123456789"):
+        raise InputError(f"{shown(text)} is not a number with a unit; {expected}")
+    if not unit_text:
+        raise InputError(f"{shown(text)} has no unit; {expected}")
+    factor = _factor(unit_text, unit)
+    if isinstance(factor, str):
+        reason = f"{factor} {what}" if factor.endswith(" of") else factor
+        raise InputError(f"{shown(text)}: {shown(unit_text)} {reason}; {expected}")
+    try:
+        value = float(Decimal(number.group()) * factor)
+    except DecimalException:
+        value = math.inf
+    if not math.isfinite(value):
+        raise InputError(f"{shown(text)} is too large a number; {expected}")
+    return value
+
+
+def format_quantity(value: float, unit: str, written: str | None = None) -> str:
+    """Return a text that `parse_quantity` reads back as exactly `value`.
+
+    Parameters
+    ----------
+    value :
+        In SI, finite.
+    unit :
+        The SI unit of `value`.
+    written :
+        The unit to write it in if that loses nothing, for example ``"mm"``; otherwise `unit`.
+    """
+    if written is not None and written != unit:
+        factor = _factor(written, unit)
+        if not isinstance(factor, str):
+            text = f"{float(f'{value / float(factor):.12g}'):.15g} {written}"
+            if parse_quantity(text, unit) == value:
+                return text
+    number = f"{value:.15g}"
+    return f"{number if float(number) == value else repr(float(value))} {unit}".rstrip()
+
+
+def read_from_file(info: ValidationInfo) -> bool:
+    """Say whether a pydantic validator is looking at a file (rather than at a call)."""
+    return isinstance(info.context, Mapping) and bool(info.context.get("from_file"))
+
+
+@cache
+def _registry() -> pint.UnitRegistry[Any]:
+    """Return pint's registry with exact decimals; made on first use, as it is slow to make."""
+    import pint
+
+    return pint.UnitRegistry(non_int_type=Decimal, cache_folder=None)
+
+
+@lru_cache(maxsize=1024)
+def _factor(text: str, unit: str) -> Decimal | str:
+    """Return how many `unit` make one `text`, or what is wrong with `text`."""
+    unknown = "is not a known unit"
+    if not _UNIT.fullmatch(text):
+        return unknown
+    registry = _registry()
+    joule = registry.get_root_units("joule")[1]
+    try:
+        given, wanted = registry.parse_units(text), registry.parse_units(unit)
+        # Root units keep the radian, which dimensions do not: N*m/rad is not N*m, 1 is no angle.
+        if registry.get_root_units(given)[1] != registry.get_root_units(wanted)[1]:
+            return "is not a unit of"
+        if any(registry.get_root_units(part)[1] == joule for part in given._units):
+            return "is a unit of energy, not of"
+        zero, one = (registry.convert(Decimal(n), given, wanted) for n in (0, 1))
+    except Exception:  # pint, its tokenizer and its evaluator raise many kinds for junk
+        return unknown
+    return Decimal(one) if zero == 0 else unknown  # an offset unit has another zero
+
+
+def _article(noun: str) -> str:
+    return f"{'an' if noun[:1] in 'aeiou' else 'a'} {noun}"
+
+
+def finite_number(value: Any) -> float:
+    """Accept a finite real number; refuse booleans, text, NaN and infinities."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise InputError(f"{shown(value)} is not a number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise InputError(f"{shown(value)} is not a finite number")
+    return number
+
+
+def _ratio(value: Any) -> float:
+    return parse_quantity(value, "", "ratio") if isinstance(value, str) else finite_number(value)
+
+
+def _reader(kind: _Kind) -> BeforeValidator:
+    """Return the validator for a kind: text with its unit, or in code a number in SI."""
+
+    def read(value: Any, info: ValidationInfo) -> float:
+        if isinstance(value, str) or read_from_file(info):
+            if isinstance(value, float) and not math.isfinite(value):
+                raise InputError(f"{value} is not a finite number")
+            return parse_quantity(value, kind.unit, kind.what)
+        return finite_number(value)
+
+    return BeforeValidator(read)
+
+
+def _writer(kind: _Kind) -> PlainSerializer:
+    """Return the serializer with which ``model_dump(mode="json")`` writes quantities as text."""
+
+    def write(value: float) -> str:
+        return format_quantity(value, kind.unit, kind.written)
+
+    return PlainSerializer(write, return_type=str, when_used="json")
+
+
+_FINITE = Field(allow_inf_nan=False)
+
+Number = Annotated[float, BeforeValidator(finite_number), _FINITE]
+"""A finite number that has no unit."""
+Ratio = Annotated[float, BeforeValidator(_ratio), _FINITE]
+"""A finite number that has no unit and may be written in per cent."""
+Length = Annotated[float, _reader(_LENGTH), _writer(_LENGTH), _FINITE]
+"""In m."""
+Angle = Annotated[float, _reader(_ANGLE), _writer(_ANGLE), _FINITE]
+"""In rad."""
+Pressure = Annotated[float, _reader(_PRESSURE), _writer(_PRESSURE), _FINITE]
+"""In Pa, gauge."""
+PressureRate = Annotated[float, _reader(_PRESSURE_RATE), _writer(_PRESSURE_RATE), _FINITE]
+"""In Pa/s."""
+Mass = Annotated[float, _reader(_MASS), _writer(_MASS), _FINITE]
+"""In kg."""
+Density = Annotated[float, _reader(_DENSITY), _writer(_DENSITY), _FINITE]
+"""In kg/m^3."""
+Acceleration = Annotated[float, _reader(_ACCELERATION), _writer(_ACCELERATION), _FINITE]
+"""In m/s^2."""
+Force = Annotated[float, _reader(_FORCE), _writer(_FORCE), _FINITE]
+"""In N."""
+Moment = Annotated[float, _reader(_MOMENT), _writer(_MOMENT), _FINITE]
+"""In N m."""
+TranslationalStiffness = Annotated[float, _reader(_TRANSLATIONAL), _writer(_TRANSLATIONAL), _FINITE]
+"""In N/m."""
+RotationalStiffness = Annotated[float, _reader(_ROTATIONAL), _writer(_ROTATIONAL), _FINITE]
+"""In N m/rad."""
+Duration = Annotated[float, _reader(_DURATION), _writer(_DURATION), _FINITE]
+"""In s."""
+Frequency = Annotated[float, _reader(_FREQUENCY), _writer(_FREQUENCY), _FINITE]
+"""In Hz."""
+Speed = Annotated[float, _reader(_SPEED), _writer(_SPEED), _FINITE]
+"""In m/s."""
