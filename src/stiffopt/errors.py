@@ -93,10 +93,15 @@ class MissingExtraError(StiffoptError):
 
 
 def shown(value: object) -> str:
-    """Return a value as an error message shows it: text in quotes, and never long."""
+    """Return a value as an error message shows it: text in quotes, on one line, never long."""
     if isinstance(value, dict):
         return "a mapping"
     if isinstance(value, list | tuple):
         return "a list"
-    text = f"'{value}'" if isinstance(value, str) else repr(value)
+    text = f"'{printable(value)}'" if isinstance(value, str) else repr(value)
     return text if len(text) <= 60 else f"{text[:56]}...{text[-1]}"
+
+
+def printable(text: str) -> str:
+    """Return text with line breaks and control characters escaped."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -12,7 +12,7 @@ import difflib
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,7 +23,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
-from stiffopt.errors import FileError, InputError, shown
+from stiffopt.errors import FileError, InputError, printable, shown
 from stiffopt.units import FROM_FILE
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "Items",
     "Schema",
     "Vector",
+    "items_of",
     "line_of",
     "read_document",
     "read_file",
@@ -41,6 +42,7 @@ __all__ = [
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 20
+MAX_MISTAKES = 10  # told at once
 VERSIONS = {"robot": 1, "task": 1, "rig": 1}
 """The version of each kind of file that is read; a kind not listed is at version 1."""
 
@@ -88,9 +90,21 @@ def _as_tuple(value: Any) -> Any:
     raise InputError(f"expected a list, not {shown(value)}")
 
 
+def items_of(n: int) -> Callable[[Any], Any]:
+    """Return the validator of a list of just `n` items."""
+
+    def read(value: Any) -> Any:
+        items = _as_tuple(value)
+        if len(items) != n:
+            raise InputError(f"expected {n} items, not {len(items)}")
+        return items
+
+    return read
+
+
 Items = Annotated[tuple[ItemT, ...], BeforeValidator(_as_tuple)]
 """A list in the file, a tuple in code."""
-Vector = Annotated[tuple[ItemT, ItemT, ItemT], BeforeValidator(_as_tuple)]
+Vector = Annotated[tuple[ItemT, ItemT, ItemT], BeforeValidator(items_of(3))]
 """Three items: x, y, z."""
 
 
@@ -183,9 +197,9 @@ def write_file(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
 def save_file(path: str | os.PathLike[str], kind: str, schema: Schema) -> None:
     """Write a description as a file of its kind, which `read_file` reads back as its equal.
 
-    Quantities are written with units, and what is None is left out.
+    Quantities are written with units; what is None or an empty list is left out.
     """
-    data = schema.model_dump(mode="json", exclude_none=True)
+    data = _without_empty_lists(schema.model_dump(mode="json", exclude_none=True))
     write_file(path, {"format": f"stiffopt-{kind}/{VERSIONS.get(kind, 1)}", **data})
 
 
@@ -279,7 +293,7 @@ class _Composer:
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
             raise self.error(event, "anchors (&) and aliases (*) are not allowed; write it out")
         if getattr(event, "tag", None) is not None:
-            raise self.error(event, f"the tag '{event.tag}' is not allowed; remove it")
+            raise self.error(event, f"the tag {shown(event.tag)} is not allowed; remove it")
         return event
 
     def error(self, event: Any, reason: str, loc: Loc = ()) -> FileError:
@@ -307,8 +321,8 @@ class _Composer:
         while not isinstance(event := self.next(), yaml.MappingEndEvent):
             key = event.value if isinstance(event, yaml.ScalarEvent) else None
             if key is None or (event.implicit[0] and not isinstance(_resolve(key), str)):
-                shown = f"'{key}'" if key else "this"
-                raise self.error(event, f"{shown} is not text; expected a name as the key", loc)
+                name = shown(key) if key else "this"
+                raise self.error(event, f"{name} is not text; expected a name as the key", loc)
             here = (*loc, key)
             if key in items:
                 first = self.lines[here]
@@ -371,6 +385,12 @@ _Dumper.add_representer(str, _Dumper.represent_text)
 _Dumper.add_representer(list, _Dumper.represent_items)
 
 
+def _without_empty_lists(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_empty_lists(item) for key, item in value.items() if item != []}
+    return [_without_empty_lists(item) for item in value] if isinstance(value, list) else value
+
+
 def _plain(value: Any) -> Any:
     """Return data as dicts, lists and scalars that YAML knows."""
     if isinstance(value, np.ndarray | np.generic):
@@ -398,8 +418,10 @@ def _file_error(document: Document, model: type[BaseModel], error: ValidationErr
         found.append((line, _dotted(loc), reason))
     found.sort(key=lambda mistake: mistake[0])
     line, key, reason = found[0]
-    for other_line, other_key, other in found[1:]:
+    for other_line, other_key, other in found[1:MAX_MISTAKES]:
         reason += f"; also line {other_line}: {other_key}: {other}"
+    if len(found) > MAX_MISTAKES:
+        reason += f"; and {len(found) - MAX_MISTAKES} more"
     return FileError(document.path, reason, line=line or None, key=key or None)
 
 
@@ -441,6 +463,10 @@ def _explain(
             "less_than_equal", "at most"
         )
         return loc, f"must be {relation.replace('_', ' ')} {bound:g}, not {shown(value)}"
+    if kind == "string_too_short" or value in ("", [], ()):
+        return loc, "must not be empty"
+    if kind == "too_long":
+        return loc, f"expected at most {context['max_length']} items, not {len(value)}"
     if kind == "string_type":
         return loc, f"expected text, not {shown(value)}"
     message = details["msg"]
@@ -507,4 +533,4 @@ def _dotted(loc: Sequence[Step]) -> str:
     text = ""
     for step in loc:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
-    return text
+    return printable(text)

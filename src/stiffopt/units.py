@@ -78,7 +78,7 @@ _MOMENT = _Kind("N*m", "moment", "0.001 N*m", "N*m")
 _TRANSLATIONAL = _Kind("N/m", "translational stiffness", "1.3 N/m", "N/m")
 _ROTATIONAL = _Kind("N*m/rad", "rotational stiffness", "0.2 N*m/rad", "N*m/rad")
 _DURATION = _Kind("s", "duration", "20 ms", "s")
-_FREQUENCY = _Kind("1/s", "frequency", "50 Hz", "Hz")
+_FREQUENCY = _Kind("Hz", "frequency", "50 Hz", "Hz")
 _SPEED = _Kind("m/s", "speed", "10 mm/s", "mm/s")
 _RATIO = _Kind("", "ratio", "1 %", "")
 
@@ -153,8 +153,9 @@ def format_quantity(value: float, unit: str, written: str | None = None) -> str:
     if written is not None and written != unit:
         factor = _factor(written, unit)
         if not isinstance(factor, str):
-            text = f"{float(f'{value / float(factor):.12g}'):.15g} {written}"
-            if parse_quantity(text, unit) == value:
+            scaled = value / float(factor)
+            text = f"{scaled:.12g} {written}"
+            if math.isfinite(scaled) and parse_quantity(text, unit) == value:
                 return text
     number = f"{value:.15g}"
     return f"{number if float(number) == value else repr(float(value))} {unit}".rstrip()

@@ -49,7 +49,7 @@ class Equilibrium:
     """Numerical equilibria of one shooting problem."""
 
     def __init__(self, shooting: Shooting) -> None:
-        self._shooting = shooting
+        self.shooting = shooting
         self._functions: dict[tuple[str, float | None], ca.Function] = {}
         self._rest: dict[bytes, State] = {}
 
@@ -61,7 +61,7 @@ class Equilibrium:
     def _function(self, name: str, at: float | None) -> ca.Function:
         """The map of Newton's method or the stability condition, for one station."""
         if (name, at) not in self._functions:
-            chain = self._shooting.chain(at)
+            chain = self.shooting.chain(at)
             outputs = (
                 [chain.residual, ca.jacobian(chain.residual, chain.x)[:, :3]]
                 if name == "newton"
@@ -146,7 +146,7 @@ class Equilibrium:
         if key not in self._rest:
             none = Loads(np.zeros(3), np.zeros(12), np.zeros(12))
             upright = np.array([1.0, 0.0, 0.0, 0.0])
-            straight = State(np.zeros(self._shooting.description.n_pressures), upright, none)
+            straight = State(np.zeros(self.shooting.description.n_pressures), upright, none)
             weighted = straight._replace(loads=none._replace(gravity=gravity))
             state, share = self.follow(straight, weighted)
             if share < 1.0:
@@ -160,16 +160,16 @@ class Equilibrium:
 
     def shape(self, state: State, stations: Vector, at: float | None = None) -> Vector:
         """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium with its load at `at`."""
-        sections = [np.asarray(part) for part in self._shooting.sections(state.pressures)]
-        length = self._shooting.description.length
+        sections = [np.asarray(part) for part in self.shooting.sections(state.pressures)]
+        length = self.shooting.description.length
         station_at = length if at is None else at
         tip, station = state.loads.tip, state.loads.station
         q, r = state.quaternion, np.zeros(3)
         R = lie.rotation_from_quaternion(q)
-        force = tip[:3] + R @ tip[6:9] + self._shooting.description.tip_mass * state.loads.gravity
+        force = tip[:3] + R @ tip[6:9] + self.shooting.description.tip_mass * state.loads.gravity
         moment = tip[3:6] + R @ tip[9:]
         found = {length: (q, r)}
-        for piece in self._shooting.pieces([station_at, *stations]):
+        for piece in self.shooting.pieces([station_at, *stations]):
             R = lie.rotation_from_quaternion(q)
             if abs(piece.distal - station_at) < 1e-12 * length:
                 force = force + station[:3] + R @ station[6:9]
@@ -179,12 +179,12 @@ class Equilibrium:
                 moment = moment + piece.length * np.cross(R[:, 2], force)
             else:
                 strain, compliance = sections[2 * piece.segment : 2 * piece.segment + 2]
-                weight = self._shooting.weight(piece.segment) * state.loads.gravity
+                weight = self.shooting.weight(piece.segment) * state.loads.gravity
                 h = piece.length / piece.steps
                 for _ in range(piece.steps):
                     y = np.concatenate([q, r, moment])
                     y = np.asarray(
-                        self._shooting.step[piece.segment](y, strain, compliance, force, weight, h)
+                        self.shooting.step[piece.segment](y, strain, compliance, force, weight, h)
                     )[:, 0]
                     q, r, moment = y[:4], y[4:7], y[7:]
                     force = force + h * weight

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Hashable, Sequence
+from copy import copy
 from functools import cached_property
 from typing import Any, Literal
 
@@ -73,11 +74,10 @@ class Manipulator:
             raise InputError(f"resolution must be a positive integer; got {resolution!r}")
         self.description = description
         self.resolution = resolution
-        self._tip_load = _two_frame_load(
-            np.concatenate([_vector("force", force), _vector("moment", moment)]), load_frame
-        )
+        self._tip_load = _tip_load(force, moment, load_frame)
         self._actuation = Actuation.of(description)
         self._functions: dict[Hashable, ca.Function] = {}
+        self._shared: dict[str, Equilibrium] = {}
         self._margin = ca.Function(
             "margin", [self._actuation.pressures], [self._actuation.margin]
         )
@@ -120,13 +120,9 @@ class Manipulator:
         self, force: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0), frame: Frame = "base"
     ) -> "Manipulator":
         """The same arm with this load at its tip, instead of any that it carries now."""
-        return Manipulator(
-            self.description,
-            force=force,
-            moment=moment,
-            load_frame=frame,
-            resolution=self.resolution,
-        )
+        other = copy(self)  # shares what is compiled: loads are arguments of it
+        other._tip_load = _tip_load(force, moment, frame)
+        return other
 
     # -- shape ------------------------------------------------------------------------------
 
@@ -339,9 +335,21 @@ class Manipulator:
 
     # -- for the optimiser ------------------------------------------------------------------
 
-    def evaluator(self, key: Hashable, outputs: Callable[[Shape], list[Any]]) -> "Evaluator":
-        """Compile outputs of the tip's shape; `key` names them in the cache."""
-        return Evaluator(self, self._function(key, outputs))
+    def evaluator(
+        self,
+        key: Hashable,
+        outputs: Callable[[Shape, Any], list[Any]],
+        n_parameters: int = 0,
+    ) -> "Evaluator":
+        """Compile outputs of the tip's shape and of parameters; `key` names them in the cache."""
+        full_key = (key, n_parameters, self.is_loaded)
+        if full_key not in self._functions:
+            tip = self._symbolic(None)
+            parameters = type(tip.position).sym("parameters", n_parameters)
+            self._functions[full_key] = ca.Function(
+                "evaluator", [*tip.inputs, parameters], outputs(tip, parameters)
+            )
+        return Evaluator(self, self._functions[full_key])
 
     # -- numerics ---------------------------------------------------------------------------
 
@@ -349,13 +357,12 @@ class Manipulator:
     def _loads(self) -> Loads:
         return Loads(np.array(self.description.gravity), self._tip_load, np.zeros(12))
 
-    @cached_property
-    def _shooting(self) -> Shooting:
-        return Shooting(self.description, self._actuation, self.resolution)
-
-    @cached_property
+    @property
     def _equilibrium(self) -> Equilibrium:
-        return Equilibrium(self._shooting)
+        if "equilibrium" not in self._shared:
+            shooting = Shooting(self.description, self._actuation, self.resolution)
+            self._shared["equilibrium"] = Equilibrium(shooting)
+        return self._shared["equilibrium"]
 
     @cached_property
     def _section_parts(self) -> ca.Function:
@@ -373,13 +380,13 @@ class Manipulator:
     def _symbolic(self, at: float | None) -> Shape:
         """Shape of a station, without or with loads."""
         if self.is_loaded:
-            return self._shooting.chain(at)
+            return self._equilibrium.shooting.chain(at)
         return FreeShape.of(self.description, self._actuation, at)
 
     def _function(
         self, key: Hashable, outputs: Callable[[Shape], list[Any]], at: float | None = None
     ) -> ca.Function:
-        full_key = (key, at)
+        full_key = (key, at, self.is_loaded)
         if full_key not in self._functions:
             shape = self._symbolic(at)
             self._functions[full_key] = ca.Function("shape", list(shape.inputs), outputs(shape))
@@ -392,17 +399,11 @@ class Manipulator:
         batch, single = self._pressures(p)
         function = self._function(key, lambda shape: [ca.densify(value(shape))], at)
         results = (
-            np.stack([function(*self.arguments(row)).full() for row in batch])
+            np.stack([function(*self._equilibrium.arguments(self.settle(row))).full() for row in batch])
             if self.is_loaded
             else evaluate_many(function, batch)
         )
         return results[0] if single else results
-
-    def arguments(self, p: Vector) -> tuple[Vector, ...]:
-        """Numbers for the inputs of the tip's shape at checked pressures (n,)."""
-        if not self.is_loaded:
-            return (p,)
-        return self._equilibrium.arguments(self.settle(p))
 
     def settle(self, p: Vector, nearby: State | None = None) -> State:
         """Equilibrium of the loaded arm at pressures (n,); from a nearby one where that helps.
@@ -413,7 +414,7 @@ class Manipulator:
             If there is none that is stable and reached continuously.
         """
         if nearby is not None:
-            state = self._equilibrium.correct(nearby._replace(pressures=p))
+            state = self._equilibrium.correct(nearby._replace(pressures=p, loads=self._loads))
             if state is not None:
                 return state
         return self._equilibrium.settle(p, self._loads)
@@ -519,14 +520,15 @@ class Evaluator:
         """Equilibrium at the last evaluation; None for an arm without loads."""
         return self._state
 
-    def __call__(self, p: Vector) -> list[Vector]:
-        """Outputs at pressures (n,) as 2-D arrays."""
-        if not self._robot.is_loaded:
-            outputs = self._function(p)
-        else:
+    def __call__(self, p: Vector, *parameters: Vector) -> list[Vector]:
+        """Outputs at checked pressures (n,) and parameters, as 2-D arrays."""
+        parameters = parameters or (np.zeros(0),)
+        if self._robot.is_loaded:
             self._state = self._robot.settle(p, self._state)
-            outputs = self._function(*self._robot._equilibrium.arguments(self._state))
-        return [value.full() for value in (outputs if isinstance(outputs, tuple) else (outputs,))]
+            inputs = self._robot._equilibrium.arguments(self._state)
+        else:
+            inputs = (p,)
+        return [value.full() for value in self._function(*inputs, *parameters)]
 
 
 def evaluate_many(function: ca.Function, batch: Vector) -> Vector:
@@ -593,6 +595,12 @@ def _direction(value: ArrayLike) -> tuple[float, ...]:
     if not length > 0:
         raise InputError("direction must not be zero")
     return tuple((vector / length).tolist())
+
+
+def _tip_load(force: ArrayLike, moment: ArrayLike, frame: Frame) -> Vector:
+    return _two_frame_load(
+        np.concatenate([_vector("force", force), _vector("moment", moment)]), frame
+    )
 
 
 def _two_frame_load(wrench: Vector, frame: Frame) -> Vector:

@@ -217,8 +217,9 @@ class Chain:
         R = lie.rotation_from_quaternion(self.tip_quaternion)
         blocks = []
         for node in self.nodes:
-            turn = _turn_between(node, ca.jacobian(node, self.x))
-            blocks.append(-_inverse_3x3(turn[:, :3]) @ turn[:, -3:] @ R)
+            per_turn = _turn_between(node, ca.jacobian(node, self.x)[:, :3])
+            per_moment = _turn_between(node, ca.jacobian(node, self.inputs[3])[:, 3:6])
+            blocks.append(-_inverse_3x3(per_turn) @ per_moment @ R)
         return ca.horzcat(*blocks)
 
 

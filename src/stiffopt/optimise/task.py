@@ -34,7 +34,7 @@ from pydantic import (
 from pydantic_core import PydanticKnownError
 
 from stiffopt.errors import FileError, InputError
-from stiffopt.files import BadKeyError, Items, Schema, Vector, line_of, read_file
+from stiffopt.files import BadKeyError, Items, Schema, Vector, items_of, line_of, read_file
 from stiffopt.model.description import RobotDescription, load_description, one_or_list
 from stiffopt.units import (
     Angle,
@@ -132,7 +132,7 @@ Coordinate = Annotated[
 Direction = Annotated[Vector[Number], AfterValidator(_unit_vector)]
 Quaternion = Annotated[
     tuple[Number, Number, Number, Number],
-    BeforeValidator(lambda value: value.tolist() if isinstance(value, np.ndarray) else value),
+    BeforeValidator(items_of(4)),
     AfterValidator(_unit_quaternion),
 ]
 OneOrMore = Annotated[Items[MeasureT], BeforeValidator(_as_items)]
