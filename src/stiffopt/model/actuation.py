@@ -190,8 +190,8 @@ class PaperLaw(StrainLaw):
         force, moment = self._axial_force(p), self._moment_about_centroid(p)
         kappa = ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E
         c = geometry.centroid
-        stretch = 1 + force / (E * area) + kappa[1] * c[0] - kappa[0] * c[1]
-        strain = stretch * ca.vertcat(0, 0, 1, kappa, 0)
+        stretch = 1 + force / (E * area)  # of the line of centroids
+        strain = stretch * ca.vertcat(0, 0, 1 + kappa[1] * c[0] - kappa[0] * c[1], kappa, 0)
         return Section(strain, stretch * per_deformed_length)
 
 

@@ -528,7 +528,7 @@ class Evaluator:
             inputs = self._robot._equilibrium.arguments(self._state)
         else:
             inputs = (p,)
-        return [value.full() for value in self._function(*inputs, *parameters)]
+        return [value.full() for value in self._function.call([*inputs, *parameters])]
 
 
 def evaluate_many(function: ca.Function, batch: Vector) -> Vector:

@@ -10,6 +10,7 @@ the multiplier pulls, together with the curvature mu/rho J'J of the sphere; both
 second order at the solution.  The rest of the Lagrangian's Hessian is a damped BFGS model.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import daqp
@@ -25,6 +26,7 @@ _MOST_ITERATIONS = 80
 _FIRST_RADIUS = 0.3  # of the trust region, in bar
 _LAST_RADIUS = 1e-6
 _INSIDE = 1 - 1e-7  # share of a ball's radius that is used, so that rounding stays within
+_TOUCHING = 1e-5  # bar; a pressure that near to a limit is meant to be at it
 _FAR = 1e6  # stands for no bound in the quadratic program
 
 
@@ -101,8 +103,8 @@ def reach(problem: Problem, x: Vector, most_iterations: int = 40) -> Point | Non
     scales = {"position": problem.robot.length, "angle": 1.0}
 
     def stacked(point: Point) -> tuple[Vector, Vector]:
-        residual = np.concatenate([ball.residual / scales[ball.name] for ball in point.balls])
-        jacobian = np.vstack([ball.jacobian / scales[ball.name] for ball in point.balls])
+        residual = np.concatenate([ball.residual / scales[ball.name] for ball in point.constraints])
+        jacobian = np.vstack([ball.jacobian / scales[ball.name] for ball in point.constraints])
         return residual, jacobian
 
     point = _attempt(problem, x, pose_only=True)
@@ -179,9 +181,27 @@ def descend(problem: Problem, start: Point) -> LocalResult:
         if radius < _LAST_RADIUS:
             converged = abs(promised) < 1e3 * objective.precision
             break
+    point = _snapped(problem, point)
     return LocalResult(
         point, objective.value(point), violation(problem, point), converged, multipliers
     )
+
+
+def _snapped(problem: Problem, point: Point) -> Point:
+    """The same point with pressures that all but touch a limit put onto it, if that holds."""
+    low = point.x < problem.lower + _TOUCHING
+    high = point.x > problem.upper - _TOUCHING
+    x = np.where(low, problem.lower, np.where(high, problem.upper, point.x))
+    if (x == point.x).all():
+        return point
+    fixed = copy(problem)
+    fixed.lower = np.where(high, problem.upper, problem.lower)
+    fixed.upper = np.where(low, problem.lower, problem.upper)
+    moved = _pulled_back(fixed, point, x - point.x)
+    if moved is None or violation(problem, moved) > violation(problem, point):
+        return point
+    worse = problem.objective.value(moved) - problem.objective.value(point)
+    return moved if worse < 100 * problem.objective.precision else point
 
 
 def violation(problem: Problem, point: Point) -> float:
@@ -267,7 +287,7 @@ def _quadratic_step(
         high.append(np.full(len(bounds), _FAR))
     frames = []
     steepest = gradients[int(values.argmax())]
-    for ball in point.balls:
+    for ball in point.constraints:
         axes, pull = _axes(ball, multipliers, steepest)
         frames.append(axes)
         rho = ball.radius * _INSIDE
@@ -288,7 +308,7 @@ def _quadratic_step(
     floors = -dual[used : used + len(problem.floors)]
     used += len(problem.floors)
     pulls = {}
-    for ball, axes in zip(point.balls, frames, strict=True):
+    for ball, axes in zip(point.constraints, frames, strict=True):
         k = len(axes)
         pulls[ball.name] = axes.T @ dual[used : used + k] / (ball.radius * _INSIDE)
         used += k
@@ -300,7 +320,7 @@ def _slope(problem: Problem, point: Point, multipliers: Multipliers) -> Vector:
     slope = multipliers.terms @ problem.objective.terms(point)[1]
     for (index, _), weight in zip(problem.floors, multipliers.floors, strict=True):
         slope = slope - weight * point.gradients[index]
-    for ball in point.balls:
+    for ball in point.constraints:
         slope = slope + multipliers.balls[ball.name] @ ball.jacobian
     return slope
 
@@ -322,7 +342,7 @@ def _bfgs(B: Vector, s: Vector, y: Vector) -> Vector:
 def _pulled_back(problem: Problem, point: Point, d: Vector) -> Point | None:
     """Point near x + d within all balls, evaluated in full; None if there is none near."""
     x = np.clip(point.x + d, problem.lower, problem.upper)
-    if point.balls:
+    if point.constraints:
         none = np.zeros((0, len(x)))
         for _ in range(8):
             trial = _attempt(problem, x, pose_only=True)
@@ -331,13 +351,13 @@ def _pulled_back(problem: Problem, point: Point, d: Vector) -> Point | None:
             if trial.reached:
                 break
             H, g = 1e-3 * np.eye(len(x)), np.zeros(len(x))
-            for ball in trial.balls:
+            for ball in trial.constraints:
                 inside = ball.residual * min(1.0, ball.radius * _INSIDE / max(ball.error, 1e-300))
                 J = ball.jacobian / ball.radius
                 H += J.T @ J
                 g += J.T @ ((ball.residual - inside) / ball.radius)
             step = solve_qp(H, g, none, problem.lower - x, problem.upper - x)
-            if step is None or np.abs(step[0]).max() > 2 * np.abs(d).max() + 1e-6:
+            if step is None or np.abs(step[0]).max() > 2 * np.abs(d).max() + 1e-4:
                 return None
             x = np.clip(x + step[0], problem.lower, problem.upper)
         else:

@@ -29,6 +29,9 @@ Vector = NDArray[np.float64]
 BAR = 1e5
 """Pressure scale of the variables, in Pa."""
 
+FLOOR_MARGIN = 1e-6
+"""How far above a stiffness that must be kept the optimiser aims, relatively."""
+
 
 @dataclass(frozen=True)
 class Ball:
@@ -75,6 +78,11 @@ class Point:
     balls: tuple[Ball, ...]
     values: Vector
     gradients: Vector
+
+    @property
+    def constraints(self) -> tuple[Ball, ...]:
+        """The balls that are not infinite."""
+        return tuple(ball for ball in self.balls if np.isfinite(ball.radius))
 
     @property
     def reached(self) -> bool:
@@ -129,7 +137,7 @@ class Problem:
         goal = task.stiffness
         first = len(goal.maximise) + (goal.match is not None) if goal else 0
         self.floors = tuple(
-            (first + index, float(np.log(floor.value)))
+            (first + index, float(np.log(floor.value)) + FLOOR_MARGIN)
             for index, floor in enumerate(goal.at_least if goal else ())
         )
         self.radii: dict[str, float] = {}
@@ -165,12 +173,7 @@ class Problem:
         balls = tuple(
             replace(ball, radius=self.radii.get(ball.name, ball.radius)) for ball in balls
         )
-        return Point(
-            x,
-            tuple(ball for ball in balls if np.isfinite(ball.radius)),
-            values[:, 0],
-            gradients * BAR,
-        )
+        return Point(x, balls, values[:, 0], gradients * BAR)
 
     # -- objectives -------------------------------------------------------------------------
 
@@ -215,6 +218,16 @@ class Problem:
 
         return Objective(terms, curvature, precision=1e-10)
 
+    def best_floors(self) -> Objective:
+        """The most by which a floor is missed: what brings all floors as close as they come."""
+        indices = [index for index, _ in self.floors]
+        bounds = np.array([bound for _, bound in self.floors])
+        return Objective(
+            lambda point: (bounds - point.values[indices], -point.gradients[indices]),
+            lambda point: 0.1 * np.eye(len(point.x)),
+            precision=1e-7,
+        )
+
     @property
     def least_pressure(self) -> Objective:
         """Mean square of the pressures, in bar^2: the stiffness-blind choice."""
@@ -256,11 +269,17 @@ class Problem:
         floors: tuple[tuple[int, float], ...] | None = None,
         **radii: float,
     ) -> "Problem":
-        """The same program with another objective, floors or radii; infinite removes a ball."""
+        """The same program with another objective, floors or radii; infinite frees a ball."""
         other = copy(self)
         other.objective = objective or self.objective
         other.floors = self.floors if floors is None else floors
         other.radii = {**self.radii, **radii}
+        return other
+
+    def at_target(self, target: Target) -> "Problem":
+        """The same program for another target."""
+        other = copy(self)
+        other.task = self.task.model_copy(update={"target": target})
         return other
 
 

@@ -1,0 +1,59 @@
+"""The trade-off between tip error and stiffness."""
+
+from math import pi
+
+import numpy as np
+
+from stiffopt.errors import InputError
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.solver import PressureSolver
+from stiffopt.optimise.task import Task
+
+LARGEST_SHARE = 0.25
+"""Largest position tolerance of the front, as a share of the arm's length."""
+
+
+def pareto_front(
+    robot: Manipulator, task: Task, n: int, *, seed: int = 0
+) -> list[PressureSolution]:
+    """Stiffest solutions at `n` growing tolerances, from the task's own to a quarter of the arm.
+
+    The tolerance that grows is the position's; of a task without position the angle's, up to
+    half a turn.  Only solutions that are stiffer than all with less error are returned, so there
+    may be fewer than `n`; none if the task's own target is out of reach at every tolerance.
+
+    Raises
+    ------
+    InputError
+        If the task maximises no stiffness, or `n` is less than 2.
+    """
+    if task.stiffness is None or not task.stiffness.maximise:
+        raise InputError("a trade-off needs a stiffness to maximise; add 'stiffness: maximise'")
+    if n < 2:
+        raise InputError(f"a trade-off needs at least 2 points; got {n}")
+    which = "position" if task.target.position is not None else "angle"
+    own: float = getattr(task.target.tolerance, which)
+    largest = LARGEST_SHARE * robot.length if which == "position" else pi
+    solver = PressureSolver(robot, task, seed=seed)
+    front: list[PressureSolution] = []
+    for size in np.geomspace(own, max(own, largest), n):
+        tolerance = task.target.tolerance.model_copy(update={which: float(size)})
+        target = task.target.model_copy(update={"tolerance": tolerance})
+        candidates = [solver.solve(target)]
+        if front:  # what was found for a smaller tolerance is a start for this one
+            candidates.append(solver.solve(target, guess=front[-1].pressures))
+        found = [solution for solution in candidates if solution.found]
+        if not found:
+            continue
+        best = max(found, key=_smallest)
+        if not front or _smallest(best) > _smallest(front[-1]) * (1 + 1e-9):
+            front.append(best)
+    return front
+
+
+def _smallest(solution: PressureSolution) -> float:
+    """Smallest of the maximised stiffnesses."""
+    goal = solution.task.stiffness
+    count = len(goal.maximise) if goal is not None else 0
+    return min(solution.stiffnesses[:count])

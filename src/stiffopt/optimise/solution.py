@@ -1,0 +1,252 @@
+"""PressureSolution: what was found, judged from the model and from nothing else."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.problem import pose_balls
+from stiffopt.optimise.task import AtLeast, MatchMatrix, StiffnessMeasure, Task
+
+Vector = NDArray[np.float64]
+Status = Literal["solved", "unreachable", "failed"]
+
+PRESSURE_SLACK = 1e-3
+"""How far from a limit a pressure still counts as at it, in Pa."""
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """How sure the global search is of its answer.
+
+    Attributes
+    ----------
+    starts : int
+        Local optimisations that were run from different pressures.
+    reached : int
+        Those that ended at the pose and converged.
+    agreeing : int
+        Those that ended within 0.1 % of the best.
+    optima : int
+        Distinct local optima among them.
+    complete : bool
+        Whether the stopping rule was met: by the Bayesian estimate of Boender and Rinnooy Kan
+        fewer than half an optimum is expected to be unseen.  False: the search ended at its
+        largest number of starts.
+    """
+
+    starts: int
+    reached: int
+    agreeing: int
+    optima: int
+    complete: bool
+
+    def __str__(self) -> str:
+        if self.starts == 1:
+            return "local answer from the given guess"
+        sure = "search complete" if self.complete else "search stopped at its limit of starts"
+        optima = "optimum" if self.optima == 1 else "optima"
+        return (
+            f"{self.agreeing} of {self.reached} starts agree on the best of {self.optima} local "
+            f"{optima} ({sure})"
+        )
+
+
+@dataclass(frozen=True)
+class Sensitivities:
+    """What small changes at the solution would do.
+
+    Attributes
+    ----------
+    tip_jacobian : ndarray (6, n)
+        Tip twist in tip axes per Pa.
+    stiffness_gradient : ndarray (n,) or None
+        First stiffness of the task per Pa, in N/m/Pa or N m/rad/Pa.
+    per_bound : dict of str to float
+        For each active pressure limit what moving it outwards is worth, per Pa: in stiffness
+        where one is maximised; else in the task's own objective (see `objective_unit`).
+    per_position_tolerance, per_angle_tolerance : float or None
+        The same per m and per rad of tolerance; None where not asked for.
+    objective_unit : str
+        Unit of what those gain, before "per Pa", "per m" or "per rad".
+    """
+
+    tip_jacobian: Vector
+    stiffness_gradient: Vector | None
+    per_bound: dict[str, float]
+    per_position_tolerance: float | None
+    per_angle_tolerance: float | None
+    objective_unit: str
+
+
+@dataclass(frozen=True)
+class PressureSolution:
+    """Answer to a task.  Errors and stiffness are computed from the model at `pressures`.
+
+    Attributes
+    ----------
+    status : {"solved", "unreachable", "failed"}
+        "unreachable": no pressures do all that was asked; the closest are given.  "failed": there
+        is no answer, and all that follows is None or empty.
+    message : str
+        One or two sentences for people.
+    pressures : ndarray (n,) or None
+        In Pa.
+    tip_pose : ndarray (4, 4) or None
+    position_error : float or None
+        Over the axes that were asked for, in m; None where none was.
+    angle_error : float or None
+        Between axes or of the rotation, in rad; None where none was asked for.
+    compliance : ndarray (6, 6) or None
+        Of the tip, in tip axes, linear first.
+    stiffness : float or None
+        The first that the task names (the matched one too), in `stiffness_unit`.
+    stiffness_unit : str or None
+    stiffnesses : tuple of float
+        All that the task names: maximised or matched ones first, then floors.
+    matrix_distance : float or None
+        Relative Frobenius distance from the stiffness matrix to match.
+    active_bounds : tuple of str
+        Pressure limits at which the solution lies.
+    freedom : int
+        Directions in pressure space in which the pose stays what it is.
+    confidence : Confidence or None
+    sensitivities : Sensitivities or None
+    timings : dict of str to float
+        Seconds.
+    """
+
+    status: Status
+    message: str
+    task: Task
+    pressures: Vector | None = None
+    tip_pose: Vector | None = None
+    position_error: float | None = None
+    angle_error: float | None = None
+    compliance: Vector | None = None
+    stiffness: float | None = None
+    stiffness_unit: str | None = None
+    stiffnesses: tuple[float, ...] = ()
+    matrix_distance: float | None = None
+    active_bounds: tuple[str, ...] = ()
+    freedom: int = 0
+    confidence: Confidence | None = None
+    sensitivities: Sensitivities | None = None
+    timings: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def found(self) -> bool:
+        """Whether every tolerance, limit and demand of the task holds."""
+        return self.status == "solved"
+
+    @property
+    def tip_position(self) -> Vector | None:
+        """Tip position (3,) in the base frame, in m."""
+        return None if self.tip_pose is None else self.tip_pose[:3, 3]
+
+    @property
+    def tip_quaternion(self) -> Vector | None:
+        """Tip orientation (w, x, y, z), w >= 0."""
+        if self.tip_pose is None:
+            return None
+        quaternion: Vector = lie.quaternion_from_rotation(self.tip_pose[:3, :3])
+        return quaternion
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """A task's quantities at given pressures, from the model alone."""
+
+    tip_pose: Vector
+    position_error: float | None
+    angle_error: float | None
+    compliance: Vector
+    stiffnesses: tuple[float, ...]
+    matrix_distance: float | None
+    pose_holds: bool
+    limits_hold: bool
+    demands_hold: bool
+
+    @property
+    def holds(self) -> bool:
+        """Whether everything that the task asks for is so."""
+        return self.pose_holds and self.limits_hold and self.demands_hold
+
+
+def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
+    """Judge pressures (n,) by the model of the arm (which carries the task's load).
+
+    Raises
+    ------
+    EquilibriumError
+        If the arm has no equilibrium at these pressures that is reached from rest.
+    """
+    tip_pose = robot.tip_pose(pressures)
+    nothing = np.zeros((6, 0))
+    errors = {
+        ball.name: ball
+        for ball in pose_balls(task.target, tip_pose[:3, 3], tip_pose[:3, :3], nothing)
+    }
+    lower, upper = task.pressure_bounds(robot.description)
+    compliance = robot.tip_compliance(pressures)
+    demands = True
+    stiffnesses, distance = [], None
+    goal = task.stiffness
+    if goal is not None:
+        stiffnesses = [_stiffness(robot, pressures, measure) for measure in goal.maximise]
+        if isinstance(goal.match, MatchMatrix):
+            distance = _distance(goal.match, compliance, tip_pose[:3, :3])
+            demands = distance <= goal.match.tolerance
+        elif goal.match is not None:
+            value = _stiffness(robot, pressures, goal.match)
+            stiffnesses.append(value)
+            demands = abs(value / goal.match.value - 1) <= goal.match.tolerance
+        for floor in goal.at_least:
+            stiffnesses.append(_stiffness(robot, pressures, floor))
+            demands = demands and stiffnesses[-1] >= floor.value
+    return Judgement(
+        tip_pose=tip_pose,
+        position_error=errors["position"].error if "position" in errors else None,
+        angle_error=errors["angle"].error if "angle" in errors else None,
+        compliance=compliance,
+        stiffnesses=tuple(stiffnesses),
+        matrix_distance=distance,
+        pose_holds=all(ball.error <= ball.radius for ball in errors.values()),
+        limits_hold=bool((pressures >= lower).all() and (pressures <= upper).all()),
+        demands_hold=bool(demands),
+    )
+
+
+def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str, tuple[int, int]]:
+    """Names of the limits that pressures lie at, with channel and side (-1: lower, 1: upper)."""
+    lower, upper = task.pressure_bounds(robot.description)
+    found = {}
+    for index in range(robot.n_pressures):
+        name = robot.description.channel_name(index)
+        if pressures[index] >= upper[index] - PRESSURE_SLACK:
+            found[f"{name} max"] = (index, 1)
+        elif pressures[index] <= lower[index] + PRESSURE_SLACK:
+            found[f"{name} min"] = (index, -1)
+    return found
+
+
+def _stiffness(robot: Manipulator, pressures: Vector, measure: StiffnessMeasure | AtLeast) -> float:
+    value: Any = robot.stiffness(
+        pressures, measure.direction, measure.kind, measure.boundary, measure.frame
+    )
+    return float(value)
+
+
+def _distance(match: MatchMatrix, compliance: Vector, rotation: Vector) -> float:
+    stiffness = (
+        np.linalg.inv(compliance)[:3, :3]
+        if match.boundary == "clamped"
+        else np.linalg.inv(compliance[:3, :3])
+    )
+    if match.frame == "base":
+        stiffness = rotation @ stiffness @ rotation.T
+    wanted = np.array(match.matrix)
+    return float(np.linalg.norm(stiffness - wanted) / np.linalg.norm(wanted))

@@ -1,0 +1,301 @@
+"""From a task to the stiffest pressures: global search, judgement and diagnosis."""
+
+from collections.abc import Iterator
+from itertools import islice
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import EquilibriumError, InputError
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise import diagnosis
+from stiffopt.optimise.local import LocalResult, descend, reach
+from stiffopt.optimise.problem import BAR, Problem
+from stiffopt.optimise.search import SampleTable, Search, search, starts
+from stiffopt.optimise.solution import (
+    Confidence,
+    Judgement,
+    PressureSolution,
+    Sensitivities,
+    active_bounds,
+    judge,
+)
+from stiffopt.optimise.task import MatchValue, Target, Task
+
+Vector = NDArray[np.float64]
+
+MOST_STARTS = 32
+"""Local searches at most, for an arm in closed form."""
+MOST_STARTS_LOADED = 12
+"""Local searches at most, for an arm under gravity or load."""
+
+_JUDGED = 5  # local optima that are tried in turn if the best does not hold from rest
+_PRICE_OF_NOTHING = 1e-9  # multipliers below are rounding
+
+
+class PressureSolver:
+    """Solver of one kind of task on one arm; what can be prepared is prepared once.
+
+    Parameters
+    ----------
+    robot : Manipulator
+        The arm; a load of the task is put on it.
+    task : Task
+    seed : int
+        Of the global search.  The same seed gives the same answer.
+
+    Raises
+    ------
+    InputError
+        If the task's pressure limits do not suit the robot.
+    """
+
+    def __init__(self, robot: Manipulator, task: Task, *, seed: int = 0) -> None:
+        load = task.load
+        self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
+        self.task = task
+        self.seed = seed
+        self._problem = Problem(self.robot, task)
+        self._samples: SampleTable | None = None
+
+    def solve(
+        self, target: Target | None = None, guess: ArrayLike | None = None
+    ) -> PressureSolution:
+        """Solve for the task's target, or for another one.
+
+        Parameters
+        ----------
+        target : Target, optional
+            Instead of the task's.
+        guess : (n,), optional
+            Pressures in Pa near the answer, for example the previous one: the answer is then
+            the local optimum next to it.  If none is found there, the search is global.
+        """
+        begin = perf_counter()
+        problem = self._problem if target is None else self._problem.at_target(target)
+        try:
+            solution = self._solve(problem, self._checked(guess))
+        except EquilibriumError as error:
+            solution = PressureSolution("failed", str(error), problem.task)
+        solution.timings["total"] = perf_counter() - begin
+        return solution
+
+    def _solve(self, problem: Problem, guess: Vector | None) -> PressureSolution:
+        if guess is not None:
+            nearby = self._from_guess(problem, guess)
+            if nearby is not None:
+                return nearby
+        most = MOST_STARTS_LOADED if self.robot.is_loaded else MOST_STARTS
+        found = search(problem, self._starts(problem), most)
+        if not found.results:
+            return self._closest(problem, found)
+        if problem.floors and found.results[0].violation > 0:
+            return self._without_floors(problem, found)
+        return self._first_that_holds(problem, found)
+
+    def _from_guess(self, problem: Problem, guess: Vector) -> PressureSolution | None:
+        problem.restart()
+        point = reach(problem, np.clip(guess / BAR, problem.lower, problem.upper))
+        if point is None or not point.reached:
+            return None
+        result = descend(problem, point)
+        if not result.converged or result.violation > 0:
+            return None
+        solution = self._solution(problem, result, Confidence(1, 1, 1, 1, complete=False))
+        return solution if solution.found else None
+
+    def _first_that_holds(self, problem: Problem, found: Search) -> PressureSolution:
+        """Best local optimum that the model confirms from rest."""
+        best: PressureSolution | None = None
+        for result in found.results[:_JUDGED]:
+            try:
+                solution = self._solution(problem, result, found.confidence)
+            except EquilibriumError:
+                continue
+            if solution.found:
+                return solution
+            best = best or solution
+        if best is None:
+            raise EquilibriumError(
+                "the optima that were found are not reached continuously from rest: the arm "
+                "buckles or falls over on the way; lower the pressure limits or the load"
+            )
+        return best
+
+    # -- what cannot be had -----------------------------------------------------------------
+
+    def _closest(self, problem: Problem, found: Search) -> PressureSolution:
+        """Closest configuration to a pose that no start came to."""
+        near = sorted(found.nearest, key=lambda point: sum(b.error for b in point.balls))
+        candidates = [point.x for point in near] + list(islice(self._starts(problem), 16))
+        result = diagnosis.closest_configuration(problem, candidates)
+        if result is None:
+            raise EquilibriumError("no stable equilibrium was found near the target")
+        if all(
+            ball.error <= problem.radii.get(ball.name, radius)
+            for ball, radius in zip(result.point.balls, self._radii(problem), strict=True)
+        ):
+            again = search(problem, iter([result.point.x]), 1)
+            if again.results:
+                return self._first_that_holds(problem, again)
+        return self._solution(problem, result, found.confidence)
+
+    @staticmethod
+    def _radii(problem: Problem) -> list[float]:
+        tolerance = problem.task.target.tolerance
+        target = problem.task.target
+        position = [tolerance.position] if target.position is not None else []
+        turned = target.pointing is not None or target.orientation is not None
+        return position + ([tolerance.angle] if turned else [])
+
+    def _without_floors(self, problem: Problem, found: Search) -> PressureSolution:
+        """Best that can be had where a stiffness that is demanded was not found."""
+        nearest = problem.changed(objective=problem.best_floors(), floors=())
+        candidates = (result.point.x for result in found.results)
+        best = search(nearest, candidates, len(found.results))
+        if best.results and best.results[0].value <= 0:
+            again = search(problem, iter([best.results[0].point.x]), 1)
+            if again.results and again.results[0].violation <= 0:
+                return self._first_that_holds(problem, again)
+        return self._first_that_holds(nearest, best if best.results else found)
+
+    # -- words and numbers ------------------------------------------------------------------
+
+    def _solution(
+        self, problem: Problem, result: LocalResult, confidence: Confidence
+    ) -> PressureSolution:
+        """Judge a result and put it into words."""
+        lower, upper = problem.task.pressure_bounds(self.robot.description)
+        pressures = np.clip(result.point.x * BAR, lower, upper)
+        task = problem.task
+        judgement = judge(self.robot, task, pressures)
+        active = active_bounds(self.robot, task, pressures)
+        sensitivities = self._sensitivities(problem, result, judgement, pressures, active)
+        freedom = diagnosis.freedom(problem, pressures / BAR)
+        if judgement.holds:
+            goal = task.stiffness
+            message = (
+                diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
+                if freedom == 0 and goal is not None
+                else ""
+            )
+        elif not judgement.pose_holds:
+            message = diagnosis.unreachable_message(judgement, task, self._holding(result, active))
+        else:
+            message = diagnosis.demands_message(judgement, task)
+        return PressureSolution(
+            status="solved" if judgement.holds else "unreachable",
+            message=message,
+            task=task,
+            pressures=pressures,
+            tip_pose=judgement.tip_pose,
+            position_error=judgement.position_error,
+            angle_error=judgement.angle_error,
+            compliance=judgement.compliance,
+            stiffness=judgement.stiffnesses[0] if judgement.stiffnesses else None,
+            stiffness_unit=_unit(task),
+            stiffnesses=judgement.stiffnesses,
+            matrix_distance=judgement.matrix_distance,
+            active_bounds=tuple(active),
+            freedom=freedom,
+            confidence=confidence,
+            sensitivities=sensitivities,
+        )
+
+    @staticmethod
+    def _holding(result: LocalResult, active: dict[str, tuple[int, int]]) -> list[str]:
+        """Active limits that the closest configuration presses against."""
+        if result.multipliers is None:
+            return list(active)
+        prices = result.multipliers.bounds
+        return [name for name, (index, side) in active.items() if side * prices[index] > 1e-9]
+
+    def _sensitivities(
+        self,
+        problem: Problem,
+        result: LocalResult,
+        judgement: Judgement,
+        pressures: Vector,
+        active: dict[str, tuple[int, int]],
+    ) -> Sensitivities | None:
+        prices = result.multipliers
+        if prices is None:
+            return None
+        goal = problem.task.stiffness
+        gradient = None
+        if goal is not None and judgement.stiffnesses:
+            match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
+            first = (*goal.maximise, *match, *goal.at_least)[0]
+            gradient = self.robot.stiffness_gradient(
+                pressures, first.direction, first.kind, first.boundary, first.frame
+            )
+        maximised = goal is not None and bool(goal.maximise)
+        unit = _unit(problem.task) if maximised else "1"
+        # d k = k d(log k): the smallest of the maximised ones is what the objective is about
+        scale = min(judgement.stiffnesses[: len(goal.maximise)]) if maximised and goal else 1.0
+
+        def radius_price(name: str) -> float | None:
+            pull = prices.balls.get(name)
+            return None if pull is None else scale * _clean(float(np.linalg.norm(pull)))
+
+        return Sensitivities(
+            tip_jacobian=self.robot.tip_jacobian(pressures),
+            stiffness_gradient=gradient,
+            per_bound={
+                name: scale * _clean(max(0.0, side * float(prices.bounds[index]))) / BAR
+                for name, (index, side) in active.items()
+            },
+            per_position_tolerance=radius_price("position"),
+            per_angle_tolerance=radius_price("angle"),
+            objective_unit=unit or "1",
+        )
+
+    # -- starts -----------------------------------------------------------------------------
+
+    def _starts(self, problem: Problem) -> Iterator[Vector]:
+        if self._samples is None:
+            self._samples = SampleTable(self.robot, problem.lower, problem.upper, self.seed)
+        return starts(problem, self._samples)
+
+    def _checked(self, guess: ArrayLike | None) -> Vector | None:
+        if guess is None:
+            return None
+        values = np.asarray(guess, dtype=float)
+        if values.shape != (self.robot.n_pressures,) or not np.isfinite(values).all():
+            raise InputError(
+                f"guess must be {self.robot.n_pressures} finite pressures in Pa; got {guess!r}"
+            )
+        return values
+
+
+def solve_pressure(
+    robot: Manipulator, task: Task, guess: ArrayLike | None = None, *, seed: int = 0
+) -> PressureSolution:
+    """Find the pressures that reach a task's pose and do best by its stiffness.
+
+    Nothing is raised for a target that cannot be reached: the solution says so and holds the
+    closest configuration.  See `PressureSolver` for many similar tasks.
+    """
+    return PressureSolver(robot, task, seed=seed).solve(guess=guess)
+
+
+def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> PressureSolution:
+    """The pose of a solution with the least pressure: what a plain solver would answer."""
+    task = solution.task.model_copy(update={"stiffness": None})
+    blind = PressureSolver(solver.robot, task.model_copy(update={"load": None}), seed=solver.seed)
+    return blind.solve(guess=solution.pressures)
+
+
+def _clean(price: float) -> float:
+    return price if price > _PRICE_OF_NOTHING else 0.0
+
+
+def _unit(task: Task) -> str | None:
+    """Unit of the first stiffness that a task names."""
+    goal = task.stiffness
+    if goal is None:
+        return None
+    match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
+    measures = (*goal.maximise, *match, *goal.at_least)
+    return measures[0].unit if measures else None
