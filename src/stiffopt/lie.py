@@ -80,9 +80,7 @@ def exponential_coefficients(x: Array) -> tuple[Array, Array, Array]:
         _series(x, [(-1) ** k / factorial(2 * k + offset) for k in range(_TERMS)])
         for offset in (1, 2, 3)
     )
-    first, second, third = (
-        _where(small, s, c) for s, c in zip(series, closed, strict=True)
-    )
+    first, second, third = (_where(small, s, c) for s, c in zip(series, closed, strict=True))
     return first, second, third
 
 

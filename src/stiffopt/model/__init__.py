@@ -1,0 +1,1 @@
+"""What an arm is and does: description, kinematics, compliance, equilibrium."""

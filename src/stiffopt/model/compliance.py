@@ -46,7 +46,12 @@ def carry_compliance(C: ca.SX, T: ca.SX) -> ca.SX:
 
 
 def directional_stiffness(
-    compliance: ca.SX, rotation: ca.SX, direction: ca.SX, frame: Frame, kind: Kind, boundary: Boundary
+    compliance: ca.SX,
+    rotation: ca.SX,
+    direction: ca.SX,
+    frame: Frame,
+    kind: Kind,
+    boundary: Boundary,
 ) -> ca.SX:
     """Stiffness along (or about) a unit direction, in N/m (or N m/rad).
 
@@ -77,5 +82,13 @@ def stiffness_block(compliance: ca.SX, kind: Kind, boundary: Boundary) -> ca.SX:
     if kind == "rotation":
         vv, vw, wv, ww = ww, wv, vw, vv
     if boundary == "clamped":
-        vv = vv - vw @ ca.inv_minor(ww) @ wv  # (C^-1)_vv by its Schur complement
-    return ca.inv_minor(vv)
+        vv = vv - vw @ inverse_3x3(ww) @ wv  # (C^-1)_vv by its Schur complement
+    return inverse_3x3(vv)
+
+
+def inverse_3x3(matrix: ca.SX | ca.MX) -> ca.SX | ca.MX:
+    """Inverse by cofactors, which CasADi has for SX alone."""
+    if isinstance(matrix, ca.MX):
+        A = ca.SX.sym("A", 3, 3)
+        return ca.Function("inverse", [A], [ca.inv_minor(A)])(matrix)
+    return ca.inv_minor(matrix)

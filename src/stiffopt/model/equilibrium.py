@@ -18,10 +18,9 @@ from stiffopt.model.shooting import Shooting
 
 Vector = NDArray[np.float64]
 
-_LARGEST_TURN = 0.5  # rad of tip rotation in one continuation step; a longer one is halved
+_LARGEST_TURN = 1.0  # rad of tip rotation in one continuation step; a longer one is halved
 _SHORTEST_STEP = 1e-4  # of the way from rest; less means that the path has ended
-_CONVERGED = 1e-11  # rad
-_ROUNDING = 1e-9  # rad; corrections below need not shrink
+_QUADRATIC = 1e-6  # rad; after a correction this small, convergence being quadratic, 1e-12 is left
 _MOST_ITERATIONS = 12
 
 
@@ -51,7 +50,7 @@ class Equilibrium:
     def __init__(self, shooting: Shooting) -> None:
         self.shooting = shooting
         self._functions: dict[tuple[str, float | None], ca.Function] = {}
-        self._rest: dict[bytes, State] = {}
+        self._rest: dict[bytes, tuple[State, float]] = {}
 
     def arguments(self, state: State) -> tuple[Vector, ...]:
         """Numbers for the inputs of a `Chain` at an equilibrium."""
@@ -71,9 +70,9 @@ class Equilibrium:
         return self._functions[name, at]
 
     def correct(self, guess: State, at: float | None = None) -> State | None:
-        """Newton's method from a nearby state; None if that is not near, or not stable.
+        """Newton's method from a nearby state; None if that is not near.
 
-        "Near" means that the first correction turns the tip by at most half a radian and the
+        "Near" means that the first correction turns the tip by at most a radian and the
         later ones shrink: then the path from the guess to the answer has no fold in between.
         """
         newton = self._function("newton", at)
@@ -82,13 +81,13 @@ class Equilibrium:
             residual, change = (part.full() for part in newton(*self.arguments(state)))
             turn = _solve_3x3(change, -residual[:, 0])
             size = float(np.linalg.norm(turn))
-            bound = previous if iteration < 2 else max(0.5 * previous, _ROUNDING)
+            bound = previous if iteration < 2 else 0.5 * previous
             if not size <= bound:  # NaN too
                 return None
             q = lie.quaternion_product(state.quaternion, np.concatenate([[1.0], turn / 2]))
             state = state._replace(quaternion=q / np.linalg.norm(q))
-            if size < _CONVERGED:
-                return state if self.is_stable(state, at) else None
+            if size < _QUADRATIC:
+                return state
             previous = size
         return None
 
@@ -101,20 +100,28 @@ class Equilibrium:
         eigenvalues = np.linalg.eigvalsh(compliances + compliances.swapaxes(1, 2))
         return bool((eigenvalues > 0).all())
 
-    def follow(self, start: State, end: State, at: float | None = None) -> tuple[State, float]:
+    def follow(
+        self,
+        start: State,
+        end: State,
+        at: float | None = None,
+        shortest: float = _SHORTEST_STEP,
+        stable: bool = True,
+    ) -> tuple[State, float]:
         """Equilibrium reached continuously between two sets of pressures and loads.
 
         Returns the last stable state on the straight way from `start` to `end` (whose
         quaternion is not used) and the share of the way that it is at; 1.0 means arrived.
+        Steps get no shorter than the share `shortest`; stability is checked if `stable`.
         """
         state, share, step = start, 0.0, 1.0
         while share < 1.0:
             target = min(1.0, share + step)
             trial = _between(start, end, target)._replace(quaternion=state.quaternion)
             corrected = self.correct(trial, at)
-            if corrected is None:
+            if corrected is None or (stable and not self.is_stable(corrected, at)):
                 step /= 2
-                if step < _SHORTEST_STEP:
+                if step < shortest:
                     return state, share
             else:
                 state, share, step = corrected, target, 2 * step
@@ -131,8 +138,10 @@ class Equilibrium:
         hanging = self._at_rest(loads.gravity)
         state, share = self.follow(hanging, State(pressures, hanging.quaternion, loads), at)
         if share < 1.0:
-            what = "its pressures and load" if loads.tip.any() or loads.station.any() else (
-                "its pressures"
+            what = (
+                "its pressures and load"
+                if loads.tip.any() or loads.station.any()
+                else ("its pressures")
             )
             raise EquilibriumError(
                 f"no stable equilibrium: the arm buckles or falls over at {share:.0%} of {what} "
@@ -148,15 +157,15 @@ class Equilibrium:
             upright = np.array([1.0, 0.0, 0.0, 0.0])
             straight = State(np.zeros(self.shooting.description.n_pressures), upright, none)
             weighted = straight._replace(loads=none._replace(gravity=gravity))
-            state, share = self.follow(straight, weighted)
-            if share < 1.0:
-                raise EquilibriumError(
-                    f"no stable equilibrium: the unpressurised arm buckles or falls over at "
-                    f"{share:.0%} of its own weight and payload; mount it hanging, or make it "
-                    f"shorter, lighter or stiffer"
-                )
-            self._rest[key] = state
-        return self._rest[key]
+            self._rest[key] = self.follow(straight, weighted)
+        state, share = self._rest[key]
+        if share < 1.0:
+            raise EquilibriumError(
+                f"no stable equilibrium: the unpressurised arm buckles or falls over at "
+                f"{share:.0%} of its own weight and payload; mount it hanging, or make it "
+                f"shorter, lighter or stiffer"
+            )
+        return state
 
     def shape(self, state: State, stations: Vector, at: float | None = None) -> Vector:
         """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium with its load at `at`."""
@@ -195,7 +204,9 @@ class Equilibrium:
         for s in stations:
             q, position = found[marks[np.argmin(np.abs(marks - s))]]
             poses.append(
-                lie.transform(lie.rotation_from_quaternion(q / np.linalg.norm(q)), position - origin)
+                lie.transform(
+                    lie.rotation_from_quaternion(q / np.linalg.norm(q)), position - origin
+                )
             )
         return np.stack(poses)
 
@@ -213,6 +224,6 @@ def _between(start: State, end: State, share: float) -> State:
 def _solve_3x3(matrix: Vector, right: Vector) -> Vector:
     """Solution of a small system; NaN where it is singular."""
     try:
-        return np.linalg.solve(matrix, right)
+        return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
     except np.linalg.LinAlgError:
         return np.full(3, np.nan)

@@ -62,7 +62,9 @@ class _Screw:
         return float(np.linalg.norm(along if along.any() else other))
 
     @classmethod
-    def _from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float) -> tuple[Vector, Vector]:
+    def _from_axis(
+        cls, point: ArrayLike, direction: ArrayLike, pitch: float
+    ) -> tuple[Vector, Vector]:
         along = np.asarray(direction, dtype=float)
         return along, np.cross(np.asarray(point, dtype=float), along) + pitch * along
 

@@ -24,6 +24,7 @@ of every shorter arm must be positive definite.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from math import ceil, sqrt
 
 import casadi as ca
@@ -32,6 +33,7 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.model.actuation import SectionGeometry
+from stiffopt.model.compliance import inverse_3x3
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.kinematics import Actuation
 
@@ -115,9 +117,7 @@ def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
         moment = ca.cross(tangent, force)
         if centroid.any():
             moment += ca.cross(R @ ca.vertcat(*centroid, 0), f)
-        return ca.vertcat(
-            -0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), -tangent, moment
-        )
+        return ca.vertcat(-0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), -tangent, moment)
 
     slopes: list[ca.SX] = []
     for row in _STAGES:
@@ -186,7 +186,7 @@ class Chain:
     def _turn_per_rest(self) -> ca.MX:
         """Turn of the tip (3, n + 6) that keeps the base upright, per pressure and wrench."""
         residual, _ = self._per_x
-        return -_inverse_3x3(residual[:, :3]) @ residual[:, 3:]
+        return -inverse_3x3(residual[:, :3]) @ residual[:, 3:]
 
     @cached_property
     def _twist_per_rest(self) -> ca.MX:
@@ -219,13 +219,8 @@ class Chain:
         for node in self.nodes:
             per_turn = _turn_between(node, ca.jacobian(node, self.x)[:, :3])
             per_moment = _turn_between(node, ca.jacobian(node, self.inputs[3])[:, 3:6])
-            blocks.append(-_inverse_3x3(per_turn) @ per_moment @ R)
+            blocks.append(-inverse_3x3(per_turn) @ per_moment @ R)
         return ca.horzcat(*blocks)
-
-
-def _inverse_3x3(matrix: ca.MX) -> ca.MX:
-    A = ca.SX.sym("A", 3, 3)
-    return ca.Function("inverse", [A], [ca.inv_minor(A)])(matrix)
 
 
 class Shooting:
@@ -269,7 +264,7 @@ class Shooting:
             for length, rigid in ((segment.length, False), (segment.connector, True)):
                 end = start + length
                 marks = [start, *sorted(c for c in cuts if start < c < end), end]
-                for near, far in zip(marks[:-1], marks[1:], strict=True):
+                for near, far in pairwise(marks):
                     if far > near:
                         steps = max(1, ceil(self.steps * (far - near) / segment.length - 1e-9))
                         pieces.append(Piece(index, rigid, far - near, steps, far))

@@ -1,0 +1,1 @@
+"""Which pressures: the task, its nonlinear program, the search and the answer."""

@@ -128,10 +128,10 @@ def reach(problem: Problem, x: Vector, most_iterations: int = 40) -> Point | Non
         if promised < 1e-9 * (residual @ residual):
             return point
         trial = _attempt(problem, np.clip(point.x + d, problem.lower, problem.upper), True)
-        gained = -np.inf
+        gained = float("-inf")
         if trial is not None:
             new = stacked(trial)[0]
-            gained = 0.5 * (residual @ residual - new @ new)
+            gained = 0.5 * float(residual @ residual - new @ new)
         if trial is not None and gained > 0.1 * promised:
             point = trial
             damping = max(damping * (0.1 if gained > 0.7 * promised else 1.0), 1e-10)
@@ -228,7 +228,7 @@ def _axes(ball: Ball, multipliers: Multipliers | None, gradient: Vector) -> tupl
     if multipliers is not None:
         pull = multipliers.balls[ball.name]
     else:  # least-squares estimate of the multiplier
-        pull = np.linalg.lstsq(ball.jacobian.T, -gradient, rcond=None)[0]
+        pull = np.asarray(np.linalg.lstsq(ball.jacobian.T, -gradient, rcond=None)[0], float)
     size = float(np.linalg.norm(pull))
     first = ball.residual if ball.error > 0.9 * ball.radius else pull
     if not np.linalg.norm(first) > 0:

@@ -189,7 +189,7 @@ class Problem:
         if goal is not None and isinstance(goal.match, MatchValue):
             wanted = float(np.log(goal.match.value))
             return self._and_some_pressure(
-                lambda point: ((point.values[0] - wanted) ** 2),
+                lambda point: (point.values[0] - wanted) ** 2,
                 lambda point: 2 * (point.values[0] - wanted) * point.gradients[0],
                 lambda point: 2 * np.outer(point.gradients[0], point.gradients[0]),
             )
@@ -343,7 +343,8 @@ def _pointing_error(wanted: Vector, rotation: Vector) -> tuple[Vector, Vector]:
 
 def _axis_per_turn(rotation: Vector) -> Vector:
     """Derivative (3, 3) of the tip's z axis by a turn in tip axes."""
-    return rotation @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    x, y = rotation[:, 0], rotation[:, 1]
+    return np.column_stack([-y, x, np.zeros(3)])  # turn x z
 
 
 def _orientation_error(wanted: Vector, rotation: Vector) -> tuple[Vector, Vector]:

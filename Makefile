@@ -1,0 +1,73 @@
+# `make demo` and `make test` do all their set-up; `make help` lists the rest.
+PYTHON ?= python3
+VENV ?= .venv
+DEMO ?= problems/two_segment_stiff_x.yaml
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+PICTURE := docs/images/two_segment_stiff_x.png
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test lint types format picture bench clean
+
+help:  ## say what can be made
+	@sed -n 's/^\([a-z]*\):.*## /  make \1@/p' $(MAKEFILE_LIST) | column -t -s @ 2>/dev/null \
+	  || grep '##' $(MAKEFILE_LIST)
+
+demo: $(VENV)/.installed-plot  ## solve a task and plot the arm
+	@mkdir -p out
+	$(BIN)/solve-pressure $(DEMO) --plot out/demo.png
+	@echo "The plot is in out/demo.png."
+
+test: $(VENV)/.installed-dev  ## run the tests (make test ARGS=--long for the long ones too)
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(VENV)/.installed-dev  ## check style, formatting and import layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check --quiet .
+	$(BIN)/lint-imports --no-logo
+
+types: $(VENV)/.installed-dev  ## check the types
+	$(BIN)/mypy
+
+format: $(VENV)/.installed-dev  ## format the code
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+picture: $(VENV)/.installed-plot  ## draw the picture of the README again
+	@mkdir -p $(dir $(PICTURE))
+	$(BIN)/solve-pressure $(DEMO) --plot $(PICTURE)
+
+ifneq ($(wildcard benchmarks/quality.py),)
+bench: $(VENV)/.installed-dev  ## measure the optimiser (make bench ARGS="--segments 2 --tasks 100")
+	$(BIN)/python benchmarks/quality.py $(ARGS)
+endif
+
+clean:  ## remove everything that was made, the virtual environment too
+	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis \
+	  .import_linter_cache
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# Stamps: each set-up step runs once, and again when what it depends on has changed.
+
+$(VENV)/.created:
+	@command -v $(PYTHON) >/dev/null || \
+	  { echo "There is no '$(PYTHON)'. Install Python 3.11 or later (Debian: apt install python3 python3-venv)" \
+	    "or name one: make PYTHON=python3.12 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "'$(PYTHON)' is older than Python 3.11; name a later one: make PYTHON=python3.12 ..." >&2; exit 1; }
+	@echo "Creating $(VENV) ..."
+	@$(PYTHON) -m venv $(VENV) || \
+	  { echo "$(PYTHON) could not create $(VENV). On Debian and Ubuntu its module comes with:" \
+	    "apt install python3-venv" >&2; exit 1; }
+	@touch $@
+
+$(VENV)/.installed-plot: $(VENV)/.created pyproject.toml
+	@echo "Installing stiffopt into $(VENV) ..."
+	@$(PIP) install --editable '.[plot]'
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.created pyproject.toml
+	@echo "Installing stiffopt and its development tools into $(VENV) ..."
+	@$(PIP) install --editable '.[dev,plot]'
+	@touch $@ $(VENV)/.installed-plot

@@ -1,0 +1,117 @@
+"""Answer: what is printed, written and drawn about one task."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from stiffopt.errors import EquilibriumError, FileError, InputError
+from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.optimise.pareto import pareto_front
+from stiffopt.optimise.solution import PressureSolution, judge
+from stiffopt.optimise.solver import PressureSolver, stiffness_blind
+from stiffopt.optimise.task import MatchValue, StiffnessMeasure, Task, load_task
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A solved (or not) task file.
+
+    Attributes
+    ----------
+    file : the task file as the user named it.
+    robot : the arm under the task's load.
+    solution : of the task.
+    plain : the task's stiffnesses at the stiffness-blind solution; empty where there is none.
+    front : the trade-off, or None if it was not asked for or cannot be had.
+    complaint : why there is no trade-off although it was asked for.
+    """
+
+    file: str
+    robot: Manipulator
+    solution: PressureSolution
+    plain: tuple[float, ...] = ()
+    front: tuple[PressureSolution, ...] | None = None
+    complaint: str = ""
+
+    @property
+    def task(self) -> Task:
+        """The task itself."""
+        return self.solution.task
+
+    @property
+    def name(self) -> str:
+        """What to call the task: its file's name without folder and ending."""
+        return os.path.splitext(os.path.basename(self.file))[0]
+
+
+def measures_of(task: Task) -> tuple[StiffnessMeasure, ...]:
+    """Return all stiffnesses that a task names, in the order of `PressureSolution.stiffnesses`."""
+    goal = task.stiffness
+    if goal is None:
+        return ()
+    match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
+    return (*goal.maximise, *match, *goal.at_least)
+
+
+def answer_file(
+    file: str, *, seed: int, pareto: int | None, say: Callable[[str], None] = lambda stage: None
+) -> Answer:
+    """Solve a task file.
+
+    Parameters
+    ----------
+    file :
+        Path of the task file.
+    seed :
+        Of the global search.
+    pareto :
+        Points of the trade-off, or None for none.
+    say :
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        The task file or its robot is wrong; the message names the file.
+    """
+    task = load_task(file)
+    try:
+        robot = load_robot(task.resolve_robot())
+        solver = PressureSolver(robot, task, seed=seed)
+        answer = _solved(file, solver)
+    except FileError:
+        raise
+    except InputError as error:
+        raise FileError(file, str(error)) from None
+    if pareto is None or answer.solution.status == "failed":
+        return answer
+    say("trade-off")
+    return _with_front(answer, pareto, seed)
+
+
+def _solved(file: str, solver: PressureSolver) -> Answer:
+    try:
+        solution = solver.solve()
+    except EquilibriumError as error:
+        solution = PressureSolution("failed", str(error), solver.task)
+    return Answer(file, solver.robot, solution, _plain(solver, solution))
+
+
+def _plain(solver: PressureSolver, solution: PressureSolution) -> tuple[float, ...]:
+    """Stiffnesses that a solver blind for them would have got."""
+    if not solution.found or not solution.stiffnesses:
+        return ()
+    try:
+        plain = stiffness_blind(solver, solution)
+        if not plain.found or plain.pressures is None:
+            return ()
+        return judge(solver.robot, solution.task, plain.pressures).stiffnesses
+    except EquilibriumError:
+        return ()
+
+
+def _with_front(answer: Answer, n: int, seed: int) -> Answer:
+    try:
+        return replace(answer, front=tuple(pareto_front(answer.robot, answer.task, n, seed=seed)))
+    except (InputError, EquilibriumError) as error:
+        return replace(answer, complaint=str(error))

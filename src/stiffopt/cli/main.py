@@ -1,0 +1,76 @@
+"""Entry points: `stiffopt` with its commands, and `solve-pressure`, which is `stiffopt solve`."""
+
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+from stiffopt.cli.console import Closed, report_error
+from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
+from stiffopt.cli.robots import robots
+from stiffopt.cli.solve import HELP, examples, solve
+from stiffopt.cli.version import print_version
+
+__all__ = ["app", "main", "solve_pressure_app", "solve_pressure_main"]
+
+_SETTINGS = {"help_option_names": ["-h", "--help"]}
+
+
+def _application() -> typer.Typer:
+    # no rich markup: a path may hold brackets, and help is read in pipes too
+    return typer.Typer(
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings=_SETTINGS,
+    )
+
+
+app = _application()
+app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
+app.command("robots")(robots)
+
+solve_pressure_app = _application()
+solve_pressure_app.command("solve-pressure", help=HELP, epilog=examples("solve-pressure"))(solve)
+
+
+@app.callback()
+def _stiffopt(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Run a fluidic soft arm stiff where it matters."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `stiffopt` and return its exit code."""
+    return _run(app, "stiffopt", arguments)
+
+
+def solve_pressure_main(arguments: Sequence[str] | None = None) -> int:
+    """Run `solve-pressure` and return its exit code."""
+    return _run(solve_pressure_app, "solve-pressure", arguments)
+
+
+def _run(application: typer.Typer, name: str, arguments: Sequence[str] | None) -> int:
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):  # a character that the terminal lacks is no error
+            stream.reconfigure(errors="backslashreplace")
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        application(given, prog_name=name)
+    except SystemExit as stop:
+        if stop.code == INTERRUPTED:
+            report_error("interrupted", label="")
+        return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
+    except Closed:
+        return CLOSED_PIPE
+    except OSError as error:  # a full disk, a vanished terminal
+        report_error(f"cannot write the answer: {error.strerror or error}")
+        return BAD_INPUT
+    return 0

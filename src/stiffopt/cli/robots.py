@@ -1,0 +1,30 @@
+"""The command `stiffopt robots`."""
+
+from rich import box
+from rich.table import Table
+
+from stiffopt.cli.console import show
+from stiffopt.model.description import RobotDescription, builtin_robots, load_description
+
+
+def robots() -> None:
+    """List the robots that come with stiffopt; a task file names one of them or a robot file."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column("robot", no_wrap=True)
+    for heading in ("segments", "channels", "length", "pressures", "gravity"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name in builtin_robots():
+        table.add_row(name, *_columns(load_description(name)))
+    show(table)
+
+
+def _columns(robot: RobotDescription) -> tuple[str, ...]:
+    low, high = min(robot.pressure_min) * 1e-5, max(robot.pressure_max) * 1e-5
+    gravity = ", ".join(f"{component:g}" for component in robot.gravity)
+    return (
+        str(robot.n_segments),
+        str(robot.n_pressures),
+        f"{robot.length * 1e3:g} mm",
+        f"{low:g} to {high:g} bar",
+        f"({gravity}) m/s^2" if any(robot.gravity) else "none",
+    )

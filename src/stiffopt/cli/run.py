@@ -1,0 +1,127 @@
+"""What `solve-pressure` does with its arguments, file by file."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+from traceback import extract_tb
+
+from stiffopt.cli import exits, outputs, records, report
+from stiffopt.cli.answer import Answer, answer_file
+from stiffopt.cli.console import Closed, Work, report_error, report_note, show, write_line
+from stiffopt.cli.inputs import find_tasks
+from stiffopt.errors import StiffoptError
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options of the command."""
+
+    as_json: bool = False
+    out: str | None = None
+    plot: str | None = None
+    pareto: int | None = None
+    seed: int = 0
+    quiet: bool = False
+
+
+def run(tasks: Sequence[str], options: Options) -> int:
+    """Solve task files and folders of them; print, write and draw; return the exit code."""
+    inputs = find_tasks(tasks)
+    try:
+        to_write = outputs.check(options.out, options.plot, inputs.files)
+    except StiffoptError as error:
+        report_error(str(error))
+        return exits.BAD_INPUT
+    batch = _Batch(options, Work(len(inputs.files), quiet=options.quiet))
+    for bad in inputs.errors:
+        batch.complain(bad.path, str(bad))
+    for note in inputs.skipped if not options.quiet else ():
+        report_note(note)
+    try:
+        for file, picture in zip(inputs.files, to_write.plots, strict=True):
+            batch.solve(file, picture)
+        batch.summarise()
+        batch.write(to_write.out)
+    except Closed:
+        return exits.CLOSED_PIPE
+    return exits.CLOSED_PIPE if batch.reader_left else exits.most_serious(batch.codes)
+
+
+@dataclass
+class _Batch:
+    """What became of the files so far."""
+
+    options: Options
+    work: Work
+    answers: list[Answer] = field(default_factory=list)
+    rows: list[report.Row] = field(default_factory=list)
+    codes: list[int] = field(default_factory=list)
+    reader_left: bool = False
+
+    def solve(self, file: str, picture: str | None) -> None:
+        """Answer one file, or report what is wrong with it."""
+        begin = perf_counter()
+        try:
+            with self.work.step(file):
+                answer = answer_file(file, seed=self.options.seed, pareto=self.options.pareto)
+                if picture:
+                    outputs.draw(answer, picture)
+        except StiffoptError as error:
+            self.complain(file, str(error))
+        except (Closed, OSError):
+            raise
+        except Exception as error:  # a mistake of ours must not leave the other files unsolved
+            self.complain(file, f"{file}: {_bug(error)}", exits.FAILED)
+        else:
+            self._take(answer, perf_counter() - begin)
+
+    def complain(self, file: str, message: str, code: int = exits.BAD_INPUT) -> None:
+        """Report a file that has no answer."""
+        report_error(message)
+        self.codes.append(code)
+        self.rows.append(report.Row(file, "bad input" if code == exits.BAD_INPUT else "failed"))
+
+    def summarise(self) -> None:
+        """Print one line a file, where there are several."""
+        if len(self.rows) > 1 and not self.options.as_json and not self.options.quiet:
+            self._print(lambda: show(report.summary(self.rows)))
+
+    def write(self, path: str | None) -> None:
+        """Write the result file."""
+        if path is None:
+            return
+        try:
+            outputs.write_results(path, self.answers)
+        except StiffoptError as error:
+            report_error(str(error))
+            self.codes.append(exits.BAD_INPUT)
+
+    def _take(self, answer: Answer, seconds: float) -> None:
+        self.answers.append(answer)
+        self.rows.append(report.Row.of(answer, seconds))
+        self.codes.append(exits.OF_STATUS[answer.solution.status])
+        if self.options.as_json:
+            self._print(lambda: write_line(records.json_line(answer)))
+        elif not self.options.quiet:
+            self._print(lambda: show(report.block(answer)))
+        if answer.complaint:
+            report_error(f"{answer.file}: {answer.complaint}")
+            self.codes.append(exits.BAD_INPUT)
+
+    def _print(self, printing: Callable[[], None]) -> None:
+        """Print; where nobody reads any more, go on only if there are files to write."""
+        if self.reader_left:
+            return
+        try:
+            printing()
+        except Closed:
+            if self.options.out is None and self.options.plot is None:
+                raise
+            self.reader_left = True
+
+
+def _bug(error: Exception) -> str:
+    """Put a mistake of ours into one sentence that says where it is."""
+    frames = extract_tb(error.__traceback__)
+    where = f" in {frames[-1].name}, line {frames[-1].lineno}" if frames else ""
+    return f"this should not happen: {type(error).__name__}{where}: {error}; please report it"

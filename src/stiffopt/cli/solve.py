@@ -1,0 +1,100 @@
+"""The command `solve-pressure`, which is `stiffopt solve` too."""
+
+from typing import Annotated
+
+import typer
+
+from stiffopt.cli.run import Options, run
+from stiffopt.cli.version import print_version
+
+HELP = """\
+Find the chamber pressures that reach a tip pose and do best by its stiffness.
+
+Each TASK is a task file, or a folder whose task files (*.yaml) are solved in the order of their
+names. Subfolders are left alone; files in a folder that say they are something else, such as robot
+files, are skipped with a note. A wrong file is reported on stderr, and the others are still solved.
+"""
+
+_EXAMPLES = """\
+\b
+Examples:
+  {command} problems/two_segment_stiff_x.yaml
+  {command} problems/
+  {command} --json problems/*.yaml | jq .stiffness
+  {command} task.yaml --out answer.yaml --plot answer.png
+  {command} task.yaml --pareto 12 --plot trade-off.png
+
+\b
+Exit codes, the most serious one if there are several files:
+  0    all solved
+  2    bad input: a file or an option is wrong
+  4    the solver failed
+  3    a target is unreachable; the closest configuration is reported
+  130  interrupted (Ctrl-C)
+
+\b
+A task file:
+  format: stiffopt-task/1
+  robot: stiff-flop-2
+  target: {{position: [-30 mm, 10 mm, 190 mm]}}
+  stiffness: {{maximise: {{direction: [1, 0, 0]}}}}
+"""
+
+
+def examples(command: str) -> str:
+    """Return what stands at the end of the help."""
+    return _EXAMPLES.format(command=command)
+
+
+def solve(
+    tasks: Annotated[
+        list[str], typer.Argument(metavar="TASK...", help="Task files, or folders of them.")
+    ],
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json",
+            help="Print one JSON object a line for each task, in SI units, instead of a table. "
+            "A task with bad input has no line.",
+        ),
+    ] = False,
+    out: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.yaml",
+            help="Write the answers to a result file. Only another result file is overwritten.",
+        ),
+    ] = None,
+    plot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.png",
+            help="Draw the arm and its pressures; of several tasks, each in FILE-<task>.png.",
+        ),
+    ] = None,
+    pareto: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=2,
+            max=1000,
+            help="Trade tip error against stiffness, at N tolerances from the task's own upwards.",
+        ),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Of the global search: the same seed, the same answer.")
+    ] = 0,
+    quiet: Annotated[
+        bool,
+        typer.Option("--quiet", "-q", help="Print no tables, notes and progress; errors only."),
+    ] = False,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", callback=print_version, is_eager=True, help="Print the version and exit."
+        ),
+    ] = False,
+) -> None:
+    """Solve task files."""
+    options = Options(as_json, out, plot, pareto, seed, quiet)
+    raise typer.Exit(run(tasks, options))

@@ -1,0 +1,308 @@
+"""The numerical side of an arm: compiled functions, equilibria and checks.
+
+`Arm` knows how to evaluate any function of an arm's shape, without and with loads;
+`stiffopt.model.manipulator.Manipulator` builds on it what users call.
+"""
+
+from collections.abc import Callable, Hashable
+from copy import copy
+from functools import cached_property
+from typing import Any, Self
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt import lie
+from stiffopt.errors import InputError, PressureError
+from stiffopt.model.actuation import strain_law
+from stiffopt.model.arguments import checked_vector, dead_and_follower
+from stiffopt.model.compliance import Frame
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.equilibrium import Equilibrium, Loads, State
+from stiffopt.model.kinematics import Actuation
+from stiffopt.model.shape import FreeShape, Shape
+from stiffopt.model.shooting import Shooting
+
+Vector = NDArray[np.float64]
+Values = Callable[[Shape], Any]
+
+
+class Arm:
+    """Functions of the shape of one arm; see `Manipulator` for the arguments."""
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        *,
+        force: ArrayLike = (0.0, 0.0, 0.0),
+        moment: ArrayLike = (0.0, 0.0, 0.0),
+        load_frame: Frame = "base",
+        resolution: int = 1,
+    ) -> None:
+        if isinstance(resolution, bool) or not isinstance(resolution, int) or resolution < 1:
+            raise InputError(f"resolution must be a positive integer; got {resolution!r}")
+        self.description = description
+        self.resolution = resolution
+        self._tip_load = _tip_load(force, moment, load_frame)
+        self._actuation = Actuation.of(description)
+        self._functions: dict[Hashable, ca.Function] = {}
+        self._shared: dict[str, Equilibrium] = {}
+        self._margin = ca.Function("margin", [self._actuation.pressures], [self._actuation.margin])
+        for corner in (self.pressure_min, self.pressure_max, self._farthest_pressures()):
+            self._check_margin(corner[np.newaxis], " within the robot's pressure limits")
+
+    # -- what the arm is --------------------------------------------------------------------
+
+    @property
+    def n_pressures(self) -> int:
+        """Number of channels n."""
+        return self.description.n_pressures
+
+    @property
+    def n_segments(self) -> int:
+        """Number of segments."""
+        return self.description.n_segments
+
+    @property
+    def length(self) -> float:
+        """Length at rest, connectors included, in m."""
+        return self.description.length
+
+    @property
+    def pressure_min(self) -> Vector:
+        """Lower limits (n,) in Pa."""
+        return np.array(self.description.pressure_min)
+
+    @property
+    def pressure_max(self) -> Vector:
+        """Upper limits (n,) in Pa."""
+        return np.array(self.description.pressure_max)
+
+    @property
+    def is_loaded(self) -> bool:
+        """Whether gravity or a tip load acts, so that shapes are equilibria."""
+        return any(self.description.gravity) or bool(self._tip_load.any())
+
+    def with_load(
+        self, force: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0), frame: Frame = "base"
+    ) -> Self:
+        """The same arm with this load at its tip, instead of any that it carries now."""
+        other = copy(self)  # shares what is compiled: loads are arguments of it
+        other._tip_load = _tip_load(force, moment, frame)
+        return other
+
+    # -- for the optimiser ------------------------------------------------------------------
+
+    def evaluator(
+        self,
+        key: Hashable,
+        outputs: Callable[[Shape, Any], list[Any]],
+        n_parameters: int = 0,
+    ) -> "Evaluator":
+        """Compile outputs of the tip's shape and of parameters; `key` names them in the cache."""
+        full_key = (key, n_parameters, self.is_loaded)
+        if full_key not in self._functions:
+            tip = self._symbolic(None)
+            parameters = type(tip.position).sym("parameters", n_parameters)
+            self._functions[full_key] = ca.Function(
+                "evaluator", [*tip.inputs, parameters], outputs(tip, parameters)
+            )
+        return Evaluator(self, self._functions[full_key])
+
+    # -- numerics ---------------------------------------------------------------------------
+
+    @property
+    def _loads(self) -> Loads:
+        return Loads(np.array(self.description.gravity), self._tip_load, np.zeros(12))
+
+    @property
+    def _equilibrium(self) -> Equilibrium:
+        if "equilibrium" not in self._shared:
+            shooting = Shooting(self.description, self._actuation, self.resolution)
+            self._shared["equilibrium"] = Equilibrium(shooting)
+        return self._shared["equilibrium"]
+
+    @cached_property
+    def _section_parts(self) -> ca.Function:
+        sections = self._actuation.sections
+        return ca.Function(
+            "sections",
+            [self._actuation.pressures],
+            [section.strain for section in sections] + [section.compliance for section in sections],
+        )
+
+    def _section_compliances(self, p: Vector) -> list[Vector]:
+        """Compliance (6, 6) of each segment's section at pressures (n,)."""
+        return [part.full() for part in self._section_parts(p)[self.n_segments :]]
+
+    def _symbolic(self, at: float | None) -> Shape:
+        """Shape of a station, without or with loads."""
+        if self.is_loaded:
+            return self._equilibrium.shooting.chain(at)
+        return FreeShape.of(self.description, self._actuation, at)
+
+    def _function(
+        self, key: Hashable, outputs: Callable[[Shape], list[Any]], at: float | None = None
+    ) -> ca.Function:
+        full_key = (key, at, self.is_loaded)
+        if full_key not in self._functions:
+            shape = self._symbolic(at)
+            self._functions[full_key] = ca.Function("shape", list(shape.inputs), outputs(shape))
+        return self._functions[full_key]
+
+    def _evaluate(
+        self, key: Hashable, value: Values, p: ArrayLike, at: float | None = None
+    ) -> Vector:
+        """Value of a shape for one or many pressures, as (..., rows, columns)."""
+        batch, single = self._pressures(p)
+        function = self._function(key, lambda shape: [ca.densify(value(shape))], at)
+        results = (
+            np.stack(
+                [self._at_equilibrium(function, row) for row in batch]
+            )
+            if self.is_loaded
+            else evaluate_many(function, batch)
+        )
+        return results[0] if single else results
+
+    def _at_equilibrium(self, function: ca.Function, p: Vector) -> Vector:
+        """Value of a function of the loaded shape at pressures (n,)."""
+        value: Vector = function(*self._equilibrium.arguments(self.settle(p))).full()
+        return value
+
+    def settle(self, p: Vector, nearby: State | None = None) -> State:
+        """Equilibrium of the loaded arm at pressures (n,); from a nearby one where that helps.
+
+        What is found from a nearby one is not checked for stability.
+
+        Raises
+        ------
+        EquilibriumError
+            If there is none that is stable and reached continuously from rest.
+        """
+        if nearby is not None:
+            end = State(p, nearby.quaternion, self._loads)
+            state, share = self._equilibrium.follow(nearby, end, shortest=0.1, stable=False)
+            if share == 1.0:
+                return state
+        return self._equilibrium.settle(p, self._loads)
+
+    def _shape(self, p: Vector, stations: Vector) -> Vector:
+        """Poses (k, 4, 4) at arc lengths (k,)."""
+        if self.is_loaded:
+            return self._equilibrium.shape(self._equilibrium.settle(p, self._loads), stations)
+        strains = [part.full()[:, 0] for part in self._section_parts(p)[: self.n_segments]]
+        poses = np.empty((len(stations), 4, 4))
+        for k, station in enumerate(stations):
+            T, left = np.eye(4), station
+            for segment, strain in zip(self.description.segments, strains, strict=True):
+                soft = min(segment.length, left)
+                rigid = min(segment.connector, left - soft)
+                left -= soft + rigid
+                T = T @ lie.exp(strain * soft) @ lie.transform(np.eye(3), np.array([0, 0, rigid]))
+            poses[k] = T
+        return poses
+
+    # -- checks -----------------------------------------------------------------------------
+
+    def _pressures(self, p: ArrayLike) -> tuple[Vector, bool]:
+        """Checked pressures (N, n), and whether a single set was given."""
+        try:
+            values = np.asarray(p, dtype=float)
+        except (TypeError, ValueError) as error:
+            raise PressureError(f"pressures must be numbers in Pa; got {p!r}") from error
+        if values.ndim not in (1, 2) or values.shape[-1] != self.n_pressures:
+            raise PressureError(
+                f"expected pressures of shape ({self.n_pressures},) or (N, {self.n_pressures}) "
+                f"for robot '{self.description.name}', proximal segment first; "
+                f"got shape {values.shape}"
+            )
+        batch = np.atleast_2d(values)
+        if not np.isfinite(batch).all():
+            raise PressureError("pressures must be finite; got NaN or an infinity")
+        self._check_margin(batch, "")
+        return batch, values.ndim == 1
+
+    def _single(self, p: ArrayLike) -> Vector:
+        batch, single = self._pressures(p)
+        if not single:
+            raise PressureError(f"expected one set of pressures ({self.n_pressures},), not a batch")
+        return batch[0]
+
+    def _check_margin(self, batch: Vector, where: str) -> None:
+        """Raise where the strain law of a segment breaks down."""
+        if not len(batch):
+            return
+        margins = self._margin(batch.T).full()  # (segments, N)
+        if (margins > 0).all():
+            return
+        segment, row = np.argwhere(~(margins > 0))[0]
+        bars = ", ".join(f"{value / 1e5:.4g}" for value in batch[row])
+        law = strain_law(self.description.segments[segment])
+        raise PressureError(
+            f"segment {segment + 1} of robot '{self.description.name}' at ({bars}) bar{where}: "
+            f"{law.limit}; lower the pressure or its limit"
+        )
+
+    def _farthest_pressures(self) -> Vector:
+        low, high = self.pressure_min, self.pressure_max
+        return np.where(np.abs(low) > np.abs(high), low, high)
+
+    def _station(self, at: float | None) -> float | None:
+        return None if at is None or at == self.length else self._arc_length(at)
+
+    def _arc_length(self, at: float, base_too: bool = False) -> float:
+        value = float(at)
+        if not (0 <= value <= self.length * (1 + 1e-12)) or (value == 0 and not base_too):
+            raise InputError(
+                f"arc length {value:g} m is not on the arm: between {'' if base_too else 'above '}"
+                f"0 and {self.length:g} m at rest"
+            )
+        return min(value, self.length)
+
+
+class Evaluator:
+    """A compiled function of the tip's shape that stays close to where it was last asked.
+
+    With loads the equilibrium at new pressures is found from the previous one; `restart`
+    forgets it, and the next is found from rest.
+    """
+
+    def __init__(self, arm: Arm, function: ca.Function) -> None:
+        self._arm = arm
+        self._function = function
+        self._state: State | None = None
+
+    def restart(self, state: State | None = None) -> None:
+        """Forget the previous equilibrium, or continue from the given one."""
+        self._state = state
+
+    @property
+    def state(self) -> State | None:
+        """Equilibrium at the last evaluation; None for an arm without loads."""
+        return self._state
+
+    def __call__(self, p: Vector, *parameters: Vector) -> list[Vector]:
+        """Outputs at checked pressures (n,) and parameters, as 2-D arrays."""
+        parameters = parameters or (np.zeros(0),)
+        if self._arm.is_loaded:
+            self._state = self._arm.settle(p, self._state)
+            inputs = self._arm._equilibrium.arguments(self._state)
+        else:
+            inputs = (p,)
+        return [value.full() for value in self._function.call([*inputs, *parameters])]
+
+
+def evaluate_many(function: ca.Function, batch: Vector) -> Vector:
+    """Evaluate a function of (n,) with one output (r, c) on (N, n): (N, r, c)."""
+    rows, columns = function.size1_out(0), function.size2_out(0)
+    if not len(batch):
+        return np.empty((0, rows, columns))
+    wide = function(batch.T).full()  # (r, N c)
+    return np.ascontiguousarray(wide.reshape(rows, len(batch), columns).swapaxes(0, 1))
+
+
+def _tip_load(force: ArrayLike, moment: ArrayLike, frame: Frame) -> Vector:
+    wrench = [checked_vector("force", force), checked_vector("moment", moment)]
+    return dead_and_follower(np.concatenate(wrench), frame)
