@@ -4,15 +4,14 @@ VENV ?= .venv
 DEMO ?= problems/two_segment_stiff_x.yaml
 
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check
 PICTURE := docs/images/two_segment_stiff_x.png
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test lint types format picture bench clean
 
 help:  ## say what can be made
-	@sed -n 's/^\([a-z]*\):.*## /  make \1@/p' $(MAKEFILE_LIST) | column -t -s @ 2>/dev/null \
-	  || grep '##' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(VENV)/.installed-plot  ## solve a task and plot the arm
 	@mkdir -p out
@@ -56,10 +55,12 @@ $(VENV)/.created:
 	    "or name one: make PYTHON=python3.12 ..." >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "'$(PYTHON)' is older than Python 3.11; name a later one: make PYTHON=python3.12 ..." >&2; exit 1; }
-	@echo "Creating $(VENV) ..."
-	@$(PYTHON) -m venv $(VENV) || \
+	@if ! $(PIP) --version >/dev/null 2>&1; then \
+	  echo "Creating $(VENV) ..."; \
+	  $(PYTHON) -m venv --clear $(VENV) || \
 	  { echo "$(PYTHON) could not create $(VENV). On Debian and Ubuntu its module comes with:" \
-	    "apt install python3-venv" >&2; exit 1; }
+	    "apt install python3-venv" >&2; exit 1; }; \
+	fi
 	@touch $@
 
 $(VENV)/.installed-plot: $(VENV)/.created pyproject.toml

@@ -39,12 +39,30 @@ class Answer:
         (relative); else the mean square of the pressures in bar^2.
     reached : starts that ended at the pose.
     agreeing : of those the ones within 0.1 % of the best.
+    spread : largest difference of a pressure in bar between those within 1e-6 of the best; None
+        if that is but one.
     """
 
     pressures: Vector
     value: float
     reached: int
     agreeing: int
+    spread: float | None = None
+
+
+@dataclass(frozen=True)
+class Closest:
+    """Closest configuration that a reference finds to an unreachable pose.
+
+    Attributes
+    ----------
+    position, angle : errors in m and rad, None where not asked for.
+    spread : largest difference of a pressure in bar between those as close within 10 nm (10 nrad).
+    """
+
+    position: float | None
+    angle: float | None
+    spread: float | None
 
 
 class Reference:
@@ -136,12 +154,13 @@ class Reference:
 
             return function
 
-        width = 1e-6 * (self.upper - self.lower)
-        inside = np.clip(x, self.lower + width, self.upper - width)
+        upper = np.maximum(self.upper, self.lower + 1e-9)  # a channel may be held at a value
+        width = 1e-6 * (upper - self.lower)
+        inside = np.clip(x, self.lower + width, upper - width)
         self._pose_function.restart()
         try:
             result = least_squares(
-                stacked(0), inside, stacked(1), bounds=(self.lower, self.upper),
+                stacked(0), inside, stacked(1), bounds=(self.lower, upper),
                 xtol=1e-11, ftol=1e-14, gtol=1e-12, max_nfev=60,
             )  # fmt: skip
         except (EquilibriumError, FloatingPointError):
@@ -322,21 +341,22 @@ class Reference:
             return None
         value, x = min(points, key=lambda point: point[0])
         agreeing = sum(v - value <= 1e-3 * max(abs(value), 1e-6) for v, _ in points)
-        return Answer(x * BAR, sign * value, len(points), agreeing)
+        size = max(abs(value), 1e-6)
+        same = [end for v, end in points if v - value <= 1e-6 * size]
+        spread = float(np.ptp(same, axis=0).max()) if len(same) > 1 else None
+        return Answer(x * BAR, sign * value, len(points), agreeing, spread)
 
-    def closest(self, starts: int, seed: int = 0) -> tuple[float | None, float | None]:
-        """Least errors (m, rad): of the position; or the angle's first where both are asked."""
+    def closest(self, starts: int, seed: int = 0) -> Closest:
+        """Least error of the position; or of the angle first, where both are asked for."""
         names = tuple(self.residuals(self._pose_values((self.lower + self.upper) / 2)))
         first = "angle" if "angle" in names else "position"
-        xs = [self.reach(x, (first,)) for x in self.starts(starts, seed)]
-        ends = [x for x in xs if x is not None]
-        errors = [pose_errors(self.task, self.robot.tip_pose(x * BAR)) for x in ends]
+        ends = [self.reach(x, (first,)) for x in self.starts(starts, seed)]
+        pairs = [(self._errors(x), x) for x in ends if x is not None]
         if len(names) == 1:
             which = 0 if first == "position" else 1
-            least = min(error[which] for error in errors if error[which] is not None)
-            return (least, None) if which == 0 else (None, least)
-        angles = [error[1] for error in errors if error[1] is not None]
-        allowed = max(self.task.target.tolerance.angle, min(angles) * (1 + 1e-6) + 1e-7)
+            return _closest([(errors[which], errors, x) for errors, x in pairs])
+        least = min(errors[1] for errors, _ in pairs)
+        allowed = max(self.task.target.tolerance.angle, least * (1 + 1e-6) + 1e-7)
         self.radii["angle"] = _chord(allowed, self.task.target.orientation is not None)
         length = self.robot.length
 
@@ -345,17 +365,28 @@ class Reference:
             return float(residual @ residual) / length**2, 2 * residual @ slope / length**2
 
         found = []
-        for x, (_, angle) in zip(ends, errors, strict=True):
-            if angle is None or angle > allowed * (1 + SLACK) + 1e-6:
+        for errors, x in pairs:
+            if errors[1] > allowed * (1 + SLACK) + 1e-6:
                 continue
-            end = self.descend(x, objective, ("angle",), floors=False)
-            for point in (x, end):
+            for point in (x, self.descend(x, objective, ("angle",), floors=False)):
                 if point is None:
                     continue
-                position, turned = pose_errors(self.task, self.robot.tip_pose(point * BAR))
-                if turned is not None and turned <= allowed * (1 + 1e-4) + 1e-6:
-                    found.append((position, turned))
-        return min(found)
+                errors = self._errors(point)
+                if errors[1] <= allowed * (1 + 1e-4) + 1e-6:
+                    found.append((errors[0], errors, point))
+        return _closest(found)
+
+    def _errors(self, x: Vector) -> tuple[float, float]:
+        position, angle = pose_errors(self.task, self.robot.tip_pose(x * BAR))
+        return (np.nan if position is None else position, np.nan if angle is None else angle)
+
+
+def _closest(found: list[tuple[float, tuple[float, float], Vector]]) -> Closest:
+    least, errors, _ = min(found, key=lambda item: item[0])
+    same = [x for error, _, x in found if error <= least + 1e-8]
+    spread = float(np.ptp(same, axis=0).max()) if len(same) > 1 else None
+    position, angle = (None if np.isnan(error) else error for error in errors)
+    return Closest(position, angle, spread)
 
 
 def pose_errors(task: Task, pose: Vector) -> tuple[float | None, float | None]:

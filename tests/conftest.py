@@ -35,6 +35,7 @@ def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def guarded(self: socket.socket, address: Any) -> None:
         if self.family in (socket.AF_INET, socket.AF_INET6):
+            self.close()
             raise RuntimeError(f"a test tried to connect to {address}")
         connect(self, address)
 

@@ -466,7 +466,9 @@ def rod_tip(arm: Arm, p: ArrayLike, loads: Sequence[Load] = (), steps: int = 2) 
             if np.abs(missing[0] / scale).max() < 1e-9:
                 break
             change = (missing[1:] - missing[0]).T / 1e-6
-            reaction = reaction - scale * np.linalg.solve(change, missing[0])
+            step = np.linalg.solve(change, missing[0])
+            assert np.abs(step).max() < 5, "too far from the equilibrium: take more steps"
+            reaction = reaction - scale * step
         else:
             raise AssertionError(f"no equilibrium found at {share:.0%} of the loads")
     return T[0]

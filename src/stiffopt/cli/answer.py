@@ -1,7 +1,6 @@
 """Answer: what is printed, written and drawn about one task."""
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from stiffopt.errors import EquilibriumError, FileError, InputError
@@ -9,7 +8,7 @@ from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.optimise.pareto import pareto_front
 from stiffopt.optimise.solution import PressureSolution, judge
 from stiffopt.optimise.solver import PressureSolver, stiffness_blind
-from stiffopt.optimise.task import MatchValue, StiffnessMeasure, Task, load_task
+from stiffopt.optimise.task import Task, load_task
 
 
 @dataclass(frozen=True)
@@ -44,18 +43,7 @@ class Answer:
         return os.path.splitext(os.path.basename(self.file))[0]
 
 
-def measures_of(task: Task) -> tuple[StiffnessMeasure, ...]:
-    """Return all stiffnesses that a task names, in the order of `PressureSolution.stiffnesses`."""
-    goal = task.stiffness
-    if goal is None:
-        return ()
-    match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
-    return (*goal.maximise, *match, *goal.at_least)
-
-
-def answer_file(
-    file: str, *, seed: int, pareto: int | None, say: Callable[[str], None] = lambda stage: None
-) -> Answer:
+def answer_file(file: str, *, seed: int, pareto: int | None) -> Answer:
     """Solve a task file.
 
     Parameters
@@ -66,8 +54,6 @@ def answer_file(
         Of the global search.
     pareto :
         Points of the trade-off, or None for none.
-    say :
-        Told what is being done.
 
     Raises
     ------
@@ -85,7 +71,6 @@ def answer_file(
         raise FileError(file, str(error)) from None
     if pareto is None or answer.solution.status == "failed":
         return answer
-    say("trade-off")
     return _with_front(answer, pareto, seed)
 
 

@@ -26,14 +26,8 @@ class Closed(Exception):  # noqa: N818 - no error: the reader has had enough
     """Nobody reads stdout any more."""
 
 
-class _Console(Console):
-    def on_broken_pipe(self) -> None:
-        """Leave it to the caller what to do."""
-        raise BrokenPipeError
-
-
-def _console(*, stderr: bool = False) -> _Console:
-    return _Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+def _console(*, stderr: bool = False) -> Console:
+    return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
 
 
 @contextmanager
@@ -48,15 +42,17 @@ def _noticing_closed_pipe() -> Iterator[None]:
 
 
 def show(renderable: RenderableType) -> None:
-    """Print text or a table to stdout.
+    """Print text or a table to stdout, in colour on a terminal.
 
     Raises
     ------
     Closed
         Nobody reads stdout any more.
     """
-    with _noticing_closed_pipe():
-        _console().print(renderable)
+    console = _console()
+    with console.capture() as capture:
+        console.print(renderable)
+    write_line("\n".join(line.rstrip() for line in capture.get().removesuffix("\n").split("\n")))
 
 
 def write_line(text: str) -> None:
@@ -104,12 +100,25 @@ class Work:
         self._task = self._progress.add_task("", total=total)
 
     @contextmanager
-    def step(self, description: str) -> Iterator[None]:
-        """Show that this step is under way; the display is gone when it is done."""
+    def step(self, file: str) -> Iterator[None]:
+        """Show that a file is being solved; the display is gone when it is done."""
+        try:
+            with self._shown(file):
+                yield
+        finally:
+            self._progress.advance(self._task)
+
+    @contextmanager
+    def drawing(self, file: str) -> Iterator[None]:
+        """Show that its picture is being drawn."""
+        with self._shown(f"{file}: drawing"):
+            yield
+
+    @contextmanager
+    def _shown(self, description: str) -> Iterator[None]:
         self._progress.update(self._task, description=printable(description))
         self._progress.start()
         try:
             yield
         finally:
             self._progress.stop()
-            self._progress.advance(self._task)

@@ -121,8 +121,9 @@ def _check_writable(path: str) -> None:
         raise FileError(path, "is a folder; expected a file")
     if not os.path.isdir(folder):
         raise FileError(path, f"cannot be written: there is no folder '{folder}'")
-    target = path if os.path.exists(path) else folder
-    if not (os.access(target, os.W_OK) and os.access(folder, os.W_OK | os.X_OK)):
+    regular = os.path.isfile(path) or not os.path.exists(path)
+    writable = not os.path.exists(path) or os.access(path, os.W_OK)
+    if not writable or (regular and not os.access(folder, os.W_OK | os.X_OK)):
         raise FileError(path, "cannot be written: permission denied")
 
 

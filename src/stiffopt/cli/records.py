@@ -6,10 +6,200 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from stiffopt.cli.answer import Answer, measures_of
-from stiffopt.optimise.pareto import smallest_stiffness
+from stiffopt.cli.answer import Answer
 from stiffopt.optimise.solution import PressureSolution, Sensitivities
-from stiffopt.optimise.task import StiffnessMeasure
+from stiffopt.plots.wording import least_maximised, measures_of
 from stiffopt.units import format_quantity
+
+Record = dict[str, Any]
+
+
+def json_line(answer: Answer) -> str:
+    """Return an answer as one line of strict JSON: no NaN, no infinity."""
+    return json.dumps(_strict(_json_record(answer)), allow_nan=False)
+
+
+def _json_record(answer: Answer) -> Record:
+    solution = answer.solution
+    record: Record = {
+        "task": answer.file,
+        "status": solution.status,
+        "found": solution.found,
+        "pressures_pa": solution.pressures,
+        "tip_position_m": solution.tip_position,
+        "tip_quaternion_wxyz": solution.tip_quaternion,
+        "position_error_m": solution.position_error,
+        "angle_error_rad": solution.angle_error,
+        "stiffness": solution.stiffness,
+        "stiffness_unit": solution.stiffness_unit,
+        "stiffnesses": solution.stiffnesses,
+        "stiffnesses_plain": answer.plain,
+        "matrix_distance": solution.matrix_distance,
+        "compliance": solution.compliance,
+        "active_bounds": solution.active_bounds,
+        "freedom": solution.freedom,
+        "confidence": None if solution.confidence is None else asdict(solution.confidence),
+        "sensitivities": _json_sensitivities(solution),
+        "solve_time_s": solution.timings.get("total"),
+        "message": solution.message,
+    }
+    if answer.front is not None:
+        record["pareto"] = [_json_point(point) for point in answer.front]
+    return record
+
+
+def _json_sensitivities(solution: PressureSolution) -> Record | None:
+    given = solution.sensitivities
+    if given is None:
+        return None
+    record: Record = {
+        "tip_jacobian_per_pa": given.tip_jacobian,
+        "stiffness_gradient_per_pa": given.stiffness_gradient,
+    }
+    if priced(solution):
+        record |= {
+            "per_bound_per_pa": given.per_bound,
+            "per_position_tolerance_per_m": given.per_position_tolerance,
+            "per_angle_tolerance_per_rad": given.per_angle_tolerance,
+            "objective_unit": given.objective_unit,
+        }
+    return record
+
+
+def _json_point(solution: PressureSolution) -> Record:
+    return {
+        "position_error_m": solution.position_error,
+        "angle_error_rad": solution.angle_error,
+        "stiffness": least_maximised(solution),
+        "pressures_pa": solution.pressures,
+    }
+
+
+def priced(solution: PressureSolution) -> Sensitivities | None:
+    """Return the sensitivities if they are worth something in stiffness, else None."""
+    given = solution.sensitivities
+    if given is None or not solution.found or given.objective_unit not in ("N/m", "N*m/rad"):
+        return None
+    return given
+
+
+def _strict(value: Any) -> Any:
+    """Return plain data; what is not finite becomes null."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+# -- the result file ------------------------------------------------------------------------
+
+
+def result_record(answer: Answer) -> Record:
+    """Return an answer as the entry of a result file: quantities as text with their units."""
+    solution = answer.solution
+    record: Record = {
+        "task": answer.file,
+        "robot": answer.robot.description.name,
+        "status": solution.status,
+        "message": solution.message or None,
+        "pressures": _quantities(solution.pressures, "Pa", "bar"),
+        "tip": _tip(solution),
+        "position_error": _quantity(solution.position_error, "m", "mm"),
+        "angle_error": _quantity(solution.angle_error, "rad", "deg"),
+        "stiffness": _stiffnesses(answer),
+        "matrix_distance": solution.matrix_distance,
+        "compliance": _compliance(solution),
+        "active_bounds": list(solution.active_bounds) or None,
+        "freedom": solution.freedom if solution.pressures is not None else None,
+        "confidence": None if solution.confidence is None else asdict(solution.confidence),
+        "worth": _worth(solution),
+        "pareto": None if answer.front is None else [_point(point) for point in answer.front],
+        "solve_time": _quantity(solution.timings.get("total"), "s"),
+    }
+    return {key: _without_none(value) for key, value in record.items() if value is not None}
+
+
+def _tip(solution: PressureSolution) -> Record | None:
+    if solution.tip_pose is None:
+        return None
+    return {
+        "position": _quantities(solution.tip_position, "m", "mm"),
+        "orientation": solution.tip_quaternion,
+    }
+
+
+def _stiffnesses(answer: Answer) -> list[Record] | None:
+    solution = answer.solution
+    plain = answer.plain or (None,) * len(solution.stiffnesses)
+    return [
+        {
+            "value": _quantity(value, measure.unit),
+            "plain": _quantity(blind, measure.unit),
+            "direction": list(measure.direction),
+            "frame": measure.frame,
+            "kind": measure.kind,
+            "boundary": measure.boundary,
+        }
+        for measure, value, blind in zip(
+            measures_of(solution.task), solution.stiffnesses, plain, strict=False
+        )
+    ] or None
+
+
+def _compliance(solution: PressureSolution) -> Record | None:
+    """The four blocks of the matrix, each with its unit."""
+    matrix = solution.compliance
+    if matrix is None:
+        return None
+    return {
+        "frame": "tip",
+        "translation_per_force": {"matrix": _strict(matrix[:3, :3]), "unit": "m/N"},
+        "translation_per_moment": {"matrix": _strict(matrix[:3, 3:]), "unit": "m/(N*m)"},
+        "rotation_per_force": {"matrix": _strict(matrix[3:, :3]), "unit": "rad/N"},
+        "rotation_per_moment": {"matrix": _strict(matrix[3:, 3:]), "unit": "rad/(N*m)"},
+    }
+
+
+def _worth(solution: PressureSolution) -> Record | None:
+    """What relaxing limits and tolerances is worth."""
+    given = priced(solution)
+    if given is None:
+        return None
+    unit = given.objective_unit
+    return {
+        **{name: _quantity(value, f"{unit}/Pa") for name, value in given.per_bound.items()},
+        "position_tolerance": _quantity(given.per_position_tolerance, f"{unit}/m"),
+        "angle_tolerance": _quantity(given.per_angle_tolerance, f"{unit}/rad"),
+    }
+
+
+def _point(solution: PressureSolution) -> Record:
+    unit = solution.stiffness_unit or ""
+    return {
+        "position_error": _quantity(solution.position_error, "m", "mm"),
+        "angle_error": _quantity(solution.angle_error, "rad", "deg"),
+        "stiffness": _quantity(least_maximised(solution), unit),
+        "pressures": _quantities(solution.pressures, "Pa", "bar"),
+    }
+
+
+def _quantity(value: float | None, unit: str, written: str | None = None) -> str | None:
+    if value is None or not math.isfinite(value):
+        return None
+    return format_quantity(float(value), unit, written)
+
+
+def _quantities(values: Any, unit: str, written: str) -> list[str | None] | None:
+    return None if values is None else [_quantity(value, unit, written) for value in values]
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    return [_without_none(item) for item in value] if isinstance(value, list) else value

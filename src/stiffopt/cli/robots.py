@@ -1,6 +1,5 @@
 """The command `stiffopt robots`."""
 
-from rich import box
 from rich.table import Table
 
 from stiffopt.cli.console import show
@@ -9,9 +8,9 @@ from stiffopt.model.description import RobotDescription, builtin_robots, load_de
 
 def robots() -> None:
     """List the robots that come with stiffopt; a task file names one of them or a robot file."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="bold")
     table.add_column("robot", no_wrap=True)
-    for heading in ("segments", "channels", "length", "pressures", "gravity"):
+    for heading in ("segments", "channels", "length", "pressures", "gravity, m/s^2"):
         table.add_column(heading, justify="right", no_wrap=True)
     for name in builtin_robots():
         table.add_row(name, *_columns(load_description(name)))
@@ -26,5 +25,5 @@ def _columns(robot: RobotDescription) -> tuple[str, ...]:
         str(robot.n_pressures),
         f"{robot.length * 1e3:g} mm",
         f"{low:g} to {high:g} bar",
-        f"({gravity}) m/s^2" if any(robot.gravity) else "none",
+        f"({gravity})" if any(robot.gravity) else "none",
     )

@@ -64,8 +64,6 @@ class _Batch:
         try:
             with self.work.step(file):
                 answer = answer_file(file, seed=self.options.seed, pareto=self.options.pareto)
-                if picture:
-                    outputs.draw(answer, picture)
         except StiffoptError as error:
             self.complain(file, str(error))
         except (Closed, OSError):
@@ -74,6 +72,8 @@ class _Batch:
             self.complain(file, f"{file}: {_bug(error)}", exits.FAILED)
         else:
             self._take(answer, perf_counter() - begin)
+            if picture is not None:
+                self._draw(answer, picture)
 
     def complain(self, file: str, message: str, code: int = exits.BAD_INPUT) -> None:
         """Report a file that has no answer."""
@@ -107,6 +107,16 @@ class _Batch:
         if answer.complaint:
             report_error(f"{answer.file}: {answer.complaint}")
             self.codes.append(exits.BAD_INPUT)
+
+    def _draw(self, answer: Answer, picture: str) -> None:
+        """Draw an answer; where that fails the answer still stands."""
+        try:
+            with self.work.drawing(answer.file):
+                outputs.draw(answer, picture)
+        except StiffoptError as error:
+            report_error(f"no picture of {answer.file}: {error}")
+            if answer.solution.pressures is not None:
+                self.codes.append(exits.BAD_INPUT)
 
     def _print(self, printing: Callable[[], None]) -> None:
         """Print; where nobody reads any more, go on only if there are files to write."""

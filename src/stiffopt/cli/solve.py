@@ -25,11 +25,11 @@ Examples:
   {command} task.yaml --pareto 12 --plot trade-off.png
 
 \b
-Exit codes, the most serious one if there are several files:
+Exit codes (of several files the most serious: 2, then 4, then 3):
   0    all solved
   2    bad input: a file or an option is wrong
-  4    the solver failed
   3    a target is unreachable; the closest configuration is reported
+  4    the solver failed
   130  interrupted (Ctrl-C)
 
 \b
@@ -48,7 +48,7 @@ def examples(command: str) -> str:
 
 def solve(
     tasks: Annotated[
-        list[str], typer.Argument(metavar="TASK...", help="Task files, or folders of them.")
+        list[str], typer.Argument(metavar="TASK", help="Task files, or folders of them.")
     ],
     as_json: Annotated[
         bool,
@@ -82,7 +82,10 @@ def solve(
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, help="Of the global search: the same seed, the same answer.")
+        int,
+        typer.Option(
+            metavar="N", min=0, help="Of the global search: the same seed, the same answer."
+        ),
     ] = 0,
     quiet: Annotated[
         bool,

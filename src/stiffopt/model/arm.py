@@ -182,7 +182,7 @@ class Arm:
             If there is none that is stable and reached continuously from rest.
         """
         if nearby is not None:
-            end = State(p, nearby.quaternion, self._loads)
+            end = nearby._replace(pressures=p, loads=self._loads)
             state, share = self._equilibrium.follow(nearby, end, shortest=0.1, stable=False)
             if share == 1.0:
                 return state

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError
+from stiffopt.model.lifted import newton_step
 from stiffopt.model.shooting import Shooting
 
 Vector = NDArray[np.float64]
@@ -37,10 +38,15 @@ class Loads(NamedTuple):
 
 
 class State(NamedTuple):
-    """An equilibrium: the tip's orientation (w, x, y, z), from which all else follows."""
+    """An equilibrium: the tip's orientation (w, x, y, z), from which all else follows.
+
+    `states` (7, k) hold orientation and moment after each integration step, which Newton's
+    method starts from (`stiffopt.model.lifted`).
+    """
 
     pressures: Vector
     quaternion: Vector
+    states: Vector
     loads: Loads
 
 
@@ -50,7 +56,7 @@ class Equilibrium:
     def __init__(self, shooting: Shooting) -> None:
         self.shooting = shooting
         self._functions: dict[tuple[str, float | None], ca.Function] = {}
-        self._rest: dict[bytes, tuple[State, float]] = {}
+        self._rest: dict[tuple[bytes, float | None], tuple[State, float]] = {}
 
     def arguments(self, state: State) -> tuple[Vector, ...]:
         """Numbers for the inputs of a `Chain` at an equilibrium."""
@@ -58,34 +64,33 @@ class Equilibrium:
         return (state.quaternion, x, *state.loads)
 
     def _function(self, name: str, at: float | None) -> ca.Function:
-        """The map of Newton's method or the stability condition, for one station."""
+        """Newton's step or the stability condition, for one station."""
         if (name, at) not in self._functions:
-            chain = self.shooting.chain(at)
-            outputs = (
-                [chain.residual, ca.jacobian(chain.residual, chain.x)[:, :3]]
-                if name == "newton"
-                else [chain.rotational_compliances]
-            )
-            self._functions[name, at] = ca.Function(name, chain.inputs, outputs)
+            if name == "newton":
+                function = newton_step(self.shooting, at)
+            else:
+                chain = self.shooting.chain(at)
+                function = ca.Function(name, chain.inputs, [chain.rotational_compliances])
+            self._functions[name, at] = function
         return self._functions[name, at]
 
     def correct(self, guess: State, at: float | None = None) -> State | None:
         """Newton's method from a nearby state; None if that is not near.
 
-        "Near" means that the first correction turns the tip by at most a radian and the
-        later ones shrink: then the path from the guess to the answer has no fold in between.
+        "Near" means that the first correction turns no part of the arm by more than a radian
+        and later ones shrink: then the path from the guess to the answer has no fold in between.
         """
         newton = self._function("newton", at)
         state, previous = guess, _LARGEST_TURN
         for iteration in range(_MOST_ITERATIONS):
-            residual, change = (part.full() for part in newton(*self.arguments(state)))
-            turn = _solve_3x3(change, -residual[:, 0])
-            size = float(np.linalg.norm(turn))
+            quaternion, states, largest = newton(
+                state.quaternion, state.states, state.pressures, *state.loads
+            )
+            size = float(largest)
             bound = previous if iteration < 2 else 0.5 * previous
             if not size <= bound:  # NaN too
                 return None
-            q = lie.quaternion_product(state.quaternion, np.concatenate([[1.0], turn / 2]))
-            state = state._replace(quaternion=q / np.linalg.norm(q))
+            state = state._replace(quaternion=quaternion.full()[:, 0], states=states.full())
             if size < _QUADRATIC:
                 return state
             previous = size
@@ -111,14 +116,14 @@ class Equilibrium:
         """Equilibrium reached continuously between two sets of pressures and loads.
 
         Returns the last stable state on the straight way from `start` to `end` (whose
-        quaternion is not used) and the share of the way that it is at; 1.0 means arrived.
+        shape is not used) and the share of the way that it is at; 1.0 means arrived.
         Steps get no shorter than the share `shortest`; stability is checked if `stable`.
         """
         state, share, step = start, 0.0, 1.0
         while share < 1.0:
             target = min(1.0, share + step)
-            trial = _between(start, end, target)._replace(quaternion=state.quaternion)
-            corrected = self.correct(trial, at)
+            pressures, loads = _between(start, end, target)
+            corrected = self.correct(state._replace(pressures=pressures, loads=loads), at)
             if corrected is None or (stable and not self.is_stable(corrected, at)):
                 step /= 2
                 if step < shortest:
@@ -135,8 +140,9 @@ class Equilibrium:
         EquilibriumError
             If the arm buckles or falls over on the way; the message says where.
         """
-        hanging = self._at_rest(loads.gravity)
-        state, share = self.follow(hanging, State(pressures, hanging.quaternion, loads), at)
+        hanging = self._at_rest(loads.gravity, at)
+        end = hanging._replace(pressures=pressures, loads=loads)
+        state, share = self.follow(hanging, end, at)
         if share < 1.0:
             what = (
                 "its pressures and load"
@@ -149,15 +155,18 @@ class Equilibrium:
             )
         return state
 
-    def _at_rest(self, gravity: Vector) -> State:
+    def _at_rest(self, gravity: Vector, at: float | None = None) -> State:
         """The unpressurised arm under its own weight and payload."""
-        key = gravity.tobytes()
+        key = (gravity.tobytes(), at)
         if key not in self._rest:
             none = Loads(np.zeros(3), np.zeros(12), np.zeros(12))
             upright = np.array([1.0, 0.0, 0.0, 0.0])
-            straight = State(np.zeros(self.shooting.description.n_pressures), upright, none)
+            steps = self._function("newton", at).size2_in(1)
+            states = np.repeat(np.concatenate([upright, np.zeros(3)])[:, np.newaxis], steps, 1)
+            pressures = np.zeros(self.shooting.description.n_pressures)
+            straight = State(pressures, upright, states, none)
             weighted = straight._replace(loads=none._replace(gravity=gravity))
-            self._rest[key] = self.follow(straight, weighted)
+            self._rest[key] = self.follow(straight, weighted, at)
         state, share = self._rest[key]
         if share < 1.0:
             raise EquilibriumError(
@@ -211,19 +220,11 @@ class Equilibrium:
         return np.stack(poses)
 
 
-def _between(start: State, end: State, share: float) -> State:
+def _between(start: State, end: State, share: float) -> tuple[Vector, Loads]:
     """Pressures and loads at a share of the straight way between two states."""
 
     def mix(a: Vector, b: Vector) -> Vector:
         return (1 - share) * a + share * b
 
     loads = Loads(*(mix(a, b) for a, b in zip(start.loads, end.loads, strict=True)))
-    return State(mix(start.pressures, end.pressures), start.quaternion, loads)
-
-
-def _solve_3x3(matrix: Vector, right: Vector) -> Vector:
-    """Solution of a small system; NaN where it is singular."""
-    try:
-        return np.asarray(np.linalg.solve(matrix, right), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return np.full(3, np.nan)
+    return mix(start.pressures, end.pressures), loads

@@ -1,0 +1,287 @@
+"""An answer for people: a block of text for each task, and a summary of several."""
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import degrees, radians
+from typing import Any
+
+from numpy.typing import NDArray
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from stiffopt.cli.answer import Answer
+from stiffopt.cli.records import priced
+from stiffopt.errors import printable
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.task import AtLeast, MatchMatrix, MatchValue, StiffnessMeasure
+from stiffopt.plots.wording import (
+    direction_text,
+    figures,
+    gain_text,
+    least_maximised,
+    measures_of,
+    unit_text,
+    vector_text,
+)
+
+_COLOURS = {"solved": "green", "unreachable": "yellow", "failed": "red", "bad input": "red"}
+_BAR = 1e-5  # per Pa
+
+Vector = NDArray[Any]
+Line = tuple[str, RenderableType]
+
+
+def block(answer: Answer) -> RenderableType:
+    """Return all there is to say about one task, at least 80 columns wide."""
+    solution = answer.solution
+    heading = Text.assemble(
+        (printable(answer.file), "bold"),
+        "  ",
+        (solution.status, f"bold {_COLOURS[solution.status]}"),
+        f"  {solution.timings.get('total', 0.0):.2f} s",
+    )
+    grid = Table.grid(padding=(0, 2), pad_edge=False)
+    grid.add_column(no_wrap=True, style="dim")
+    grid.add_column(overflow="fold")
+    for label, content in _lines(answer):
+        grid.add_row(f"  {label}", content)
+    return Group(heading, grid, "")
+
+
+def _lines(answer: Answer) -> Iterable[Line]:
+    solution = answer.solution
+    if solution.message:
+        message = solution.message.removeprefix("unreachable: ")
+        yield "note", Text(message, style=_COLOURS[solution.status])
+    yield "robot", Text(_robot(answer))
+    if solution.pressures is None or solution.tip_pose is None:
+        return
+    yield "pressures", _pressures(answer, solution.pressures)
+    yield from _tip(solution, solution.tip_pose)
+    yield from _stiffnesses(answer)
+    yield from _worth(solution)
+    if solution.confidence is not None and solution.confidence.reached:
+        yield "search", Text(str(solution.confidence))
+    if answer.front is not None:
+        yield "trade-off", _front(answer)
+
+
+def _robot(answer: Answer) -> str:
+    robot = answer.robot
+    segments = "1 segment" if robot.n_segments == 1 else f"{robot.n_segments} segments"
+    loaded = ", in equilibrium under gravity or load" if robot.is_loaded else ""
+    name = printable(robot.description.name)
+    return f"{name}, {segments}, {robot.length * 1e3:g} mm, {robot.n_pressures} channels{loaded}"
+
+
+def _pressures(answer: Answer, pressures: Vector) -> RenderableType:
+    """Pressures in bar, a row for each segment; those at a limit say so."""
+    description = answer.robot.description
+    active = answer.solution.active_bounds
+    table = Table.grid(padding=(0, 2), pad_edge=False)
+    widest = max(segment.n_channels for segment in description.segments)
+    table.add_row("", *(Text(f"channel {k + 1}", "dim") for k in range(widest)))
+    index = 0
+    for number, segment in enumerate(description.segments, start=1):
+        cells = []
+        for _ in range(segment.n_channels):
+            name = description.channel_name(index)
+            at = next((side for side in ("min", "max") if f"{name} {side}" in active), "")
+            cells.append(_pressure(pressures[index], at))
+            index += 1
+        table.add_row(Text(f"segment {number}", "dim"), *cells)
+    return table
+
+
+def _pressure(value: float, at: str) -> Text:
+    return Text.assemble(
+        (f"{value * _BAR + 0.0:.3f} bar", "bold"), (f" {at}" if at else "", "yellow")
+    )
+
+
+def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
+    x, y, z = (f"{value * 1e3 + 0.0:.3f}" for value in pose[:3, 3])
+    yield "tip at", Text(f"({x}, {y}, {z}) mm, pointing {vector_text(pose[:3, 2])}")
+    tolerance = solution.task.target.tolerance
+    if solution.position_error is not None:
+        yield (
+            "tip error",
+            _error(solution.position_error * 1e3, tolerance.position * 1e3, "mm", "position"),
+        )
+    if solution.angle_error is not None:
+        label = "" if solution.position_error is not None else "tip error"
+        yield label, _error(degrees(solution.angle_error), degrees(tolerance.angle), "deg", "angle")
+
+
+def _error(value: float, tolerance: float, unit: str, what: str) -> Text:
+    over = value > tolerance * (1 + 1e-9)
+    return Text.assemble(
+        (
+            f"{figures(value)} {unit}" if over else f"{value:.3f} {unit}",
+            "bold yellow" if over else "bold",
+        ),
+        f" in {what}, {'more than the ' if over else ''}tolerance {tolerance:g} {unit}",
+    )
+
+
+def _stiffnesses(answer: Answer) -> Iterable[Line]:
+    solution = answer.solution
+    goal = solution.task.stiffness
+    plain = answer.plain or (None,) * len(solution.stiffnesses)
+    for number, (measure, value, blind) in enumerate(
+        zip(measures_of(solution.task), solution.stiffnesses, plain, strict=False)
+    ):
+        yield "" if number else "stiffness", _stiffness(measure, value, blind)
+    if (
+        goal is not None
+        and isinstance(goal.match, MatchMatrix)
+        and solution.matrix_distance is not None
+    ):
+        yield (
+            "stiffness",
+            Text.assemble(
+                (f"{solution.matrix_distance:.4f}", "bold"),
+                f" from the matrix to match, tolerance {goal.match.tolerance:g} "
+                "(relative Frobenius distance)",
+            ),
+        )
+
+
+def _stiffness(measure: StiffnessMeasure, value: float, plain: float | None) -> Text:
+    unit = unit_text(measure.unit)
+    compared = "" if plain is None else f"  (plain: {figures(plain)}, {gain_text(value, plain)})"
+    meaning = f"\n{_meaning(measure)}{_demand(measure, unit)}"
+    return Text.assemble((f"{figures(value)} {unit}", "bold"), compared, meaning)
+
+
+def _meaning(measure: StiffnessMeasure) -> str:
+    """Direction, frame, kind and boundary in words."""
+    direction = direction_text(measure)
+    return f"against {measure.kind} {direction}, {measure.frame} axes, {measure.boundary}"
+
+
+def _demand(measure: StiffnessMeasure, unit: str) -> str:
+    if isinstance(measure, AtLeast):
+        return f"; at least {figures(measure.value)} {unit} asked for"
+    if isinstance(measure, MatchValue):
+        return f"; {figures(measure.value)} {unit} asked for, to {measure.tolerance * 100:g} %"
+    return ""
+
+
+def _worth(solution: PressureSolution) -> Iterable[Line]:
+    """What relaxing limits and tolerances would buy."""
+    given = priced(solution)
+    if given is None:
+        return
+    unit = unit_text(given.objective_unit)
+    offers = []
+    if given.per_position_tolerance:
+        offers.append((given.per_position_tolerance * 1e-3, "mm of position tolerance"))
+    if given.per_angle_tolerance:
+        offers.append((given.per_angle_tolerance * radians(1), "degree of angle tolerance"))
+    for name, value in sorted(given.per_bound.items(), key=lambda item: -item[1]):
+        moved = "raised" if name.endswith("max") else "lowered"
+        if value:
+            offers.append((value / _BAR, f"bar by which {name} is {moved}"))
+    for number, (value, per) in enumerate(offers):
+        text = Text.assemble((f"{value:+.3g} {unit}", "bold"), f" per {per}")
+        yield "" if number else "worth", text
+
+
+def _front(answer: Answer) -> RenderableType:
+    front = answer.front or ()
+    if not front:
+        return Text("none: the target is out of reach at every tolerance that was tried")
+    unit = unit_text(front[0].stiffness_unit)
+    table = Table.grid(padding=(0, 2), pad_edge=False)
+    headings = ["error"] if front[0].position_error is not None else []
+    headings += ["angle"] if front[0].angle_error is not None else []
+    headings += ["stiffness", "gain", "pressures in bar"]
+    for heading in headings:
+        left = heading.startswith("pressures")
+        table.add_column(justify="left" if left else "right", no_wrap=not left)
+    table.add_row(*(Text(heading, "dim") for heading in headings))
+    first = least_maximised(front[0]) or 1.0
+    for point in front:
+        value = least_maximised(point) or 0.0
+        table.add_row(
+            *_errors(point),
+            f"{figures(value)} {unit}",
+            gain_text(value, first),
+            _list(answer, point),
+        )
+    return table
+
+
+def _errors(solution: PressureSolution) -> list[str]:
+    cells = []
+    if solution.position_error is not None:
+        cells.append(f"{solution.position_error * 1e3:.2f} mm")
+    if solution.angle_error is not None:
+        cells.append(f"{degrees(solution.angle_error):.2f} deg")
+    return cells
+
+
+def _list(answer: Answer, solution: PressureSolution) -> str:
+    """All pressures on one line, segments apart."""
+    values = [] if solution.pressures is None else list(solution.pressures)
+    groups = []
+    for segment in answer.robot.description.segments:
+        mine, values = values[: segment.n_channels], values[segment.n_channels :]
+        groups.append(" ".join(f"{value * _BAR + 0.0:.2f}" for value in mine))
+    return " | ".join(groups)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A task in the summary."""
+
+    file: str
+    status: str
+    position: str = ""
+    angle: str = ""
+    stiffness: str = ""
+    gain: str = ""
+    time: str = ""
+
+    @classmethod
+    def of(cls, answer: Answer, seconds: float) -> "Row":
+        """Return the row of an answer that took so long altogether."""
+        solution = answer.solution
+        position, angle = solution.position_error, solution.angle_error
+        unit = unit_text(solution.stiffness_unit)
+        return cls(
+            answer.file,
+            solution.status,
+            "" if position is None else f"{position * 1e3:.3f}",
+            "" if angle is None else f"{degrees(angle):.2f}",
+            "" if solution.stiffness is None else f"{figures(solution.stiffness)} {unit}",
+            gain_text(solution.stiffnesses[0], answer.plain[0]) if answer.plain else "",
+            f"{seconds:.1f}",
+        )
+
+
+def summary(rows: Sequence[Row]) -> RenderableType:
+    """Return one line for each task and how many came to what."""
+    names = [os.path.basename(row.file) for row in rows]
+    if len(set(names)) < len(rows):
+        names = [row.file for row in rows]
+    table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="bold")
+    table.add_column("task", overflow="fold")
+    table.add_column("status", no_wrap=True)
+    for heading in ("error mm", "deg", "stiffness", "gain", "time s"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, row in zip(names, rows, strict=True):
+        table.add_row(
+            Text(printable(name)),
+            Text(row.status, _COLOURS[row.status]),
+            *(row.position, row.angle, row.stiffness, row.gain, row.time),
+        )
+    return Group(table, "", Text(_counts(rows)))
+
+
+def _counts(rows: Sequence[Row]) -> str:
+    counts = {status: sum(row.status == status for row in rows) for status in _COLOURS}
+    return f"{len(rows)} tasks: " + ", ".join(f"{n} {name}" for name, n in counts.items() if n)

@@ -1,0 +1,48 @@
+"""What numbers and stiffness measures are called, in pictures and in tables alike."""
+
+from collections.abc import Iterable
+
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.task import MatchValue, StiffnessMeasure, Task
+
+
+def measures_of(task: Task) -> tuple[StiffnessMeasure, ...]:
+    """Return all stiffnesses that a task names, in the order of a solution's `stiffnesses`."""
+    goal = task.stiffness
+    if goal is None:
+        return ()
+    match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
+    return (*goal.maximise, *match, *goal.at_least)
+
+
+def least_maximised(solution: PressureSolution) -> float | None:
+    """Return the smallest of the stiffnesses that a task maximises: what its trade-off is about."""
+    goal = solution.task.stiffness
+    count = len(goal.maximise) if goal is not None else 0
+    return min(solution.stiffnesses[:count], default=None)
+
+
+def unit_text(unit: str | None) -> str:
+    """Return a unit as people write it."""
+    return (unit or "").replace("*", " ")
+
+
+def figures(value: float) -> str:
+    """Return a number with four significant figures."""
+    return f"{value:#.4g}".removesuffix(".")
+
+
+def gain_text(value: float, plain: float) -> str:
+    """Return by how many per cent a value is above a plain one."""
+    return f"{(value / plain - 1) * 100:+.0f} %".replace("-0 %", "+0 %")
+
+
+def vector_text(values: Iterable[float]) -> str:
+    """Return a vector with at most three decimals."""
+    return f"({', '.join(f'{round(float(value), 3) + 0.0:g}' for value in values)})"
+
+
+def direction_text(measure: StiffnessMeasure) -> str:
+    """Return along or about what a stiffness is meant."""
+    way = "along" if measure.kind == "translation" else "about"
+    return f"{way} {vector_text(measure.direction)}"

@@ -1,0 +1,193 @@
+"""Pictures: that they are drawn, to scale, and say what they show."""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+import stiffopt
+from stiffopt import plots
+from stiffopt.optimise.solution import PressureSolution
+
+MAXIMISE = {"maximise": {"direction": (1, 0, 0)}}
+
+
+@cache
+def solved(
+    robot: str = "stiff-flop-2", **changes: Any
+) -> tuple[stiffopt.Manipulator, PressureSolution]:
+    target = changes.pop("target", (-0.03, 0.01, 0.19))
+    task = stiffopt.Task(robot=robot, target={"position": target}, stiffness=MAXIMISE)
+    arm = stiffopt.load_robot(robot)
+    return arm, stiffopt.solve_pressure(arm, task)
+
+
+def texts(figure: Any) -> str:
+    """All that a figure says."""
+    figure.canvas.draw()
+    found = figure.findobj(lambda artist: hasattr(artist, "get_text"))
+    return "\n".join(artist.get_text() for artist in found)
+
+
+def test_the_file_is_a_picture_with_something_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "answer.png"
+    plots.save_figure(plots.plot_solution(*solved()), path)
+    image = imread(path)
+    height, width = image.shape[:2]
+    assert 600 < height < 2000
+    assert 1000 < width < 3000
+    grey = image[..., :3].mean(axis=2)
+    for half in (grey[:, : width // 2], grey[:, width // 2 :]):  # the arm, the pressures
+        assert 0.02 < (half < 0.97).mean() < 0.6
+    assert [entry.name for entry in tmp_path.iterdir()] == ["answer.png"]
+
+
+def test_it_says_what_it_shows() -> None:
+    figure = plots.plot_solution(*solved(), plain=1.308, title="push [a] $5 & more_")
+    text = texts(figure)
+    for part in (
+        r"push [a] \$5 & more_",
+        "solved",
+        "tip error 0.1 mm (tolerance 0.1 mm)",
+        "1.445 N/m (plain: 1.308, +10 %)",
+        "x (mm)",
+        "z (mm)",
+        "pressure (bar)",
+        "segment 2",
+        "stiffness ellipsoid",
+        "target",
+        "at a limit",
+    ):
+        assert part in text
+
+
+def test_all_three_axes_have_one_scale() -> None:
+    figure = plots.plot_solution(*solved())
+    axes = figure.axes[0]
+    sides = [np.ptp(getattr(axes, f"get_{name}lim")()) for name in "xyz"]
+    boxes = axes.get_box_aspect() if hasattr(axes, "get_box_aspect") else None
+    shape = np.array(axes._box_aspect if boxes is None else axes._box_aspect)
+    assert np.allclose(shape / shape.max(), np.array(sides) / max(sides), rtol=1e-6)
+
+
+def test_bars_are_the_pressures() -> None:
+    arm, solution = solved()
+    figure = plots.plot_solution(arm, solution)
+    heights = [bar.get_height() for bar in figure.axes[1].patches]
+    assert solution.pressures is not None
+    assert heights[-6:] == pytest.approx(solution.pressures * 1e-5)
+    assert heights[:6] == pytest.approx([1.5] * 6)
+
+
+def test_the_ellipsoid_squared_is_the_free_stiffness() -> None:
+    """The identity that the legend states."""
+    arm, solution = solved()
+    assert solution.tip_pose is not None
+    assert solution.compliance is not None
+    R = solution.tip_pose[:3, :3]
+    C = R @ solution.compliance[:3, :3] @ R.T
+    d = np.array([0.6, 0.0, 0.8])
+    radius = 1 / np.sqrt(d @ C @ d)  # of {f: f'Cf = 1} along d
+    assert radius**2 == pytest.approx(arm.stiffness(solution.pressures, d))
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        {"position": (-0.02, None, None)},
+        {"pointing": (-0.3, 0.1, 0.95), "tolerance": {"angle": 0.1}},
+        {"orientation": (1, 0, 0, 0), "position": (None, None, 0.18)},
+        {"position": (-0.2, 0.0, 0.3)},
+    ],
+)
+def test_every_kind_of_target_is_drawn(target: dict[str, Any]) -> None:
+    task = stiffopt.Task(
+        robot="stiff-flop-2",
+        target=target,
+        stiffness={
+            "maximise": {"direction": (0, 0, 1), "frame": "tip", "boundary": "guided"},
+            "at_least": {"direction": (0, 0, 1), "kind": "rotation", "value": 1e-4},
+        },
+    )
+    arm = stiffopt.load_robot("stiff-flop-2")
+    text = texts(plots.plot_solution(arm, stiffopt.solve_pressure(arm, task)))
+    assert "tip axes, guided" in text
+    if "orientation" in target:
+        assert "orientation asked for" in text
+    if "pointing" in target:
+        assert "pointing asked for" in text
+    if target.get("position", (0,)).count(None) == 2:
+        assert "free)" in text
+
+
+def test_a_load_is_drawn() -> None:
+    task = stiffopt.Task(
+        robot="stiff-flop-1",
+        target={"position": (-0.01, 0, None), "tolerance": {"position": 1e-3}},
+        load={"force": (0, 0, -0.02)},
+    )
+    arm = stiffopt.load_robot("stiff-flop-1")
+    assert "load 0.02 N" in texts(plots.plot_solution(arm, stiffopt.solve_pressure(arm, task)))
+
+
+def test_a_hanging_arm_hangs() -> None:
+    arm = stiffopt.load_robot("stiff-flop-2-hanging")
+    p = np.full(6, 2e4)
+    task = stiffopt.Task(robot="stiff-flop-2-hanging", target={"position": (0, 0, 0.18)})
+    solution = PressureSolution(
+        "solved", "", task, p, arm.tip_pose(p), 0.0, compliance=arm.tip_compliance(p)
+    )
+    figure = plots.plot_solution(arm, solution)
+    figure.canvas.draw()
+    axes = figure.axes[0]
+    from mpl_toolkits.mplot3d import proj3d
+
+    base, tip = (proj3d.proj_transform(0, 0, z, axes.get_proj())[1] for z in (0, 180))
+    assert tip < base  # downwards on the page
+    assert "gravity" in texts(figure)
+
+
+def test_many_channels_have_no_numbers_on_top_of_each_other() -> None:
+    arm, solution = solved("stiff-flop-3", target=(-0.06, 0.02, 0.25))
+    assert len(plots.plot_solution(arm, solution).axes[1].get_xticks()) == 9
+
+
+def test_pareto_is_drawn_alone_and_beside() -> None:
+    arm, solution = solved()
+    front = stiffopt.pareto_front(arm, solution.task, 3)
+    alone = plots.plot_pareto(front, plain=1.3, title="trade")
+    assert "tip error (mm)" in texts(alone)
+    beside = plots.plot_solution(arm, solution, front=front, plain=1.3)
+    assert len(beside.axes) == 3
+    x, y = beside.axes[2].lines[0].get_data()
+    assert x == pytest.approx([(point.position_error or 0) * 1e3 for point in front])
+    assert y == pytest.approx([point.stiffness for point in front])
+    assert "out of reach" in texts(plots.plot_pareto([]))
+
+
+def test_a_failure_cannot_be_drawn() -> None:
+    arm, solution = solved()
+    with pytest.raises(stiffopt.InputError, match="nothing to draw"):
+        plots.plot_solution(arm, PressureSolution("failed", "", solution.task))
+
+
+def test_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
+    arm, solution = solved()
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    for draw in (lambda: plots.plot_solution(arm, solution), lambda: plots.plot_pareto([])):
+        with pytest.raises(stiffopt.MissingExtraError, match="stiffopt\\[plot\\]"):
+            draw()
+
+
+def test_a_picture_that_cannot_be_written(tmp_path: Path) -> None:
+    figure = plots.plot_pareto([])
+    for name in ("no/folder/a.png", "a.xyz"):
+        with pytest.raises(stiffopt.FileError, match="cannot be"):
+            plots.save_figure(figure, tmp_path / name)
+    assert not list(tmp_path.iterdir())
