@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -69,6 +72,32 @@ def test_files_page_names_every_key(schema: type[BaseModel]) -> None:
     keys = {name for name, info in schema.model_fields.items() if not info.exclude}
     missing = {key for key in keys if not re.search(rf"[`.]{key}[`.]", page)}
     assert not missing, f"docs/files.md does not describe {sorted(missing)}"
+
+
+def solve_pressure(*arguments: str) -> str:
+    command = Path(sys.executable).with_name("solve-pressure")
+    done = subprocess.run(
+        [command, *arguments], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return done.stdout
+
+
+def test_command_page_names_every_option() -> None:
+    page = (ROOT / "docs" / "command.md").read_text(encoding="utf-8")
+    options = set(re.findall(r"^  (?:-\w, )?(--\w+)", solve_pressure("--help"), re.M))
+    assert {"--json", "--plot", "--help"} <= options
+    missing = {option for option in options if f"`{option}" not in page}
+    assert not missing, f"docs/command.md does not describe {sorted(missing)}"
+
+
+def test_command_page_names_every_key_of_the_json() -> None:
+    page = (ROOT / "docs" / "command.md").read_text(encoding="utf-8")
+    line = solve_pressure("problems/two_segment_stiff_x.yaml", "--json", "--pareto", "2")
+    answer = json.loads(line)
+    nested = [answer["confidence"], answer["sensitivities"], answer["pareto"][0]]
+    keys = set(answer).union(*nested)
+    missing = {key for key in keys if f"`{key}`" not in page}
+    assert not missing, f"docs/command.md does not describe {sorted(missing)}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

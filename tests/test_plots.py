@@ -71,8 +71,7 @@ def test_all_three_axes_have_one_scale() -> None:
     figure = plots.plot_solution(*solved())
     axes = figure.axes[0]
     sides = [np.ptp(getattr(axes, f"get_{name}lim")()) for name in "xyz"]
-    boxes = axes.get_box_aspect() if hasattr(axes, "get_box_aspect") else None
-    shape = np.array(axes._box_aspect if boxes is None else axes._box_aspect)
+    shape = np.array(axes._box_aspect)
     assert np.allclose(shape / shape.max(), np.array(sides) / max(sides), rtol=1e-6)
 
 

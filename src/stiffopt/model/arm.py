@@ -158,9 +158,7 @@ class Arm:
         batch, single = self._pressures(p)
         function = self._function(key, lambda shape: [ca.densify(value(shape))], at)
         results = (
-            np.stack(
-                [self._at_equilibrium(function, row) for row in batch]
-            )
+            np.stack([self._at_equilibrium(function, row) for row in batch])
             if self.is_loaded
             else evaluate_many(function, batch)
         )
@@ -228,7 +226,7 @@ class Arm:
         batch, single = self._pressures(p)
         if not single:
             raise PressureError(f"expected one set of pressures ({self.n_pressures},), not a batch")
-        return batch[0]
+        return np.asarray(batch[0])
 
     def _check_margin(self, batch: Vector, where: str) -> None:
         """Raise where the strain law of a segment breaks down."""

@@ -12,7 +12,7 @@ import casadi as ca
 
 from stiffopt import lie
 from stiffopt.model.compliance import inverse_3x3
-from stiffopt.model.shooting import Piece, Shooting
+from stiffopt.model.shooting import Shooting
 
 _CARRIED = 4  # changes carried along: three turns of the tip, and the defects
 
@@ -47,9 +47,8 @@ def _applied_wrench() -> ca.Function:
     """Force and moment in base axes of a dead and a follower wrench (12,) at orientation q."""
     q, load = ca.SX.sym("q", 4), ca.SX.sym("load", 12)
     R = lie.rotation_from_quaternion(q)
-    return ca.Function(
-        "applied", [q, load], [load[:3] + R @ load[6:9], load[3:6] + R @ load[9:]]
-    )
+    force, moment = load[:3] + R @ load[6:9], load[3:6] + R @ load[9:]
+    return ca.Function("applied", [q, load], [force, moment])
 
 
 def _rigid_step() -> ca.Function:
@@ -63,7 +62,7 @@ def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
     """One step of the lifted Newton method, with the load's station at `at` (None: the tip).
 
     Maps (tip quaternion (4,), states (7, k), pressures, gravity, tip load, station load) to
-    (quaternion, states, largest turn of tip or states in rad, largest defect).
+    (quaternion, states, largest turn of the tip or a state in rad).
     """
     pieces = shooting.pieces([] if at is None else [at])
     count = sum(piece.steps for piece in pieces if not piece.rigid)
@@ -72,13 +71,14 @@ def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
     tip, station = ca.MX.sym("tip", 12), ca.MX.sym("station", 12)
     sections = shooting.sections.call([p])
     applied, rigid = _applied_wrench(), _rigid_step()
+    steps = [_lifted_step(step) for step in shooting.step]
 
     per_turn = [lie.quaternion_product(q, ca.DM([0, *row])) / 2 for row in ca.DM.eye(3).full()]
     orientation = _Carried(q, ca.horzcat(*per_turn, ca.MX.zeros(4)))
     force, moment = _apply(applied, orientation, _constant(tip))
     force = force + shooting.description.tip_mass * gravity
     length = shooting.description.length
-    met: list[_Carried] = []
+    met: list[ca.MX] = []  # changes of the states after each step
     for piece in pieces:
         if abs(piece.distal - (length if at is None else at)) < 1e-12 * length:
             added_force, added_moment = _apply(applied, orientation, _constant(station))
@@ -87,21 +87,22 @@ def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
             (added,) = _apply(rigid, orientation, force, _constant(ca.MX(piece.length)))
             moment = moment + added
             continue
+        strain, compliance = sections[2 * piece.segment : 2 * piece.segment + 2]
+        weight = shooting.weight(piece.segment) * gravity
+        h = piece.length / piece.steps
         for _ in range(piece.steps):
-            orientation, moment = _lifted_step(
-                shooting, piece, sections, gravity, orientation, moment, force,
-                states[:, len(met)],
+            lifted = states[:, len(met)]
+            changes = steps[piece.segment](
+                orientation.value, orientation.changes, moment.value, moment.changes,
+                force.value, force.changes, strain, compliance, weight, h, lifted,
             )  # fmt: skip
-            force = force + piece.length / piece.steps * shooting.weight(piece.segment) * gravity
-            met.append(
-                _Carried(
-                    ca.vertcat(orientation.value, moment.value),
-                    ca.vertcat(orientation.changes, moment.changes),
-                )
-            )
+            orientation = _Carried(lifted[:4], changes[:4, :])
+            moment = _Carried(lifted[4:], changes[4:, :])
+            force = force + h * weight
+            met.append(changes)
     base = orientation.changes[1:, :]
     turn = -inverse_3x3(base[:, :3]) @ (orientation.value[1:] + base[:, 3])
-    moves = [state.changes @ ca.vertcat(turn, 1) for state in met]
+    moves = [changes @ ca.vertcat(turn, 1) for changes in met]
     turned = lie.quaternion_product(q, ca.vertcat(1, turn / 2))
     largest = ca.norm_2(turn)
     for move in moves:
@@ -113,38 +114,19 @@ def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
     )
 
 
-def _lifted_step(
-    shooting: Shooting,
-    piece: Piece,
-    sections: list[ca.MX],
-    gravity: ca.MX,
-    orientation: _Carried,
-    moment: _Carried,
-    force: _Carried,
-    lifted: ca.MX,
-) -> tuple[_Carried, _Carried]:
-    """Step towards the base, its end replaced by the lifted state and the defect carried."""
-    strain, compliance = sections[2 * piece.segment : 2 * piece.segment + 2]
-    start = _Carried(
-        ca.vertcat(orientation.value, ca.MX.zeros(3), moment.value),
-        ca.vertcat(orientation.changes, ca.MX.zeros(3, _CARRIED), moment.changes),
-    )
-    values = [
-        start.value, strain, compliance, force.value,
-        shooting.weight(piece.segment) * gravity, ca.MX(piece.length / piece.steps),
-    ]  # fmt: skip
-    step = shooting.step[piece.segment]
-    end = step(*values)
-    # only the state and the force carry changes
-    C = compliance.sparsity()
-    zeros = [
-        ca.MX.zeros(6, _CARRIED), ca.MX(ca.Sparsity(C.size1(), C.size2() * _CARRIED)),
-    ]  # fmt: skip
-    changes = step.forward(_CARRIED)(
-        *values, end, start.changes, *zeros, force.changes,
-        ca.MX.zeros(3, _CARRIED), ca.MX.zeros(1, _CARRIED),
-    )  # fmt: skip
-    defect = ca.vertcat(end[:4] - lifted[:4], end[7:] - lifted[4:])
-    both = ca.vertcat(changes[:4, :], changes[7:, :])
-    both = ca.horzcat(both[:, :3], both[:, 3] + defect)
-    return _Carried(lifted[:4], both[:4, :]), _Carried(lifted[4:], both[4:, :])
+def _lifted_step(step: ca.Function) -> ca.Function:
+    """Integration step with changes carried along and the lifted state in place of its end.
+
+    Maps orientation, moment and force, each followed by its changes, the section (strain,
+    compliance), weight, length and lifted state (7,) to the changes of the latter: those of the
+    step's end, the defect added to the last of them.
+    """
+    q, m, n = ca.SX.sym("q", 4), ca.SX.sym("m", 3), ca.SX.sym("n", 3)
+    dq, dm, dn = (ca.SX.sym("d", size, _CARRIED) for size in (4, 3, 3))
+    strain, C = ca.SX.sym("strain", 6), ca.SX.sym("C", step.sparsity_in(2))
+    f, h, lifted = ca.SX.sym("f", 3), ca.SX.sym("h"), ca.SX.sym("lifted", 7)
+    end = step(ca.vertcat(q, ca.SX.zeros(3), m), strain, C, n, f, h)
+    end = ca.vertcat(end[:4], end[7:])
+    changes = ca.jtimes(end, ca.vertcat(q, m, n), ca.vertcat(dq, dm, dn))
+    changes[:, 3] += end - lifted
+    return ca.Function("lifted", [q, dq, m, dm, n, dn, strain, C, f, h, lifted], [changes])

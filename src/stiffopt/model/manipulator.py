@@ -216,7 +216,8 @@ class Manipulator(Arm):
         local = _in_local_axes(wrench, T_at, frame)
         if method == "first-order":
             C = self.tip_compliance(p) if at is None else self.compliance(p, at)
-            return T_at @ lie.exp(C @ local) @ lie.inverse(T_at) @ self.tip_pose(p)
+            T: Vector = T_at @ lie.exp(C @ local) @ lie.inverse(T_at) @ self.tip_pose(p)
+            return T
         if method == "elementwise":
             if self.is_loaded:
                 raise InputError(
@@ -233,7 +234,8 @@ class Manipulator(Arm):
     ) -> Vector:
         loads = self._loads._replace(station=dead_and_follower(wrench, frame))
         state = self._equilibrium.settle(p, loads, at)
-        return self._equilibrium.shape(state, np.array([self.length]), at)[0]
+        (tip,) = self._equilibrium.shape(state, np.array([self.length]), at)
+        return np.asarray(tip)
 
     def _elementwise(self, p: Vector, local: Vector, at: float) -> Vector:
         """Eq. 19 with elements at whose middle wrench and compliance are taken."""
