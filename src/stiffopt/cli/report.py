@@ -150,10 +150,15 @@ def _stiffnesses(answer: Answer) -> Iterable[Line]:
 
 
 def _stiffness(measure: StiffnessMeasure, value: float, plain: float | None) -> Text:
-    unit = unit_text(measure.unit)
-    compared = "" if plain is None else f"  (plain: {figures(plain)}, {gain_text(value, plain)})"
-    meaning = f"\n{_meaning(measure)}{_demand(measure, unit)}"
-    return Text.assemble((f"{figures(value)} {unit}", "bold"), compared, meaning)
+    remarks = [_demand(measure)]
+    if plain is not None:
+        remarks.append(f"plain: {figures(plain)}, {gain_text(value, plain)}")
+    remark = ", ".join(filter(None, remarks))
+    return Text.assemble(
+        (f"{figures(value)} {unit_text(measure.unit)}", "bold"),
+        f"  ({remark})" if remark else "",
+        f"\n{_meaning(measure)}",
+    )
 
 
 def _meaning(measure: StiffnessMeasure) -> str:
@@ -162,11 +167,12 @@ def _meaning(measure: StiffnessMeasure) -> str:
     return f"against {measure.kind} {direction}, {measure.frame} axes, {measure.boundary}"
 
 
-def _demand(measure: StiffnessMeasure, unit: str) -> str:
+def _demand(measure: StiffnessMeasure) -> str:
+    """What the task asks of the value."""
     if isinstance(measure, AtLeast):
-        return f"; at least {figures(measure.value)} {unit} asked for"
+        return f"asked: at least {figures(measure.value)}"
     if isinstance(measure, MatchValue):
-        return f"; {figures(measure.value)} {unit} asked for, to {measure.tolerance * 100:g} %"
+        return f"asked: {figures(measure.value)} to {measure.tolerance * 100:g} %"
     return ""
 
 

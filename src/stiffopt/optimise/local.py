@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.optimise.problem import Ball, Point, Problem
+from stiffopt.optimise.problem import Point, Problem
+from stiffopt.optimise.terms import Ball
 
 Vector = NDArray[np.float64]
 

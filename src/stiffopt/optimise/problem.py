@@ -18,11 +18,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt import lie
-from stiffopt.model.compliance import directional_stiffness, stiffness_block
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.shape import Shape
-from stiffopt.optimise.task import MatchMatrix, MatchValue, StiffnessMeasure, Target, Task
+from stiffopt.optimise.measures import Measure, measures
+from stiffopt.optimise.task import MatchValue, Target, Task
+from stiffopt.optimise.terms import Ball, pose_terms
 
 Vector = NDArray[np.float64]
 
@@ -31,31 +31,6 @@ BAR = 1e5
 
 FLOOR_MARGIN = 1e-6
 """How far above a stiffness that must be kept the optimiser aims, relatively."""
-
-
-@dataclass(frozen=True)
-class Ball:
-    """A residual of the pose that shall not leave a ball.
-
-    Attributes
-    ----------
-    name : str
-        "position" (m) or "angle" (rad).
-    residual : ndarray (k,)
-    jacobian : ndarray (k, n)
-        Per bar.
-    radius : float
-    """
-
-    name: str
-    residual: Vector
-    jacobian: Vector
-    radius: float
-
-    @property
-    def error(self) -> float:
-        """Length of the residual."""
-        return float(np.linalg.norm(self.residual))
 
 
 @dataclass(frozen=True)
@@ -124,15 +99,14 @@ class Problem:
         self.task = task
         lower, upper = task.pressure_bounds(robot.description)
         self.lower, self.upper = lower / BAR, upper / BAR
-        self._measures = _measures(task)
-        self._parameters = np.concatenate(
-            [np.zeros(0), *(_parameters(measure) for measure in self._measures)]
-        )
+        found = measures(task)
+        self._parameters = np.concatenate([np.zeros(0), *(each.parameters for each in found)])
         self._pose = robot.evaluator("pose and jacobian", _pose_outputs)
-        structure = tuple(_structure(measure) for measure in self._measures)
+        structure = tuple(each.structure for each in found)
         self._full = robot.evaluator(
-            ("values", structure), _value_outputs(structure), len(self._parameters)
+            ("values", structure), _value_outputs(found), len(self._parameters)
         )
+        self._terms = pose_terms(task.target)
         self.objective = self._objective()
         goal = task.stiffness
         first = len(goal.maximise) + (goal.match is not None) if goal else 0
@@ -169,9 +143,9 @@ class Problem:
         values: Vector,
         gradients: Vector,
     ) -> Point:
-        balls = pose_balls(self.task.target, position[:, 0], rotation, jacobian * BAR)
+        found = (term.ball(position[:, 0], rotation, jacobian * BAR) for term in self._terms)
         balls = tuple(
-            replace(ball, radius=self.radii.get(ball.name, ball.radius)) for ball in balls
+            replace(ball, radius=self.radii.get(ball.name, ball.radius)) for ball in found
         )
         return Point(x, balls, values[:, 0], gradients * BAR)
 
@@ -280,151 +254,28 @@ class Problem:
         """The same program for another target."""
         other = copy(self)
         other.task = self.task.model_copy(update={"target": target})
+        other._terms = pose_terms(target)
         return other
 
 
-def pose_balls(
-    target: Target, position: Vector, rotation: Vector, jacobian: Vector
-) -> tuple[Ball, ...]:
-    """Residuals of a tip pose from a target, with their Jacobians.
+def _pose_outputs(tip: Shape, _: Any) -> list[Any]:
+    return [tip.position, tip.rotation, tip.jacobian]
 
-    Parameters
-    ----------
-    position, rotation : (3,), (3, 3)
-        Pose of the tip in the base frame.
-    jacobian : (6, n)
-        Body twist of the tip per variable.
-    """
-    balls = []
-    if target.position is not None:
-        asked = [axis for axis in range(3) if target.position[axis] is not None]
-        wanted = np.array([target.position[axis] for axis in asked], dtype=float)
-        balls.append(
-            Ball(
-                "position",
-                position[asked] - wanted,
-                (rotation @ jacobian[:3])[asked],
-                target.tolerance.position,
+
+def _value_outputs(found: tuple[Measure, ...]) -> Callable[[Shape, Any], list[Any]]:
+    """Pose, Jacobian, values and gradients for measures."""
+
+    def outputs(tip: Shape, parameters: Any) -> list[Any]:
+        pose = _pose_outputs(tip, parameters)
+        if not found:
+            return [*pose, ca.DM.zeros(0, 1), ca.DM.zeros(0, 0)]
+        ends = np.cumsum([0, *(len(measure.parameters) for measure in found)])
+        values = ca.vertcat(
+            *(
+                measure.value(tip, parameters[int(start) : int(end)])
+                for measure, start, end in zip(found, ends[:-1], ends[1:], strict=True)
             )
         )
-    if target.pointing is not None:
-        residual, per_turn = _pointing_error(np.array(target.pointing), rotation)
-        balls.append(Ball("angle", residual, per_turn @ jacobian[3:], target.tolerance.angle))
-    if target.orientation is not None:
-        wanted_rotation = lie.rotation_from_quaternion(np.array(target.orientation))
-        residual, per_turn = _orientation_error(wanted_rotation, rotation)
-        balls.append(Ball("angle", residual, per_turn @ jacobian[3:], target.tolerance.angle))
-    return tuple(balls)
-
-
-def _pointing_error(wanted: Vector, rotation: Vector) -> tuple[Vector, Vector]:
-    """Angle between the tip's z axis and a unit vector, as a vector (2,) across the latter.
-
-    Returns it with its derivative (2, 3) by a turn in tip axes.  The axis is unrolled from the
-    sphere onto the plane that touches it at the wanted direction, so that distances from there
-    are angles.
-    """
-    across = np.linalg.svd(wanted[np.newaxis])[2][1:]  # (2, 3)
-    axis = rotation[:, 2]
-    cosine = float(np.clip(wanted @ axis, -1.0, 1.0))
-    flat = across @ axis
-    sine = float(np.hypot(*flat))
-    angle = np.arctan2(sine, cosine)
-    if sine > 1e-4:
-        factor = angle / sine
-        slope = (cosine * factor - 1) / sine**2  # of the factor by the cosine
-    elif cosine > 0:
-        factor, slope = 1.0 + sine**2 / 6, -1 / 3
-    else:  # opposite: every way round is as good
-        return np.array([np.pi, 0.0]), across @ _axis_per_turn(rotation)
-    per_axis = factor * across + slope * np.outer(flat, wanted)
-    return factor * flat, per_axis @ _axis_per_turn(rotation)
-
-
-def _axis_per_turn(rotation: Vector) -> Vector:
-    """Derivative (3, 3) of the tip's z axis by a turn in tip axes."""
-    x, y = rotation[:, 0], rotation[:, 1]
-    return np.column_stack([-y, x, np.zeros(3)])  # turn x z
-
-
-def _orientation_error(wanted: Vector, rotation: Vector) -> tuple[Vector, Vector]:
-    """Rotation vector (3,) from a wanted orientation, with its derivative by a turn (3, 3)."""
-    q = lie.quaternion_from_rotation(wanted.T @ rotation)
-    vector = lie.rotation_vector_from_quaternion(q)
-    angle_squared = float(vector @ vector)
-    first, second, _ = lie.exponential_coefficients(max(angle_squared, 1e-12))
-    W = lie.hat(vector)
-    # inverse of the right Jacobian of SO(3)
-    factor = 1 / 12 if angle_squared < 1e-8 else (1 - first / (2 * second)) / angle_squared
-    return vector, np.eye(3) + 0.5 * W + factor * (W @ W)
-
-
-# -- stiffness values -----------------------------------------------------------------------
-
-Measure = StiffnessMeasure | MatchMatrix
-
-
-def _measures(task: Task) -> tuple[Measure, ...]:
-    """All that is computed of the stiffness: what is sought, then the floors."""
-    goal = task.stiffness
-    if goal is None:
-        return ()
-    match = (goal.match,) if goal.match is not None else ()
-    return (*goal.maximise, *match, *goal.at_least)
-
-
-def _structure(measure: Measure) -> tuple[str, ...]:
-    if isinstance(measure, MatchMatrix):
-        return ("matrix", measure.frame, measure.boundary)
-    return (measure.kind, measure.frame, measure.boundary)
-
-
-def _parameters(measure: Measure) -> Vector:
-    if isinstance(measure, MatchMatrix):
-        return np.array(measure.matrix).ravel()
-    return np.array(measure.direction)
-
-
-def _pose_outputs(shape: Shape, _: Any) -> list[Any]:
-    return [shape.position, shape.rotation, shape.jacobian]
-
-
-def _value_outputs(structure: tuple[tuple[str, ...], ...]) -> Callable[[Shape, Any], list[Any]]:
-    """Pose, Jacobian, values and gradients for a structure of measures."""
-
-    def outputs(shape: Shape, parameters: Any) -> list[Any]:
-        values, used = [], 0
-        for kind, frame, boundary in structure:
-            size = 9 if kind == "matrix" else 3
-            own = parameters[used : used + size]
-            used += size
-            if kind == "matrix":
-                values.append(_matrix_distance(shape, own, frame, boundary))
-            else:
-                values.append(
-                    ca.log(
-                        directional_stiffness(
-                            shape.compliance,
-                            shape.rotation,
-                            own,
-                            frame=frame,  # type: ignore[arg-type]
-                            kind=kind,  # type: ignore[arg-type]
-                            boundary=boundary,  # type: ignore[arg-type]
-                        )
-                    )
-                )
-        pose = _pose_outputs(shape, None)
-        if not values:
-            return [*pose, ca.DM.zeros(0, 1), ca.DM.zeros(0, 0)]
-        column = ca.vertcat(*values)
-        return [*pose, column, ca.densify(shape.total_jacobian(column))]
+        return [*pose, values, ca.densify(tip.total_jacobian(values))]
 
     return outputs
-
-
-def _matrix_distance(shape: Shape, wanted: Any, frame: str, boundary: str) -> Any:
-    """Squared relative Frobenius distance of the translational stiffness from a matrix."""
-    K = stiffness_block(shape.compliance, "translation", boundary)  # type: ignore[arg-type]
-    if frame == "base":
-        K = shape.rotation @ K @ shape.rotation.T
-    return ca.sumsqr(ca.vec(K) - wanted) / ca.sumsqr(wanted)

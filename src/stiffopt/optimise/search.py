@@ -16,9 +16,10 @@ from stiffopt.errors import EquilibriumError
 from stiffopt.model.equilibrium import State
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.local import LocalResult, descend, reach
-from stiffopt.optimise.problem import BAR, Point, Problem, pose_balls
+from stiffopt.optimise.problem import BAR, Point, Problem
 from stiffopt.optimise.solution import Confidence
 from stiffopt.optimise.task import Target
+from stiffopt.optimise.terms import pose_errors
 
 Vector = NDArray[np.float64]
 
@@ -65,12 +66,7 @@ class SampleTable:
             cosines = rotations[:, :, 2] @ np.array(target.pointing)
             errors += np.arccos(np.clip(cosines, -1, 1)) / np.pi
         if target.orientation is not None:
-            nothing = np.zeros((6, 0))
-            alone = target.model_copy(update={"position": None})
-            errors += [
-                pose_balls(alone, position, rotation, nothing)[0].error / np.pi
-                for position, rotation in zip(positions, rotations, strict=True)
-            ]
+            errors += [pose_errors(target, pose)["angle"].error / np.pi for pose in self.poses]
         return np.argsort(errors, kind="stable")
 
 

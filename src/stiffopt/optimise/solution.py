@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.problem import pose_balls
 from stiffopt.optimise.task import AtLeast, MatchMatrix, StiffnessMeasure, Task
+from stiffopt.optimise.terms import pose_errors
 
 Vector = NDArray[np.float64]
 Status = Literal["solved", "unreachable", "failed"]
@@ -185,11 +185,7 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
         If the arm has no equilibrium at these pressures that is reached from rest.
     """
     tip_pose = robot.tip_pose(pressures)
-    nothing = np.zeros((6, 0))
-    errors = {
-        ball.name: ball
-        for ball in pose_balls(task.target, tip_pose[:3, 3], tip_pose[:3, :3], nothing)
-    }
+    errors = pose_errors(task.target, tip_pose)
     lower, upper = task.pressure_bounds(robot.description)
     compliance = robot.tip_compliance(pressures)
     demands = True
