@@ -21,8 +21,8 @@ from stiffopt.cli import main as entry
 from stiffopt.cli.answer import Answer
 from stiffopt.cli.inputs import find_tasks
 from stiffopt.cli.records import json_line
+from stiffopt.documents import read_document
 from stiffopt.errors import EquilibriumError
-from stiffopt.files import read_document
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.units import parse_quantity
 
@@ -388,7 +388,7 @@ def test_bad_input_is_one_readable_message(case: str, write: Write) -> None:
 
 
 def test_a_robot_file_that_breaks_the_strain_law_names_the_task(write: Write) -> None:
-    arm = stiffopt.model.description.files("stiffopt").joinpath("robots", "stiff-flop-1.yaml")
+    arm = stiffopt.model.robot_files.files("stiffopt").joinpath("robots", "stiff-flop-1.yaml")
     write("arm.yaml", arm.read_text().replace("max: 1.5 bar", "max: 9 bar"))
     path = write("task.yaml", ONE.replace("stiff-flop-1", "arm.yaml"))
     result = run(path)

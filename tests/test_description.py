@@ -21,9 +21,8 @@ from stiffopt.model.description import (
     PressureLimits,
     RobotDescription,
     Segment,
-    builtin_robots,
-    load_description,
 )
+from stiffopt.model.robot_files import builtin_robots, load_description
 
 ROBOT = """\
 format: stiffopt-robot/1

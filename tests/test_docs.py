@@ -20,16 +20,9 @@ from stiffopt.model.description import (
     RobotDescription,
     Segment,
 )
-from stiffopt.optimise.task import (
-    Load,
-    MatchMatrix,
-    MatchValue,
-    PressureRange,
-    StiffnessGoal,
-    Target,
-    Task,
-    Tolerance,
-)
+from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
+from stiffopt.optimise.target import Target, Tolerance
+from stiffopt.optimise.task import Load, PressureRange, Task
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -14,17 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import Field
 
+from stiffopt.documents import read_document, write_file
 from stiffopt.errors import FileError, InputError, MissingExtraError, StiffoptError
-from stiffopt.files import (
-    BadKeyError,
-    Items,
-    Schema,
-    line_of,
-    read_document,
-    read_file,
-    save_file,
-    write_file,
-)
+from stiffopt.files import line_of, read_file, save_file
+from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Length
 
 

@@ -270,3 +270,16 @@ def test_arm_that_falls_over_is_a_failure_and_not_an_exception():
     assert solution.status == "failed"
     assert "falls over" in solution.message
     assert solution.pressures is None
+
+
+def test_price_of_a_limit_at_an_unreachable_target_is_a_distance(robot):
+    far = so.Target(position=(-0.03, 0.01, 0.29))
+
+    def solve(limit):
+        return so.solve_pressure(robot, two_segment_task(far, pressure={"max": limit}))
+
+    here, there = solve(1.2e5), solve(1.205e5)
+    assert here.sensitivities.objective_unit == "m"
+    gained = (here.position_error - there.position_error) / 500.0
+    assert sum(here.sensitivities.per_bound.values()) == pytest.approx(gained, rel=0.05)
+    assert "none of" in str(here.confidence)

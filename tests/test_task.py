@@ -13,20 +13,10 @@ from hypothesis import strategies as st
 
 from stiffopt.errors import FileError, InputError
 from stiffopt.files import save_file
-from stiffopt.model.description import load_description
-from stiffopt.optimise.task import (
-    AtLeast,
-    Load,
-    MatchMatrix,
-    MatchValue,
-    PressureRange,
-    StiffnessGoal,
-    StiffnessMeasure,
-    Target,
-    Task,
-    Tolerance,
-    load_task,
-)
+from stiffopt.model.robot_files import load_description
+from stiffopt.optimise.goal import AtLeast, MatchMatrix, MatchValue, StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.target import Target, Tolerance
+from stiffopt.optimise.task import Load, PressureRange, Task, load_task
 
 TASK = """\
 format: stiffopt-task/1

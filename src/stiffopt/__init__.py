@@ -11,24 +11,16 @@ from stiffopt.errors import (
     PressureError,
     StiffoptError,
 )
-from stiffopt.model.description import RobotDescription, builtin_robots
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.robot_files import builtin_robots
 from stiffopt.model.screws import Twist, Wrench
+from stiffopt.optimise.goal import AtLeast, MatchMatrix, MatchValue, StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.pareto import pareto_front
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver, solve_pressure
-from stiffopt.optimise.task import (
-    AtLeast,
-    Load,
-    MatchMatrix,
-    MatchValue,
-    StiffnessGoal,
-    StiffnessMeasure,
-    Target,
-    Task,
-    Tolerance,
-    load_task,
-)
+from stiffopt.optimise.target import Target, Tolerance
+from stiffopt.optimise.task import Load, Task, load_task
 
 __version__ = "0.1.0"
 

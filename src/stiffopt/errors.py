@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+
+Loc = tuple[str | int, ...]
+"""The place of a value in nested data: keys, and indices of items counted from 0."""
 
 
 class StiffoptError(Exception):
@@ -105,3 +109,11 @@ def shown(value: object) -> str:
 def printable(text: str) -> str:
     """Return text with line breaks and control characters escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def dotted(loc: Sequence[str | int]) -> str:
+    """Return a place as people write it: ``target.position[0]``."""
+    text = ""
+    for step in loc:
+        text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
+    return printable(text)

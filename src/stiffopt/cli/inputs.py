@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from stiffopt.documents import read_document
 from stiffopt.errors import FileError
-from stiffopt.files import read_document
 
 _SUFFIXES = (".yaml", ".yml")
 

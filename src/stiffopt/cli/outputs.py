@@ -7,8 +7,8 @@ from pathlib import Path
 
 from stiffopt.cli.answer import Answer
 from stiffopt.cli.records import result_record
+from stiffopt.documents import write_file
 from stiffopt.errors import FileError
-from stiffopt.files import write_file
 
 RESULT_FORMAT = "stiffopt-result/1"
 _PICTURES = (".png", ".pdf", ".svg")

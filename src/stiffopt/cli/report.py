@@ -14,8 +14,8 @@ from rich.text import Text
 from stiffopt.cli.answer import Answer
 from stiffopt.cli.records import priced
 from stiffopt.errors import printable
+from stiffopt.optimise.goal import AtLeast, MatchMatrix, MatchValue, StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
-from stiffopt.optimise.task import AtLeast, MatchMatrix, MatchValue, StiffnessMeasure
 from stiffopt.plots.wording import (
     direction_text,
     figures,

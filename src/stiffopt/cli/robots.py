@@ -3,7 +3,8 @@
 from rich.table import Table
 
 from stiffopt.cli.console import show
-from stiffopt.model.description import RobotDescription, builtin_robots, load_description
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.robot_files import builtin_robots, load_description
 
 
 def robots() -> None:

@@ -8,7 +8,8 @@ from traceback import extract_tb
 from stiffopt.cli import exits, outputs, records, report
 from stiffopt.cli.answer import Answer, answer_file
 from stiffopt.cli.console import Closed, Work, report_error, report_note, show, write_line
-from stiffopt.cli.inputs import find_tasks
+from stiffopt.cli.inputs import Inputs, find_tasks
+from stiffopt.cli.interrupts import Interruptible
 from stiffopt.errors import StiffoptError
 
 
@@ -32,7 +33,14 @@ def run(tasks: Sequence[str], options: Options) -> int:
     except StiffoptError as error:
         report_error(str(error))
         return exits.BAD_INPUT
-    batch = _Batch(options, Work(len(inputs.files), quiet=options.quiet))
+    with Interruptible() as interrupts:
+        return _run_checked(inputs, to_write, options, interrupts)
+
+
+def _run_checked(
+    inputs: Inputs, to_write: outputs.FilesToWrite, options: Options, interrupts: Interruptible
+) -> int:
+    batch = _Batch(options, Work(len(inputs.files), quiet=options.quiet), interrupts)
     for bad in inputs.errors:
         batch.complain(bad.path, str(bad))
     for note in inputs.skipped if not options.quiet else ():
@@ -53,6 +61,7 @@ class _Batch:
 
     options: Options
     work: Work
+    interrupts: Interruptible
     answers: list[Answer] = field(default_factory=list)
     rows: list[report.Row] = field(default_factory=list)
     codes: list[int] = field(default_factory=list)
@@ -64,11 +73,14 @@ class _Batch:
         try:
             with self.work.step(file):
                 answer = answer_file(file, seed=self.options.seed, pareto=self.options.pareto)
+            self.interrupts.check()
         except StiffoptError as error:
+            self.interrupts.check()
             self.complain(file, str(error))
         except (Closed, OSError):
             raise
         except Exception as error:  # a mistake of ours must not leave the other files unsolved
+            self.interrupts.check()
             self.complain(file, f"{file}: {_bug(error)}", exits.FAILED)
         else:
             self._take(answer, perf_counter() - begin)

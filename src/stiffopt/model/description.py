@@ -7,20 +7,15 @@ Everything is in SI: m, rad, Pa, kg. Built in code::
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import math
-import os
 from collections.abc import Sequence
-from functools import cache
-from importlib.resources import as_file, files
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from stiffopt.errors import InputError, shown
-from stiffopt.files import BadKeyError, Items, Schema, Vector, read_file
+from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import (
     Acceleration,
     Angle,
@@ -39,8 +34,6 @@ __all__ = [
     "PressureLimits",
     "RobotDescription",
     "Segment",
-    "builtin_robots",
-    "load_description",
 ]
 
 _SLACK = 1e-9  # m; two circles that touch may overlap by rounding
@@ -328,51 +321,3 @@ class RobotDescription(Schema):
                         "add one such as 'density: 1070 kg/m^3' or remove gravity",
                     )
         return self
-
-
-@cache
-def builtin_robots() -> tuple[str, ...]:
-    """Return the names of the robots that come with stiffopt."""
-    folder = files("stiffopt").joinpath("robots")
-    names = (entry.name for entry in folder.iterdir() if entry.name.endswith(".yaml"))
-    return tuple(sorted(name.removesuffix(".yaml") for name in names))
-
-
-def load_description(
-    name_or_path: str | os.PathLike[str], base: str | os.PathLike[str] | None = None
-) -> RobotDescription:
-    """Return a built-in robot or read a robot file.
-
-    Parameters
-    ----------
-    name_or_path :
-        Text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is a `Path`;
-        any other is the name of a built-in robot.
-    base :
-        Folder from which a relative path starts; by default the current one.
-
-    Raises
-    ------
-    InputError
-        There is no such built-in robot.
-    FileError
-        The file cannot be read or is wrong.
-    """
-    if not isinstance(name_or_path, str | os.PathLike):
-        raise InputError(f"expected a robot's name or path, not {shown(name_or_path)}")
-    text = os.fspath(name_or_path)
-    if not isinstance(name_or_path, str) or _is_path(text):
-        return read_file(Path(base or "") / text, "robot", RobotDescription)
-    if text not in builtin_robots():
-        near = difflib.get_close_matches(text, builtin_robots(), n=1)
-        hint = f"did you mean '{near[0]}'? " if near else ""
-        raise InputError(
-            f"there is no robot '{text}'; {hint}The built-in robots are "
-            f"{', '.join(builtin_robots())}; the path of a robot file ends in .yaml"
-        )
-    with as_file(files("stiffopt").joinpath("robots", f"{text}.yaml")) as path:
-        return read_file(path, "robot", RobotDescription)
-
-
-def _is_path(text: str) -> bool:
-    return text.endswith((".yaml", ".yml")) or "/" in text or os.sep in text

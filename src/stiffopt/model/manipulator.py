@@ -18,7 +18,8 @@ from stiffopt.model.arguments import (
 )
 from stiffopt.model.arm import Arm, Values
 from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
-from stiffopt.model.description import RobotDescription, load_description
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.robot_files import load_description
 from stiffopt.model.screws import Twist, Wrench
 from stiffopt.model.shape import Shape
 

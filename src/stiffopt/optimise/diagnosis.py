@@ -10,10 +10,11 @@ from math import degrees, inf
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.optimise.goal import MatchMatrix, MatchValue
 from stiffopt.optimise.local import LocalResult, descend, reach
 from stiffopt.optimise.problem import Problem
 from stiffopt.optimise.solution import Judgement, Sensitivities
-from stiffopt.optimise.task import MatchMatrix, MatchValue, Task
+from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 

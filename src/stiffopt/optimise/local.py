@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.optimise.problem import Point, Problem
+from stiffopt.optimise.problem import Objective, Point, Problem
 from stiffopt.optimise.terms import Ball
 
 Vector = NDArray[np.float64]
@@ -65,6 +65,8 @@ class LocalResult:
     violation : float
         Sum by which floors are missed, in logarithms of stiffness.
     converged : bool
+    objective : Objective
+        What was minimised.
     multipliers : Multipliers or None
         None if no quadratic program was solved.
     """
@@ -73,6 +75,7 @@ class LocalResult:
     value: float
     violation: float
     converged: bool
+    objective: Objective
     multipliers: Multipliers | None
 
 
@@ -147,7 +150,7 @@ def descend(problem: Problem, start: Point) -> LocalResult:
     """Minimise the problem's objective from a point that reaches the pose."""
     point = _attempt(problem, start.x, pose_only=False)
     if point is None:
-        return LocalResult(start, np.inf, np.inf, False, None)
+        return LocalResult(start, np.inf, np.inf, False, problem.objective, None)
     objective = problem.objective
     B = objective.curvature(point)
     B = B + 1e-8 * np.trace(B) * np.eye(len(B))
@@ -184,7 +187,7 @@ def descend(problem: Problem, start: Point) -> LocalResult:
             break
     point = _snapped(problem, point)
     return LocalResult(
-        point, objective.value(point), violation(problem, point), converged, multipliers
+        point, objective.value(point), violation(problem, point), converged, objective, multipliers
     )
 
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from stiffopt.model.compliance import directional_stiffness, stiffness_block
 from stiffopt.model.shape import Shape
-from stiffopt.optimise.task import MatchMatrix, StiffnessMeasure, Task
+from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
+from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 

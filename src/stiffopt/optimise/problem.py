@@ -20,8 +20,10 @@ from numpy.typing import NDArray
 
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.shape import Shape
+from stiffopt.optimise.goal import MatchValue
 from stiffopt.optimise.measures import Measure, measures
-from stiffopt.optimise.task import MatchValue, Target, Task
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
 from stiffopt.optimise.terms import Ball, pose_terms
 
 Vector = NDArray[np.float64]
@@ -76,6 +78,8 @@ class Objective:
     terms: Callable[[Point], tuple[Vector, Vector]]  # values (m,), gradients (m, n)
     curvature: Callable[[Point], Vector]  # (n, n)
     precision: float  # decrease that no longer matters
+    unit: str  # of what a decrease gains, for prices
+    gain: Callable[[Point], float]  # that gain per unit of decrease
 
     def value(self, point: Point) -> float:
         """Value at a point."""
@@ -159,6 +163,8 @@ class Problem:
                 lambda point: (-point.values[:count], -point.gradients[:count]),
                 lambda point: 0.1 * np.eye(len(point.x)),
                 precision=1e-7,
+                unit=goal.maximise[0].unit,
+                gain=lambda point: float(np.exp(point.values[:count].min())),
             )
         if goal is not None and isinstance(goal.match, MatchValue):
             wanted = float(np.log(goal.match.value))
@@ -190,7 +196,11 @@ class Problem:
             jacobian = ball(point).jacobian / scale
             return jacobian.T @ jacobian
 
-        return Objective(terms, curvature, precision=1e-10)
+        def gain(point: Point) -> float:
+            return scale**2 / max(ball(point).error, 1e-12)
+
+        unit = "m" if name == "position" else "rad"
+        return Objective(terms, curvature, precision=1e-10, unit=unit, gain=gain)
 
     def best_floors(self) -> Objective:
         """The most by which a floor is missed: what brings all floors as close as they come."""
@@ -200,6 +210,8 @@ class Problem:
             lambda point: (bounds - point.values[indices], -point.gradients[indices]),
             lambda point: 0.1 * np.eye(len(point.x)),
             precision=1e-7,
+            unit="1",
+            gain=lambda point: 1.0,
         )
 
     @property
@@ -213,6 +225,8 @@ class Problem:
             ),
             lambda point: 2 * np.eye(n) / n,
             precision=1e-9,
+            unit="bar^2",
+            gain=lambda point: 1.0,
         )
 
     def _and_some_pressure(
@@ -235,6 +249,8 @@ class Problem:
             terms,
             lambda point: curvature(point) + 2 * share * np.eye(len(point.x)),
             precision=1e-10,
+            unit="1",
+            gain=lambda point: 1.0,
         )
 
     def changed(

@@ -18,7 +18,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.local import LocalResult, descend, reach
 from stiffopt.optimise.problem import BAR, Point, Problem
 from stiffopt.optimise.solution import Confidence
-from stiffopt.optimise.task import Target
+from stiffopt.optimise.target import Target
 from stiffopt.optimise.terms import pose_errors
 
 Vector = NDArray[np.float64]

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.task import AtLeast, MatchMatrix, StiffnessMeasure, Task
+from stiffopt.optimise.goal import AtLeast, MatchMatrix, StiffnessMeasure
+from stiffopt.optimise.task import Task
 from stiffopt.optimise.terms import pose_errors
 
 Vector = NDArray[np.float64]
@@ -45,6 +46,8 @@ class Confidence:
     complete: bool
 
     def __str__(self) -> str:
+        if not self.reached:
+            return f"none of {self.starts} starts came to the pose"
         if self.starts == 1:
             return "local answer from the given guess"
         sure = "search complete" if self.complete else "search stopped at its limit of starts"
@@ -66,12 +69,14 @@ class Sensitivities:
     stiffness_gradient : ndarray (n,) or None
         First stiffness of the task per Pa, in N/m/Pa or N m/rad/Pa.
     per_bound : dict of str to float
-        For each active pressure limit what moving it outwards is worth, per Pa: in stiffness
-        where one is maximised; else in the task's own objective (see `objective_unit`).
+        For each active pressure limit what moving it outwards is worth, in `objective_unit`
+        per Pa.
     per_position_tolerance, per_angle_tolerance : float or None
         The same per m and per rad of tolerance; None where not asked for.
     objective_unit : str
-        Unit of what those gain, before "per Pa", "per m" or "per rad".
+        What is gained: "N/m" or "N*m/rad" of the (smallest) stiffness that is maximised; "m" or
+        "rad" of the error of an unreachable pose; "bar^2" of mean square pressure where no
+        stiffness is asked for; "1", the squared relative mismatch, where one is matched.
     """
 
     tip_jacobian: Vector

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise import diagnosis
+from stiffopt.optimise.goal import MatchValue
 from stiffopt.optimise.local import LocalResult, descend, reach
 from stiffopt.optimise.problem import BAR, Problem
 from stiffopt.optimise.search import SampleTable, Search, search, starts
@@ -21,7 +22,8 @@ from stiffopt.optimise.solution import (
     active_bounds,
     judge,
 )
-from stiffopt.optimise.task import MatchValue, Target, Task
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 
@@ -230,10 +232,7 @@ class PressureSolver:
             gradient = self.robot.stiffness_gradient(
                 pressures, first.direction, first.kind, first.boundary, first.frame
             )
-        maximised = goal is not None and bool(goal.maximise)
-        unit = _unit(problem.task) if maximised else "1"
-        # d k = k d(log k): the smallest of the maximised ones is what the objective is about
-        scale = min(judgement.stiffnesses[: len(goal.maximise)]) if maximised and goal else 1.0
+        scale = result.objective.gain(result.point)
 
         def radius_price(name: str) -> float | None:
             pull = prices.balls.get(name)
@@ -248,7 +247,7 @@ class PressureSolver:
             },
             per_position_tolerance=radius_price("position"),
             per_angle_tolerance=radius_price("angle"),
-            objective_unit=unit or "1",
+            objective_unit=result.objective.unit,
         )
 
     # -- starts -----------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.optimise.task import Target
+from stiffopt.optimise.target import Target
 
 Vector = NDArray[np.float64]
 

@@ -2,8 +2,9 @@
 
 from collections.abc import Iterable
 
+from stiffopt.optimise.goal import MatchValue, StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
-from stiffopt.optimise.task import MatchValue, StiffnessMeasure, Task
+from stiffopt.optimise.task import Task
 
 
 def measures_of(task: Task) -> tuple[StiffnessMeasure, ...]:

@@ -1,0 +1,241 @@
+"""YAML documents: plain data with the line of everything in them, read and written.
+
+The core schema of YAML 1.2 holds: ``1e-3`` is a number, ``yes``, ``on``, ``1:30`` and dates are
+text. What a hand-written file does not need and a malicious one does (anchors, aliases, tags,
+several documents, bottomless nesting) is refused.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from stiffopt.errors import FileError, InputError, Loc, dotted, shown
+
+__all__ = ["Document", "read_document", "write_file"]
+
+MAX_BYTES = 1_000_000
+MAX_DEPTH = 20
+
+
+@dataclass(frozen=True)
+class Document:
+    """Plain data and the line of everything in them."""
+
+    path: str
+    data: dict[str, Any]
+    lines: dict[Loc, int] = field(repr=False)
+
+    def error(self, loc: Loc, reason: str) -> FileError:
+        """Return the error that blames what is at `loc`."""
+        return FileError(self.path, reason, line=self.lines.get(loc), key=dotted(loc) or None)
+
+
+def read_document(path: str | os.PathLike[str]) -> Document:
+    """Read a YAML file as plain data with line numbers; the top level must be a mapping."""
+    name = os.fspath(path)
+    return _Composer(name, _read_text(name)).document()
+
+
+def write_file(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
+    """Write data as YAML that `read_document` reads back as they were.
+
+    The file appears whole or not at all: it is written beside its place and then moved there.
+
+    Parameters
+    ----------
+    path :
+        The file; its folder must exist.
+    data :
+        Text, numbers, booleans, None, lists, tuples, arrays and mappings with text as keys.
+    """
+    text = yaml.dump(_plain(data), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    target = Path(path)
+    try:
+        target = target.resolve()
+        if target.exists() and not target.is_file():
+            target.write_text(text, encoding="utf-8")  # a folder (an error), a pipe, /dev/stdout
+            return
+        with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
+            part = Path(folder) / "part"
+            with part.open("w", encoding="utf-8") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+            part.replace(target)
+    except (OSError, ValueError) as error:
+        raise FileError(path, f"cannot be written: {_os_reason(error)}") from None
+
+
+# Text to data ------------------------------------------------------------------------------------
+
+
+def _read_text(path: str) -> str:
+    try:
+        with open(path, "rb") as stream:
+            raw = stream.read(MAX_BYTES + 1)
+    except FileNotFoundError:
+        raise FileError(path, "there is no such file") from None
+    except IsADirectoryError:
+        raise FileError(path, "is a folder; expected a file") from None
+    except (OSError, ValueError) as error:
+        raise FileError(path, f"cannot be read: {_os_reason(error)}") from None
+    if len(raw) > MAX_BYTES:
+        raise FileError(path, f"is larger than {MAX_BYTES // 1_000_000} MB; expected a short file")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise FileError(path, "is not UTF-8 text", line=line) from None
+
+
+def _os_reason(error: OSError | ValueError) -> str:
+    return (error.strerror or str(error)).lower() if isinstance(error, OSError) else str(error)
+
+
+_INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")
+_FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
+_WORDS: dict[str, Any] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL"), None),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **{f"{sign}{word}": float(f"{sign}inf") for sign in ("", "+", "-") for word in
+       (".inf", ".Inf", ".INF")},
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
+}  # fmt: skip
+
+
+def _resolve(text: str) -> Any:
+    """Return what a plain scalar means in the core schema of YAML 1.2."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INT.fullmatch(text) and len(text) < 400:
+        bases = {"0o": 8, "0x": 16}
+        return int(text[2:], bases[text[:2]]) if text[:2] in bases else int(text)
+    return float(text) if _FLOAT.fullmatch(text) else text
+
+
+class _Composer:
+    """Builds a `Document` from the events of the YAML parser."""
+
+    def __init__(self, path: str, text: str) -> None:
+        self.path = path
+        self.lines: dict[Loc, int] = {}
+        loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+        self.events: Iterator[Any] = yaml.parse(text, Loader=loader)
+
+    def document(self) -> Document:
+        self.next()  # start of the stream
+        event = self.next()
+        if isinstance(event, yaml.StreamEndEvent):
+            raise FileError(self.path, "is empty")
+        event = self.next()
+        data = self.value(event, ())
+        self.next()  # end of the document
+        after = self.next()
+        if not isinstance(after, yaml.StreamEndEvent):
+            raise self.error(after, "a second document begins here; expected one document a file")
+        if data is None:
+            raise FileError(self.path, "is empty")
+        if not isinstance(data, dict):
+            raise self.error(event, "expected a mapping (lines of 'key: value') at the top level")
+        return Document(self.path, data, self.lines)
+
+    def next(self) -> Any:
+        try:
+            event = next(self.events)
+        except yaml.MarkedYAMLError as error:
+            mark = error.problem_mark or error.context_mark
+            parts = [part for part in (error.context, error.problem) if part]
+            line = mark.line + 1 if mark else None
+            raise FileError(
+                self.path, f"is not valid YAML: {', '.join(parts)}", line=line
+            ) from None
+        except yaml.YAMLError as error:
+            reason = getattr(error, "reason", None) or "it cannot be parsed"
+            raise FileError(self.path, f"is not valid YAML: {reason}") from None
+        if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
+            raise self.error(event, "anchors (&) and aliases (*) are not allowed; write it out")
+        if getattr(event, "tag", None) is not None:
+            raise self.error(event, f"the tag {shown(event.tag)} is not allowed; remove it")
+        return event
+
+    def error(self, event: Any, reason: str, loc: Loc = ()) -> FileError:
+        line = event.start_mark.line + 1
+        return FileError(self.path, reason, line=line, key=dotted(loc) or None)
+
+    def value(self, event: Any, loc: Loc) -> Any:
+        self.lines.setdefault(loc, event.start_mark.line + 1)
+        if len(loc) > MAX_DEPTH:
+            raise self.error(event, f"is nested more than {MAX_DEPTH} levels deep")
+        if isinstance(event, yaml.MappingStartEvent):
+            return self.mapping(loc)
+        if isinstance(event, yaml.SequenceStartEvent):
+            return self.sequence(loc)
+        return _resolve(event.value) if event.implicit[0] else event.value
+
+    def sequence(self, loc: Loc) -> list[Any]:
+        items: list[Any] = []
+        while not isinstance(event := self.next(), yaml.SequenceEndEvent):
+            items.append(self.value(event, (*loc, len(items))))
+        return items
+
+    def mapping(self, loc: Loc) -> dict[str, Any]:
+        items: dict[str, Any] = {}
+        while not isinstance(event := self.next(), yaml.MappingEndEvent):
+            key = event.value if isinstance(event, yaml.ScalarEvent) else None
+            if key is None or (event.implicit[0] and not isinstance(_resolve(key), str)):
+                name = shown(key) if key else "this"
+                raise self.error(event, f"{name} is not text; expected a name as the key", loc)
+            here = (*loc, key)
+            if key in items:
+                first = self.lines[here]
+                raise self.error(event, f"duplicate key, first given on line {first}", here)
+            self.lines[here] = event.start_mark.line + 1
+            items[key] = self.value(self.next(), here)
+        return items
+
+
+# Data to text ------------------------------------------------------------------------------------
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes what `read_document` reads: no aliases, and text quoted where it looks like data."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+    def represent_text(self, text: str) -> yaml.ScalarNode:
+        quote = None if isinstance(_resolve(text), str) else "'"
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style=quote)
+
+    def represent_items(self, items: list[Any]) -> yaml.SequenceNode:
+        flow = not any(isinstance(item, dict) for item in items)
+        return self.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
+
+
+_Dumper.add_representer(str, _Dumper.represent_text)
+_Dumper.add_representer(list, _Dumper.represent_items)
+
+
+def _plain(value: Any) -> Any:
+    """Return data as dicts, lists and scalars that YAML knows."""
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    raise InputError(f"a {type(value).__name__} cannot be written to a YAML file")

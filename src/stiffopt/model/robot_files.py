@@ -1,0 +1,63 @@
+"""Robots by name or path: those that come with stiffopt and those in a user's files."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from functools import cache
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from stiffopt.errors import InputError, shown
+from stiffopt.files import read_file
+from stiffopt.model.description import RobotDescription
+
+__all__ = ["builtin_robots", "load_description"]
+
+
+@cache
+def builtin_robots() -> tuple[str, ...]:
+    """Return the names of the robots that come with stiffopt."""
+    folder = files("stiffopt").joinpath("robots")
+    names = (entry.name for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return tuple(sorted(name.removesuffix(".yaml") for name in names))
+
+
+def load_description(
+    name_or_path: str | os.PathLike[str], base: str | os.PathLike[str] | None = None
+) -> RobotDescription:
+    """Return a built-in robot or read a robot file.
+
+    Parameters
+    ----------
+    name_or_path :
+        Text that ends in ``.yaml`` or ``.yml`` or has a path separator is a path, as is a `Path`;
+        any other is the name of a built-in robot.
+    base :
+        Folder from which a relative path starts; by default the current one.
+
+    Raises
+    ------
+    InputError
+        There is no such built-in robot.
+    FileError
+        The file cannot be read or is wrong.
+    """
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise InputError(f"expected a robot's name or path, not {shown(name_or_path)}")
+    text = os.fspath(name_or_path)
+    if not isinstance(name_or_path, str) or _is_path(text):
+        return read_file(Path(base or "") / text, "robot", RobotDescription)
+    if text not in builtin_robots():
+        near = difflib.get_close_matches(text, builtin_robots(), n=1)
+        hint = f"did you mean '{near[0]}'? " if near else ""
+        raise InputError(
+            f"there is no robot '{text}'; {hint}The built-in robots are "
+            f"{', '.join(builtin_robots())}; the path of a robot file ends in .yaml"
+        )
+    with as_file(files("stiffopt").joinpath("robots", f"{text}.yaml")) as path:
+        return read_file(path, "robot", RobotDescription)
+
+
+def _is_path(text: str) -> bool:
+    return text.endswith((".yaml", ".yml")) or "/" in text or os.sep in text

@@ -1,0 +1,49 @@
+"""Directions and rotations as a user gives them: brought to length 1, or refused."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BeforeValidator
+
+from stiffopt.errors import InputError
+from stiffopt.schema import Vector, items_of
+from stiffopt.units import Number
+
+__all__ = ["Direction", "Frame", "Quaternion"]
+
+
+def _unit_vector(vector: tuple[float, ...]) -> tuple[float, ...]:
+    """Return a vector at length 1; leave it be if it has that already."""
+    largest = max(map(abs, vector))
+    if largest == 0:
+        raise InputError("is zero; expected a direction such as [1, 0, 0]")
+    norm = math.hypot(*vector)
+    if abs(norm - 1) < 1e-15:
+        return vector
+    scaled = [x / largest for x in vector]
+    norm = math.hypot(*scaled)
+    return tuple(x / norm for x in scaled)
+
+
+def _unit_quaternion(quaternion: tuple[float, ...]) -> tuple[float, ...]:
+    norm = math.hypot(*quaternion)
+    if abs(norm - 1) > 1e-3:
+        raise InputError(
+            f"has norm {norm:.4g}; expected a unit quaternion (w, x, y, z) such as [1, 0, 0, 0]"
+        )
+    sign = math.copysign(1, quaternion[0]) if quaternion[0] else 1.0
+    return tuple(sign * x for x in _unit_vector(quaternion))
+
+
+Frame = Literal["base", "tip"]
+"""The axes in which a vector is given."""
+Direction = Annotated[Vector[Number], AfterValidator(_unit_vector)]
+"""A unit vector."""
+Quaternion = Annotated[
+    tuple[Number, Number, Number, Number],
+    BeforeValidator(items_of(4)),
+    AfterValidator(_unit_quaternion),
+]
+"""A unit quaternion (w, x, y, z) with w >= 0."""

@@ -1,0 +1,181 @@
+"""What a description is: a frozen pydantic model, whose mistakes are told as sentences.
+
+The same model is the schema of a file and the description in code, see `Schema`.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Annotated, Any, TypeVar, get_args
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
+
+from stiffopt.errors import InputError, Loc, dotted, shown
+
+__all__ = ["BadKeyError", "Items", "Schema", "Vector", "explain", "items_of"]
+
+ItemT = TypeVar("ItemT")
+
+
+class BadKeyError(ValueError):
+    """Raised by a validator of a whole mapping to say which of its keys is to blame."""
+
+    def __init__(self, key: str, reason: str) -> None:
+        super().__init__(reason)
+        self.loc: Loc = tuple(int(step) if step.isdigit() else step for step in key.split("."))
+
+
+class Schema(BaseModel):
+    """Base of what is both the schema of a file and its frozen description in code.
+
+    Built in code, quantities are numbers in SI (or text with a unit) and a mistake raises
+    `InputError`. Read by `read_file`, quantities must have units and mistakes raise `FileError`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=False)
+
+    def __init__(self, /, **data: Any) -> None:
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            raise InputError(_sentence(type(self), error)) from None
+
+    # pydantic then keeps building nested models itself, so that errors know where they are.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+
+def _as_tuple(value: Any) -> Any:
+    """Let lists and arrays stand for tuples; nothing else that can be iterated over."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return tuple(value)
+    raise InputError(f"expected a list, not {shown(value)}")
+
+
+def items_of(n: int) -> Callable[[Any], Any]:
+    """Return the validator of a list of just `n` items."""
+
+    def read(value: Any) -> Any:
+        items = _as_tuple(value)
+        if len(items) != n:
+            raise InputError(f"expected {n} items, not {len(items)}")
+        return items
+
+    return read
+
+
+Items = Annotated[tuple[ItemT, ...], BeforeValidator(_as_tuple)]
+"""A list in the file, a tuple in code."""
+Vector = Annotated[tuple[ItemT, ItemT, ItemT], BeforeValidator(items_of(3))]
+"""Three items: x, y, z."""
+
+
+# pydantic's errors to sentences ------------------------------------------------------------------
+
+
+def _sentence(model: type[BaseModel], error: ValidationError) -> str:
+    """Return the message for mistakes in a call."""
+    found = (explain(model, details, None) for details in error.errors())
+    return "; also ".join(
+        f"{'.'.join(filter(None, (model.__name__, dotted(loc))))}: {reason}"
+        for loc, reason in found
+    )
+
+
+def explain(
+    model: type[BaseModel], details: ErrorDetails, data: Mapping[str, Any] | None
+) -> tuple[Loc, str]:
+    """Return where a mistake is, in the file's own terms, and what it is, as a sentence."""
+    kind, value, context = details["type"], details["input"], details.get("ctx", {})
+    raw: Loc = details["loc"]
+    error = context.get("error")
+    if isinstance(error, BadKeyError):
+        raw = (*raw, *error.loc)
+    if kind == "missing":
+        loc = _place(raw[:-1], data)
+        return loc, f"the key '{raw[-1]}' is missing"
+    loc = _place(raw, data)
+    if kind == "extra_forbidden":
+        return (*loc[:-1], str(raw[-1])), _unknown_key(model, raw)
+    if error is not None:
+        return loc, str(error)
+    if data is not None:
+        value = _at(data, loc)
+    if kind in ("model_type", "model_attributes_type", "dict_type"):
+        return loc, f"expected a mapping, not {shown(value)}"
+    if kind == "literal_error":
+        return loc, f"{shown(value)} is not one of {context['expected']}"
+    if kind in ("greater_than", "greater_than_equal", "less_than", "less_than_equal"):
+        bound = next(iter(context.values()))
+        relation = kind.replace("greater_than_equal", "at least").replace(
+            "less_than_equal", "at most"
+        )
+        return loc, f"must be {relation.replace('_', ' ')} {bound:g}, not {shown(value)}"
+    if kind == "string_too_short" or value in ("", [], ()):
+        return loc, "must not be empty"
+    if kind == "too_long":
+        return loc, f"expected at most {context['max_length']} items, not {len(value)}"
+    if kind == "string_type":
+        return loc, f"expected text, not {shown(value)}"
+    message = details["msg"]
+    return loc, f"{message[:1].lower()}{message[1:]}"
+
+
+def _place(raw: Loc, data: Mapping[str, Any] | None) -> Loc:
+    """Drop from pydantic's path what the user did not write: union tags, implied list items."""
+    steps = tuple(step for step in raw if not str(step).startswith("<"))
+    if data is None:
+        return steps
+    loc: Loc = ()
+    value: Any = data
+    for index, step in enumerate(steps):
+        if isinstance(value, dict) and isinstance(step, int):
+            continue
+        if isinstance(value, dict) and step not in value and index < len(steps) - 1:
+            continue
+        loc = (*loc, step)
+        value = _at(data, loc)
+    return loc
+
+
+def _at(data: Any, loc: Loc) -> Any:
+    for step in loc:
+        try:
+            data = data[step]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return data
+
+
+def _unknown_key(model: type[BaseModel], raw: Loc) -> str:
+    """Name the valid key that is nearest to an unknown one, or all of them."""
+    models: list[type[BaseModel]] = [model]
+    for step in raw[:-1]:
+        if isinstance(step, str) and not step.startswith("<"):
+            models = [
+                inner
+                for outer in models
+                if step in outer.model_fields
+                for inner in _models(outer.model_fields[step].annotation)
+            ]
+    known = {
+        name: None
+        for each in models
+        for name, info in each.model_fields.items()
+        if not info.exclude
+    }
+    near = difflib.get_close_matches(str(raw[-1]), known, n=1)
+    hint = f"did you mean '{near[0]}'?" if near else f"the keys here are {', '.join(known)}"
+    return f"unknown key; {hint}"
+
+
+def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models that an annotation speaks of."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _models(inner)
