@@ -60,10 +60,10 @@ def write_file(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
     text = yaml.dump(_plain(data), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
     target = Path(path)
     try:
-        target = target.resolve()
         if target.exists() and not target.is_file():
             target.write_text(text, encoding="utf-8")  # a folder (an error), a pipe, /dev/stdout
             return
+        target = target.resolve()
         with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
             part = Path(folder) / "part"
             with part.open("w", encoding="utf-8") as stream:

@@ -9,7 +9,7 @@ import numpy as np
 
 from stiffopt.cli.answer import Answer
 from stiffopt.optimise.solution import PressureSolution, Sensitivities
-from stiffopt.plots.wording import least_maximised, measures_of
+from stiffopt.plots.wording import least_maximised
 from stiffopt.units import format_quantity
 
 Record = dict[str, Any]
@@ -147,7 +147,7 @@ def _stiffnesses(answer: Answer) -> list[Record] | None:
             "boundary": measure.boundary,
         }
         for measure, value, blind in zip(
-            measures_of(solution.task), solution.stiffnesses, plain, strict=False
+            solution.task.measures, solution.stiffnesses, plain, strict=False
         )
     ] or None
 

@@ -21,7 +21,6 @@ from stiffopt.plots.wording import (
     figures,
     gain_text,
     least_maximised,
-    measures_of,
     unit_text,
     vector_text,
 )
@@ -131,7 +130,7 @@ def _stiffnesses(answer: Answer) -> Iterable[Line]:
     goal = solution.task.stiffness
     plain = answer.plain or (None,) * len(solution.stiffnesses)
     for number, (measure, value, blind) in enumerate(
-        zip(measures_of(solution.task), solution.stiffnesses, plain, strict=False)
+        zip(solution.task.measures, solution.stiffnesses, plain, strict=False)
     ):
         yield "" if number else "stiffness", _stiffness(measure, value, blind)
     if (

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.goal import AtLeast, MatchMatrix, StiffnessMeasure
+from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.terms import pose_errors
 
@@ -194,20 +194,18 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     lower, upper = task.pressure_bounds(robot.description)
     compliance = robot.tip_compliance(pressures)
     demands = True
-    stiffnesses, distance = [], None
+    stiffnesses = [_stiffness(robot, pressures, measure) for measure in task.measures]
+    distance = None
     goal = task.stiffness
     if goal is not None:
-        stiffnesses = [_stiffness(robot, pressures, measure) for measure in goal.maximise]
         if isinstance(goal.match, MatchMatrix):
             distance = _distance(goal.match, compliance, tip_pose[:3, :3])
             demands = distance <= goal.match.tolerance
         elif goal.match is not None:
-            value = _stiffness(robot, pressures, goal.match)
-            stiffnesses.append(value)
-            demands = abs(value / goal.match.value - 1) <= goal.match.tolerance
-        for floor in goal.at_least:
-            stiffnesses.append(_stiffness(robot, pressures, floor))
-            demands = demands and stiffnesses[-1] >= floor.value
+            demands = abs(stiffnesses[0] / goal.match.value - 1) <= goal.match.tolerance
+        floored = stiffnesses[len(stiffnesses) - len(goal.at_least) :]
+        for floor, value in zip(goal.at_least, floored, strict=True):
+            demands = demands and value >= floor.value
     return Judgement(
         tip_pose=tip_pose,
         position_error=errors["position"].error if "position" in errors else None,
@@ -234,7 +232,7 @@ def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str
     return found
 
 
-def _stiffness(robot: Manipulator, pressures: Vector, measure: StiffnessMeasure | AtLeast) -> float:
+def _stiffness(robot: Manipulator, pressures: Vector, measure: StiffnessMeasure) -> float:
     value: Any = robot.stiffness(
         pressures, measure.direction, measure.kind, measure.boundary, measure.frame
     )

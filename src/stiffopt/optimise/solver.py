@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise import diagnosis
-from stiffopt.optimise.goal import MatchValue
 from stiffopt.optimise.local import LocalResult, descend, reach
 from stiffopt.optimise.problem import BAR, Problem
 from stiffopt.optimise.search import SampleTable, Search, search, starts
@@ -196,7 +195,7 @@ class PressureSolver:
             angle_error=judgement.angle_error,
             compliance=judgement.compliance,
             stiffness=judgement.stiffnesses[0] if judgement.stiffnesses else None,
-            stiffness_unit=_unit(task),
+            stiffness_unit=task.measures[0].unit if task.measures else None,
             stiffnesses=judgement.stiffnesses,
             matrix_distance=judgement.matrix_distance,
             active_bounds=tuple(active),
@@ -224,11 +223,9 @@ class PressureSolver:
         prices = result.multipliers
         if prices is None:
             return None
-        goal = problem.task.stiffness
         gradient = None
-        if goal is not None and judgement.stiffnesses:
-            match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
-            first = (*goal.maximise, *match, *goal.at_least)[0]
+        if problem.task.measures:
+            first = problem.task.measures[0]
             gradient = self.robot.stiffness_gradient(
                 pressures, first.direction, first.kind, first.boundary, first.frame
             )
@@ -288,13 +285,3 @@ def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> Press
 
 def _clean(price: float) -> float:
     return price if price > _PRICE_OF_NOTHING else 0.0
-
-
-def _unit(task: Task) -> str | None:
-    """Unit of the first stiffness that a task names."""
-    goal = task.stiffness
-    if goal is None:
-        return None
-    match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
-    measures = (*goal.maximise, *match, *goal.at_least)
-    return measures[0].unit if measures else None

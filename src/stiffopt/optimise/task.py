@@ -25,7 +25,7 @@ from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.directions import Frame
-from stiffopt.optimise.goal import StiffnessGoal
+from stiffopt.optimise.goal import MatchValue, StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import Force, Moment, Pressure, read_from_file
@@ -96,6 +96,15 @@ class Task(Schema):
         if read_from_file(info):
             raise PydanticKnownError("extra_forbidden")
         return value
+
+    @property
+    def measures(self) -> tuple[StiffnessMeasure, ...]:
+        """All directional stiffnesses that are named: maximised, then matched, then floors."""
+        goal = self.stiffness
+        if goal is None:
+            return ()
+        match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
+        return (*goal.maximise, *match, *goal.at_least)
 
     def resolve_robot(self) -> RobotDescription:
         """Return the robot; a relative path starts at the task file's folder.

@@ -11,7 +11,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.style import MM
-from stiffopt.plots.wording import direction_text, figures, measures_of, unit_text
+from stiffopt.plots.wording import direction_text, figures, unit_text
 
 Vector = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ class _Scene:
 
     def draw_directions(self) -> None:
         """An arrow along each direction in which stiffness is asked for."""
-        pairs = zip(measures_of(self.solution.task), self.solution.stiffnesses, strict=False)
+        pairs = zip(self.solution.task.measures, self.solution.stiffnesses, strict=False)
         for number, (measure, value) in enumerate(pairs):
             shade = style.DIRECTIONS[number % len(style.DIRECTIONS)]
             way = np.asarray(measure.direction)

@@ -15,7 +15,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots.arm import draw_arm
 from stiffopt.plots.panels import draw_pareto, draw_pressures
-from stiffopt.plots.wording import direction_text, figures, gain_text, measures_of, unit_text
+from stiffopt.plots.wording import direction_text, figures, gain_text, unit_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -182,7 +182,7 @@ def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
             f"{degrees(solution.angle_error):.3g} deg (tolerance {degrees(tolerance.angle):g} deg)"
         )
     if solution.stiffness is not None:
-        measure = measures_of(solution.task)[0]
+        measure = solution.task.measures[0]
         compared = (
             ""
             if plain is None

@@ -2,18 +2,8 @@
 
 from collections.abc import Iterable
 
-from stiffopt.optimise.goal import MatchValue, StiffnessMeasure
+from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
-from stiffopt.optimise.task import Task
-
-
-def measures_of(task: Task) -> tuple[StiffnessMeasure, ...]:
-    """Return all stiffnesses that a task names, in the order of a solution's `stiffnesses`."""
-    goal = task.stiffness
-    if goal is None:
-        return ()
-    match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
-    return (*goal.maximise, *match, *goal.at_least)
 
 
 def least_maximised(solution: PressureSolution) -> float | None:
