@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.optimise.problem import Objective, Point, Problem
+from stiffopt.optimise.problem import FLOOR_MARGIN, Objective, Point, Problem
 from stiffopt.optimise.terms import Ball
 
 Vector = NDArray[np.float64]
@@ -77,6 +77,11 @@ class LocalResult:
     converged: bool
     objective: Objective
     multipliers: Multipliers | None
+
+    @property
+    def holds_floors(self) -> bool:
+        """Whether no floor is missed by more than the margin that is aimed above it."""
+        return self.violation < 0.5 * FLOOR_MARGIN
 
 
 def solve_qp(

@@ -91,7 +91,7 @@ class PressureSolver:
         found = search(problem, self._starts(problem), most)
         if not found.results:
             return self._closest(problem, found)
-        if problem.floors and found.results[0].violation > 0:
+        if problem.floors and not found.results[0].holds_floors:
             return self._without_floors(problem, found)
         return self._first_that_holds(problem, found)
 
@@ -101,7 +101,7 @@ class PressureSolver:
         if point is None or not point.reached:
             return None
         result = descend(problem, point)
-        if not result.converged or result.violation > 0:
+        if not result.converged or not result.holds_floors:
             return None
         solution = self._solution(problem, result, Confidence(1, 1, 1, 1, complete=False))
         return solution if solution.found else None
@@ -157,7 +157,7 @@ class PressureSolver:
         best = search(nearest, candidates, len(found.results))
         if best.results and best.results[0].value <= 0:
             again = search(problem, iter([best.results[0].point.x]), 1)
-            if again.results and again.results[0].violation <= 0:
+            if again.results and again.results[0].holds_floors:
                 return self._first_that_holds(problem, again)
         return self._first_that_holds(nearest, best if best.results else found)
 
