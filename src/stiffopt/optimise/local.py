@@ -28,6 +28,8 @@ _FIRST_RADIUS = 0.3  # of the trust region, in bar
 _LAST_RADIUS = 1e-6
 _INSIDE = 1 - 1e-7  # share of a ball's radius that is used, so that rounding stays within
 _TOUCHING = 1e-5  # bar; a pressure that near to a limit is meant to be at it
+_BINDING = 1e-4  # how nearly, relatively, a constraint must hold to count as binding
+_BEYOND = 1e-3  # bar; where the price of a limit is taken, outside of it
 _FAR = 1e6  # stands for no bound in the quadratic program
 
 
@@ -191,6 +193,7 @@ def descend(problem: Problem, start: Point) -> LocalResult:
             converged = abs(promised) < 1e3 * objective.precision
             break
     point = _snapped(problem, point)
+    multipliers = _prices(problem, point) or multipliers
     return LocalResult(
         point, objective.value(point), violation(problem, point), converged, objective, multipliers
     )
@@ -211,6 +214,54 @@ def _snapped(problem: Problem, point: Point) -> Point:
         return point
     worse = problem.objective.value(moved) - problem.objective.value(point)
     return moved if worse < 100 * problem.objective.precision else point
+
+
+def _prices(problem: Problem, point: Point) -> Multipliers | None:
+    """Multipliers at a solution: those that leave the least of the Lagrangian's gradient.
+
+    Each constraint that binds pulls with a weight that is not negative; the weights of the
+    objective's largest terms sum to one.
+    """
+    values, gradients = problem.objective.terms(point)
+    n = len(point.x)
+    columns: list[Vector] = []
+    top = [i for i, value in enumerate(values) if value > values.max() - _BINDING]
+    columns += [gradients[i] for i in top]
+    floors = [
+        i for i, (k, bound) in enumerate(problem.floors) if point.values[k] < bound + _BINDING
+    ]
+    columns += [-point.gradients[problem.floors[i][0]] for i in floors]
+    balls = [ball for ball in point.constraints if ball.error > (1 - _BINDING) * ball.radius]
+    columns += [ball.residual / ball.error @ ball.jacobian for ball in balls]
+    sides = [(i, -1.0) for i in range(n) if point.x[i] <= problem.lower[i]]
+    sides += [(i, 1.0) for i in range(n) if point.x[i] >= problem.upper[i]]
+    columns += [side * np.eye(n)[i] for i, side in sides]
+    A = np.column_stack(columns)
+    total = (np.arange(len(columns)) < len(top)).astype(float)[np.newaxis]
+    low = np.concatenate([np.zeros(len(columns)), [1.0]])
+    high = np.concatenate([np.full(len(columns), _FAR), [1.0]])
+    H = A.T @ A
+    H += 1e-12 * np.trace(H) * np.eye(len(H)) + 1e-300 * np.eye(len(H))
+    answer = solve_qp(H, np.zeros(len(columns)), total, low, high)
+    if answer is None:
+        return None
+    weights = iter(np.maximum(answer[0], 0.0))
+    terms, held, bounds = np.zeros(len(values)), np.zeros(len(problem.floors)), np.zeros(n)
+    for i in top:
+        terms[i] = next(weights)
+    for i in floors:
+        held[i] = next(weights)
+    pulls = {ball.name: np.zeros(len(ball.residual)) for ball in point.constraints}
+    for ball in balls:
+        pulls[ball.name] = next(weights) * ball.residual / ball.error
+    prices = Multipliers(bounds, pulls, terms, held)
+    for (i, side), weight in zip(sides, weights, strict=True):
+        # a little beyond the limit: the norm law has a kink where a segment is unpressurised
+        beyond = point.x + side * _BEYOND * np.eye(n)[i]
+        moved = _attempt(problem, beyond, pose_only=False)
+        slope = _slope(problem, moved, prices)[i] if moved is not None else -side * weight
+        bounds[i] += side * max(0.0, -side * float(slope))
+    return prices
 
 
 def violation(problem: Problem, point: Point) -> float:

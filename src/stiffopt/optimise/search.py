@@ -1,9 +1,10 @@
 """Global search: where to start local optimisations, and when to stop.
 
 Starts come from a table of sampled configurations: of those whose tip is nearest to the target
-the stiffest first, each unlike the ones before it.  The search stops when the Bayesian estimate
-of Boender and Rinnooy Kan (Math. Programming 37, 1987) expects fewer than half a local optimum
-to be unseen: with w distinct optima after n local searches, ``w (n - 1) / (n - w - 2) < w + 1/2``.
+the stiffest first, in turn with the nearest and with ones from anywhere, each unlike the ones
+before it.  The search stops when the Bayesian estimate of Boender and Rinnooy Kan (Math.
+Programming 37, 1987) expects fewer than a quarter of a local optimum to be unseen: with w
+distinct optima after n local searches, ``w (n - 1) / (n - w - 2) < w + 1/4``.
 """
 
 from collections.abc import Iterator
@@ -30,7 +31,7 @@ _FREE_SAMPLES = 4096
 _LOADED_SAMPLES = 128  # an equilibrium takes a thousand times longer than a closed form
 _HOPELESS_SAMPLES = 16  # if none of so many first ones has an equilibrium, the arm has none
 _RANKED = 32  # nearest samples that are ranked by their objective
-_FEWEST_STARTS = 4
+_UNSEEN = 0.25  # local optima that may be expected to be unseen when the search stops
 
 
 class SampleTable:
@@ -116,9 +117,9 @@ def starts(problem: Problem, table: SampleTable) -> Iterator[Vector]:
     ranked = list(order[:_RANKED])
     if not problem.robot.is_loaded and problem.task.stiffness is not None:
         ranked.sort(key=lambda i: problem.objective.value(problem.point(table.x[i])))
-    # every other start by its objective, the others by its distance from the target
-    mixed = [i for pair in zip(ranked, order[: len(ranked)], strict=True) for i in pair]
-    mixed += list(order[_RANKED:])
+    # in turn: a near one that is good, the nearest one left, and one from anywhere
+    mixed = [i for trio in zip(ranked, order, range(len(order)), strict=False) for i in trio]
+    mixed += list(order)
     apart = 0.2 * float(np.linalg.norm(problem.upper - problem.lower))
     given: list[Vector] = []
     later: list[int] = []
@@ -203,6 +204,6 @@ def _distinct(results: list[LocalResult]) -> list[LocalResult]:
 def _seen_all(results: list[LocalResult], problem: Problem) -> bool:
     """Stopping rule of Boender and Rinnooy Kan."""
     n, w = len(results), len(_distinct(results))
-    if n < _FEWEST_STARTS or n - w - 2 <= 0:
+    if n - w - 2 <= 0:
         return False
-    return w * (n - 1) / (n - w - 2) < w + 0.5
+    return w * (n - 1) / (n - w - 2) < w + _UNSEEN

@@ -35,7 +35,7 @@ class Confidence:
         Distinct local optima among them.
     complete : bool
         Whether the stopping rule was met: by the Bayesian estimate of Boender and Rinnooy Kan
-        fewer than half an optimum is expected to be unseen.  False: the search ended at its
+        fewer than a quarter of an optimum is expected to be unseen.  False: the search ended at its
         largest number of starts.
     """
 
