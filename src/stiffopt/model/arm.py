@@ -160,7 +160,7 @@ class Arm:
         results = (
             np.stack([self._at_equilibrium(function, row) for row in batch])
             if self.is_loaded
-            else evaluate_many(function, batch)
+            else evaluate_many(function, batch)[0]
         )
         return results[0] if single else results
 
@@ -281,6 +281,10 @@ class Evaluator:
         """Equilibrium at the last evaluation; None for an arm without loads."""
         return self._state
 
+    def many(self, batch: Vector, *parameters: Vector) -> list[Vector]:
+        """Outputs at checked pressures (N, n) of an arm without loads, each (N, rows, columns)."""
+        return evaluate_many(self._function, batch, *(parameters or (np.zeros(0),)))
+
     def __call__(self, p: Vector, *parameters: Vector) -> list[Vector]:
         """Outputs at checked pressures (n,) and parameters, as 2-D arrays."""
         parameters = parameters or (np.zeros(0),)
@@ -292,13 +296,16 @@ class Evaluator:
         return [value.full() for value in self._function.call([*inputs, *parameters])]
 
 
-def evaluate_many(function: ca.Function, batch: Vector) -> Vector:
-    """Evaluate a function of (n,) with one output (r, c) on (N, n): (N, r, c)."""
-    rows, columns = function.size1_out(0), function.size2_out(0)
+def evaluate_many(function: ca.Function, batch: Vector, *parameters: Vector) -> list[Vector]:
+    """Outputs (r, c) of a function of (n,) and parameters, for a batch (N, n): each (N, r, c)."""
+    shapes = [function.size_out(index) for index in range(function.n_out())]
     if not len(batch):
-        return np.empty((0, rows, columns))
-    wide = function(batch.T).full()  # (r, N c)
-    return np.ascontiguousarray(wide.reshape(rows, len(batch), columns).swapaxes(0, 1))
+        return [np.empty((0, *shape)) for shape in shapes]
+    wide = function.call([batch.T, *parameters])  # each (r, N c)
+    return [
+        np.ascontiguousarray(value.full().reshape(rows, len(batch), columns).swapaxes(0, 1))
+        for value, (rows, columns) in zip(wide, shapes, strict=True)
+    ]
 
 
 def _tip_load(force: ArrayLike, moment: ArrayLike, frame: Frame) -> Vector:

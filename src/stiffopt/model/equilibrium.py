@@ -36,6 +36,11 @@ class Loads(NamedTuple):
     tip: Vector
     station: Vector
 
+    @property
+    def are_conservative(self) -> bool:
+        """Whether all are dead forces, which have a potential."""
+        return not (self.tip[3:].any() or self.station[3:].any())
+
 
 class State(NamedTuple):
     """An equilibrium: the tip's orientation (w, x, y, z), from which all else follows.
@@ -70,7 +75,9 @@ class Equilibrium:
                 function = newton_step(self.shooting, at)
             else:
                 chain = self.shooting.chain(at)
-                function = ca.Function(name, chain.inputs, [chain.rotational_compliances])
+                function = ca.Function(
+                    name, chain.inputs, [chain.rotational_compliances, chain.base_turn]
+                )
             self._functions[name, at] = function
         return self._functions[name, at]
 
@@ -97,13 +104,23 @@ class Equilibrium:
         return None
 
     def is_stable(self, state: State, at: float | None = None) -> bool:
-        """Whether an equilibrium is a minimum of the energy (Jacobi's condition)."""
-        blocks = self._function("stability", at)(*self.arguments(state)).full()
-        if not np.isfinite(blocks).all():
+        """Whether an equilibrium is a minimum of the energy (Jacobi's condition).
+
+        Follower loads and moments have no energy.  There what counts is that the arm has not
+        passed a divergence, where turns of the tip leave the base unturned and beyond which they
+        turn it the wrong way round.  Flutter is not looked for.
+        """
+        blocks, base_turn = (
+            part.full() for part in self._function("stability", at)(*self.arguments(state))
+        )
+        if not (np.isfinite(blocks).all() and np.isfinite(base_turn).all()):
             return False
-        compliances = blocks.T.reshape(-1, 3, 3)
-        eigenvalues = np.linalg.eigvalsh(compliances + compliances.swapaxes(1, 2))
-        return bool((eigenvalues > 0).all())
+        compliances = blocks.T.reshape(-1, 3, 3)  # from the tip to the base
+        if state.loads.are_conservative:
+            symmetric = (compliances + compliances.swapaxes(1, 2)) / 2
+            return bool((np.linalg.eigvalsh(symmetric) > 0).all())
+        eigenvalues = np.linalg.eigvals(base_turn)
+        return not (eigenvalues.real <= -np.abs(eigenvalues.imag)).any()
 
     def follow(
         self,

@@ -99,7 +99,11 @@ class Manipulator(Arm):
 
     def tip_compliance(self, p: ArrayLike) -> Vector:
         """Compliance of the tip in tip axes (eq. 17, or tangent), (6, 6), linear first."""
-        return self._evaluate("compliance", lambda tip: tip.compliance, p)
+        C = self._evaluate("compliance", lambda tip: tip.compliance, p)
+        if self.is_loaded and self._loads.are_conservative:
+            # symmetric but for the integrator's error of about 1e-6
+            C = (C + np.swapaxes(C, -1, -2)) / 2
+        return C
 
     def compliance(self, p: ArrayLike, at: float) -> Vector:
         """Compliance (6, 6) at arc length `at` (m, at rest), in the axes of that point."""

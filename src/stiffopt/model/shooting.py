@@ -15,7 +15,7 @@ Everything else follows from the same map by the implicit function theorem.
 The integrator is the eleven-stage Runge-Kutta method of order eight of Cooper and Verner
 (SIAM J. Numer. Anal. 9, 1972).
 
-Stability is Jacobi's condition: the energy is at a minimum if and only if no shorter arm, clamped
+Stability under conservative loads is Jacobi's condition: the energy is at a minimum if and only if no shorter arm, clamped
 anywhere between tip and base, is at the point of buckling.  At that point a moment at the tip
 turns it without bound, and beyond it turns it the wrong way round: so the rotational compliance
 of every shorter arm must be positive definite.
@@ -86,8 +86,8 @@ _STAGES: tuple[dict[int, float], ...] = (
 )
 _WEIGHTS: dict[int, float] = {0: 1 / 20, 7: 49 / 180, 8: 16 / 45, 9: 49 / 180, 10: 1 / 20}
 
-STEPS_PER_SEGMENT = 2
-"""Integration steps per segment at resolution 1."""
+STEP_LENGTH = 3.0
+"""Longest integration step at resolution 1, in outer radii of the segment at rest."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +209,12 @@ class Chain:
         return change[:, 3:-6] + change[:, :3] @ self._turn_per_rest[:, :-6]
 
     @property
+    def base_turn(self) -> ca.MX:
+        """Turn of the base (3, 3) per turn of the tip, in base axes: the identity if unloaded."""
+        per_turn = _turn_between(self.nodes[-1], ca.jacobian(self.nodes[-1], self.x)[:, :3])
+        return per_turn @ lie.rotation_from_quaternion(self.tip_quaternion).T
+
+    @property
     def rotational_compliances(self) -> ca.MX:
         """Rotation of the tip per moment at it, side by side (3, 3 k), in tip axes.
 
@@ -240,7 +246,7 @@ class Shooting:
         self, description: RobotDescription, actuation: Actuation, resolution: int = 1
     ) -> None:
         self.description = description
-        self.steps = STEPS_PER_SEGMENT * resolution
+        self.resolution = resolution
         self._geometry = [SectionGeometry.of(segment) for segment in description.segments]
         self.sections = ca.Function(
             "sections",
@@ -266,7 +272,8 @@ class Shooting:
                 marks = [start, *sorted(c for c in cuts if start < c < end), end]
                 for near, far in pairwise(marks):
                     if far > near:
-                        steps = max(1, ceil(self.steps * (far - near) / segment.length - 1e-9))
+                        longest = STEP_LENGTH * segment.outer_radius / self.resolution
+                        steps = max(1, ceil((far - near) / longest - 1e-9))
                         pieces.append(Piece(index, rigid, far - near, steps, far))
                 start = end
         return pieces[::-1]

@@ -138,6 +138,12 @@ class Problem:
         self._pose.restart(self._full.state)
         return self._point(x, *outputs)
 
+    def objective_values(self, xs: Vector) -> Vector:
+        """Objective (N,) at many pressures (N, n) of an arm without loads."""
+        outputs = self._full.many(xs * BAR, self._parameters)
+        points = (self._point(x, *row) for x, *row in zip(xs, *outputs, strict=True))
+        return np.array([self.objective.value(point) for point in points])
+
     def _point(
         self,
         x: Vector,

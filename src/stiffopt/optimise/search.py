@@ -30,7 +30,7 @@ SAME_OPTIMUM = 1e-3
 _FREE_SAMPLES = 4096
 _LOADED_SAMPLES = 128  # an equilibrium takes a thousand times longer than a closed form
 _HOPELESS_SAMPLES = 16  # if none of so many first ones has an equilibrium, the arm has none
-_RANKED = 32  # nearest samples that are ranked by their objective
+_RANKED = 256  # nearest samples that are ranked by their objective
 _UNSEEN = 0.25  # local optima that may be expected to be unseen when the search stops
 
 
@@ -114,9 +114,9 @@ def _settled(robot: Manipulator, x: Vector) -> tuple[Vector, Vector]:
 def starts(problem: Problem, table: SampleTable) -> Iterator[Vector]:
     """Pressures to start from: near the target, promising, and unlike each other."""
     order = table.nearest_first(problem.task.target, problem.robot.length)
-    ranked = list(order[:_RANKED])
+    ranked = order[:_RANKED]
     if not problem.robot.is_loaded and problem.task.stiffness is not None:
-        ranked.sort(key=lambda i: problem.objective.value(problem.point(table.x[i])))
+        ranked = ranked[np.argsort(problem.objective_values(table.x[ranked]), kind="stable")]
     # in turn: a near one that is good, the nearest one left, and one from anywhere
     mixed = [i for trio in zip(ranked, order, range(len(order)), strict=False) for i in trio]
     mixed += list(order)
