@@ -17,7 +17,7 @@ from functools import cache, lru_cache
 from numbers import Real
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BeforeValidator, Field, PlainSerializer, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, ValidationInfo
 
 from stiffopt.errors import InputError, shown
 
@@ -46,6 +46,7 @@ __all__ = [
     "format_quantity",
     "parse_quantity",
     "read_from_file",
+    "within",
 ]
 
 FROM_FILE = {"from_file": True}
@@ -236,6 +237,19 @@ def _writer(kind: _Kind) -> PlainSerializer:
         return format_quantity(value, kind.unit, kind.written)
 
     return PlainSerializer(write, return_type=str, when_used="json")
+
+
+def within(limit: float, unit: str) -> AfterValidator:
+    """Return the validator that refuses magnitudes beyond a limit, both in SI."""
+
+    def check(value: float) -> float:
+        if abs(value) > limit:
+            raise InputError(
+                f"{value:g} {unit} is out of range; expected -{limit:g} {unit} to {limit:g} {unit}"
+            )
+        return value
+
+    return AfterValidator(check)
 
 
 _FINITE = Field(allow_inf_nan=False)

@@ -151,8 +151,9 @@ class PaperLaw(StrainLaw):
 
     ``lambda_E = E + slope |p|``, ``lambda_A = a A``, ``lambda_I = i I``; elongation
     ``f_z l / (E A)``; curvature ``M / (E I)`` per *deformed* length, and the compliance of
-    eq. 17 integrated over deformed length (slip 8 of the notes).  The compensation of the
-    second moment acts about the centroid.
+    eq. 17 integrated over deformed length (slip 8 of the notes).  Where the centroid is off the
+    axis, which the paper does not treat, all this holds for the line of centroids, and the
+    compensated second moment is that about the centroid.
     """
 
     limit = "the pressure drives the compensated modulus of this segment to zero"
@@ -207,7 +208,8 @@ class NeoHookeanLaw(StrainLaw):
     * bending stiffness ``E_t I a^2``, moment ``a sum P A_c r``,
     * shear stiffness ``mu A`` and torsional stiffness ``mu J a^2``,
 
-    all exact to first order in curvature.
+    exact for the strain to first order in curvature, and for the compliance where the segment
+    is straight; the coupling of stretch and bending that grows with curvature is left out.
     """
 
     limit = "the pressure compresses this segment beyond the neo-Hookean law's range"

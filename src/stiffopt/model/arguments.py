@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.compliance import Boundary, Frame, Kind
+from stiffopt.model.numeric import checked_vector, length_and_unit
 from stiffopt.model.screws import Wrench
 
 Vector = NDArray[np.float64]
@@ -24,30 +25,18 @@ class Measure(NamedTuple):
 def checked_measure(direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame) -> Measure:
     """Directional stiffness from arguments; the direction need not be of unit length."""
     vector = checked_vector("direction", direction)
-    length = np.linalg.norm(vector)
-    if not length > 0:
+    if not vector.any():
         raise InputError("direction must not be zero")
     check_choice("kind", kind, get_args(Kind))
     check_choice("boundary", boundary, get_args(Boundary))
     check_choice("frame", frame, get_args(Frame))
-    return Measure(tuple((vector / length).tolist()), kind, boundary, frame)
+    return Measure(tuple(length_and_unit(vector)[1].tolist()), kind, boundary, frame)
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
     """Raise unless a value is one of the choices."""
-    if value not in choices:
+    if not isinstance(value, str) or value not in choices:
         raise InputError(f"unknown {name} {value!r}; choose one of {', '.join(choices)}")
-
-
-def checked_vector(name: str, value: ArrayLike, size: int = 3) -> Vector:
-    """Finite vector (size,) from an argument."""
-    try:
-        vector = np.asarray(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} must be {size} numbers; got {value!r}") from error
-    if vector.shape != (size,) or not np.isfinite(vector).all():
-        raise InputError(f"{name} must be {size} finite numbers; got {value!r}")
-    return vector
 
 
 def checked_wrench(value: "ArrayLike | Wrench") -> Vector:

@@ -5,7 +5,6 @@
 """
 
 from collections.abc import Callable, Hashable
-from copy import copy
 from functools import cached_property
 from typing import Any, Self
 
@@ -14,15 +13,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
-from stiffopt.errors import InputError, PressureError
+from stiffopt.errors import EquilibriumError, InputError, PressureError, shown
 from stiffopt.model.actuation import strain_law
-from stiffopt.model.arguments import checked_vector, dead_and_follower
+from stiffopt.model.arguments import dead_and_follower
 from stiffopt.model.compliance import Frame
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.equilibrium import Equilibrium, Loads, State
 from stiffopt.model.kinematics import Actuation
+from stiffopt.model.numeric import (
+    checked_integer,
+    checked_number,
+    checked_vector,
+    real_numbers,
+)
 from stiffopt.model.shape import FreeShape, Shape
-from stiffopt.model.shooting import Shooting
+from stiffopt.model.shooting import SAME_STATION, Shooting
 
 Vector = NDArray[np.float64]
 Values = Callable[[Shape], Any]
@@ -40,10 +45,10 @@ class Arm:
         load_frame: Frame = "base",
         resolution: int = 1,
     ) -> None:
-        if isinstance(resolution, bool) or not isinstance(resolution, int) or resolution < 1:
-            raise InputError(f"resolution must be a positive integer; got {resolution!r}")
+        if not isinstance(description, RobotDescription):
+            raise InputError(f"expected a RobotDescription, not {shown(description)}")
         self.description = description
-        self.resolution = resolution
+        self.resolution = checked_integer("resolution", resolution, 1)
         self._tip_load = _tip_load(force, moment, load_frame)
         self._actuation = Actuation.of(description)
         self._functions: dict[Hashable, ca.Function] = {}
@@ -88,9 +93,22 @@ class Arm:
         self, force: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0), frame: Frame = "base"
     ) -> Self:
         """The same arm with this load at its tip, instead of any that it carries now."""
-        other = copy(self)  # shares what is compiled: loads are arguments of it
+        other = self.__copy__()
         other._tip_load = _tip_load(force, moment, frame)
         return other
+
+    def __copy__(self) -> Self:
+        """The same arm; what is compiled is shared, since loads are arguments of it."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Support pickling: compiled functions are left behind and made anew."""
+        dead, follower = self._tip_load[:6], self._tip_load[6:]
+        frame = "tip" if follower.any() else "base"
+        wrench = tuple((follower if follower.any() else dead).tolist())
+        return _rebuild, (type(self), self.description, wrench, frame, self.resolution)
 
     # -- for the optimiser ------------------------------------------------------------------
 
@@ -158,7 +176,7 @@ class Arm:
         batch, single = self._pressures(p)
         function = self._function(key, lambda shape: [ca.densify(value(shape))], at)
         results = (
-            np.stack([self._at_equilibrium(function, row) for row in batch])
+            _stacked([self._at_equilibrium(function, row) for row in batch], function.size_out(0))
             if self.is_loaded
             else evaluate_many(function, batch)[0]
         )
@@ -170,21 +188,28 @@ class Arm:
         return value
 
     def settle(self, p: Vector, nearby: State | None = None) -> State:
-        """Equilibrium of the loaded arm at pressures (n,); from a nearby one where that helps.
+        """Equilibrium of the loaded arm at pressures (n,), from rest or from a nearby one.
 
         What is found from a nearby one is not checked for stability.
 
         Raises
         ------
         EquilibriumError
-            If there is none that is stable and reached continuously from rest.
+            If there is none that is reached continuously (and, from rest, stable).
         """
-        if nearby is not None:
-            end = nearby._replace(pressures=p, loads=self._loads)
-            state, share = self._equilibrium.follow(nearby, end, shortest=0.1, stable=False)
-            if share == 1.0:
-                return state
-        return self._equilibrium.settle(p, self._loads)
+        if nearby is None:
+            return self._equilibrium.settle(p, self._loads)
+        end = nearby._replace(pressures=p, loads=self._loads)
+        path = self._equilibrium.follow(nearby, end, shortest=0.1, stable=False)
+        if path.share < 1.0:
+            raise EquilibriumError("no equilibrium was found on the way from the nearby one")
+        return path.state
+
+    def _shapes(self, p: ArrayLike, stations: Vector) -> Vector:
+        """Poses (k, 4, 4) or (N, k, 4, 4) at arc lengths (k,) for one or many pressures."""
+        batch, single = self._pressures(p)
+        shapes = _stacked([self._shape(row, stations) for row in batch], (len(stations), 4, 4))
+        return shapes[0] if single else shapes
 
     def _shape(self, p: Vector, stations: Vector) -> Vector:
         """Poses (k, 4, 4) at arc lengths (k,)."""
@@ -207,8 +232,8 @@ class Arm:
     def _pressures(self, p: ArrayLike) -> tuple[Vector, bool]:
         """Checked pressures (N, n), and whether a single set was given."""
         try:
-            values = np.asarray(p, dtype=float)
-        except (TypeError, ValueError) as error:
+            values = real_numbers(p)
+        except ValueError as error:
             raise PressureError(f"pressures must be numbers in Pa; got {p!r}") from error
         if values.ndim not in (1, 2) or values.shape[-1] != self.n_pressures:
             raise PressureError(
@@ -248,16 +273,20 @@ class Arm:
         return np.where(np.abs(low) > np.abs(high), low, high)
 
     def _station(self, at: float | None) -> float | None:
-        return None if at is None or at == self.length else self._arc_length(at)
+        if at is None:
+            return None
+        value = self._arc_length(at)
+        return None if value == self.length else value
 
     def _arc_length(self, at: float, base_too: bool = False) -> float:
-        value = float(at)
-        if not (0 <= value <= self.length * (1 + 1e-12)) or (value == 0 and not base_too):
+        value = checked_number("arc length", at)
+        slack = SAME_STATION * self.length
+        if not (0 if base_too else slack) <= value <= self.length + slack:
             raise InputError(
                 f"arc length {value:g} m is not on the arm: between {'' if base_too else 'above '}"
                 f"0 and {self.length:g} m at rest"
             )
-        return min(value, self.length)
+        return self.length if value > self.length - slack else value
 
 
 class Evaluator:
@@ -296,6 +325,11 @@ class Evaluator:
         return [value.full() for value in self._function.call([*inputs, *parameters])]
 
 
+def _stacked(results: list[Vector], shape: tuple[int, ...]) -> Vector:
+    """Results of this shape as one array (N, ...), N may be 0."""
+    return np.array(results).reshape(len(results), *shape)
+
+
 def evaluate_many(function: ca.Function, batch: Vector, *parameters: Vector) -> list[Vector]:
     """Outputs (r, c) of a function of (n,) and parameters, for a batch (N, n): each (N, r, c)."""
     shapes = [function.size_out(index) for index in range(function.n_out())]
@@ -311,3 +345,15 @@ def evaluate_many(function: ca.Function, batch: Vector, *parameters: Vector) -> 
 def _tip_load(force: ArrayLike, moment: ArrayLike, frame: Frame) -> Vector:
     wrench = [checked_vector("force", force), checked_vector("moment", moment)]
     return dead_and_follower(np.concatenate(wrench), frame)
+
+
+def _rebuild(
+    kind: type[Arm],
+    description: RobotDescription,
+    wrench: tuple[float, ...],
+    frame: Frame,
+    resolution: int,
+) -> Arm:
+    """The arm that was pickled."""
+    force, moment = wrench[:3], wrench[3:]
+    return kind(description, force=force, moment=moment, load_frame=frame, resolution=resolution)

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.lifted import newton_step
-from stiffopt.model.shooting import Shooting
+from stiffopt.model.shooting import SAME_STATION, Shooting
 
 Vector = NDArray[np.float64]
 
 _LARGEST_TURN = 1.0  # rad of tip rotation in one continuation step; a longer one is halved
-_SHORTEST_STEP = 1e-4  # of the way from rest; less means that the path has ended
+_SHORTEST_STEP = 1e-3  # of the way from rest; less means that the path has ended
 _QUADRATIC = 1e-6  # rad; after a correction this small, convergence being quadratic, 1e-12 is left
 _MOST_ITERATIONS = 12
 
@@ -55,13 +55,31 @@ class State(NamedTuple):
     loads: Loads
 
 
+class Path(NamedTuple):
+    """How far an equilibrium could be followed.
+
+    Attributes
+    ----------
+    state : State
+        The last one that was found.
+    share : float
+        Of the way that it is at; 1.0 means arrived.
+    unstable : bool
+        Whether the path ends because stability is lost there.
+    """
+
+    state: State
+    share: float
+    unstable: bool
+
+
 class Equilibrium:
     """Numerical equilibria of one shooting problem."""
 
     def __init__(self, shooting: Shooting) -> None:
         self.shooting = shooting
         self._functions: dict[tuple[str, float | None], ca.Function] = {}
-        self._rest: dict[tuple[bytes, float | None], tuple[State, float]] = {}
+        self._rest: dict[tuple[bytes, float | None], Path] = {}
 
     def arguments(self, state: State) -> tuple[Vector, ...]:
         """Numbers for the inputs of a `Chain` at an equilibrium."""
@@ -129,25 +147,27 @@ class Equilibrium:
         at: float | None = None,
         shortest: float = _SHORTEST_STEP,
         stable: bool = True,
-    ) -> tuple[State, float]:
+    ) -> "Path":
         """Equilibrium reached continuously between two sets of pressures and loads.
 
-        Returns the last stable state on the straight way from `start` to `end` (whose
-        shape is not used) and the share of the way that it is at; 1.0 means arrived.
-        Steps get no shorter than the share `shortest`; stability is checked if `stable`.
+        Goes the straight way from `start` to `end` (whose shape is not used) in steps no shorter
+        than the share `shortest`; stability is checked if `stable`.
         """
         state, share, step = start, 0.0, 1.0
+        halved = unstable = False
         while share < 1.0:
             target = min(1.0, share + step)
             pressures, loads = _between(start, end, target)
             corrected = self.correct(state._replace(pressures=pressures, loads=loads), at)
-            if corrected is None or (stable and not self.is_stable(corrected, at)):
-                step /= 2
+            unstable = corrected is not None and stable and not self.is_stable(corrected, at)
+            if corrected is None or unstable:
+                step, halved = step / 2, True
                 if step < shortest:
-                    return state, share
+                    return Path(state, share, unstable)
             else:
-                state, share, step = corrected, target, 2 * step
-        return state, 1.0
+                state, share = corrected, target
+                step, halved = step if halved else 2 * step, False
+        return Path(state, 1.0, False)
 
     def settle(self, pressures: Vector, loads: Loads, at: float | None = None) -> State:
         """Equilibrium reached from rest: first the arm's weight, then pressures and loads.
@@ -159,17 +179,17 @@ class Equilibrium:
         """
         hanging = self._at_rest(loads.gravity, at)
         end = hanging._replace(pressures=pressures, loads=loads)
-        state, share = self.follow(hanging, end, at)
-        if share < 1.0:
-            what = (
-                "its pressures and load"
-                if loads.tip.any() or loads.station.any()
-                else ("its pressures")
-            )
+        state, share, unstable = self.follow(hanging, end, at)
+        what = "its pressures"
+        if loads.tip.any() or loads.station.any():
+            what += " and load"
+        if unstable:
             raise EquilibriumError(
                 f"no stable equilibrium: the arm buckles or falls over at {share:.0%} of {what} "
                 f"(raised together from the unpressurised arm under its weight)"
             )
+        if share < 1.0:
+            raise EquilibriumError(_lost(share, what))
         return state
 
     def _at_rest(self, gravity: Vector, at: float | None = None) -> State:
@@ -184,14 +204,16 @@ class Equilibrium:
             straight = State(pressures, upright, states, none)
             weighted = straight._replace(loads=none._replace(gravity=gravity))
             self._rest[key] = self.follow(straight, weighted, at)
-        state, share = self._rest[key]
-        if share < 1.0:
+        path = self._rest[key]
+        if path.unstable:
             raise EquilibriumError(
                 f"no stable equilibrium: the unpressurised arm buckles or falls over at "
-                f"{share:.0%} of its own weight and payload; mount it hanging, or make it "
+                f"{path.share:.0%} of its own weight and payload; mount it hanging, or make it "
                 f"shorter, lighter or stiffer"
             )
-        return state
+        if path.share < 1.0:
+            raise EquilibriumError(_lost(path.share, "its own weight and payload"))
+        return path.state
 
     def shape(self, state: State, stations: Vector, at: float | None = None) -> Vector:
         """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium with its load at `at`."""
@@ -206,7 +228,7 @@ class Equilibrium:
         found = {length: (q, r)}
         for piece in self.shooting.pieces([station_at, *stations]):
             R = lie.rotation_from_quaternion(q)
-            if abs(piece.distal - station_at) < 1e-12 * length:
+            if abs(piece.distal - station_at) <= SAME_STATION * length:
                 force = force + station[:3] + R @ station[6:9]
                 moment = moment + station[3:6] + R @ station[9:]
             if piece.rigid:
@@ -235,6 +257,13 @@ class Equilibrium:
                 )
             )
         return np.stack(poses)
+
+
+def _lost(share: float, what: str) -> str:
+    return (
+        f"no equilibrium was found beyond {share:.0%} of {what}: either there is none, or the load "
+        "is so large that it takes a higher resolution to integrate the arm"
+    )
 
 
 def _between(start: State, end: State, share: float) -> tuple[Vector, Loads]:

@@ -12,7 +12,7 @@ import casadi as ca
 
 from stiffopt import lie
 from stiffopt.model.compliance import inverse_3x3
-from stiffopt.model.shooting import Shooting
+from stiffopt.model.shooting import SAME_STATION, Shooting
 
 _CARRIED = 4  # changes carried along: three turns of the tip, and the defects
 
@@ -80,7 +80,7 @@ def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
     length = shooting.description.length
     met: list[ca.MX] = []  # changes of the states after each step
     for piece in pieces:
-        if abs(piece.distal - (length if at is None else at)) < 1e-12 * length:
+        if abs(piece.distal - (length if at is None else at)) <= SAME_STATION * length:
             added_force, added_moment = _apply(applied, orientation, _constant(station))
             force, moment = force + added_force, moment + added_moment
         if piece.rigid:

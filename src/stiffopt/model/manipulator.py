@@ -19,6 +19,7 @@ from stiffopt.model.arguments import (
 from stiffopt.model.arm import Arm, Values
 from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.numeric import checked_integer
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.screws import Twist, Wrench
 from stiffopt.model.shape import Shape
@@ -81,25 +82,21 @@ class Manipulator(Arm):
 
     def backbone(self, p: ArrayLike, n: int = 50) -> Vector:
         """Poses (n, 4, 4) along the arm, equally spaced at rest from the base to the tip."""
-        if isinstance(n, bool) or not isinstance(n, int) or n < 2:
-            raise InputError(f"backbone needs at least n = 2 poses; got {n!r}")
-        batch, single = self._pressures(p)
-        stations = np.linspace(0.0, self.length, n)
-        shapes = np.stack([self._shape(row, stations) for row in batch])
-        return shapes[0] if single else shapes
+        n = checked_integer("n, the number of poses of a backbone,", n, 2)
+        return self._shapes(p, np.linspace(0.0, self.length, n))
 
     def pose(self, p: ArrayLike, at: float) -> Vector:
         """Pose (4, 4) or (N, 4, 4) at arc length `at` (m, at rest, from the base)."""
-        at = self._arc_length(at)
-        batch, single = self._pressures(p)
-        poses = np.stack([self._shape(row, np.array([at]))[0] for row in batch])
-        return poses[0] if single else poses
+        return self._shapes(p, np.array([self._arc_length(at)]))[..., 0, :, :]
 
     # -- compliance -------------------------------------------------------------------------
 
     def tip_compliance(self, p: ArrayLike) -> Vector:
         """Compliance of the tip in tip axes (eq. 17, or tangent), (6, 6), linear first."""
-        C = self._evaluate("compliance", lambda tip: tip.compliance, p)
+        return self._compliance(p, None)
+
+    def _compliance(self, p: ArrayLike, at: float | None) -> Vector:
+        C = self._evaluate("compliance", lambda point: point.compliance, p, at=at)
         if self.is_loaded and self._loads.are_conservative:
             # symmetric but for the integrator's error of about 1e-6
             C = (C + np.swapaxes(C, -1, -2)) / 2
@@ -107,8 +104,7 @@ class Manipulator(Arm):
 
     def compliance(self, p: ArrayLike, at: float) -> Vector:
         """Compliance (6, 6) at arc length `at` (m, at rest), in the axes of that point."""
-        at = self._arc_length(at)
-        return self._evaluate("compliance", lambda point: point.compliance, p, at=at)
+        return self._compliance(p, self._station(self._arc_length(at)))
 
     def stiffness(
         self,
@@ -163,7 +159,8 @@ class Manipulator(Arm):
 
     def tip_twist(self, p: ArrayLike, channel: int) -> Twist:
         """Screw of the tip's motion per Pa in one channel (counted from 0), in tip axes."""
-        if isinstance(channel, bool) or not 0 <= channel < self.n_pressures:
+        channel = checked_integer("channel", channel, 0)
+        if channel >= self.n_pressures:
             raise InputError(
                 f"channel must be between 0 and {self.n_pressures - 1}; got {channel!r}"
             )
@@ -248,9 +245,11 @@ class Manipulator(Arm):
         soft: list[int | None] = []
         for index, segment in enumerate(self.description.segments):
             start = ends[-1]
-            cuts = np.linspace(0.0, segment.length, _ELEMENTS_PER_SEGMENT + 1)[1:]
-            ends.extend(start + cuts)
-            soft.extend([index] * _ELEMENTS_PER_SEGMENT)
+            cuts = start + np.linspace(0.0, segment.length, _ELEMENTS_PER_SEGMENT + 1)[1:]
+            if start < at < cuts[-1]:
+                cuts = np.union1d(cuts, at)  # elements end where the load is
+            ends.extend(cuts)
+            soft.extend([index] * len(cuts))
             if segment.connector:
                 ends.append(start + segment.length + segment.connector)
                 soft.append(None)

@@ -8,26 +8,36 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
-from stiffopt.errors import InputError
+from stiffopt.errors import InputError, shown
+from stiffopt.model.numeric import (
+    checked_motion,
+    checked_number,
+    checked_vector,
+    length_and_unit,
+)
 
 Vector = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Screw:
     """Six coordinates in some frame; subclasses say which half turns about the axis."""
 
     coordinates: Vector
 
     def __post_init__(self) -> None:
-        coordinates = np.array(self.coordinates, dtype=float)
-        if coordinates.shape != (6,) or not np.isfinite(coordinates).all():
-            raise InputError(
-                f"a {type(self).__name__.lower()} has six finite coordinates, linear part first; "
-                f"got {coordinates.tolist()}"
-            )
+        name = f"the coordinates of a {type(self).__name__.lower()}, linear part first,"
+        coordinates = checked_vector(name, self.coordinates, 6)
         coordinates.flags.writeable = False
         object.__setattr__(self, "coordinates", coordinates)
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return np.array_equal(self.coordinates, other.coordinates)
+
+    def __hash__(self) -> int:
+        return hash((type(self), *self.coordinates.tolist()))
 
     def _along_and_about(self) -> tuple[Vector, Vector]:
         """The vector along the axis, and the other half of the coordinates."""
@@ -37,36 +47,35 @@ class _Screw:
     def pitch(self) -> float:
         """Advance along the axis per unit about it, in m; infinite without the latter."""
         along, other = self._along_and_about()
-        square = along @ along
-        return float(along @ other / square) if square > 0 else inf
+        length, unit = length_and_unit(along)
+        return float(unit @ other / length) if length > 0 else inf
 
     @property
     def axis_direction(self) -> Vector:
         """Unit vector (3,) along the axis; zero for the zero screw."""
         along, other = self._along_and_about()
-        vector = along if along.any() else other
-        length = np.linalg.norm(vector)
-        return vector / length if length > 0 else vector
+        return length_and_unit(along if along.any() else other)[1]
 
     @property
     def axis_point(self) -> Vector:
         """Point (3,) of the axis nearest to the frame's origin, in m."""
         along, other = self._along_and_about()
-        square = along @ along
-        return np.cross(along, other) / square if square > 0 else np.zeros(3)
+        length, unit = length_and_unit(along)
+        return np.cross(unit, other) / length if length > 0 else np.zeros(3)
 
     @property
     def magnitude(self) -> float:
         """Length of the vector along the axis, or of the other half where that is zero."""
         along, other = self._along_and_about()
-        return float(np.linalg.norm(along if along.any() else other))
+        return length_and_unit(along if along.any() else other)[0]
 
     @classmethod
     def _from_axis(
         cls, point: ArrayLike, direction: ArrayLike, pitch: float
     ) -> tuple[Vector, Vector]:
-        along = np.asarray(direction, dtype=float)
-        return along, np.cross(np.asarray(point, dtype=float), along) + pitch * along
+        along = checked_vector("direction", direction)
+        moment = np.cross(checked_vector("point", point), along)
+        return along, moment + checked_number("pitch", pitch) * along
 
 
 class Twist(_Screw):
@@ -90,7 +99,7 @@ class Twist(_Screw):
 
     def transformed(self, T_ab: Vector) -> Self:
         """The same motion with coordinates in frame a, given in frame b (eq. 15)."""
-        return type(self)(lie.adjoint(np.asarray(T_ab)) @ self.coordinates)
+        return type(self)(lie.adjoint(checked_motion("T_ab", T_ab)) @ self.coordinates)
 
     def _along_and_about(self) -> tuple[Vector, Vector]:
         return self.angular, self.linear
@@ -117,10 +126,12 @@ class Wrench(_Screw):
 
     def transformed(self, T_ab: Vector) -> Self:
         """The same wrench with coordinates in frame a, given in frame b (eq. 5)."""
-        return type(self)(lie.coadjoint(np.asarray(T_ab)) @ self.coordinates)
+        return type(self)(lie.coadjoint(checked_motion("T_ab", T_ab)) @ self.coordinates)
 
     def power(self, twist: Twist) -> float:
         """Work done on a twist in the same frame: ``F.v + M.omega``."""
+        if not isinstance(twist, Twist):
+            raise InputError(f"a wrench does work on a Twist, not on {shown(twist)}")
         return float(self.coordinates @ twist.coordinates)
 
     def _along_and_about(self) -> tuple[Vector, Vector]:

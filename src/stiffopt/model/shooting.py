@@ -15,10 +15,10 @@ Everything else follows from the same map by the implicit function theorem.
 The integrator is the eleven-stage Runge-Kutta method of order eight of Cooper and Verner
 (SIAM J. Numer. Anal. 9, 1972).
 
-Stability under conservative loads is Jacobi's condition: the energy is at a minimum if and only if no shorter arm, clamped
-anywhere between tip and base, is at the point of buckling.  At that point a moment at the tip
-turns it without bound, and beyond it turns it the wrong way round: so the rotational compliance
-of every shorter arm must be positive definite.
+Stability under conservative loads is Jacobi's condition: the energy is at a minimum if and only
+if no shorter arm, clamped anywhere between tip and base, is at the point of buckling.  At that
+point a moment at the tip turns it without bound, and beyond it turns it the wrong way round: so
+the rotational compliance of every shorter arm must be positive definite.
 """
 
 from collections.abc import Sequence
@@ -86,8 +86,11 @@ _STAGES: tuple[dict[int, float], ...] = (
 )
 _WEIGHTS: dict[int, float] = {0: 1 / 20, 7: 49 / 180, 8: 16 / 45, 9: 49 / 180, 10: 1 / 20}
 
-STEP_LENGTH = 3.0
+STEP_LENGTH = 2.0
 """Longest integration step at resolution 1, in outer radii of the segment at rest."""
+
+SAME_STATION = 1e-12
+"""Arc lengths that differ by less than this share of the arm's length are one station."""
 
 
 @dataclass(frozen=True)
@@ -265,13 +268,13 @@ class Shooting:
     def pieces(self, cuts: Sequence[float]) -> list[Piece]:
         """The arm from tip to base, cut at the given arc lengths."""
         pieces: list[Piece] = []
-        start = 0.0
+        start, slack = 0.0, SAME_STATION * self.description.length
         for index, segment in enumerate(self.description.segments):
             for length, rigid in ((segment.length, False), (segment.connector, True)):
                 end = start + length
-                marks = [start, *sorted(c for c in cuts if start < c < end), end]
-                for near, far in pairwise(marks):
-                    if far > near:
+                inside = sorted(c for c in cuts if start + slack < c < end - slack)
+                for near, far in pairwise([start, *inside, end]):
+                    if far - near > slack:
                         longest = STEP_LENGTH * segment.outer_radius / self.resolution
                         steps = max(1, ceil((far - near) / longest - 1e-9))
                         pieces.append(Piece(index, rigid, far - near, steps, far))
@@ -297,7 +300,7 @@ class Shooting:
         station_quaternion, station_position = tip_quaternion, position
         nodes = []
         for piece in self.pieces([station_at]):
-            if abs(piece.distal - station_at) < 1e-12 * length:
+            if abs(piece.distal - station_at) <= SAME_STATION * length:
                 R = lie.rotation_from_quaternion(orientation)
                 force = force + station[:3] + added[:3] + R @ station[6:9]
                 moment = moment + station[3:6] + added[3:] + R @ station[9:]

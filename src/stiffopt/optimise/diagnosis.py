@@ -15,34 +15,41 @@ from stiffopt.optimise.local import LocalResult, descend, reach
 from stiffopt.optimise.problem import Problem
 from stiffopt.optimise.solution import Judgement, Sensitivities
 from stiffopt.optimise.task import Task
+from stiffopt.optimise.terms import pose_terms
 
 Vector = NDArray[np.float64]
 
 _MOST_DESCENTS = 16
 
 
-def closest_configuration(problem: Problem, candidates: Iterable[Vector]) -> LocalResult | None:
-    """Pressures that come nearest to the pose, over all candidates to start from.
+def closest_configurations(problem: Problem, candidates: Iterable[Vector]) -> list[LocalResult]:
+    """Pressures that come nearest to the pose, from all candidates to start from, best first.
 
     The least position error; where an angle is asked for too, within the angle's tolerance if
-    that can be had, else at the least angle error.  None if the arm has no equilibrium anywhere.
+    that can be had, else at the least angle error.
     """
     xs = list(candidates)
-    names = [ball.name for ball in problem.pose(xs[0]).balls] if xs else []
+    names = [term.name for term in pose_terms(problem.task.target)]
     free = problem.changed(floors=(), position=inf, angle=inf)
     if names != ["position", "angle"]:
-        return _best(free.changed(objective=problem.closest(names[0])), xs)
-    turned = _best(free.changed(objective=problem.closest("angle")), xs)
-    if turned is None:
-        return None
-    least = next(ball.error for ball in turned.point.balls if ball.name == "angle")
+        return _descents(free.changed(objective=problem.closest(names[0])), xs)
+    turned = _descents(free.changed(objective=problem.closest("angle")), xs)
+    if not turned:
+        return []
+    least = next(ball.error for ball in turned[0].point.balls if ball.name == "angle")
     allowed = max(problem.task.target.tolerance.angle, least * (1 + 1e-6) + 1e-7)
-    return _best(
-        free.changed(objective=problem.closest("position"), angle=allowed), [turned.point.x, *xs]
-    )
+    nearest = free.changed(objective=problem.closest("position"), angle=allowed)
+    return _descents(nearest, [turned[0].point.x, *xs])
 
 
-def _best(problem: Problem, xs: Iterable[Vector]) -> LocalResult | None:
+def unimproved(problem: Problem, x: Vector) -> LocalResult:
+    """Pressures as they are, as a result that can be judged beside those of descents."""
+    problem.restart()
+    point = problem.pose(x)
+    return LocalResult(point, inf, 0.0, False, problem.closest(point.balls[0].name), None)
+
+
+def _descents(problem: Problem, xs: Iterable[Vector]) -> list[LocalResult]:
     results = []
     for x in xs:
         problem.restart()
@@ -51,11 +58,12 @@ def _best(problem: Problem, xs: Iterable[Vector]) -> LocalResult | None:
             results.append(descend(problem, point))
         if len(results) >= _MOST_DESCENTS:
             break
-    return min(results, key=lambda result: result.value, default=None)
+    return sorted(results, key=lambda result: result.value)
 
 
 def freedom(problem: Problem, x: Vector) -> int:
     """Directions in pressure space in which what is asked of the pose stays what it is."""
+    problem.restart()
     rows = [ball.jacobian / ball.radius for ball in problem.pose(x).constraints]
     return int(len(x) - np.linalg.matrix_rank(np.vstack(rows), rtol=1e-6))
 

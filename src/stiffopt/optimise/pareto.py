@@ -4,8 +4,9 @@ from math import pi
 
 import numpy as np
 
-from stiffopt.errors import InputError
+from stiffopt.errors import InputError, shown
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.numeric import checked_integer
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.task import Task
@@ -28,14 +29,15 @@ def pareto_front(
     InputError
         If the task maximises no stiffness, or `n` is less than 2.
     """
+    if not isinstance(task, Task):
+        raise InputError(f"task must be a Task, see load_task; got {shown(task)}")
     if task.stiffness is None or not task.stiffness.maximise:
         raise InputError("a trade-off needs a stiffness to maximise; add 'stiffness: maximise'")
-    if n < 2:
-        raise InputError(f"a trade-off needs at least 2 points; got {n}")
+    n = checked_integer("n, the number of points of a trade-off,", n, 2)
+    solver = PressureSolver(robot, task, seed=seed)
     which = "position" if task.target.position is not None else "angle"
     own: float = getattr(task.target.tolerance, which)
     largest = LARGEST_SHARE * robot.length if which == "position" else pi
-    solver = PressureSolver(robot, task, seed=seed)
     front: list[PressureSolution] = []
     for size in np.geomspace(own, max(own, largest), n):
         tolerance = task.target.tolerance.model_copy(update={which: float(size)})

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.equilibrium import State
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.local import LocalResult, descend, reach
 from stiffopt.optimise.problem import BAR, Point, Problem
@@ -50,7 +49,10 @@ class SampleTable:
         count = _LOADED_SAMPLES if robot.is_loaded else _FREE_SAMPLES
         x = lower + (upper - lower) * _spread_with_edges(count, len(lower), seed)
         if robot.is_loaded:
-            x, poses = _settled(robot, x)
+            # under load little pressure can do much: every other sample is scaled down
+            scale = 10 ** (-2.5 * np.arange(count) / count)
+            scale[::2] = 1.0
+            x, poses = _settled(robot, lower + (x - lower) * scale[:, np.newaxis])
         else:
             poses = robot.tip_pose(x * BAR)
         self.x, self.poses = x, poses
@@ -87,18 +89,12 @@ def _spread_with_edges(count: int, n: int, seed: int) -> Vector:
 
 
 def _settled(robot: Manipulator, x: Vector) -> tuple[Vector, Vector]:
-    """Those configurations of a loaded arm that have an equilibrium, and their poses.
-
-    Each is found from the nearest one that was settled before it.
-    """
+    """Those configurations of a loaded arm that have an equilibrium, and their poses."""
     evaluator = robot.evaluator("pose", lambda shape, _: [shape.transform])
     kept: list[int] = []
-    states: list[State | None] = []
     poses: list[Vector] = []
     for index in range(len(x)):
-        if kept:
-            nearest = int(np.argmin(((x[kept] - x[index]) ** 2).sum(axis=1)))
-            evaluator.restart(states[nearest])
+        evaluator.restart()  # each from rest, so that local searches start on the right branch
         try:
             (pose,) = evaluator(x[index] * BAR)
         except EquilibriumError:
@@ -106,7 +102,6 @@ def _settled(robot: Manipulator, x: Vector) -> tuple[Vector, Vector]:
                 raise
             continue
         kept.append(index)
-        states.append(evaluator.state)
         poses.append(pose)
     return x[kept], np.stack(poses)
 

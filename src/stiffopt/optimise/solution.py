@@ -19,6 +19,16 @@ PRESSURE_SLACK = 1e-3
 """How far from a limit a pressure still counts as at it, in Pa."""
 
 
+def _protect(owner: object, *names: str) -> None:
+    """Replace arrays of a frozen dataclass by copies that cannot be written to."""
+    for name in names:
+        value = getattr(owner, name)
+        if value is not None:
+            value = np.array(value)
+            value.flags.writeable = False
+            object.__setattr__(owner, name, value)
+
+
 @dataclass(frozen=True)
 class Confidence:
     """How sure the global search is of its answer.
@@ -86,6 +96,9 @@ class Sensitivities:
     per_angle_tolerance: float | None
     objective_unit: str
 
+    def __post_init__(self) -> None:
+        _protect(self, "tip_jacobian", "stiffness_gradient")
+
 
 @dataclass(frozen=True)
 class PressureSolution:
@@ -141,6 +154,9 @@ class PressureSolution:
     confidence: Confidence | None = None
     sensitivities: Sensitivities | None = None
     timings: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _protect(self, "pressures", "tip_pose", "compliance")
 
     @property
     def found(self) -> bool:

@@ -7,8 +7,9 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.errors import EquilibriumError, InputError
+from stiffopt.errors import EquilibriumError, InputError, shown
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.numeric import checked_integer, checked_vector
 from stiffopt.optimise import diagnosis
 from stiffopt.optimise.local import LocalResult, descend, reach
 from stiffopt.optimise.problem import BAR, Problem
@@ -23,6 +24,7 @@ from stiffopt.optimise.solution import (
 )
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.optimise.terms import pose_terms
 
 Vector = NDArray[np.float64]
 
@@ -53,10 +55,14 @@ class PressureSolver:
     """
 
     def __init__(self, robot: Manipulator, task: Task, *, seed: int = 0) -> None:
+        if not isinstance(robot, Manipulator):
+            raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
+        if not isinstance(task, Task):
+            raise InputError(f"task must be a Task, see load_task; got {shown(task)}")
         load = task.load
         self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
         self.task = task
-        self.seed = seed
+        self.seed = checked_integer("seed", seed, 0)
         self._problem = Problem(self.robot, task)
         self._samples: SampleTable | None = None
 
@@ -73,6 +79,8 @@ class PressureSolver:
             Pressures in Pa near the answer, for example the previous one: the answer is then
             the local optimum next to it.  If none is found there, the search is global.
         """
+        if target is not None and not isinstance(target, Target):
+            raise InputError(f"target must be a Target; got {shown(target)}")
         begin = perf_counter()
         problem = self._problem if target is None else self._problem.at_target(target)
         try:
@@ -129,26 +137,25 @@ class PressureSolver:
     def _closest(self, problem: Problem, found: Search) -> PressureSolution:
         """Closest configuration to a pose that no start came to."""
         near = sorted(found.nearest, key=lambda point: sum(b.error for b in point.balls))
-        candidates = [point.x for point in near] + list(islice(self._starts(problem), 16))
-        result = diagnosis.closest_configuration(problem, candidates)
-        if result is None:
-            raise EquilibriumError("no stable equilibrium was found near the target")
-        if all(
-            ball.error <= problem.radii.get(ball.name, radius)
-            for ball, radius in zip(result.point.balls, self._radii(problem), strict=True)
-        ):
-            again = search(problem, iter([result.point.x]), 1)
+        candidates = [*self._nearest(problem, 16), *(point.x for point in near)]
+        results = diagnosis.closest_configurations(problem, candidates)
+        if results and _reaches(problem, results[0]):
+            again = search(problem, iter([results[0].point.x]), 1)
             if again.results:
                 return self._first_that_holds(problem, again)
-        return self._solution(problem, result, found.confidence)
-
-    @staticmethod
-    def _radii(problem: Problem) -> list[float]:
-        tolerance = problem.task.target.tolerance
-        target = problem.task.target
-        position = [tolerance.position] if target.position is not None else []
-        turned = target.pointing is not None or target.orientation is not None
-        return position + ([tolerance.angle] if turned else [])
+        results = results[:1]
+        if self.robot.is_loaded:  # what is found need not be what is reached from rest
+            sampled = (diagnosis.unimproved(problem, x) for x in islice(candidates, _JUDGED))
+            results = [*results[:_JUDGED], *sampled]
+        judged = []
+        for result in results:
+            try:
+                judged.append(self._solution(problem, result, found.confidence))
+            except EquilibriumError:
+                continue  # not reached from rest
+        if not judged:
+            raise EquilibriumError("no stable equilibrium was found near the target")
+        return min(judged, key=_distance)
 
     def _without_floors(self, problem: Problem, found: Search) -> PressureSolution:
         """Best that can be had where a stiffness that is demanded was not found."""
@@ -250,19 +257,23 @@ class PressureSolver:
     # -- starts -----------------------------------------------------------------------------
 
     def _starts(self, problem: Problem) -> Iterator[Vector]:
+        return starts(problem, self._table(problem))
+
+    def _table(self, problem: Problem) -> SampleTable:
         if self._samples is None:
             self._samples = SampleTable(self.robot, problem.lower, problem.upper, self.seed)
-        return starts(problem, self._samples)
+        return self._samples
+
+    def _nearest(self, problem: Problem, count: int) -> list[Vector]:
+        """Samples that are nearest to the target."""
+        table = self._table(problem)
+        order = table.nearest_first(problem.task.target, self.robot.length)
+        return list(table.x[order[:count]])
 
     def _checked(self, guess: ArrayLike | None) -> Vector | None:
         if guess is None:
             return None
-        values = np.asarray(guess, dtype=float)
-        if values.shape != (self.robot.n_pressures,) or not np.isfinite(values).all():
-            raise InputError(
-                f"guess must be {self.robot.n_pressures} finite pressures in Pa; got {guess!r}"
-            )
-        return values
+        return checked_vector("guess, pressures in Pa,", guess, self.robot.n_pressures)
 
 
 def solve_pressure(
@@ -281,6 +292,18 @@ def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> Press
     task = solution.task.model_copy(update={"stiffness": None})
     blind = PressureSolver(solver.robot, task.model_copy(update={"load": None}), seed=solver.seed)
     return blind.solve(guess=solution.pressures)
+
+
+def _reaches(problem: Problem, result: LocalResult) -> bool:
+    """Whether a result of another program lies within the tolerances of this one."""
+    radii = {term.name: term.radius for term in pose_terms(problem.task.target)}
+    return all(ball.error <= radii[ball.name] for ball in result.point.balls)
+
+
+def _distance(solution: PressureSolution) -> tuple[float, float]:
+    """Rank of a closest configuration: the angle beyond its tolerance, then the distance."""
+    beyond = (solution.angle_error or 0.0) - solution.task.target.tolerance.angle * (1 + 1e-6)
+    return max(0.0, beyond), solution.position_error or 0.0
 
 
 def _clean(price: float) -> float:

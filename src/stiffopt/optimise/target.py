@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, mo
 
 from stiffopt.optimise.directions import Direction, Quaternion
 from stiffopt.schema import BadKeyError, Schema, Vector
-from stiffopt.units import Angle, Length, format_quantity
+from stiffopt.units import Angle, Length, format_quantity, within
 
 __all__ = ["Target", "Tolerance"]
 
@@ -28,7 +28,7 @@ def _write_coordinate(value: float | None) -> str:
 
 
 Coordinate = Annotated[
-    Length | None,
+    Annotated[Length, within(1e3, "m")] | None,
     BeforeValidator(_coordinate),
     PlainSerializer(_write_coordinate, return_type=str, when_used="json"),
 ]

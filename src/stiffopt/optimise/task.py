@@ -28,7 +28,7 @@ from stiffopt.optimise.directions import Frame
 from stiffopt.optimise.goal import MatchValue, StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
-from stiffopt.units import Force, Moment, Pressure, read_from_file
+from stiffopt.units import Force, Moment, Pressure, read_from_file, within
 
 __all__ = ["Load", "PressureRange", "Task", "load_task"]
 
@@ -43,8 +43,8 @@ class Load(Schema):
     frame : base, it keeps its direction; tip, it follows the tip.
     """
 
-    force: Vector[Force] = (0.0, 0.0, 0.0)
-    moment: Vector[Moment] = (0.0, 0.0, 0.0)
+    force: Vector[Annotated[Force, within(1e6, "N")]] = (0.0, 0.0, 0.0)
+    moment: Vector[Annotated[Moment, within(1e6, "N*m")]] = (0.0, 0.0, 0.0)
     frame: Frame = "base"
 
 
