@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from independent import body_twists, derivative
 
 import stiffopt as so
+from independent import body_twists, derivative
 
 ROBOTS = ["stiff-flop-1", "stiff-flop-3", "stiff-flop-2-hanging"]
 

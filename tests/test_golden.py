@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from independent import ARMS, FLOP, PAIR, Arm, discretise, eq_9, neo_hookean, silicone
 
 import stiffopt as so
+from independent import ARMS, FLOP, PAIR, Arm, discretise, eq_9, neo_hookean, silicone
 from stiffopt.model.actuation import SectionGeometry
 
 GOLDEN = [  # bar, tip x and z in mm, k_x k_y k_z in N/cm

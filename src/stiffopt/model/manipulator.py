@@ -47,7 +47,7 @@ class Manipulator(Arm):
     load_frame : {"base", "tip"}
         Whether the load keeps its direction in space, or follows the tip.
     resolution : int
-        Multiplies the integration steps of the equilibrium; 1 is exact to about a micrometre.
+        Multiplies the integration steps of the equilibrium; 1 is exact to a few micrometres.
 
     Raises
     ------

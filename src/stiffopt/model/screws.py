@@ -26,8 +26,13 @@ class _Screw:
     coordinates: Vector
 
     def __post_init__(self) -> None:
-        name = f"the coordinates of a {type(self).__name__.lower()}, linear part first,"
-        coordinates = checked_vector(name, self.coordinates, 6)
+        try:
+            coordinates = checked_vector("coordinates", self.coordinates, 6)
+        except InputError:
+            raise InputError(
+                f"a {type(self).__name__.lower()} has six finite coordinates, linear part first; "
+                f"got {self.coordinates!r}"
+            ) from None
         coordinates.flags.writeable = False
         object.__setattr__(self, "coordinates", coordinates)
 
