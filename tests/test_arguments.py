@@ -26,7 +26,7 @@ BAD = {
     "no task": (lambda: so.solve_pressure(ARM, None), "task must be a Task"),
     "task as text": (lambda: so.solve_pressure(ARM, "x"), "task must be a Task"),
     "target as list": (lambda: SOLVER.solve([1, 2, 3]), "target must be a Target"),
-    "guess as text": (lambda: SOLVER.solve(guess="abc"), "guess, pressures in Pa, must be 6"),
+    "guess as text": (lambda: SOLVER.solve(guess="abc"), "guess must be 6"),
     "guess of texts": (lambda: SOLVER.solve(guess=["1"] * 6), "guess"),
     "short guess": (lambda: SOLVER.solve(guess=[1, 2]), "guess"),
     "guess with NaN": (lambda: SOLVER.solve(guess=[np.nan] * 6), "guess"),

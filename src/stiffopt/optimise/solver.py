@@ -273,7 +273,7 @@ class PressureSolver:
     def _checked(self, guess: ArrayLike | None) -> Vector | None:
         if guess is None:
             return None
-        return checked_vector("guess, pressures in Pa,", guess, self.robot.n_pressures)
+        return checked_vector("guess", guess, self.robot.n_pressures)
 
 
 def solve_pressure(
