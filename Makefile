@@ -4,6 +4,8 @@ VENV ?= .venv
 DEMO ?= problems/two_segment_stiff_x.yaml
 
 BIN := $(VENV)/bin
+BENCH := $(VENV)/bench
+PEERS := scipy pin-pink soromox pyelastica
 PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check
 PICTURE := docs/images/two_segment_stiff_x.png
 
@@ -37,10 +39,8 @@ picture: $(VENV)/.installed-plot  ## draw the picture of the README again
 	@mkdir -p $(dir $(PICTURE))
 	$(BIN)/solve-pressure $(DEMO) --plot $(PICTURE)
 
-ifneq ($(wildcard benchmarks/quality.py),)
-bench: $(VENV)/.installed-dev  ## measure the optimiser (make bench ARGS="--segments 2 --tasks 100")
-	$(BIN)/python benchmarks/quality.py $(ARGS)
-endif
+bench: $(BENCH)/.installed  ## measure speed beside other packages (make bench ARGS=--quick)
+	$(BENCH)/bin/python benchmarks/run.py $(ARGS)
 
 clean:  ## remove everything that was made, the virtual environment too
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis \
@@ -72,3 +72,13 @@ $(VENV)/.installed-dev: $(VENV)/.created pyproject.toml
 	@echo "Installing stiffopt and its development tools into $(VENV) ..."
 	@$(PIP) install --editable '.[dev,plot]'
 	@touch $@ $(VENV)/.installed-plot
+
+# The peers of the benchmarks are heavy and have an environment of their own.
+$(BENCH)/.installed: $(VENV)/.created pyproject.toml
+	@echo "Installing what the benchmarks compare with into $(BENCH) ..."
+	@[ -x $(BENCH)/bin/python ] || $(BIN)/python -m venv $(BENCH)
+	@pip="$(BENCH)/bin/python -m pip --quiet --quiet --disable-pip-version-check"; \
+	$$pip install --editable '.[plot,bench]' || \
+	  { $$pip install --editable '.[plot]' && for peer in $(PEERS); do \
+	    $$pip install $$peer || echo "$$peer cannot be installed and is left out."; done; }
+	@touch $@

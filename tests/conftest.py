@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 os.environ["MPLBACKEND"] = "Agg"
+os.environ["STIFFOPT_COMPILER"] = "none"  # but for tests that ask for `compiled`
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -26,6 +29,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         for item in items:
             if "long" in item.keywords:
                 item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def code_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where compiled code is kept for all tests of this run."""
+    return tmp_path_factory.mktemp("code")
+
+
+@pytest.fixture
+def compiled(code_cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Machine code instead of the CasADi VM."""
+    if not any(shutil.which(name) for name in ("cc", "gcc", "clang")):
+        pytest.skip("there is no C compiler")
+    monkeypatch.delenv("STIFFOPT_COMPILER")
+    monkeypatch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
+    return code_cache
 
 
 @pytest.fixture(autouse=True)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from independent import ARMS, hat, wrench_map
+from independent import ARMS, derivative, discretise, hat, wrench_map
 
 FREE = so.load_robot("stiff-flop-2")
 ROBOTS = {
@@ -116,6 +116,65 @@ def test_stiffness_by_its_definition(name, kind, boundary, frame):
     C, R = arm.compliance(p, 0.07), arm.pose(p, 0.07)[:3, :3]
     assert k_at == pytest.approx(defined_stiffness(C, R, kind, boundary, frame), rel=tolerance)
     assert arm.stiffness(p, -5 * D, kind, boundary, frame) == pytest.approx(k, rel=1e-12)
+
+
+@pytest.mark.parametrize(("kind", "boundary", "frame"), VARIANTS)
+@pytest.mark.parametrize("name", ["free", "mixed"])
+def test_stiffness_gradient_of_every_kind(name, kind, boundary, frame):
+    arm = ROBOTS[name]
+    p = batch(arm)[0]
+    expected = derivative(lambda q: arm.stiffness(q, D, kind, boundary, frame), p, 50.0)
+    found = arm.stiffness_gradient(p, D, kind, boundary, frame)
+    assert found == pytest.approx(expected, rel=1e-6, abs=1e-8 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", ["2 segments", "3 segments, mixed"])
+def test_the_strain_energy_of_a_unit_load(name):
+    """The directional compliance is that of the 6x6 matrix, here and by sums over elements."""
+    other = ARMS[name]
+    arm = so.Manipulator(so.RobotDescription(**other.mapping()))
+    p = batch(arm)[0]
+    C, R = arm.tip_compliance(p), arm.tip_pose(p)[:3, :3]
+    sums = discretise(other, p, 200)
+    d = D / np.linalg.norm(D)
+    for kind, block in (("translation", slice(0, 3)), ("rotation", slice(3, 6))):
+        for frame, local in (("tip", d), ("base", R.T @ d)):
+            k = arm.stiffness(p, D, kind, frame=frame)
+            assert 1 / k == pytest.approx(local @ C[block, block] @ local, rel=1e-9)
+            assert 1 / k == pytest.approx(local @ sums.compliance[block, block] @ local, rel=1e-4)
+
+
+@pytest.mark.parametrize("name", ["mixed", "hanging"])
+@pytest.mark.parametrize("boundary", ["free", "clamped"])
+def test_several_directions(name, boundary):
+    arm = ROBOTS[name]
+    ps, directions = batch(arm), [[1, 0, 0], [0, 2, 0], [0.5, -1, 0.3]]
+    expected = [arm.stiffness(ps, d, boundary=boundary) for d in directions]  # k of (N,)
+    assert np.array_equal(arm.stiffness(ps, directions, boundary=boundary), np.transpose(expected))
+    single = arm.stiffness(ps[0], np.array(directions), boundary=boundary)
+    assert single == pytest.approx(np.array(expected)[:, 0], rel=1e-9)
+    for wrong in ([], [[1, 0]], [[1, 0, 0], [0, 1]], [[0, 0, 0]], [[[1, 0, 0]]]):
+        with pytest.raises(so.InputError, match="direction"):
+            arm.stiffness(ps, wrong)
+
+
+def test_a_remembered_direction_is_checked_as_any_other():
+    p = batch(FREE)[0]
+    k = FREE.stiffness(p, [1, 0, 0])
+    assert FREE.stiffness(p, np.array([1.0, 0, 0])) == FREE.stiffness(p, (2.0, 0, 0)) == k
+    for wrong in (["1", 0, 0], [1, 0, 0, 0], [np.nan, 0, 0], None):
+        with pytest.raises(so.InputError, match="direction"):
+            FREE.stiffness(p, wrong)
+    with pytest.raises(so.InputError, match="unknown kind"):
+        FREE.stiffness(p, [1, 0, 0], ["translation"])
+
+
+def test_results_are_the_callers_own():
+    p = batch(FREE)[0]
+    first = FREE.tip_pose(p)
+    first[:] = 0
+    p[:] = 0
+    assert FREE.tip_pose(batch(FREE)[0])[3, 3] == 1
 
 
 @pytest.mark.parametrize("name", ["free", "mixed", "hanging"])

@@ -5,7 +5,7 @@ import pytest
 
 import stiffopt as so
 from stiffopt.optimise.problem import BAR, Problem
-from stiffopt.optimise.terms import pose_errors, pose_terms
+from stiffopt.optimise.terms import pose_errors
 
 X2 = np.array([0.5, 1.0, 0.2, 0.9, 0.1, 1.2])
 
@@ -69,14 +69,42 @@ def test_ball_jacobians(name):
 
 @pytest.mark.parametrize("robot", ["stiff-flop-2", "stiff-flop-2-hanging"])
 @pytest.mark.parametrize("name", GOALS)
-def test_values_and_objective_gradients(name, robot):
+def test_gradients_of_terms_and_floors(name, robot):
     p = problem(goal=GOALS[name], robot=robot)
     point = p.point(X2)
-    expected = differences(lambda x: p.point(x).values, X2, 1e-3)
-    assert point.gradients == pytest.approx(expected, abs=2e-5 * np.abs(expected).max())
-    terms = p.objective.terms
-    expected = differences(lambda x: terms(p.point(x))[0], X2, 1e-3)
-    assert terms(point)[1] == pytest.approx(expected, abs=2e-5 * np.abs(expected).max())
+    expected = differences(lambda x: p.point(x).terms, X2, 1e-3)
+    assert point.term_gradients == pytest.approx(expected, abs=2e-5 * np.abs(expected).max())
+    if len(point.floors):
+        expected = differences(lambda x: p.point(x).floors, X2, 1e-3)
+        assert point.floor_gradients == pytest.approx(expected, abs=2e-5 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", ["position", "angle"])
+def test_gradient_of_the_distance_from_a_target(name):
+    p = problem(TARGETS["position and pointing"])
+    terms = p.closest(name).terms
+    expected = differences(lambda x: terms(p.pose(x))[0], X2, 1e-3)
+    assert terms(p.pose(X2))[1] == pytest.approx(expected, abs=2e-5 * np.abs(expected).max())
+
+
+def test_many_poses_are_those_one_by_one():
+    p = problem(TARGETS["position and pointing"])
+    x = X2 * np.linspace(0.2, 1.0, 5)[:, np.newaxis]
+    residuals, jacobians = p.poses(x)
+    for row, residual, jacobian in zip(x, residuals, jacobians, strict=True):
+        point = p.pose(row)
+        assert (residual == point.residual).all()
+        assert (jacobian == point.jacobian).all()
+
+
+def test_point_and_pose_agree_on_the_balls():
+    p = problem(TARGETS["position and pointing"], GOALS["several and a floor"])
+    pose, point = p.pose(X2), p.point(X2)
+    assert point.residual == pytest.approx(pose.residual, abs=1e-14)
+    assert point.jacobian == pytest.approx(pose.jacobian, abs=1e-14)
+    assert pose.errors == tuple(ball.error for ball in pose.balls)
+    assert not pose.terms.size
+    assert not pose.reached
 
 
 def test_values_are_logarithms_of_the_robots_stiffnesses():
@@ -87,7 +115,8 @@ def test_values_are_logarithms_of_the_robots_stiffnesses():
         robot.stiffness(X2 * BAR, (0.3, -0.5, 0.8), frame="tip"),
         robot.stiffness(X2 * BAR, (0, 0, 1)),
     ]
-    assert np.exp(p.point(X2).values) == pytest.approx(expected, rel=1e-12)
+    point = p.point(X2)
+    assert np.exp([*-point.terms, *point.floors]) == pytest.approx(expected, rel=1e-12)
 
 
 def test_angle_errors_are_angles():
@@ -101,11 +130,10 @@ def test_angle_errors_are_angles():
 
 
 def test_opposite_pointing_has_a_finite_residual():
-    opposite = so.Target(pointing=(0, 0, -1))
-    (term,) = pose_terms(opposite)
-    ball = term.ball(np.zeros(3), np.eye(3), np.eye(6))
-    assert ball.error == pytest.approx(np.pi)
-    assert np.isfinite(ball.jacobian).all()
+    p = problem(so.Target(pointing=(0, 0, -1)))
+    straight = p.pose(np.full(6, 0.5))
+    assert straight.errors == pytest.approx([np.pi])
+    assert np.isfinite(straight.jacobian).all()
 
 
 def test_pressure_limits_of_the_task_tighten_the_robots():

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
+from stiffopt import units
 from stiffopt.errors import InputError
 from stiffopt.units import (
     FROM_FILE,
@@ -104,6 +105,22 @@ def test_a_refusal_says_what_was_expected(text: object, unit: str, what: str, me
         parse_quantity(text, unit, what)  # type: ignore[arg-type]
     assert message in str(caught.value)
     assert "expected" in str(caught.value)
+
+
+def test_common_units_are_what_pint_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    common = {(text, unit): units._factor(text, unit) for unit in units._COMMON
+              for text in units._COMMON[unit]}  # fmt: skip
+    monkeypatch.setattr(units, "_COMMON", {})
+    units._factor.cache_clear()
+    for (text, unit), factor in common.items():
+        assert units._factor(text, unit) == factor, (text, unit)
+    units._factor.cache_clear()
+
+
+def test_every_kind_and_the_unit_it_is_written_in_are_common() -> None:
+    for kind in units._KINDS:
+        assert {kind.unit, kind.written} <= {"", *units._COMMON[kind.unit]}
+        assert kind.example.split()[1] in units._COMMON[kind.unit]
 
 
 @given(st.text(max_size=30))

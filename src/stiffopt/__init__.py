@@ -3,24 +3,36 @@
 The model (`load_robot`), the task (`load_task`) and the optimiser (`solve_pressure`) in SI units.
 """
 
-from stiffopt.errors import (
-    EquilibriumError,
-    FileError,
-    InputError,
-    MissingExtraError,
-    PressureError,
-    StiffoptError,
-)
-from stiffopt.model.description import RobotDescription
-from stiffopt.model.manipulator import Manipulator, load_robot
-from stiffopt.model.robot_files import builtin_robots
-from stiffopt.model.screws import Twist, Wrench
-from stiffopt.optimise.goal import AtLeast, MatchMatrix, MatchValue, StiffnessGoal, StiffnessMeasure
-from stiffopt.optimise.pareto import pareto_front
-from stiffopt.optimise.solution import PressureSolution
-from stiffopt.optimise.solver import PressureSolver, solve_pressure
-from stiffopt.optimise.target import Target, Tolerance
-from stiffopt.optimise.task import Load, Task, load_task
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stiffopt.errors import (
+        EquilibriumError,
+        FileError,
+        InputError,
+        MissingExtraError,
+        PressureError,
+        SlowWarning,
+        StiffoptError,
+    )
+    from stiffopt.model.description import RobotDescription
+    from stiffopt.model.manipulator import Manipulator, load_robot
+    from stiffopt.model.robot_files import builtin_robots
+    from stiffopt.model.screws import Twist, Wrench
+    from stiffopt.optimise.goal import (
+        AtLeast,
+        MatchMatrix,
+        MatchValue,
+        StiffnessGoal,
+        StiffnessMeasure,
+    )
+    from stiffopt.optimise.pareto import pareto_front
+    from stiffopt.optimise.solution import PressureSolution
+    from stiffopt.optimise.solver import PressureSolver, solve_batch, solve_pressure
+    from stiffopt.optimise.target import Target, Tolerance
+    from stiffopt.optimise.task import Load, Task, load_task
+    from stiffopt.workspace import WorkspaceMap, map_workspace, open_workspace_map
 
 __version__ = "0.1.0"
 
@@ -38,6 +50,7 @@ __all__ = [
     "PressureSolution",
     "PressureSolver",
     "RobotDescription",
+    "SlowWarning",
     "StiffnessGoal",
     "StiffnessMeasure",
     "StiffoptError",
@@ -45,11 +58,62 @@ __all__ = [
     "Task",
     "Tolerance",
     "Twist",
+    "WorkspaceMap",
     "Wrench",
     "__version__",
     "builtin_robots",
     "load_robot",
     "load_task",
+    "map_workspace",
+    "open_workspace_map",
     "pareto_front",
+    "solve_batch",
     "solve_pressure",
 ]
+
+# Names are imported when they are first asked for: NumPy, CasADi and pydantic take a quarter of a
+# second, for which neither `--help` nor a wrong option should wait.
+_NAMES = {
+    "stiffopt.errors": (
+        *("EquilibriumError", "FileError", "InputError", "MissingExtraError"),
+        *("PressureError", "SlowWarning", "StiffoptError"),
+    ),
+    "stiffopt.model.description": ("RobotDescription",),
+    "stiffopt.model.manipulator": ("Manipulator", "load_robot"),
+    "stiffopt.model.robot_files": ("builtin_robots",),
+    "stiffopt.model.screws": ("Twist", "Wrench"),
+    "stiffopt.optimise.goal": (
+        *("AtLeast", "MatchMatrix", "MatchValue", "StiffnessGoal", "StiffnessMeasure"),
+    ),
+    "stiffopt.optimise.pareto": ("pareto_front",),
+    "stiffopt.optimise.solution": ("PressureSolution",),
+    "stiffopt.optimise.solver": ("PressureSolver", "solve_batch", "solve_pressure"),
+    "stiffopt.optimise.target": ("Target", "Tolerance"),
+    "stiffopt.optimise.task": ("Load", "Task", "load_task"),
+    "stiffopt.workspace": ("WorkspaceMap", "map_workspace", "open_workspace_map"),
+}
+_MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
+_MODULES = (
+    "documents",
+    "errors",
+    "files",
+    "lie",
+    "model",
+    "optimise",
+    "schema",
+    "units",
+    "workspace",
+)
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULE_OF:
+        value = globals()[name] = getattr(import_module(_MODULE_OF[name]), name)
+        return value
+    if name in _MODULES:
+        return import_module(f"{__name__}.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -96,6 +96,10 @@ class MissingExtraError(StiffoptError):
         )
 
 
+class SlowWarning(UserWarning):
+    """Machine code cannot be made or kept here; the same results come more slowly."""
+
+
 def shown(value: object) -> str:
     """Return a value as an error message shows it: text in quotes, on one line, never long."""
     if isinstance(value, dict):

@@ -75,13 +75,13 @@ def exponential_coefficients(x: Array) -> tuple[Array, Array, Array]:
     theta = _sqrt(safe)
     sine = ca.sin(theta) if _is_casadi(theta) else np.sin(theta)
     cosine = ca.cos(theta) if _is_casadi(theta) else np.cos(theta)
-    closed = (sine / theta, (1 - cosine) / safe, (theta - sine) / (safe * theta))
+    closed = ((1 - cosine) / safe, (theta - sine) / (safe * theta))
     series = (
         _series(x, [(-1) ** k / factorial(2 * k + offset) for k in range(_TERMS)])
-        for offset in (1, 2, 3)
+        for offset in (2, 3)
     )
-    first, second, third = (_where(small, s, c) for s, c in zip(series, closed, strict=True))
-    return first, second, third
+    second, third = (_where(small, s, c) for s, c in zip(series, closed, strict=True))
+    return 1 - x * third, second, third
 
 
 def hat(w: Array) -> Array:

@@ -1,32 +1,33 @@
 """Where output goes: answers to stdout, errors, notes and progress to stderr.
 
 Nothing that is printed is markup: a path may hold brackets.
+
+rich is imported when something is shown, not before: JSON and help need none of it.
 """
+
+from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, TextIO
 
-from rich.console import Console, RenderableType
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
-from rich.text import Text
+from stiffopt.errors import SlowWarning, printable
 
-from stiffopt.errors import printable
+if TYPE_CHECKING:
+    from rich.console import Console, RenderableType
+    from rich.progress import Progress
 
 
 class Closed(Exception):  # noqa: N818 - no error: the reader has had enough
     """Nobody reads stdout any more."""
 
 
-def _console(*, stderr: bool = False) -> Console:
+def console_on(*, stderr: bool = False) -> Console:
+    from rich.console import Console
+
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
 
 
@@ -49,7 +50,7 @@ def show(renderable: RenderableType) -> None:
     Closed
         Nobody reads stdout any more.
     """
-    console = _console()
+    console = console_on()
     with console.capture() as capture:
         console.print(renderable)
     write_line("\n".join(line.rstrip() for line in capture.get().removesuffix("\n").split("\n")))
@@ -70,9 +71,11 @@ def write_line(text: str) -> None:
 
 def report_error(message: str, *, label: str = "error: ") -> None:
     """Print one message to stderr, on one line if it has no line breaks of its own."""
+    from rich.text import Text
+
     lines = "\n".join(printable(line) for line in message.splitlines())
     text = Text.assemble((label, "bold red"), lines)
-    _console(stderr=True).print(text, soft_wrap=True)
+    console_on(stderr=True).print(text, soft_wrap=True)
 
 
 def report_note(message: str) -> None:
@@ -80,24 +83,35 @@ def report_note(message: str) -> None:
     report_error(message, label="note: ")
 
 
+@contextmanager
+def warnings_as_notes(*, quiet: bool) -> Iterator[None]:
+    """Show a `SlowWarning` as a note, or not at all."""
+    others = warnings.showwarning
+
+    def show_note(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
+        if not issubclass(category, SlowWarning):
+            others(message, category, filename, lineno, file, line)
+        elif not quiet:
+            report_note(str(message))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", SlowWarning)
+        warnings.showwarning = show_note
+        yield
+
+
 class Work:
     """Progress of long work, shown on stderr while it lasts and only on a terminal."""
 
     def __init__(self, total: int, *, quiet: bool) -> None:
-        console = _console(stderr=True)
-        count = [BarColumn(bar_width=24), MofNCompleteColumn()] if total > 1 else []
-        self._progress = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}", markup=False),
-            *count,
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            redirect_stdout=False,
-            redirect_stderr=False,
-            disable=quiet or not console.is_terminal,
-        )
-        self._task = self._progress.add_task("", total=total)
+        self._progress = None if quiet or not sys.stderr.isatty() else _progress(total)
 
     @contextmanager
     def step(self, file: str) -> Iterator[None]:
@@ -106,7 +120,8 @@ class Work:
             with self._shown(file):
                 yield
         finally:
-            self._progress.advance(self._task)
+            if self._progress is not None:
+                self._progress.advance(self._progress.task_ids[0])
 
     @contextmanager
     def drawing(self, file: str) -> Iterator[None]:
@@ -116,9 +131,39 @@ class Work:
 
     @contextmanager
     def _shown(self, description: str) -> Iterator[None]:
-        self._progress.update(self._task, description=printable(description))
+        if self._progress is None:
+            yield
+            return
+        self._progress.update(self._progress.task_ids[0], description=printable(description))
         self._progress.start()
         try:
             yield
         finally:
             self._progress.stop()
+
+
+def _progress(total: int) -> Progress:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+        TimeElapsedColumn,
+    )
+
+    console = console_on(stderr=True)
+    count = [BarColumn(bar_width=24), MofNCompleteColumn()] if total > 1 else []
+    progress = Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        *count,
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        redirect_stdout=False,
+        redirect_stderr=False,
+        disable=not console.is_terminal,
+    )
+    progress.add_task("", total=total)
+    return progress

@@ -1,5 +1,7 @@
 """Entry points: `stiffopt` with its commands, and `solve-pressure`, which is `stiffopt solve`."""
 
+import gc
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -8,6 +10,7 @@ import typer
 
 from stiffopt.cli.console import Closed, report_error
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
+from stiffopt.cli.map import map_app
 from stiffopt.cli.robots import robots
 from stiffopt.cli.solve import HELP, examples, solve
 from stiffopt.cli.version import print_version
@@ -30,6 +33,7 @@ def _application() -> typer.Typer:
 app = _application()
 app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
 app.command("robots")(robots)
+app.add_typer(map_app, name="map")
 
 solve_pressure_app = _application()
 solve_pressure_app.command("solve-pressure", help=HELP, epilog=examples("solve-pressure"))(solve)
@@ -61,6 +65,8 @@ def _run(application: typer.Typer, name: str, arguments: Sequence[str] | None) -
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # a character that the terminal lacks is no error
             stream.reconfigure(errors="backslashreplace")
+    # Before NumPy is imported: the matrices are small, a second thread would only spin.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
         application(given, prog_name=name)
@@ -73,4 +79,7 @@ def _run(application: typer.Typer, name: str, arguments: Sequence[str] | None) -
     except OSError as error:  # a full disk, a vanished terminal
         report_error(f"cannot write the answer: {error.strerror or error}")
         return BAD_INPUT
+    finally:
+        if arguments is None:  # the process ends here, and a last search for garbage takes 40 ms
+            gc.freeze()
     return 0

@@ -1,16 +1,33 @@
-"""What `solve-pressure` does with its arguments, file by file."""
+"""What `solve-pressure` does with its arguments, file by file.
+
+The tables need rich, so their module is imported where one is printed.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from traceback import extract_tb
+from typing import TYPE_CHECKING
 
-from stiffopt.cli import exits, outputs, records, report
+from stiffopt.cli import exits, outputs, records
 from stiffopt.cli.answer import Answer, answer_file
-from stiffopt.cli.console import Closed, Work, report_error, report_note, show, write_line
+from stiffopt.cli.console import (
+    Closed,
+    Work,
+    report_error,
+    report_note,
+    show,
+    warnings_as_notes,
+    write_line,
+)
 from stiffopt.cli.inputs import Inputs, find_tasks
 from stiffopt.cli.interrupts import Interruptible
 from stiffopt.errors import StiffoptError
+
+if TYPE_CHECKING:
+    from stiffopt.cli.report import Row
 
 
 @dataclass(frozen=True)
@@ -24,6 +41,11 @@ class Options:
     seed: int = 0
     quiet: bool = False
 
+    @property
+    def tables(self) -> bool:
+        """Whether answers are printed as tables."""
+        return not self.as_json and not self.quiet
+
 
 def run(tasks: Sequence[str], options: Options) -> int:
     """Solve task files and folders of them; print, write and draw; return the exit code."""
@@ -33,7 +55,7 @@ def run(tasks: Sequence[str], options: Options) -> int:
     except StiffoptError as error:
         report_error(str(error))
         return exits.BAD_INPUT
-    with Interruptible() as interrupts:
+    with Interruptible() as interrupts, warnings_as_notes(quiet=options.quiet):
         return _run_checked(inputs, to_write, options, interrupts)
 
 
@@ -63,7 +85,7 @@ class _Batch:
     work: Work
     interrupts: Interruptible
     answers: list[Answer] = field(default_factory=list)
-    rows: list[report.Row] = field(default_factory=list)
+    rows: list[Row] = field(default_factory=list)
     codes: list[int] = field(default_factory=list)
     reader_left: bool = False
 
@@ -91,12 +113,17 @@ class _Batch:
         """Report a file that has no answer."""
         report_error(message)
         self.codes.append(code)
-        self.rows.append(report.Row(file, "bad input" if code == exits.BAD_INPUT else "failed"))
+        if self.options.tables:
+            from stiffopt.cli.report import Row
+
+            self.rows.append(Row(file, "bad input" if code == exits.BAD_INPUT else "failed"))
 
     def summarise(self) -> None:
         """Print one line a file, where there are several."""
-        if len(self.rows) > 1 and not self.options.as_json and not self.options.quiet:
-            self._print(lambda: show(report.summary(self.rows)))
+        if len(self.rows) > 1:
+            from stiffopt.cli.report import summary
+
+            self._print(lambda: show(summary(self.rows)))
 
     def write(self, path: str | None) -> None:
         """Write the result file."""
@@ -110,12 +137,14 @@ class _Batch:
 
     def _take(self, answer: Answer, seconds: float) -> None:
         self.answers.append(answer)
-        self.rows.append(report.Row.of(answer, seconds))
         self.codes.append(exits.OF_STATUS[answer.solution.status])
         if self.options.as_json:
             self._print(lambda: write_line(records.json_line(answer)))
-        elif not self.options.quiet:
-            self._print(lambda: show(report.block(answer)))
+        if self.options.tables:
+            from stiffopt.cli.report import Row, block
+
+            self.rows.append(Row.of(answer, seconds))
+            self._print(lambda: show(block(answer)))
         if answer.complaint:
             report_error(f"{answer.file}: {answer.complaint}")
             self.codes.append(exits.BAD_INPUT)

@@ -4,7 +4,6 @@ from typing import Annotated
 
 import typer
 
-from stiffopt.cli.run import Options, run
 from stiffopt.cli.version import print_version
 
 HELP = """\
@@ -99,5 +98,7 @@ def solve(
     ] = False,
 ) -> None:
     """Solve task files."""
+    from stiffopt.cli.run import Options, run  # here, so that --help waits for no numerics
+
     options = Options(as_json, out, plot, pareto, seed, quiet)
     raise typer.Exit(run(tasks, options))

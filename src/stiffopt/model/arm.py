@@ -6,7 +6,8 @@
 
 from collections.abc import Callable, Hashable
 from functools import cached_property
-from typing import Any, Self
+from math import isfinite
+from typing import Any, Self, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -20,6 +21,9 @@ from stiffopt.model.compliance import Frame
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.equilibrium import Equilibrium, Loads, State
 from stiffopt.model.kinematics import Actuation
+from stiffopt.model.native_calls import BatchFunction, InterpretedFunction
+from stiffopt.model.native_robot import TipFunctions
+from stiffopt.model.native_source import dense
 from stiffopt.model.numeric import (
     checked_integer,
     checked_number,
@@ -31,6 +35,7 @@ from stiffopt.model.shooting import SAME_STATION, Shooting
 
 Vector = NDArray[np.float64]
 Values = Callable[[Shape], Any]
+Kept = TypeVar("Kept")
 
 
 class Arm:
@@ -51,9 +56,13 @@ class Arm:
         self.resolution = checked_integer("resolution", resolution, 1)
         self._tip_load = _tip_load(force, moment, load_frame)
         self._actuation = Actuation.of(description)
-        self._functions: dict[Hashable, ca.Function] = {}
+        self._functions: dict[Hashable, InterpretedFunction] = {}
         self._shared: dict[str, Equilibrium] = {}
-        self._margin = ca.Function("margin", [self._actuation.pressures], [self._actuation.margin])
+        self._kept: dict[Hashable, Any] = {}
+        self._margin = InterpretedFunction(
+            ca.Function("margin", [self._actuation.pressures], [ca.densify(self._actuation.margin)])
+        )
+        self._tip = TipFunctions(description, self._actuation)
         for corner in (self.pressure_min, self.pressure_max, self._farthest_pressures()):
             self._check_margin(corner[np.newaxis], " within the robot's pressure limits")
 
@@ -89,6 +98,11 @@ class Arm:
         """Whether gravity or a tip load acts, so that shapes are equilibria."""
         return any(self.description.gravity) or bool(self._tip_load.any())
 
+    @property
+    def tip_load(self) -> tuple[float, ...]:
+        """Dead wrench in base axes (6), then follower wrench in tip axes (6), at the tip."""
+        return tuple(self._tip_load.tolist())
+
     def with_load(
         self, force: ArrayLike, moment: ArrayLike = (0.0, 0.0, 0.0), frame: Frame = "base"
     ) -> Self:
@@ -112,21 +126,36 @@ class Arm:
 
     # -- for the optimiser ------------------------------------------------------------------
 
+    def tip_function(
+        self, name: str, outputs: Callable[[Shape, Any], list[Any]], n_parameters: int = 0
+    ) -> ca.Function:
+        """Symbolic function of the inputs of the tip's shape and of parameters, dense."""
+        tip = self._symbolic(None)
+        parameters = type(tip.position).sym("parameters", n_parameters)
+        found = ca.cse([ca.densify(output) for output in outputs(tip, parameters)])
+        return dense(ca.Function(name, [*tip.inputs, parameters], found))
+
     def evaluator(
         self,
         key: Hashable,
         outputs: Callable[[Shape, Any], list[Any]],
         n_parameters: int = 0,
     ) -> "Evaluator":
-        """Compile outputs of the tip's shape and of parameters; `key` names them in the cache."""
-        full_key = (key, n_parameters, self.is_loaded)
-        if full_key not in self._functions:
-            tip = self._symbolic(None)
-            parameters = type(tip.position).sym("parameters", n_parameters)
-            self._functions[full_key] = ca.Function(
-                "evaluator", [*tip.inputs, parameters], outputs(tip, parameters)
-            )
-        return Evaluator(self, self._functions[full_key])
+        """Outputs of the tip's shape and of parameters; `key` names them in the cache."""
+        return Evaluator(
+            self,
+            self.kept(
+                ("evaluator", key, n_parameters, self.is_loaded),
+                lambda: InterpretedFunction(self.tip_function("evaluator", outputs, n_parameters)),
+            ),
+        )
+
+    def kept(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
+        """What others made of this arm, or of the same under another load, or make now."""
+        if key not in self._kept:
+            self._kept[key] = make()
+        found: Kept = self._kept[key]
+        return found
 
     # -- numerics ---------------------------------------------------------------------------
 
@@ -162,11 +191,13 @@ class Arm:
 
     def _function(
         self, key: Hashable, outputs: Callable[[Shape], list[Any]], at: float | None = None
-    ) -> ca.Function:
+    ) -> InterpretedFunction:
         full_key = (key, at, self.is_loaded)
         if full_key not in self._functions:
             shape = self._symbolic(at)
-            self._functions[full_key] = ca.Function("shape", list(shape.inputs), outputs(shape))
+            self._functions[full_key] = InterpretedFunction(
+                dense(ca.Function("shape", list(shape.inputs), outputs(shape)))
+            )
         return self._functions[full_key]
 
     def _evaluate(
@@ -174,18 +205,36 @@ class Arm:
     ) -> Vector:
         """Value of a shape for one or many pressures, as (..., rows, columns)."""
         batch, single = self._pressures(p)
-        function = self._function(key, lambda shape: [ca.densify(value(shape))], at)
+        function = self._function(key, lambda shape: [value(shape)], at)
         results = (
-            _stacked([self._at_equilibrium(function, row) for row in batch], function.size_out(0))
+            _stacked(
+                [self._at_equilibrium(function, row) for row in batch],
+                function.signature.outputs[0],
+            )
             if self.is_loaded
-            else evaluate_many(function, batch)[0]
+            else function.many(batch)[0]
         )
         return results[0] if single else results
 
-    def _at_equilibrium(self, function: ca.Function, p: Vector) -> Vector:
+    def _checked_tip(self, evaluate: Callable[[Vector], list[Vector]], p: ArrayLike) -> Vector:
+        """Value (..., rows, columns) of something of the arm without loads.
+
+        `evaluate` gives it with the margins of the strain laws, which are looked at here.
+        """
+        values = self._checked(p)
+        result, margins = evaluate(values)
+        allowed = (
+            all(margin > 0 for margin in margins[:, 0].tolist())
+            if values.ndim == 1
+            else (margins > 0).all()
+        )
+        if not allowed:
+            self._check_margin(np.atleast_2d(values), "")
+        return result
+
+    def _at_equilibrium(self, function: InterpretedFunction, p: Vector) -> Vector:
         """Value of a function of the loaded shape at pressures (n,)."""
-        value: Vector = function(*self._equilibrium.arguments(self.settle(p))).full()
-        return value
+        return function(*self._equilibrium.arguments(self.settle(p)))[0]
 
     def settle(self, p: Vector, nearby: State | None = None) -> State:
         """Equilibrium of the loaded arm at pressures (n,), from rest or from a nearby one.
@@ -231,21 +280,38 @@ class Arm:
 
     def _pressures(self, p: ArrayLike) -> tuple[Vector, bool]:
         """Checked pressures (N, n), and whether a single set was given."""
-        try:
-            values = real_numbers(p)
-        except ValueError as error:
-            raise PressureError(f"pressures must be numbers in Pa; got {p!r}") from error
+        values = self._checked(p)
+        batch = np.atleast_2d(values)
+        self._check_margin(batch, "")
+        return batch, values.ndim == 1
+
+    def _checked(self, p: ArrayLike) -> Vector:
+        """Finite pressures (n,) or (N, n), which the strain law may not allow.
+
+        An array of the right kind is returned as it is.
+        """
+        if type(p) is np.ndarray and p.dtype == np.float64:
+            values = p
+        else:
+            try:
+                values = real_numbers(p)
+            except ValueError as error:
+                raise PressureError(f"pressures must be numbers in Pa; got {p!r}") from error
         if values.ndim not in (1, 2) or values.shape[-1] != self.n_pressures:
             raise PressureError(
                 f"expected pressures of shape ({self.n_pressures},) or (N, {self.n_pressures}) "
                 f"for robot '{self.description.name}', proximal segment first; "
                 f"got shape {values.shape}"
             )
-        batch = np.atleast_2d(values)
-        if not np.isfinite(batch).all():
+        # a loop over a few numbers is several times as fast as NumPy
+        finite = (
+            all(map(isfinite, values.tolist()))
+            if values.ndim == 1
+            else bool(np.isfinite(values).all())
+        )
+        if not finite:
             raise PressureError("pressures must be finite; got NaN or an infinity")
-        self._check_margin(batch, "")
-        return batch, values.ndim == 1
+        return values
 
     def _single(self, p: ArrayLike) -> Vector:
         batch, single = self._pressures(p)
@@ -257,10 +323,10 @@ class Arm:
         """Raise where the strain law of a segment breaks down."""
         if not len(batch):
             return
-        margins = self._margin(batch.T).full()  # (segments, N)
+        margins = self._margin.many(batch)[0][..., 0]  # (N, segments)
         if (margins > 0).all():
             return
-        segment, row = np.argwhere(~(margins > 0))[0]
+        segment, row = np.argwhere(~(margins.T > 0))[0]
         bars = ", ".join(f"{value / 1e5:.4g}" for value in batch[row])
         law = strain_law(self.description.segments[segment])
         raise PressureError(
@@ -296,7 +362,7 @@ class Evaluator:
     forgets it, and the next is found from rest.
     """
 
-    def __init__(self, arm: Arm, function: ca.Function) -> None:
+    def __init__(self, arm: Arm, function: BatchFunction) -> None:
         self._arm = arm
         self._function = function
         self._state: State | None = None
@@ -312,7 +378,7 @@ class Evaluator:
 
     def many(self, batch: Vector, *parameters: Vector) -> list[Vector]:
         """Outputs at checked pressures (N, n) of an arm without loads, each (N, rows, columns)."""
-        return evaluate_many(self._function, batch, *(parameters or (np.zeros(0),)))
+        return self._function.many(batch, *(parameters or (np.zeros(0),)))
 
     def __call__(self, p: Vector, *parameters: Vector) -> list[Vector]:
         """Outputs at checked pressures (n,) and parameters, as 2-D arrays."""
@@ -322,24 +388,12 @@ class Evaluator:
             inputs = self._arm._equilibrium.arguments(self._state)
         else:
             inputs = (p,)
-        return [value.full() for value in self._function.call([*inputs, *parameters])]
+        return self._function(*inputs, *parameters)
 
 
 def _stacked(results: list[Vector], shape: tuple[int, ...]) -> Vector:
     """Results of this shape as one array (N, ...), N may be 0."""
     return np.array(results).reshape(len(results), *shape)
-
-
-def evaluate_many(function: ca.Function, batch: Vector, *parameters: Vector) -> list[Vector]:
-    """Outputs (r, c) of a function of (n,) and parameters, for a batch (N, n): each (N, r, c)."""
-    shapes = [function.size_out(index) for index in range(function.n_out())]
-    if not len(batch):
-        return [np.empty((0, *shape)) for shape in shapes]
-    wide = function.call([batch.T, *parameters])  # each (r, N c)
-    return [
-        np.ascontiguousarray(value.full().reshape(rows, len(batch), columns).swapaxes(0, 1))
-        for value, (rows, columns) in zip(wide, shapes, strict=True)
-    ]
 
 
 def _tip_load(force: ArrayLike, moment: ArrayLike, frame: Frame) -> Vector:

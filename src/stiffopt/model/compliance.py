@@ -5,6 +5,7 @@ it is meant.  `C_a = X C_b X^T` with ``X = adjoint(T_ab)`` is eq. 16, since
 ``adjoint = coadjoint^-T``.
 """
 
+from dataclasses import dataclass
 from typing import Literal
 
 import casadi as ca
@@ -26,23 +27,95 @@ bend by up to 170 degrees, and below 1e-6 at a full circle.
 """
 
 
-def segment_compliance(section: Section, arc_length: ca.SX | float) -> ca.SX:
+@dataclass(frozen=True)
+class NodePair:
+    """Two Gauss points, at ``-s`` and ``+s`` from the middle of a segment.
+
+    The motion from the middle to them is ``(even +- odd)``, in rotation and in position.
+    """
+
+    weight: float  # of each, times the length
+    rotation: tuple[ca.SX, ca.SX]  # (3, 3), even and odd in s
+    position: tuple[ca.SX, ca.SX]  # (3,)
+
+
+def node_pairs(section: Section, arc_length: float) -> list[NodePair]:
+    """Gauss points of a segment of constant strain and this length."""
+    nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
+    pairs = []
+    for node, weight in zip(nodes, weights, strict=True):
+        if node <= 0:
+            continue  # the points are symmetric, and of even number
+        twist = section.strain * (0.5 * arc_length * node)
+        v, w = twist[:3], twist[3:]
+        first, second, third = lie.exponential_coefficients(ca.sumsqr(w))
+        W = lie.hat(w)
+        W2 = W @ W
+        pairs.append(
+            NodePair(
+                0.5 * arc_length * weight,
+                (ca.SX.eye(3) + second * W2, first * W),
+                (second * (W @ v), v + third * (W2 @ v)),
+            )
+        )
+    return pairs
+
+
+def segment_compliance(section: Section, arc_length: float, half: ca.SX) -> ca.SX:
     """Compliance (6, 6) of the first `arc_length` of a segment, in its far end's frame.
 
-    ``int X C_S X^T dS`` with X the adjoint from the far end to S (eq. 17).
+    ``int X C_S X^T dS`` with X the adjoint from the far end to S (eq. 17), taken about the
+    middle, from where `half` (4, 4) leads to the far end.
     """
-    nodes, weights = np.polynomial.legendre.leggauss(QUADRATURE_POINTS)
     C = ca.SX.zeros(6, 6)
-    for node, weight in zip((1 + nodes) / 2, weights / 2, strict=True):
-        X = lie.adjoint(lie.exp(section.strain * (-node * arc_length)))
-        C += weight * (X @ section.compliance @ X.T)
-    return C * arc_length
+    for pair in node_pairs(section, arc_length):
+        R, odd_R = pair.rotation
+        p, odd_p = (lie.hat(position) for position in pair.position)
+        even = _upper_triangular(R, p @ R + odd_p @ odd_R)
+        odd = _upper_triangular(odd_R, p @ odd_R + odd_p @ R)
+        own = section.compliance
+        C += (2 * pair.weight) * (_congruent(even, own) + _congruent(odd, own))
+    return carry_compliance(C, lie.inverse(half))
+
+
+def segment_flexibility(section: Section, arc_length: float, wrench: ca.SX) -> ca.SX:
+    """Twice the strain energy of a wrench (6,) at the middle of a segment, in axes of that.
+
+    ``int w' C_S w dS`` with w the wrench as it is met at S.
+    """
+    force, moment = wrench[:3], wrench[3:]
+    total = ca.SX(0)
+    for pair in node_pairs(section, arc_length):
+        R, odd_R = pair.rotation
+        p, odd_p = pair.position
+        here, odd = moment - ca.cross(p, force), ca.cross(odd_p, force)
+        # (R + odd_R)' (here - odd), of which R is symmetric and odd_R skew
+        parts = (
+            ca.vertcat(R @ force, R @ here + odd_R @ odd),
+            ca.vertcat(odd_R @ force, odd_R @ here + R @ odd),  # but for the sign
+        )
+        energies = (part.T @ section.compliance @ part for part in parts)
+        total += (2 * pair.weight) * sum(energies)
+    return total
+
+
+def _upper_triangular(diagonal: ca.SX, corner: ca.SX) -> ca.SX:
+    return ca.vertcat(ca.horzcat(diagonal, corner), ca.horzcat(ca.SX(3, 3), diagonal))
 
 
 def carry_compliance(C: ca.SX, T: ca.SX) -> ca.SX:
     """Compliance C of frame b as seen in frame a, with ``T = T_ab`` (eq. 16)."""
-    X = lie.adjoint(T)
-    return X @ C @ X.T
+    return _congruent(lie.adjoint(T), C)
+
+
+def _congruent(X: ca.SX, C: ca.SX) -> ca.SX:
+    """``X C X'`` of a symmetric C, half of which is worked out."""
+    XC = X @ C
+    upper = ca.SX(*C.shape)
+    for row in range(C.shape[0]):
+        for column in range(row, C.shape[1]):
+            upper[row, column] = ca.dot(XC[row, :], X[column, :])
+    return ca.triu2symm(upper)
 
 
 def directional_stiffness(
@@ -73,6 +146,26 @@ def directional_stiffness(
         block = compliance[:3, :3] if kind == "translation" else compliance[3:, 3:]
         return 1 / (d.T @ block @ d)
     return d.T @ stiffness_block(compliance, kind, boundary) @ d
+
+
+def held_stiffness(
+    compliance: ca.SX, direction: ca.SX, is_rotation: ca.SX, is_clamped: ca.SX
+) -> tuple[ca.SX, ca.SX]:
+    """Stiffness along a unit direction (3,) in axes of the compliance, "guided" or "clamped".
+
+    The conditions are symbols, 0 or 1.  The second result is the wrench (6,) that moves the held
+    point by one unit in this direction.
+    """
+    vv, vw = compliance[:3, :3], compliance[:3, 3:]
+    wv, ww = compliance[3:, :3], compliance[3:, 3:]
+
+    def chosen(rotation: ca.SX, translation: ca.SX) -> ca.SX:
+        return ca.if_else(is_rotation, rotation, translation)
+
+    reaction = -is_clamped * inverse_3x3(chosen(vv, ww)) @ chosen(vw, wv)  # per own force
+    own = inverse_3x3(chosen(ww, vv) + chosen(wv, vw) @ reaction) @ direction
+    held = reaction @ own
+    return ca.dot(direction, own), ca.vertcat(chosen(held, own), chosen(own, held))
 
 
 def stiffness_block(compliance: ca.SX, kind: Kind, boundary: Boundary) -> ca.SX:

@@ -1,7 +1,9 @@
 """Manipulator: the numerical functions of one arm, single and batched, that everyone calls."""
 
 import os
-from typing import Any, Literal, get_args
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, Literal, TypeGuard, get_args
 
 import casadi as ca
 import numpy as np
@@ -17,12 +19,12 @@ from stiffopt.model.arguments import (
     dead_and_follower,
 )
 from stiffopt.model.arm import Arm, Values
-from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
+from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.numeric import checked_integer
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.screws import Twist, Wrench
-from stiffopt.model.shape import Shape
+from stiffopt.model.shape import Shape, stiffness_along
 
 Vector = NDArray[np.float64]
 Method = Literal["equilibrium", "first-order", "elementwise"]
@@ -62,10 +64,14 @@ class Manipulator(Arm):
 
     def tip_pose(self, p: ArrayLike) -> Vector:
         """Pose of the tip in the base frame (eq. 7), (4, 4) or (N, 4, 4)."""
+        if not self.is_loaded:
+            return self._checked_tip(lambda q: self._tip.evaluate("tip_pose", q), p)
         return self._evaluate("pose", lambda tip: tip.transform, p)
 
     def tip_jacobian(self, p: ArrayLike) -> Vector:
         """Twist of the tip in tip axes per pressure, (6, n): m/Pa above, rad/Pa below."""
+        if not self.is_loaded:
+            return self._checked_tip(lambda q: self._tip.evaluate("tip_jacobian", q), p)
         return self._evaluate("jacobian", lambda tip: tip.jacobian, p)
 
     def tip_jacobian_derivative(self, p: ArrayLike) -> Vector:
@@ -96,6 +102,8 @@ class Manipulator(Arm):
         return self._compliance(p, None)
 
     def _compliance(self, p: ArrayLike, at: float | None) -> Vector:
+        if not self.is_loaded and at is None:
+            return self._checked_tip(lambda q: self._tip.evaluate("tip_compliance", q), p)
         C = self._evaluate("compliance", lambda point: point.compliance, p, at=at)
         if self.is_loaded and self._loads.are_conservative:
             # symmetric but for the integrator's error of about 1e-6
@@ -121,7 +129,7 @@ class Manipulator(Arm):
         ----------
         p : (n,) or (N, n)
             Pressures in Pa.
-        direction : (3,)
+        direction : (3,) or (k, 3)
             Need not be of unit length; in the axes that `frame` names.
         kind : {"translation", "rotation"}
         boundary : {"free", "guided", "clamped"}
@@ -132,12 +140,18 @@ class Manipulator(Arm):
 
         Returns
         -------
-        float or ndarray (N,)
+        float or ndarray (N,), and with k directions (k,) or (N, k)
         """
-        measure = checked_measure(direction, kind, boundary, frame)
-        result = self._evaluate(
-            ("stiffness", measure), _stiffness_of(measure), p, at=self._station(at)
-        )[..., 0, 0]
+        at = self._station(at)
+        if _is_table(direction):
+            each = [self.stiffness(p, row, kind, boundary, frame, at) for row in direction]
+            return np.stack(each, axis=-1)
+        measure = _measure(direction, kind, boundary, frame)
+        if self.is_loaded or at is not None:
+            values = self._evaluate(("stiffness", measure), _stiffness_of(measure), p, at=at)
+        else:
+            values = self._checked_tip(lambda q: self._tip.stiffness(q, measure), p)
+        result = values[..., 0, 0]
         return float(result) if result.ndim == 0 else result
 
     def stiffness_gradient(
@@ -149,7 +163,10 @@ class Manipulator(Arm):
         frame: Frame = "base",
     ) -> Vector:
         """Derivative of `stiffness` at the tip by the pressures, (n,) or (N, n)."""
-        measure = checked_measure(direction, kind, boundary, frame)
+        measure = _measure(direction, kind, boundary, frame)
+        if not self.is_loaded:
+            gradient = self._checked_tip(lambda q: self._tip.stiffness_gradient(q, measure), p)
+            return gradient[..., 0, :]
         stiffness = _stiffness_of(measure)
         return self._evaluate(
             ("stiffness gradient", measure), lambda tip: tip.total_jacobian(stiffness(tip)), p
@@ -281,11 +298,35 @@ def load_robot(
     return Manipulator(load_description(name_or_path), resolution=resolution)
 
 
+def _is_table(direction: ArrayLike) -> TypeGuard[Sequence[ArrayLike]]:
+    """Whether several directions are given, at least one."""
+    if isinstance(direction, list | tuple) and direction and isinstance(direction[0], float | int):
+        return False  # the usual case, at once
+    try:
+        shape = np.shape(direction)
+    except ValueError:  # rows of different lengths
+        return False
+    return len(shape) == 2 and shape[0] > 0
+
+
+def _measure(direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame) -> Measure:
+    """Checked directional stiffness; what was checked before is remembered."""
+    values = direction.tolist() if isinstance(direction, np.ndarray) else direction
+    if isinstance(values, list | tuple) and all(type(value) in (float, int) for value in values):
+        try:
+            return _checked_before(tuple(values), kind, boundary, frame)
+        except TypeError:  # a name that is none, and of a kind that cannot be remembered
+            pass
+    return checked_measure(direction, kind, boundary, frame)
+
+
+_checked_before = lru_cache(maxsize=256)(checked_measure)
+
+
 def _stiffness_of(measure: Measure) -> Values:
     def value(shape: Shape) -> Any:
-        return directional_stiffness(
-            shape.compliance,
-            shape.rotation,
+        return stiffness_along(
+            shape,
             ca.DM(measure.direction),
             frame=measure.frame,
             kind=measure.kind,

@@ -104,6 +104,25 @@ class Piece:
     distal: float  # arc length at rest of its far end, from the base
 
 
+def slopes(
+    q: ca.SX,
+    m: ca.SX,
+    force: ca.SX,
+    weight: ca.SX,
+    strain: ca.SX,
+    compliance: ca.SX,
+    centroid: Vector,
+) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """Right-hand sides q' and m' of the rod's equations and the tangent -r', per length."""
+    R = lie.rotation_from_quaternion(q)
+    xi = strain + compliance @ ca.vertcat(R.T @ force, R.T @ m)
+    tangent = R @ xi[:3]
+    moment = ca.cross(tangent, force)
+    if centroid.any():
+        moment += ca.cross(R @ ca.vertcat(*centroid, 0), weight)
+    return -0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), tangent, moment
+
+
 def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
     """One integration step of length h towards the base: state (10,) -> state (10,)."""
     start = ca.SX.sym("y", 10)  # q (4), r (3), m (3)
@@ -112,25 +131,20 @@ def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
     n, f, h = ca.SX.sym("n", 3), ca.SX.sym("f", 3), ca.SX.sym("h")
 
     def derivative(state: ca.SX, tau: ca.SX) -> ca.SX:
-        q, m = state[:4], state[7:]
-        R = lie.rotation_from_quaternion(q)
-        force = n + f * tau
-        xi = strain + compliance @ ca.vertcat(R.T @ force, R.T @ m)
-        tangent = R @ xi[:3]
-        moment = ca.cross(tangent, force)
-        if centroid.any():
-            moment += ca.cross(R @ ca.vertcat(*centroid, 0), f)
-        return ca.vertcat(-0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), -tangent, moment)
+        turning, tangent, moment = slopes(
+            state[:4], state[7:], n + f * tau, f, strain, compliance, centroid
+        )
+        return ca.vertcat(turning, -tangent, moment)
 
-    slopes: list[ca.SX] = []
+    found: list[ca.SX] = []
     for row in _STAGES:
         state = start
         for j, a in row.items():
-            state = state + h * a * slopes[j]
-        slopes.append(derivative(state, h * sum(row.values())))
+            state = state + h * a * found[j]
+        found.append(derivative(state, h * sum(row.values())))
     end = start
     for j, b in _WEIGHTS.items():
-        end = end + h * b * slopes[j]
+        end = end + h * b * found[j]
     return ca.Function("step", [start, strain, compliance, n, f, h], [end])
 
 
@@ -165,6 +179,11 @@ class Chain:
     def x(self) -> ca.MX:
         """Variables (3 + n + 6,): turn of the tip, pressures, added dead wrench."""
         return self.inputs[1]
+
+    @property
+    def pressures(self) -> ca.MX:
+        """Channel pressures (n,)."""
+        return self.x[3:-6]
 
     @property
     def rotation(self) -> ca.MX:
@@ -205,6 +224,10 @@ class Chain:
     def compliance(self) -> ca.MX:
         """Tangent compliance (6, 6) at the station, in its axes, for added dead loads."""
         return self._twist_per_rest[:, -6:] @ ca.diagcat(self.rotation, self.rotation)
+
+    def flexibility(self, wrench: ca.MX) -> ca.MX:
+        """``w' C w`` of a dead wrench (6,) at the station, in its axes."""
+        return wrench.T @ self.compliance @ wrench
 
     def total_jacobian(self, values: ca.MX) -> ca.MX:
         """Derivative (k, n) of values (k,) by the pressures, along the equilibrium."""

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.optimise.goal import MatchMatrix, MatchValue
-from stiffopt.optimise.local import LocalResult, descend, reach
+from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.problem import Problem
+from stiffopt.optimise.search import search
 from stiffopt.optimise.solution import Judgement, Sensitivities
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.terms import pose_terms
@@ -20,6 +21,8 @@ from stiffopt.optimise.terms import pose_terms
 Vector = NDArray[np.float64]
 
 _MOST_DESCENTS = 16
+_AGREEING = 4  # descents in a row that find nothing nearer before a search for it ends
+_SAME = 1e-7  # half a squared error over a scale, of configurations that are as near
 
 
 def closest_configurations(problem: Problem, candidates: Iterable[Vector]) -> list[LocalResult]:
@@ -30,35 +33,28 @@ def closest_configurations(problem: Problem, candidates: Iterable[Vector]) -> li
     """
     xs = list(candidates)
     names = [term.name for term in pose_terms(problem.task.target)]
-    free = problem.changed(floors=(), position=inf, angle=inf)
+    free = problem.changed(problem.objective, floors=False, position=inf, angle=inf)
     if names != ["position", "angle"]:
-        return _descents(free.changed(objective=problem.closest(names[0])), xs)
-    turned = _descents(free.changed(objective=problem.closest("angle")), xs)
+        return _descents(free.changed(problem.closest(names[0])), xs)
+    turned = _descents(free.changed(problem.closest("angle")), xs)
     if not turned:
         return []
     least = next(ball.error for ball in turned[0].point.balls if ball.name == "angle")
     allowed = max(problem.task.target.tolerance.angle, least * (1 + 1e-6) + 1e-7)
-    nearest = free.changed(objective=problem.closest("position"), angle=allowed)
+    nearest = free.changed(problem.closest("position"), angle=allowed)
     return _descents(nearest, [turned[0].point.x, *xs])
+
+
+def _descents(problem: Problem, xs: list[Vector]) -> list[LocalResult]:
+    return list(search(problem, xs, _MOST_DESCENTS, _SAME, _AGREEING).results)
 
 
 def unimproved(problem: Problem, x: Vector) -> LocalResult:
     """Pressures as they are, as a result that can be judged beside those of descents."""
     problem.restart()
     point = problem.pose(x)
-    return LocalResult(point, inf, 0.0, False, problem.closest(point.balls[0].name), None)
-
-
-def _descents(problem: Problem, xs: Iterable[Vector]) -> list[LocalResult]:
-    results = []
-    for x in xs:
-        problem.restart()
-        point = reach(problem, x)
-        if point is not None and point.reached:
-            results.append(descend(problem, point))
-        if len(results) >= _MOST_DESCENTS:
-            break
-    return sorted(results, key=lambda result: result.value)
+    nearest = problem.changed(problem.closest(point.balls[0].name), floors=False)
+    return LocalResult(nearest, point, inf, 0.0, converged=False, is_optimum=False)
 
 
 def freedom(problem: Problem, x: Vector) -> int:

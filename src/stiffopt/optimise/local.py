@@ -1,17 +1,22 @@
 """Local optimisation that stays on the pose: a feasible-path SQP method.
 
-`reach` brings pressures to the pose (Levenberg-Marquardt with bounds); `descend` goes down the
-objective from there.  Each step solves a convex quadratic program within a trust region and is
-then pulled back into the pose's balls, so that every iterate reaches the target and progress is
-judged by the objective alone: no merit function between pose and stiffness is needed.
+`reach` brings pressures to the pose (Levenberg-Marquardt steps that mind the limits), `reach_all`
+many at once; `descend` goes down the objective from there.  Each step solves a convex quadratic
+program within a trust region and is then pulled back into the pose's balls, so that every iterate
+reaches the target and progress is judged by the objective alone: no merit function between pose
+and stiffness is needed.
 
 A ball |r| <= rho enters the quadratic program as a box around it whose first axis points where
 the multiplier pulls, together with the curvature mu/rho J'J of the sphere; both are exact to
 second order at the solution.  The rest of the Lagrangian's Hessian is a damped BFGS model.
+
+The folder ``native`` holds the same method in C.
 """
 
-from copy import copy
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import daqp
 import numpy as np
@@ -19,17 +24,18 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
 from stiffopt.optimise.problem import FLOOR_MARGIN, Objective, Point, Problem
-from stiffopt.optimise.terms import Ball
 
 Vector = NDArray[np.float64]
 
-_MOST_ITERATIONS = 80
-_FIRST_RADIUS = 0.3  # of the trust region, in bar
-_LAST_RADIUS = 1e-6
-_INSIDE = 1 - 1e-7  # share of a ball's radius that is used, so that rounding stays within
-_TOUCHING = 1e-5  # bar; a pressure that near to a limit is meant to be at it
+MOST_ITERATIONS = 80
+FIRST_RADIUS = 0.3  # of the trust region, in bar
+LAST_RADIUS = 1e-6
+INSIDE = 1 - 1e-7  # share of a ball's radius that is used, so that rounding stays within
+TOUCHING = 1e-5  # bar; a pressure that near to a limit is meant to be at it
+NEXT_TO = 0.05  # bar; a descent that near to an optimum of the same value is on its way there
 _BINDING = 1e-4  # how nearly, relatively, a constraint must hold to count as binding
 _BEYOND = 1e-3  # bar; where the price of a limit is taken, outside of it
+_CURVED = 2.0  # second-order error of a correction, for the squared first order over a scale
 _FAR = 1e6  # stands for no bound in the quadratic program
 
 
@@ -55,30 +61,49 @@ class Multipliers:
     floors: Vector
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LocalResult:
     """Where a descent ended.
 
     Attributes
     ----------
+    problem : Problem
+        What was solved.
     point : Point
     value : float
         Objective there.
     violation : float
         Sum by which floors are missed, in logarithms of stiffness.
     converged : bool
-    objective : Objective
-        What was minimised.
-    multipliers : Multipliers or None
-        None if no quadratic program was solved.
+    is_optimum : bool
+        False: the point is no more than a candidate, and has no prices.
     """
 
+    problem: Problem
     point: Point
     value: float
     violation: float
     converged: bool
-    objective: Objective
-    multipliers: Multipliers | None
+    is_optimum: bool = True
+
+    @classmethod
+    def at(cls, problem: Problem, point: Point) -> "LocalResult":
+        """A solution that is known already."""
+        value, missed = problem.objective.value(point), violation(problem, point)
+        return cls(problem, point, value, missed, converged=True)
+
+    @property
+    def objective(self) -> Objective:
+        """What was minimised."""
+        return self.problem.objective
+
+    @cached_property
+    def multipliers(self) -> Multipliers | None:
+        """Prices of the constraints; None where they cannot be had."""
+        if not self.is_optimum:
+            return None
+        self.problem.restart()
+        return _prices(self.problem, self.point)
 
     @property
     def holds_floors(self) -> bool:
@@ -86,24 +111,30 @@ class LocalResult:
         return self.violation < 0.5 * FLOOR_MARGIN
 
 
+def violation(problem: Problem, point: Point) -> float:
+    """Sum by which floors are missed, in logarithms of stiffness."""
+    if not len(problem.floors):
+        return 0.0
+    return float(np.maximum(problem.floors - point.floors, 0.0).sum())
+
+
 def solve_qp(
     H: Vector, g: Vector, A: Vector, low: Vector, high: Vector
 ) -> tuple[Vector, Vector] | None:
     """Minimise ``z'Hz/2 + g'z`` with ``low <= (z, Az) <= high``: solution and multipliers.
 
-    None where the solver's answer is not finite or not marked as optimal.
+    The arrays are contiguous.  None where the solver's answer is not finite or not marked as
+    optimal.
     """
-    if not (np.isfinite(H).all() and np.isfinite(g).all() and np.isfinite(A).all()):
-        return None
     sense = np.zeros(len(low), dtype=np.int32)
-    z, _, flag, info = daqp.solve(
-        np.ascontiguousarray(H), g.copy(), np.ascontiguousarray(A), high, low, sense,
-        primal_tol=1e-9,
-    )  # fmt: skip
+    z, _, flag, info = daqp.solve(H, g, A, high, low, sense, primal_tol=1e-9)
     z, multipliers = np.asarray(z), np.asarray(info["lam"])
-    if flag < 1 or not np.isfinite(z).all() or not np.isfinite(multipliers).all():
+    if flag < 1 or not math.isfinite(z.dot(z) + multipliers.dot(multipliers)):
         return None
     return z, multipliers
+
+
+# -- onto the pose --------------------------------------------------------------------------
 
 
 def reach(problem: Problem, x: Vector, most_iterations: int = 40) -> Point | None:
@@ -111,40 +142,31 @@ def reach(problem: Problem, x: Vector, most_iterations: int = 40) -> Point | Non
 
     None if the arm has no equilibrium at the start.
     """
-    scales = {"position": problem.robot.length, "angle": 1.0}
-
-    def stacked(point: Point) -> tuple[Vector, Vector]:
-        residual = np.concatenate([ball.residual / scales[ball.name] for ball in point.constraints])
-        jacobian = np.vstack([ball.jacobian / scales[ball.name] for ball in point.constraints])
-        return residual, jacobian
-
-    point = _attempt(problem, x, pose_only=True)
+    point = _attempt(problem.pose, x)
     if point is None:
         return None
+    rows, scale = problem.bounding.rows, problem.bounding.scale
     damping = 1e-4
-    none = np.zeros((0, len(x)))
+    before = _misfit(point.residual[rows] / scale)
     for _ in range(most_iterations):
         if point.reached:
             return point
-        residual, jacobian = stacked(point)
-        gradient = residual @ jacobian
-        low = np.maximum(problem.lower - point.x, -1.0)
-        high = np.minimum(problem.upper - point.x, 1.0)
-        H = jacobian.T @ jacobian + damping * np.eye(len(x))
-        step = solve_qp(H, gradient, none, low, high)
-        if step is None:
+        residual, jacobian = point.residual[rows], point.jacobian[rows]
+        d = bounded_step(
+            jacobian,
+            -residual,
+            damping * problem.bounding.far_damping,
+            np.maximum(problem.lower - point.x, -1.0),
+            np.minimum(problem.upper - point.x, 1.0),
+        )
+        promised = before - _misfit((residual + jacobian @ d) / scale)
+        if not promised >= 1e-9 * before:
             return point
-        d = step[0]
-        promised = -(gradient @ d + 0.5 * d @ jacobian.T @ jacobian @ d)
-        if promised < 1e-9 * (residual @ residual):
-            return point
-        trial = _attempt(problem, np.clip(point.x + d, problem.lower, problem.upper), True)
-        gained = float("-inf")
-        if trial is not None:
-            new = stacked(trial)[0]
-            gained = 0.5 * float(residual @ residual - new @ new)
+        trial = _attempt(problem.pose, _within(problem.lower, point.x + d, problem.upper))
+        after = math.inf if trial is None else _misfit(trial.residual[rows] / scale)
+        gained = before - after
         if trial is not None and gained > 0.1 * promised:
-            point = trial
+            point, before = trial, after
             damping = max(damping * (0.1 if gained > 0.7 * promised else 1.0), 1e-10)
         else:
             damping *= 10
@@ -153,67 +175,410 @@ def reach(problem: Problem, x: Vector, most_iterations: int = 40) -> Point | Non
     return point
 
 
-def descend(problem: Problem, start: Point) -> LocalResult:
-    """Minimise the problem's objective from a point that reaches the pose."""
-    point = _attempt(problem, start.x, pose_only=False)
+def reach_all(problem: Problem, x: Vector, most_iterations: int = 20) -> tuple[Vector, Vector]:
+    """Bring pressures (N, n) of an arm without loads to the pose, all at once.
+
+    Returns where they came to, and by how much (N,) the worst residual there exceeds its radius,
+    as a ratio: at most one where the pose was reached.
+    """
+    bounding = problem.bounding
+    x = _within(problem.lower, x, problem.upper)
+    if not bounding.spheres:
+        return x, np.zeros(len(x))
+    rows, scale = bounding.rows, bounding.scale
+    residual, jacobian = (part[:, rows] for part in problem.poses(x))
+    before = _misfits(residual / scale)
+    ratio = bounding.errors(residual)
+    damping = np.full(len(x), 1e-4)
+    going = np.flatnonzero((ratio > 1) & np.isfinite(before))
+    for _ in range(most_iterations):
+        if not len(going):
+            break
+        here, r, J, misfit = x[going], residual[going], jacobian[going], before[going]
+        low = np.maximum(problem.lower - here, -1.0)
+        high = np.minimum(problem.upper - here, 1.0)
+        D = damping[going, np.newaxis, np.newaxis] * bounding.far_damping
+        d = bounded_steps(J, -r, D, low, high)
+        left = _misfits((r + np.matmul(J, d[..., np.newaxis])[..., 0]) / scale)
+        promised = misfit - left
+        trial = _within(problem.lower, here + d, problem.upper)
+        new_residual, new_jacobian = (part[:, rows] for part in problem.poses(trial))
+        after = _misfits(new_residual / scale)
+        gained = misfit - after
+        better = gained > 0.1 * promised
+        taken = going[better]
+        x[taken], before[taken] = trial[better], after[better]
+        residual[taken], jacobian[taken] = new_residual[better], new_jacobian[better]
+        ratio[taken] = bounding.errors(new_residual[better])
+        change = np.where(better, np.where(gained > 0.7 * promised, 0.1, 1.0), 10.0)
+        damping[going] = np.maximum(damping[going] * change, 1e-10)
+        hopeful = (promised >= 1e-9 * misfit) & (damping[going] <= 1e6)
+        going = going[hopeful & (ratio[going] > 1)]
+    return x, ratio
+
+
+def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
+    """Steps d (..., n) within [low, high] that make ``|W (J d - wanted)|^2 + |d|^2`` small.
+
+    J (..., m, n), wanted (..., m), and D (..., m, m), the inverse of ``W^2``.  Components that
+    would leave their range are put on its end and the rest is solved again.
+    """
+    Jt = J.swapaxes(-1, -2)
+    y = np.linalg.solve(J @ Jt + D, wanted[..., np.newaxis])
+    d = (Jt @ y)[..., 0]
+    leaving = (d < low) | (d > high)
+    held = leaving
+    while leaving.any():
+        d = np.where(held, _within(low, d, high), 0.0)
+        free = J * ~held[..., np.newaxis, :]
+        rest = wanted[..., np.newaxis] - J @ d[..., np.newaxis]
+        free_t = free.swapaxes(-1, -2)
+        d = d + (free_t @ np.linalg.solve(free @ free_t + D, rest))[..., 0]
+        leaving = ((d < low) | (d > high)) & ~held
+        held = held | leaving
+    return d
+
+
+def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
+    """The same for one row, which is most of the cost of small steps."""
+    d = np.linalg.solve(J.dot(J.T) + D, wanted).dot(J)
+    leaving = (d < low) | (d > high)
+    return bounded_steps(J, wanted, D, low, high) if leaving.any() else d
+
+
+def _misfit(residual: Vector) -> float:
+    return float(residual.dot(residual))
+
+
+def _misfits(residuals: Vector) -> Vector:
+    """Squared lengths (N,) of residuals (N, m), infinite where anything is not finite."""
+    squares = np.einsum("ij,ij->i", residuals, residuals)
+    return np.where(np.isfinite(squares), squares, np.inf)
+
+
+def _within(low: Vector, x: Vector, high: Vector) -> Vector:
+    return np.minimum(np.maximum(x, low), high)
+
+
+def _attempt(evaluate: Callable[[Vector], Point], x: Vector) -> Point | None:
+    """Evaluate; None where the arm has no stable equilibrium or anything is not finite."""
+    try:
+        point = evaluate(x)
+    except EquilibriumError:
+        return None
+    return point if point.is_finite else None
+
+
+# -- down the objective ---------------------------------------------------------------------
+
+
+class _Place:
+    """An iterate with its objective.
+
+    Attributes
+    ----------
+    point : Point
+    values : ndarray (t,)
+        Terms of the objective.
+    value, missed : float
+        The largest of them, and by how much floors are missed.
+    slopes : ndarray (t + f + m, n)
+        Gradients of the terms, of the floors with their signs changed, and of the residuals in
+        finite balls: what multipliers weigh.
+    """
+
+    __slots__ = ("missed", "point", "slopes", "value", "values")
+
+    def __init__(self, problem: Problem, point: Point) -> None:
+        self.point = point
+        self.values, gradients = problem.objective.terms(point)
+        self.value = float(self.values.max())
+        self.missed = violation(problem, point)
+        parts = [gradients, point.jacobian[problem.bounding.rows]]
+        if len(problem.floors):
+            parts.insert(1, -point.floor_gradients)
+        self.slopes = np.concatenate(parts)
+
+
+def descend(
+    problem: Problem, start: Point, known: Sequence[LocalResult] = (), same: float = 0.0
+) -> LocalResult:
+    """Minimise the problem's objective from a point that reaches the pose.
+
+    A descent that comes next to a known optimum, with the same value but for `same`, ends there:
+    the result is that optimum.
+    """
+    point: Point | None = start
+    if not len(start.terms):
+        point = _attempt(problem.needed, start.x)
     if point is None:
-        return LocalResult(start, np.inf, np.inf, False, problem.objective, None)
-    objective = problem.objective
-    B = objective.curvature(point)
+        return LocalResult(problem, start, math.inf, math.inf, converged=False)
+    here = _Place(problem, point)
+    subproblem = _Subproblem(problem, len(here.values))
+    precision = problem.objective.precision
+    B = problem.objective.curvature(point)
     B = B + 1e-8 * np.trace(B) * np.eye(len(B))
-    radius, price = _FIRST_RADIUS, 10.0
-    multipliers: Multipliers | None = None
+    radius, price = FIRST_RADIUS, 10.0
+    weights: Vector | None = None
     converged = False
-    for _ in range(_MOST_ITERATIONS):
-        step = _quadratic_step(problem, point, B, radius, price, multipliers)
+    for _ in range(MOST_ITERATIONS):
+        step = subproblem.step(here, B, radius, price, weights)
         if step is None:
             break
-        d, promised, multipliers = step
-        price = max(price, 2 * float(multipliers.floors.max(initial=0.0)))
-        if promised < objective.precision:
+        d, promised, weights = step
+        price = max(price, 2 * subproblem.dearest_floor(weights))
+        if promised < precision:
+            here = _last_step(problem, here, d, price)
             converged = True
             break
-        trial = _pulled_back(problem, point, d)
+        length = float(np.abs(d).max())
+        trial = _pulled_back(problem, here.point, d, problem.lower, problem.upper)
         if trial is None:
-            radius = 0.3 * float(np.abs(d).max())
-            if radius < _LAST_RADIUS:
+            radius = 0.3 * length
+            if radius < LAST_RADIUS:
                 break
             continue
-        gained = _merit(problem, point, price) - _merit(problem, trial, price)
-        B = _bfgs(B, trial.x - point.x, _slope(problem, trial, multipliers)
-                  - _slope(problem, point, multipliers))  # fmt: skip
+        there = _Place(problem, trial)
+        gained = here.value - there.value + price * (here.missed - there.missed)
+        _update(B, trial.x - here.point.x, weights @ (there.slopes - here.slopes))
         share = gained / promised
         if share < 0.25:
-            radius = 0.4 * float(np.abs(d).max())
-        elif share > 0.7 and np.abs(d).max() > 0.8 * radius:
+            radius = 0.4 * length
+        elif share > 0.7 and length > 0.8 * radius:
             radius = min(2.5 * radius, 2.0)
         if gained > 0:
-            point = trial
-        if radius < _LAST_RADIUS:
-            converged = abs(promised) < 1e3 * objective.precision
+            here = there
+            found = _next_to(here, known, same)
+            if found is not None:
+                return found
+        if radius < LAST_RADIUS:
+            converged = abs(promised) < 1e3 * precision
             break
-    point = _snapped(problem, point)
-    multipliers = _prices(problem, point) or multipliers
-    return LocalResult(
-        point, objective.value(point), violation(problem, point), converged, objective, multipliers
-    )
+    here = _snapped(problem, here)
+    return LocalResult(problem, here.point, here.value, here.missed, converged)
 
 
-def _snapped(problem: Problem, point: Point) -> Point:
-    """The same point with pressures that all but touch a limit put onto it, if that holds."""
-    low = point.x < problem.lower + _TOUCHING
-    high = point.x > problem.upper - _TOUCHING
-    x = np.where(low, problem.lower, np.where(high, problem.upper, point.x))
-    if (x == point.x).all():
-        return point
-    fixed = copy(problem)
-    fixed.lower = np.where(high, problem.upper, problem.lower)
-    fixed.upper = np.where(low, problem.lower, problem.upper)
-    moved = _pulled_back(fixed, point, x - point.x)
-    if moved is None or violation(problem, moved) > violation(problem, point):
-        return point
-    worse = problem.objective.value(moved) - problem.objective.value(point)
-    return moved if worse < 100 * problem.objective.precision else point
+def _last_step(problem: Problem, here: _Place, d: Vector, price: float) -> _Place:
+    """The place after a step that gains next to nothing, if it gains at all."""
+    trial = _pulled_back(problem, here.point, d, problem.lower, problem.upper)
+    if trial is None:
+        return here
+    there = _Place(problem, trial)
+    gained = here.value - there.value + price * (here.missed - there.missed)
+    return there if gained > 0 else here
+
+
+def _next_to(here: _Place, known: Sequence[LocalResult], same: float) -> LocalResult | None:
+    """Known optimum that an iterate has all but come to."""
+    for result in known:
+        same_value = abs(here.value - result.value) <= same
+        if same_value and np.abs(here.point.x - result.point.x).max() < NEXT_TO:
+            return result
+    return None
+
+
+def _update(B: Vector, s: Vector, y: Vector) -> None:
+    """Powell's damped BFGS update in place, which keeps B positive definite."""
+    Bs = B @ s
+    sBs = float(s @ Bs)
+    if not sBs >= 1e-16:
+        return
+    sy = float(s @ y)
+    if sy < 0.2 * sBs:
+        theta = 0.8 * sBs / (sBs - sy)
+        y = theta * y + (1 - theta) * Bs
+        sy = float(s @ y)
+    B += y[:, np.newaxis] * (y / sy) - Bs[:, np.newaxis] * (Bs / sBs)
+
+
+def _pulled_back(
+    problem: Problem, point: Point, d: Vector, lower: Vector, upper: Vector
+) -> Point | None:
+    """Point near x + d within all balls, evaluated as needed; None if there is none near."""
+    bounding = problem.bounding
+    x = _within(lower, point.x + d, upper)
+    if not bounding.spheres:
+        return _attempt(problem.needed, x)
+    allowed = 2 * float(np.abs(d).max()) + 1e-4
+    trial, complete = _attempt(problem.pose, x), False
+    for _ in range(8):
+        if trial is None:
+            return None
+        if trial.reached:
+            if complete:
+                return trial
+            trial = _attempt(problem.needed, x)
+            return trial if trial is not None and trial.reached else None
+        wanted = trial.residual[bounding.rows].copy()
+        for index, (_, first, end, radius) in zip(bounding.indices, bounding.spheres, strict=True):
+            beyond = trial.errors[index] - radius * INSIDE
+            if beyond > 0:
+                # while steps are long, further in by as much as the correction may be wrong
+                wrong = min(_CURVED * beyond**2 / bounding.scale[first], 0.3 * radius)
+                wrong = wrong if beyond > radius else 0.0
+                wanted[first:end] *= -(beyond + wrong) / trial.errors[index]
+            else:
+                wanted[first:end] = 0.0
+        back = bounded_step(
+            trial.jacobian[bounding.rows],
+            wanted,
+            1e-3 * bounding.near_damping,
+            lower - x,
+            upper - x,
+        )
+        if not np.abs(back).max() <= allowed:
+            return None
+        x = _within(lower, x + back, upper)
+        # one correction is enough most of the time, so the rest is evaluated at once
+        trial, complete = _attempt(problem.needed, x), True
+    return None
+
+
+def _snapped(problem: Problem, here: _Place) -> _Place:
+    """The same place with pressures that all but touch a limit put onto it, if that holds."""
+    x = here.point.x
+    low = x < problem.lower + TOUCHING
+    high = x > problem.upper - TOUCHING
+    d = np.where(low, problem.lower, np.where(high, problem.upper, x)) - x
+    if not d.any():
+        return here
+    lower = np.where(high, problem.upper, problem.lower)
+    upper = np.where(low, problem.lower, problem.upper)
+    moved = _pulled_back(problem, here.point, d, lower, upper)
+    if moved is None:
+        return here
+    there = _Place(problem, moved)
+    worse = there.value - here.value
+    holds = there.missed <= here.missed and worse < 100 * problem.objective.precision
+    return there if holds else here
+
+
+class _Subproblem:
+    """The quadratic program of each step of one descent; its arrays are used again and again.
+
+    Its variables are the step d (n,), the largest term t (if there are several) and the floors'
+    slack s (if there are any).  Its rows are those of `_Place.slopes`, less a single term.
+    """
+
+    def __init__(self, problem: Problem, n_terms: int) -> None:
+        n, floors, rows = len(problem.lower), len(problem.floors), len(problem.bounding.radius)
+        self._problem, self._n = problem, n
+        self._several, self._floored = n_terms > 1, floors > 0
+        self._skipped = 0 if self._several else n_terms  # a single term goes into the gradient
+        self._terms = slice(0, n_terms)
+        self._floors = slice(n_terms, n_terms + floors)
+        self._balls = n_terms + floors
+        size = n + self._several + self._floored
+        above = self._balls - self._skipped  # rows above those of the balls
+        self._H, self._g = np.zeros((size, size)), np.zeros(size)
+        self._A = np.zeros((above + rows, size))
+        self._low, self._high = (
+            np.full(size + above + rows, -_FAR),
+            np.full(size + above + rows, _FAR),
+        )
+        self._ball_rows = slice(above, above + rows)
+        self._H[range(n, size), range(n, size)] = 1e-6
+        if self._several:
+            self._g[n] = 1.0
+            self._A[:n_terms, n] = -1.0
+        if self._floored:
+            self._A[above - floors : above, -1] = -1.0
+            self._low[size - 1] = 0.0
+        self._size = size
+        self._axes = np.zeros((rows, rows))  # over the radii
+        self._curvature = np.zeros(rows)
+
+    def dearest_floor(self, weights: Vector) -> float:
+        """Largest multiplier of a floor."""
+        return float(weights[self._floors].max()) if self._floored else 0.0
+
+    def step(
+        self, here: _Place, B: Vector, radius: float, price: float, weights: Vector | None
+    ) -> tuple[Vector, float, Vector] | None:
+        """Step (n,), promised decrease of the merit, and multipliers of the slopes."""
+        problem, point, n, size = self._problem, here.point, self._n, self._size
+        H, g, A, low, high = self._H, self._g, self._A, self._low, self._high
+        jacobian = here.slopes[self._balls :]
+        residual = point.residual[problem.bounding.rows]
+        self._turn_boxes(here, weights, residual, jacobian)
+        H[:n, :n] = B + (jacobian.T * self._curvature) @ jacobian
+        np.maximum(problem.lower - point.x, -radius, out=low[:n])
+        np.minimum(problem.upper - point.x, radius, out=high[:n])
+        if self._several:
+            high[size : size + len(here.values)] = here.value - here.values
+        else:
+            g[:n] = here.slopes[0]
+        above = self._ball_rows.start
+        if above:
+            A[:above, :n] = here.slopes[self._skipped : self._balls]
+        if self._floored:
+            g[-1] = price
+            high[size + above - len(problem.floors) : size + above] = point.floors - problem.floors
+        A[self._ball_rows, :n] = self._axes @ jacobian
+        across = self._axes @ residual
+        np.minimum(-1.0 - across, 0.0, out=low[size + above :])
+        np.maximum(1.0 - across, 0.0, out=high[size + above :])
+        answer = solve_qp(H, g, A, low, high)
+        if answer is None:
+            return None
+        z, dual = answer
+        promised = price * here.missed - float(g.dot(z) + 0.5 * z.dot(H.dot(z)))
+        new = np.ones(len(here.slopes))
+        new[self._skipped :] = dual[size:]
+        new[self._balls :] = new[self._balls :] @ self._axes
+        return z[:n], promised, new
+
+    def _turn_boxes(
+        self, here: _Place, weights: Vector | None, residual: Vector, jacobian: Vector
+    ) -> None:
+        """Set the axes of the box around each ball, the first one where it will bind."""
+        bounding = self._problem.bounding
+        residuals = residual.tolist()
+        pulls = None if weights is None else weights[self._balls :].tolist()
+        for index, (_, first, end, radius) in zip(bounding.indices, bounding.spheres, strict=True):
+            rho = radius * INSIDE
+            if pulls is None:
+                steepest = here.slopes[int(here.values.argmax())]
+                pull = _least_squares(jacobian[first:end], -steepest)
+            else:
+                pull = pulls[first:end]
+            self._curvature[first:end] = math.hypot(*pull) / rho
+            binds = here.point.errors[index] > 0.9 * radius
+            along = _axes_along(residuals[first:end] if binds else pull)
+            self._axes[first:end, first:end] = [[value / rho for value in row] for row in along]
+
+
+def _least_squares(rows: Vector, wanted: Vector) -> list[float]:
+    """Weights of rows (k, n) that sum up to a vector (n,) as nearly as can be."""
+    square = rows @ rows.T
+    square += 1e-10 * np.trace(square) * np.eye(len(square))
+    try:
+        found: list[float] = np.linalg.solve(square, rows @ wanted).tolist()
+    except np.linalg.LinAlgError:
+        found = [0.0] * len(rows)
+    return found
+
+
+def _axes_along(vector: list[float]) -> list[list[float]]:
+    """Orthonormal axes, the first along a vector of one to three components; any if it is zero."""
+    length = math.hypot(*vector)
+    if not length > 0:
+        vector, length = [1.0, 0.0, 0.0][: len(vector)], 1.0
+    a = [value / length for value in vector]
+    if len(a) == 1:
+        return [a]
+    if len(a) == 2:
+        return [a, [-a[1], a[0]]]
+    least = min(range(3), key=lambda i: abs(a[i]))
+    b = [-a[least] * value for value in a]
+    b[least] += 1.0
+    length = math.hypot(*b)
+    b = [value / length for value in b]
+    c = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    return [a, b, c]
+
+
+# -- prices ---------------------------------------------------------------------------------
 
 
 def _prices(problem: Problem, point: Point) -> Multipliers | None:
@@ -227,16 +592,14 @@ def _prices(problem: Problem, point: Point) -> Multipliers | None:
     columns: list[Vector] = []
     top = [i for i, value in enumerate(values) if value > values.max() - _BINDING]
     columns += [gradients[i] for i in top]
-    floors = [
-        i for i, (k, bound) in enumerate(problem.floors) if point.values[k] < bound + _BINDING
-    ]
-    columns += [-point.gradients[problem.floors[i][0]] for i in floors]
+    floors = [i for i, bound in enumerate(problem.floors) if point.floors[i] < bound + _BINDING]
+    columns += [-point.floor_gradients[i] for i in floors]
     balls = [ball for ball in point.constraints if ball.error > (1 - _BINDING) * ball.radius]
     columns += [ball.residual / ball.error @ ball.jacobian for ball in balls]
     sides = [(i, -1.0) for i in range(n) if point.x[i] <= problem.lower[i]]
     sides += [(i, 1.0) for i in range(n) if point.x[i] >= problem.upper[i]]
     columns += [side * np.eye(n)[i] for i, side in sides]
-    A = np.column_stack(columns)
+    A = np.array(columns).T
     total = (np.arange(len(columns)) < len(top)).astype(float)[np.newaxis]
     low = np.concatenate([np.zeros(len(columns)), [1.0]])
     high = np.concatenate([np.full(len(columns), _FAR), [1.0]])
@@ -258,169 +621,17 @@ def _prices(problem: Problem, point: Point) -> Multipliers | None:
     for (i, side), weight in zip(sides, weights, strict=True):
         # a little beyond the limit: the norm law has a kink where a segment is unpressurised
         beyond = point.x + side * _BEYOND * np.eye(n)[i]
-        moved = _attempt(problem, beyond, pose_only=False)
+        moved = _attempt(problem.needed, beyond)
         slope = _slope(problem, moved, prices)[i] if moved is not None else -side * weight
         bounds[i] += side * max(0.0, -side * float(slope))
     return prices
 
 
-def violation(problem: Problem, point: Point) -> float:
-    """Sum by which floors are missed, in logarithms of stiffness."""
-    return float(sum(max(0.0, bound - point.values[index]) for index, bound in problem.floors))
-
-
-def _merit(problem: Problem, point: Point, price: float) -> float:
-    return problem.objective.value(point) + price * violation(problem, point)
-
-
-def _attempt(problem: Problem, x: Vector, pose_only: bool) -> Point | None:
-    """Evaluate; None where the arm has no stable equilibrium or anything is not finite."""
-    try:
-        point = problem.pose(x) if pose_only else problem.point(x)
-    except EquilibriumError:
-        return None
-    finite = np.isfinite(point.values).all() and np.isfinite(point.gradients).all()
-    return point if finite and all(np.isfinite(b.residual).all() for b in point.balls) else None
-
-
-def _axes(ball: Ball, multipliers: Multipliers | None, gradient: Vector) -> tuple[Vector, float]:
-    """Axes (k, k) of the box around a ball, the first one where it will bind, and its price."""
-    if multipliers is not None:
-        pull = multipliers.balls[ball.name]
-    else:  # least-squares estimate of the multiplier
-        pull = np.asarray(np.linalg.lstsq(ball.jacobian.T, -gradient, rcond=None)[0], float)
-    size = float(np.linalg.norm(pull))
-    first = ball.residual if ball.error > 0.9 * ball.radius else pull
-    if not np.linalg.norm(first) > 0:
-        return np.eye(len(pull)), size
-    basis = np.linalg.qr(np.column_stack([first, np.eye(len(first))]))[0].T
-    return basis * np.sign(basis[:1] @ first), size
-
-
-def _quadratic_step(
-    problem: Problem,
-    point: Point,
-    B: Vector,
-    radius: float,
-    price: float,
-    multipliers: Multipliers | None,
-) -> tuple[Vector, float, Multipliers] | None:
-    """Step (n,), promised decrease of the merit, and multipliers of the quadratic program.
-
-    Its variables are the step d, the largest term t (if there are several) and the floors'
-    slack s (if there are any).
-    """
-    n = len(point.x)
-    values, gradients = problem.objective.terms(point)
-    several, floored = len(values) > 1, bool(problem.floors)
-    size = n + several + floored
-    H = np.zeros((size, size))
-    H[:n, :n] = B
-    H[n:, n:] = 1e-6 * np.eye(size - n)
-    g = np.zeros(size)
-    rows: list[Vector] = []
-    low: list[Vector] = [np.maximum(problem.lower - point.x, -radius)]
-    high: list[Vector] = [np.minimum(problem.upper - point.x, radius)]
-    if several:
-        g[n] = 1.0
-        rows.append(np.hstack([gradients, -np.ones((len(values), 1)),
-                               np.zeros((len(values), int(floored)))]))  # fmt: skip
-        low.append(np.full(1, -_FAR))
-        high.append(np.full(1, _FAR))
-    else:
-        g[:n] = gradients[0]
-    if floored:
-        g[-1] = price
-        indices = [index for index, _ in problem.floors]
-        block = np.zeros((len(indices), size))
-        block[:, :n] = point.gradients[indices]
-        block[:, -1] = 1.0
-        rows.append(block)
-        low.append(np.zeros(1))
-        high.append(np.full(1, _FAR))
-    if several:
-        low.append(np.full(len(values), -_FAR))
-        high.append(values.max() - values)
-    if floored:
-        bounds = np.array([bound for _, bound in problem.floors])
-        low.append(bounds - point.values[indices])
-        high.append(np.full(len(bounds), _FAR))
-    frames = []
-    steepest = gradients[int(values.argmax())]
-    for ball in point.constraints:
-        axes, pull = _axes(ball, multipliers, steepest)
-        frames.append(axes)
-        rho = ball.radius * _INSIDE
-        H[:n, :n] += pull / rho * ball.jacobian.T @ ball.jacobian
-        across = axes @ ball.residual / rho
-        rows.append(np.hstack([axes @ ball.jacobian / rho, np.zeros((len(axes), size - n))]))
-        low.append(np.minimum(-1.0 - across, 0.0))
-        high.append(np.maximum(1.0 - across, 0.0))
-    A = np.vstack(rows) if rows else np.zeros((0, size))
-    answer = solve_qp(H, g, A, np.concatenate(low), np.concatenate(high))
-    if answer is None:
-        return None
-    z, dual = answer
-    promised = price * violation(problem, point) - float(g @ z + 0.5 * z @ H @ z)
-    used = size
-    terms = dual[used : used + len(values)] if several else np.ones(1)
-    used += len(values) if several else 0
-    floors = -dual[used : used + len(problem.floors)]
-    used += len(problem.floors)
-    pulls = {}
-    for ball, axes in zip(point.constraints, frames, strict=True):
-        k = len(axes)
-        pulls[ball.name] = axes.T @ dual[used : used + k] / (ball.radius * _INSIDE)
-        used += k
-    return z[:n], promised, Multipliers(dual[:n], pulls, terms, floors)
-
-
 def _slope(problem: Problem, point: Point, multipliers: Multipliers) -> Vector:
     """Gradient of the Lagrangian with the multipliers held, bounds left out."""
     slope = multipliers.terms @ problem.objective.terms(point)[1]
-    for (index, _), weight in zip(problem.floors, multipliers.floors, strict=True):
-        slope = slope - weight * point.gradients[index]
+    if len(problem.floors):
+        slope = slope - multipliers.floors @ point.floor_gradients
     for ball in point.constraints:
         slope = slope + multipliers.balls[ball.name] @ ball.jacobian
     return slope
-
-
-def _bfgs(B: Vector, s: Vector, y: Vector) -> Vector:
-    """Powell's damped update, which keeps B positive definite."""
-    Bs = B @ s
-    sBs = float(s @ Bs)
-    if sBs < 1e-16:
-        return B
-    sy = float(s @ y)
-    if sy < 0.2 * sBs:
-        theta = 0.8 * sBs / (sBs - sy)
-        y = theta * y + (1 - theta) * Bs
-        sy = float(s @ y)
-    return B - np.outer(Bs, Bs) / sBs + np.outer(y, y) / sy
-
-
-def _pulled_back(problem: Problem, point: Point, d: Vector) -> Point | None:
-    """Point near x + d within all balls, evaluated in full; None if there is none near."""
-    x = np.clip(point.x + d, problem.lower, problem.upper)
-    if point.constraints:
-        none = np.zeros((0, len(x)))
-        for _ in range(8):
-            trial = _attempt(problem, x, pose_only=True)
-            if trial is None:
-                return None
-            if trial.reached:
-                break
-            H, g = 1e-3 * np.eye(len(x)), np.zeros(len(x))
-            for ball in trial.constraints:
-                inside = ball.residual * min(1.0, ball.radius * _INSIDE / max(ball.error, 1e-300))
-                J = ball.jacobian / ball.radius
-                H += J.T @ J
-                g += J.T @ ((ball.residual - inside) / ball.radius)
-            step = solve_qp(H, g, none, problem.lower - x, problem.upper - x)
-            if step is None or np.abs(step[0]).max() > 2 * np.abs(d).max() + 1e-4:
-                return None
-            x = np.clip(x + step[0], problem.lower, problem.upper)
-        else:
-            return None
-    full = _attempt(problem, x, pose_only=False)
-    return full if full is not None and full.reached else None

@@ -11,8 +11,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.compliance import directional_stiffness, stiffness_block
-from stiffopt.model.shape import Shape
+from stiffopt import lie
+from stiffopt.model.compliance import held_stiffness, stiffness_block
+from stiffopt.model.shape import FreeShape, Shape, stiffness_along
 from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
 from stiffopt.optimise.task import Task
 
@@ -36,6 +37,10 @@ class Measure(ABC):
     def value(self, tip: Shape, parameters: Any) -> Any:
         """Symbolic value for symbolic parameters (k,)."""
 
+    def gradient(self, tip: Shape, parameters: Any) -> Any:
+        """Symbolic derivative (1, n) of the value by the pressures."""
+        return tip.total_jacobian(self.value(tip, parameters))
+
 
 class LogStiffness(Measure):
     """Logarithm of a directional stiffness, in N/m or N m/rad before it is taken."""
@@ -55,16 +60,31 @@ class LogStiffness(Measure):
 
     def value(self, tip: Shape, parameters: Any) -> Any:
         """``log k``; see `stiffopt.model.compliance.directional_stiffness`."""
+        measure = self._measure
         return ca.log(
-            directional_stiffness(
-                tip.compliance,
-                tip.rotation,
-                parameters,
-                frame=self._measure.frame,
-                kind=self._measure.kind,
-                boundary=self._measure.boundary,
-            )
+            stiffness_along(tip, parameters, measure.frame, measure.kind, measure.boundary)
         )
+
+    def gradient(self, tip: Shape, parameters: Any) -> Any:
+        """Derivative of the value; see `Measure.gradient`.
+
+        Where other motions are held, ``k = d' K d`` and W is the wrench that moves the tip by d:
+        then ``dk = -W' dC W``, in axes in which d does not turn.  That is the derivative of a
+        flexibility, of a third of the operations.
+        """
+        measure = self._measure
+        if measure.boundary == "free" or not isinstance(tip, FreeShape):
+            return super().gradient(tip, parameters)
+        turn = tip.rotation.T if measure.frame == "base" else ca.SX.eye(3)
+        stiffness, wrench = held_stiffness(
+            tip.compliance,
+            turn @ parameters,
+            measure.kind == "rotation",
+            measure.boundary == "clamped",
+        )
+        still = ca.SX.sym("wrench", 6)
+        slope = tip.total_jacobian(tip.flexibility(lie.rotate_blocks(turn) @ still))
+        return -ca.substitute(slope, still, lie.rotate_blocks(turn.T) @ wrench) / stiffness
 
 
 class MatrixDistance(Measure):

@@ -2,40 +2,44 @@
 
 Variables are the pressures x (n,) in bar.  The pose is asked for by *balls*: residuals r(x) with
 |r| <= radius, which is how tolerances are used and not ignored.  What is sought is the lowest
-value of an objective, with some stiffnesses bounded from below.  All stiffnesses enter by their
-logarithm, so that a tenth of a newton per metre weighs the same wherever it is a tenth.
-
-The compiled functions depend on the *structure* of a task only (which kinds of stiffness, not
-which directions or values), and stay with the robot.
+value of an objective, with some stiffnesses bounded from below.  The functions behind it belong
+to the structure of the task (`stiffopt.optimise.program`) and stay with the robot.
 """
 
+import math
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.shape import Shape
-from stiffopt.optimise.goal import MatchValue
-from stiffopt.optimise.measures import Measure, measures
+from stiffopt.optimise.functions import functions
+from stiffopt.optimise.goal import StiffnessGoal
+from stiffopt.optimise.program import BAR, Program
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
-from stiffopt.optimise.terms import Ball, pose_terms
+from stiffopt.optimise.terms import Ball
 
 Vector = NDArray[np.float64]
-
-BAR = 1e5
-"""Pressure scale of the variables, in Pa."""
 
 FLOOR_MARGIN = 1e-6
 """How far above a stiffness that must be kept the optimiser aims, relatively."""
 
 
-@dataclass(frozen=True)
+class Sphere(NamedTuple):
+    """The ball of some rows, first to end - 1, of the residual."""
+
+    name: str
+    first: int
+    end: int
+    radius: float
+
+
 class Point:
     """The program at one set of pressures.
 
@@ -43,43 +47,92 @@ class Point:
     ----------
     x : ndarray (n,)
         Pressures in bar.
-    balls : tuple of Ball
-    values : ndarray (m,)
-        Logarithms of the stiffnesses, or the distance to a matrix; empty where only the pose
-        was evaluated.
-    gradients : ndarray (m, n)
+    residual : ndarray (m,)
+        Of all balls, in m or rad.
+    jacobian : ndarray (m, n)
+        Per bar.
+    spheres : tuple of Sphere
+        Which rows make which ball.
+    errors : tuple of float
+        Length of each ball's residual.
+    reached : bool
+        Whether every residual lies within its ball.
+    terms : ndarray (t,)
+        Of the task's objective; empty where only the pose was evaluated.
+    term_gradients : ndarray (t, n)
+        Per bar.
+    floors : ndarray (f,)
+        Logarithms of the stiffnesses that are bounded from below.
+    floor_gradients : ndarray (f, n)
         Per bar.
     """
 
-    x: Vector
-    balls: tuple[Ball, ...]
-    values: Vector
-    gradients: Vector
+    __slots__ = (
+        "errors", "floor_gradients", "floors", "jacobian", "reached", "residual", "spheres",
+        "term_gradients", "terms", "x",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        x: Vector,
+        residual: Vector,
+        jacobian: Vector,
+        spheres: tuple[Sphere, ...],
+        terms: Vector,
+        term_gradients: Vector,
+        floors: Vector,
+        floor_gradients: Vector,
+    ) -> None:
+        self.x, self.residual, self.jacobian = x, residual, jacobian
+        self.spheres = spheres
+        values = residual.tolist()
+        self.errors = tuple([math.hypot(*values[first:end]) for _, first, end, _ in spheres])
+        self.reached = all(
+            error <= sphere.radius for error, sphere in zip(self.errors, spheres, strict=True)
+        )
+        self.terms, self.term_gradients = terms, term_gradients
+        self.floors, self.floor_gradients = floors, floor_gradients
+
+    @property
+    def balls(self) -> tuple[Ball, ...]:
+        """The balls one by one."""
+        return tuple(
+            Ball(name, self.residual[first:end], self.jacobian[first:end], radius)
+            for name, first, end, radius in self.spheres
+        )
 
     @property
     def constraints(self) -> tuple[Ball, ...]:
         """The balls that are not infinite."""
-        return tuple(ball for ball in self.balls if np.isfinite(ball.radius))
+        return tuple(ball for ball in self.balls if ball.radius < math.inf)
 
     @property
-    def reached(self) -> bool:
-        """Whether every residual lies within its ball."""
-        return all(ball.error <= ball.radius for ball in self.balls)
+    def is_finite(self) -> bool:
+        """Whether all numbers are finite."""
+        # a sum is as good as a look at each, and several times as fast
+        total = sum(self.errors) + _total(self.jacobian, None)
+        if self.terms.size:
+            total += _total(self.terms) + _total(self.term_gradients, None)
+        if self.floors.size:
+            total += _total(self.floors) + _total(self.floor_gradients, None)
+        return math.isfinite(total)
 
 
 @dataclass(frozen=True)
 class Objective:
     """What is minimised, as a function of a point.
 
-    The value is the largest of `terms` (m,); several terms are minimised together (the smallest
-    of several stiffnesses maximised).  `curvature` is a convex guess of the Hessian.
+    The value is the largest of `terms` (t,); several terms are minimised together (the smallest
+    of several stiffnesses maximised).  `curvature` is a convex guess of the Hessian.  With
+    `of_pose` the residuals are all that it needs.
     """
 
-    terms: Callable[[Point], tuple[Vector, Vector]]  # values (m,), gradients (m, n)
+    terms: Callable[[Point], tuple[Vector, Vector]]  # values (t,), gradients (t, n)
     curvature: Callable[[Point], Vector]  # (n, n)
     precision: float  # decrease that no longer matters
     unit: str  # of what a decrease gains, for prices
     gain: Callable[[Point], float]  # that gain per unit of decrease
+    of_pose: bool = False
 
     def value(self, point: Point) -> float:
         """Value at a point."""
@@ -94,8 +147,10 @@ class Problem:
     lower, upper : ndarray (n,)
         Bounds of the variables, in bar.
     objective : Objective
-    floors : tuple of (int, float)
-        Values that are bounded from below, as (index into `Point.values`, bound).
+    floors : ndarray (f,)
+        What `Point.floors` may not fall below; empty where they do not matter.
+    radii : dict of str to float
+        Radii of balls, by name, other than the target's.
     """
 
     def __init__(self, robot: Manipulator, task: Task) -> None:
@@ -103,22 +158,28 @@ class Problem:
         self.task = task
         lower, upper = task.pressure_bounds(robot.description)
         self.lower, self.upper = lower / BAR, upper / BAR
-        found = measures(task)
-        self._parameters = np.concatenate([np.zeros(0), *(each.parameters for each in found)])
-        self._pose = robot.evaluator("pose and jacobian", _pose_outputs)
-        structure = tuple(each.structure for each in found)
-        self._full = robot.evaluator(
-            ("values", structure), _value_outputs(found), len(self._parameters)
-        )
-        self._terms = pose_terms(task.target)
-        self.objective = self._objective()
-        goal = task.stiffness
-        first = len(goal.maximise) + (goal.match is not None) if goal else 0
-        self.floors = tuple(
-            (first + index, float(np.log(floor.value)) + FLOOR_MARGIN)
-            for index, floor in enumerate(goal.at_least if goal else ())
-        )
         self.radii: dict[str, float] = {}
+        self._set_program(Program.of(task.target, task.stiffness))
+        self.objective = self._objective()
+        self.floors = floor_bounds(task.stiffness)
+
+    def _set_program(self, program: Program) -> None:
+        self.program = program
+        self.parameters = program.parameters
+        self._functions = functions(self.robot, program)
+        self._is_loaded = self.robot.is_loaded
+        self._pose = Evaluator(self.robot, self._functions.pose)
+        self._full = Evaluator(self.robot, self._functions.point)
+        self._set_spheres()
+
+    def _set_spheres(self) -> None:
+        spheres, first = [], 0
+        for term in self.program.terms:
+            end = first + term.size
+            spheres.append(Sphere(term.name, first, end, self.radii.get(term.name, term.radius)))
+            first = end
+        self.spheres = tuple(spheres)
+        self.bounding = Bounding(self.spheres, self.robot.length)
 
     # -- evaluation -------------------------------------------------------------------------
 
@@ -128,176 +189,182 @@ class Problem:
 
     def pose(self, x: Vector) -> Point:
         """The balls alone at pressures x; cheaper than `point`."""
-        position, rotation, jacobian = self._pose(x * BAR)
-        return self._point(x, position, rotation, jacobian, np.zeros((0, 1)), np.zeros((0, 0)))
+        if self._is_loaded:
+            residual, jacobian = self._pose(x * BAR, self.parameters)
+        else:
+            residual, jacobian = self._functions.pose(x * BAR, self.parameters)
+        return Point(x, residual[:, 0], jacobian.T * BAR, self.spheres, *_NOTHING)
+
+    def poses(self, x: Vector) -> tuple[Vector, Vector]:
+        """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads."""
+        m = self.spheres[-1].end
+        residuals, jacobians = np.empty((len(x), m)), np.empty((len(x), m, x.shape[1]))
+        evaluate, parameters = self._functions.pose, self.parameters
+        # one by one: rows are few, and a call costs little more than its work
+        for row, p in enumerate(x * BAR):
+            residual, jacobian = evaluate(p, parameters)
+            residuals[row] = residual[:, 0]
+            jacobians[row] = jacobian.T
+        jacobians *= BAR
+        return residuals, jacobians
 
     def point(self, x: Vector) -> Point:
         """Everything at pressures x."""
-        self._full.restart(self._pose.state)
-        outputs = self._full(x * BAR, self._parameters)
-        self._pose.restart(self._full.state)
-        return self._point(x, *outputs)
-
-    def objective_values(self, xs: Vector) -> Vector:
-        """Objective (N,) at many pressures (N, n) of an arm without loads."""
-        outputs = self._full.many(xs * BAR, self._parameters)
-        points = (self._point(x, *row) for x, *row in zip(xs, *outputs, strict=True))
-        return np.array([self.objective.value(point) for point in points])
-
-    def _point(
-        self,
-        x: Vector,
-        position: Vector,
-        rotation: Vector,
-        jacobian: Vector,
-        values: Vector,
-        gradients: Vector,
-    ) -> Point:
-        found = (term.ball(position[:, 0], rotation, jacobian * BAR) for term in self._terms)
-        balls = tuple(
-            replace(ball, radius=self.radii.get(ball.name, ball.radius)) for ball in found
+        if self._is_loaded:
+            self._full.restart(self._pose.state)
+            outputs = self._full(x * BAR, self.parameters)
+            self._pose.restart(self._full.state)
+        else:
+            outputs = self._functions.point(x * BAR, self.parameters)
+        residual, jacobian, terms, term_gradients, floors, floor_gradients = outputs
+        return Point(
+            x,
+            residual[:, 0],
+            jacobian.T * BAR,
+            self.spheres,
+            terms[:, 0],
+            term_gradients.T * BAR,
+            floors[:, 0] if floors.size else _NONE,
+            floor_gradients.reshape(len(x), -1).T * BAR,
         )
-        return Point(x, balls, values[:, 0], gradients * BAR)
+
+    def needed(self, x: Vector) -> Point:
+        """As much as objective and floors take at pressures x."""
+        of_pose = self.objective.of_pose and not len(self.floors)
+        return self.pose(x) if of_pose else self.point(x)
+
+    def judged(self, pressures: Vector) -> tuple[list[float], Vector, Vector, list[float]]:
+        """What `Judgement.of` takes, at pressures (n,) in Pa of an arm without loads."""
+        residuals, pose, compliance, values = self._functions.judge(pressures, self.parameters)
+        return residuals.ravel().tolist(), pose.T, compliance.T, values.ravel().tolist()
 
     # -- objectives -------------------------------------------------------------------------
 
     def _objective(self) -> Objective:
-        goal = self.task.stiffness
-        if goal is not None and goal.maximise:
-            count = len(goal.maximise)
-            return Objective(
-                lambda point: (-point.values[:count], -point.gradients[:count]),
-                lambda point: 0.1 * np.eye(len(point.x)),
-                precision=1e-7,
-                unit=goal.maximise[0].unit,
-                gain=lambda point: float(np.exp(point.values[:count].min())),
-            )
-        if goal is not None and isinstance(goal.match, MatchValue):
-            wanted = float(np.log(goal.match.value))
-            return self._and_some_pressure(
-                lambda point: (point.values[0] - wanted) ** 2,
-                lambda point: 2 * (point.values[0] - wanted) * point.gradients[0],
-                lambda point: 2 * np.outer(point.gradients[0], point.gradients[0]),
-            )
-        if goal is not None and goal.match is not None:
-            return self._and_some_pressure(
-                lambda point: point.values[0],
-                lambda point: point.gradients[0],
-                lambda point: 0.1 * np.eye(len(point.x)),
-            )
-        return self.least_pressure
+        n = len(self.lower)
+        program, goal = self.program, self.task.stiffness
+        unit = "bar^2" if program.aim == "least pressure" else "1"
+        gain: Callable[[Point], float] = lambda point: 1.0  # noqa: E731
+        if program.aim == "maximise" and goal is not None:
+            unit = goal.maximise[0].unit
+            gain = lambda point: float(np.exp(-point.terms.max()))  # noqa: E731
+        return Objective(
+            lambda point: (point.terms, point.term_gradients),
+            lambda point: program.steepness * np.eye(n),
+            precision=program.precision,
+            unit=unit,
+            gain=gain,
+        )
 
     def closest(self, name: str) -> Objective:
         """Half the squared error of one ball over a scale: what brings the tip closest."""
         scale = self.robot.length if name == "position" else 1.0
 
-        def ball(point: Point) -> Ball:
-            return next(ball for ball in point.balls if ball.name == name)
+        (rows,) = [slice(first, end) for which, first, end, _ in self.spheres if which == name]
 
         def terms(point: Point) -> tuple[Vector, Vector]:
-            residual, jacobian = ball(point).residual / scale, ball(point).jacobian / scale
-            return np.array([0.5 * residual @ residual]), (residual @ jacobian)[np.newaxis]
+            residual, jacobian = point.residual[rows] / scale, point.jacobian[rows] / scale
+            return np.array([0.5 * residual.dot(residual)]), (residual @ jacobian)[np.newaxis]
 
         def curvature(point: Point) -> Vector:
-            jacobian = ball(point).jacobian / scale
+            jacobian = point.jacobian[rows] / scale
             return jacobian.T @ jacobian
 
         def gain(point: Point) -> float:
-            return scale**2 / max(ball(point).error, 1e-12)
+            return scale**2 / max(math.hypot(*point.residual[rows].tolist()), 1e-12)
 
         unit = "m" if name == "position" else "rad"
-        return Objective(terms, curvature, precision=1e-10, unit=unit, gain=gain)
+        return Objective(terms, curvature, precision=1e-10, unit=unit, gain=gain, of_pose=True)
 
     def best_floors(self) -> Objective:
         """The most by which a floor is missed: what brings all floors as close as they come."""
-        indices = [index for index, _ in self.floors]
-        bounds = np.array([bound for _, bound in self.floors])
         return Objective(
-            lambda point: (bounds - point.values[indices], -point.gradients[indices]),
-            lambda point: 0.1 * np.eye(len(point.x)),
+            lambda point: (self.floors - point.floors, -point.floor_gradients),
+            lambda point: self.program.steepness * np.eye(len(point.x)),
             precision=1e-7,
             unit="1",
             gain=lambda point: 1.0,
         )
 
-    @property
-    def least_pressure(self) -> Objective:
-        """Mean square of the pressures, in bar^2: the stiffness-blind choice."""
-        n = len(self.lower)
-        return Objective(
-            lambda point: (
-                np.array([point.x @ point.x / n]),
-                2 * point.x[np.newaxis] / n,
-            ),
-            lambda point: 2 * np.eye(n) / n,
-            precision=1e-9,
-            unit="bar^2",
-            gain=lambda point: 1.0,
-        )
+    # -- similar programs -------------------------------------------------------------------
 
-    def _and_some_pressure(
-        self,
-        value: Callable[[Point], float],
-        gradient: Callable[[Point], Vector],
-        curvature: Callable[[Point], Vector],
-    ) -> Objective:
-        """Match, and of all that match equally well prefer the one with less pressure."""
-        share = 1e-7
+    def changed(self, objective: Objective, floors: bool = True, **radii: float) -> "Problem":
+        """The same program with another objective, without floors, or with other radii.
 
-        def terms(point: Point) -> tuple[Vector, Vector]:
-            x = point.x
-            return (
-                np.array([value(point) + share * (x @ x)]),
-                (gradient(point) + 2 * share * x)[np.newaxis],
-            )
-
-        return Objective(
-            terms,
-            lambda point: curvature(point) + 2 * share * np.eye(len(point.x)),
-            precision=1e-10,
-            unit="1",
-            gain=lambda point: 1.0,
-        )
-
-    def changed(
-        self,
-        objective: Objective | None = None,
-        floors: tuple[tuple[int, float], ...] | None = None,
-        **radii: float,
-    ) -> "Problem":
-        """The same program with another objective, floors or radii; infinite frees a ball."""
+        An infinite radius frees a ball.
+        """
         other = copy(self)
-        other.objective = objective or self.objective
-        other.floors = self.floors if floors is None else floors
+        other.objective = objective
+        if not floors:
+            other.floors = np.zeros(0)
         other.radii = {**self.radii, **radii}
+        other._set_spheres()
         return other
 
     def at_target(self, target: Target) -> "Problem":
         """The same program for another target."""
         other = copy(self)
         other.task = self.task.model_copy(update={"target": target})
-        other._terms = pose_terms(target)
+        other._set_program(Program.of(target, self.task.stiffness))
         return other
 
 
-def _pose_outputs(tip: Shape, _: Any) -> list[Any]:
-    return [tip.position, tip.rotation, tip.jacobian]
+class Bounding:
+    """What the steps of local searches take from the balls that are not infinite.
 
+    Attributes
+    ----------
+    spheres : tuple of Sphere
+        Rows are counted within `rows`.
+    indices : tuple of int
+        Which of all balls they are.
+    rows : slice
+        Their rows of the residual.
+    radius, scale : ndarray (m,)
+        Radius of each row's ball; what its residual is compared with while the pose is far.
+    """
 
-def _value_outputs(found: tuple[Measure, ...]) -> Callable[[Shape, Any], list[Any]]:
-    """Pose, Jacobian, values and gradients for measures."""
-
-    def outputs(tip: Shape, parameters: Any) -> list[Any]:
-        pose = _pose_outputs(tip, parameters)
-        if not found:
-            return [*pose, ca.DM.zeros(0, 1), ca.DM.zeros(0, 0)]
-        ends = np.cumsum([0, *(len(measure.parameters) for measure in found)])
-        values = ca.vertcat(
-            *(
-                measure.value(tip, parameters[int(start) : int(end)])
-                for measure, start, end in zip(found, ends[:-1], ends[1:], strict=True)
-            )
+    def __init__(self, spheres: tuple[Sphere, ...], length: float) -> None:
+        kept = [(i, sphere) for i, sphere in enumerate(spheres) if sphere.radius < math.inf]
+        begin = kept[0][1].first if kept else 0
+        self.indices = tuple(i for i, _ in kept)
+        self.spheres = tuple(
+            sphere._replace(first=sphere.first - begin, end=sphere.end - begin)
+            for _, sphere in kept
         )
-        return [*pose, values, ca.densify(tip.total_jacobian(values))]
+        self.rows = slice(begin, kept[-1][1].end if kept else 0)
+        self.radius = np.ones(self.rows.stop - begin)
+        self.scale = np.ones(self.rows.stop - begin)
+        for name, first, end, radius in self.spheres:
+            self.radius[first:end] = radius
+            self.scale[first:end] = length if name == "position" else 1.0
 
-    return outputs
+    @cached_property
+    def far_damping(self) -> Vector:
+        """Squared scales (m, m), on the diagonal."""
+        return np.diag(self.scale**2)
+
+    @cached_property
+    def near_damping(self) -> Vector:
+        """Squared radii (m, m), on the diagonal."""
+        return np.diag(self.radius**2)
+
+    def errors(self, residuals: Vector) -> Vector:
+        """Largest ratio (N,) of a residual's length to its ball's radius, of (N, m)."""
+        worst = np.zeros(len(residuals))
+        for _, first, end, radius in self.spheres:
+            part = residuals[:, first:end]
+            np.maximum(worst, np.sqrt(np.einsum("ij,ij->i", part, part)) / radius, out=worst)
+        return worst
+
+
+def floor_bounds(goal: StiffnessGoal | None) -> Vector:
+    """Logarithms (f,) that the floors of a goal may not fall below, with some margin."""
+    values = [floor.value for floor in goal.at_least] if goal is not None else []
+    bounds: Vector = np.log(np.array(values)) + FLOOR_MARGIN
+    return bounds
+
+
+_total = np.add.reduce
+_NONE = np.zeros(0)
+_NOTHING = (_NONE, np.zeros((0, 0)), _NONE, np.zeros((0, 0)))

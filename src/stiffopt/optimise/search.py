@@ -1,132 +1,50 @@
 """Global search: where to start local optimisations, and when to stop.
 
-Starts come from a table of sampled configurations: of those whose tip is nearest to the target
-the stiffest first, in turn with the nearest and with ones from anywhere, each unlike the ones
-before it.  The search stops when the Bayesian estimate of Boender and Rinnooy Kan (Math.
-Programming 37, 1987) expects fewer than a quarter of a local optimum to be unseen: with w
-distinct optima after n local searches, ``w (n - 1) / (n - w - 2) < w + 1/4``.
+Samples whose tip is nearest to the target are brought to the pose and ranked by the objective
+there.  Descents start from the best, those unlike each other first; one that comes next to an
+optimum that is known already ends there.  The search ends when so many descents in a row have
+found no new local optimum (`stiffopt.optimise.effort`): those with a basin of some size have been
+seen then, but nothing is proved.
+
+The folder ``native`` holds the same method in C.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import EquilibriumError
-from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.local import LocalResult, descend, reach
-from stiffopt.optimise.problem import BAR, Point, Problem
+from stiffopt.optimise.effort import Effort, effort
+from stiffopt.optimise.local import NEXT_TO, LocalResult, descend, reach, reach_all, violation
+from stiffopt.optimise.problem import Point, Problem
+from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.solution import Confidence
-from stiffopt.optimise.target import Target
-from stiffopt.optimise.terms import pose_errors
 
 Vector = NDArray[np.float64]
 
 SAME_OPTIMUM = 1e-3
 """Objectives closer than this (0.1 % of a stiffness) count as the same optimum."""
 
-_FREE_SAMPLES = 4096
-_LOADED_SAMPLES = 128  # an equilibrium takes a thousand times longer than a closed form
-_HOPELESS_SAMPLES = 16  # if none of so many first ones has an equilibrium, the arm has none
-_RANKED = 256  # nearest samples that are ranked by their objective
-_UNSEEN = 0.25  # local optima that may be expected to be unseen when the search stops
+MOST_STARTS_LOADED = 12
+"""Starts at most for an arm under gravity or load, where each takes far longer than without."""
 
-
-class SampleTable:
-    """Configurations spread over the pressure range of an arm, with their tip poses.
-
-    Parameters
-    ----------
-    robot : Manipulator
-    lower, upper : ndarray (n,)
-        Range in bar.
-    seed : int
-        Shifts the low-discrepancy sequence.
-    """
-
-    def __init__(self, robot: Manipulator, lower: Vector, upper: Vector, seed: int) -> None:
-        count = _LOADED_SAMPLES if robot.is_loaded else _FREE_SAMPLES
-        x = lower + (upper - lower) * _spread_with_edges(count, len(lower), seed)
-        if robot.is_loaded:
-            # under load little pressure can do much: every other sample is scaled down
-            scale = 10 ** (-2.5 * np.arange(count) / count)
-            scale[::2] = 1.0
-            x, poses = _settled(robot, lower + (x - lower) * scale[:, np.newaxis])
-        else:
-            poses = robot.tip_pose(x * BAR)
-        self.x, self.poses = x, poses
-
-    def nearest_first(self, target: Target, length: float) -> NDArray[np.intp]:
-        """Indices of the samples, those with the smallest pose error first."""
-        errors = np.zeros(len(self.x))
-        rotations, positions = self.poses[:, :3, :3], self.poses[:, :3, 3]
-        if target.position is not None:
-            asked = [axis for axis in range(3) if target.position[axis] is not None]
-            wanted = np.array([target.position[axis] for axis in asked], dtype=float)
-            errors += np.linalg.norm(positions[:, asked] - wanted, axis=1) / length
-        if target.pointing is not None:
-            cosines = rotations[:, :, 2] @ np.array(target.pointing)
-            errors += np.arccos(np.clip(cosines, -1, 1)) / np.pi
-        if target.orientation is not None:
-            errors += [pose_errors(target, pose)["angle"].error / np.pi for pose in self.poses]
-        return np.argsort(errors, kind="stable")
-
-
-def _spread_with_edges(count: int, n: int, seed: int) -> Vector:
-    """Points (count, n) of the unit cube, a part of them on its faces and edges.
-
-    Additive recurrence with the generalised golden ratio (M. Roberts, 2018); optima often lie
-    at limits, so the cube is stretched by a quarter and clipped.
-    """
-    ratio = 2.0
-    for _ in range(60):
-        ratio = (1 + ratio) ** (1 / (n + 1))
-    steps = ratio ** -np.arange(1.0, n + 1)
-    shift = np.random.default_rng(seed).random(n)
-    points = (shift + np.outer(np.arange(1.0, count + 1), steps)) % 1.0
-    return np.clip(1.25 * points - 0.125, 0.0, 1.0)
-
-
-def _settled(robot: Manipulator, x: Vector) -> tuple[Vector, Vector]:
-    """Those configurations of a loaded arm that have an equilibrium, and their poses."""
-    evaluator = robot.evaluator("pose", lambda shape, _: [shape.transform])
-    kept: list[int] = []
-    poses: list[Vector] = []
-    for index in range(len(x)):
-        evaluator.restart()  # each from rest, so that local searches start on the right branch
-        try:
-            (pose,) = evaluator(x[index] * BAR)
-        except EquilibriumError:
-            if not kept and index >= _HOPELESS_SAMPLES:
-                raise
-            continue
-        kept.append(index)
-        poses.append(pose)
-    return x[kept], np.stack(poses)
+_UNLIKE = 0.2  # share of the diagonal of the pressure range that starts lie apart
+_PRICE_OF_FLOORS = 10.0  # in a rank, of a floor that is missed
 
 
 def starts(problem: Problem, table: SampleTable) -> Iterator[Vector]:
-    """Pressures to start from: near the target, promising, and unlike each other."""
+    """Pressures to start from: those near the target.
+
+    Under load, where few are tried, near ones and any are given in turn, unlike each other.
+    """
     order = table.nearest_first(problem.task.target, problem.robot.length)
-    ranked = order[:_RANKED]
-    if not problem.robot.is_loaded and problem.task.stiffness is not None:
-        ranked = ranked[np.argsort(problem.objective_values(table.x[ranked]), kind="stable")]
-    # in turn: a near one that is good, the nearest one left, and one from anywhere
-    mixed = [i for trio in zip(ranked, order, range(len(order)), strict=False) for i in trio]
-    mixed += list(order)
-    apart = 0.2 * float(np.linalg.norm(problem.upper - problem.lower))
-    given: list[Vector] = []
-    later: list[int] = []
-    for i in dict.fromkeys(mixed):
-        x = table.x[i]
-        if all(np.linalg.norm(x - other) > apart for other in given):
-            given.append(x)
-            yield x
-        else:
-            later.append(i)
-    for i in later:
-        yield table.x[i]
+    if not problem.robot.is_loaded:
+        return iter(table.x[order[: _effort(problem).screened]])
+    mixed = [i for pair in zip(order, range(len(order)), strict=True) for i in pair]
+    x = table.x[list(dict.fromkeys(mixed))]
+    return islice((x[i] for i in _unlike_first(problem, x)), MOST_STARTS_LOADED)
 
 
 @dataclass(frozen=True)
@@ -136,9 +54,10 @@ class Search:
     Attributes
     ----------
     results : tuple of LocalResult
-        One per start that reached the pose, the best first.
+        Where descents ended, the best first; one that stopped next to an optimum that was known
+        already is left out.
     nearest : tuple of Point
-        Where the starts that did not reach the pose ended.
+        Where starts that did not reach the pose ended, if none reached it.
     confidence : Confidence
     """
 
@@ -148,57 +67,154 @@ class Search:
 
 
 def search(
-    problem: Problem, candidates: Iterator[Vector], most_starts: int, hopeless: int = 12
+    problem: Problem,
+    candidates: Iterable[Vector],
+    most_descents: int | None = None,
+    same: float = SAME_OPTIMUM,
+    agreeing: int | None = None,
 ) -> Search:
-    """Run local optimisations from candidates until the stopping rule holds.
+    """Run local optimisations from candidates until so many in a row find nothing new.
 
-    Gives up after `hopeless` starts of which none came to the pose.
+    That many, and how many at most, is a matter of `_effort` if not told otherwise.  `same` is
+    the difference of values below which optima count as one.
     """
-    results: list[LocalResult] = []
-    nearest: list[Point] = []
-    count, complete = 0, False
-    for x in candidates:
-        if count >= most_starts or (count >= hopeless and not results):
-            break
-        count += 1
-        problem.restart()
-        point = reach(problem, x)
+    tries = _effort(problem)
+    most = tries.most_descents if most_descents is None else most_descents
+    trail = _Trail(same, tries.agreeing if agreeing is None else agreeing)
+    ends: dict[int, LocalResult] = {}
+    for tried, point in _places(problem, candidates):
+        trail.starts = tried
         if point is None:
             continue
         if not point.reached:
-            nearest.append(point)
+            trail.nearest.append(point)
             continue
-        result = descend(problem, point)
-        if np.isfinite(result.value):
-            results.append(result)
-        complete = _seen_all(results, problem)
-        if complete:
+        if id(point) not in ends:
+            ends[id(point)] = descend(problem, point, trail.optima, same)
+        trail.add(ends[id(point)])
+        if trail.is_complete or trail.descents >= most:
             break
-    results.sort(key=_rank)
-    agreeing = sum(_same(result, results[0]) for result in results)
-    confidence = Confidence(count, len(results), agreeing, len(_distinct(results)), complete)
-    return Search(tuple(results), tuple(nearest), confidence)
+    return trail.outcome()
+
+
+class _Trail:
+    """What a search has seen so far."""
+
+    def __init__(self, same: float, agreeing: int) -> None:
+        self._same, self._agreeing = same, agreeing
+        self.starts = self.descents = self._nothing_new = 0
+        self.nearest: list[Point] = []
+        self.optima: list[LocalResult] = []
+        self._results: list[LocalResult] = []
+        self._converged: list[LocalResult] = []
+
+    def add(self, result: LocalResult) -> None:
+        """Take note of where a descent ended."""
+        self.descents += 1
+        if not np.isfinite(result.value):
+            return
+        if not any(result is known for known in self._results):
+            self._results.append(result)
+        if not result.converged:
+            return
+        self._converged.append(result)
+        if any(self._agree(result, known) for known in self.optima):
+            self._nothing_new += 1
+        else:
+            self.optima.append(result)
+            self._nothing_new = 0
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the last descents have found nothing new."""
+        return self._nothing_new >= self._agreeing
+
+    def _agree(self, a: LocalResult, b: LocalResult) -> bool:
+        return abs(a.value - b.value) < self._same and abs(a.violation - b.violation) < self._same
+
+    def outcome(self) -> Search:
+        """All of it, the best first."""
+        results = sorted(self._results, key=_rank)
+        agreeing = sum(self._agree(result, results[0]) for result in self._converged)
+        confidence = Confidence(
+            self.starts, len(self._converged), agreeing, len(self.optima), self.is_complete
+        )
+        return Search(tuple(results), tuple(self.nearest), confidence)
 
 
 def _rank(result: LocalResult) -> tuple[float, float]:
     return (round(result.violation, 7), result.value)
 
 
-def _same(a: LocalResult, b: LocalResult) -> bool:
-    return abs(a.value - b.value) < SAME_OPTIMUM and abs(a.violation - b.violation) < SAME_OPTIMUM
+def _effort(problem: Problem) -> Effort:
+    """Less than that of compiled code for an arm without loads, since all takes longer here.
+
+    A quarter of the samples and two agreeing descents less halve the time with up to six pressures
+    and overlook the best optimum of about one task in a hundred, where its basin is small; with
+    more pressures there are more optima, so that more is screened.
+    """
+    full = effort(problem.spheres[-1].end)
+    screened, agreeing, most = full
+    if problem.robot.is_loaded:
+        return full
+    if len(problem.lower) <= 6:
+        return Effort(screened // 4, agreeing - 2, most)
+    return Effort(screened // 2, agreeing - 1, most)
 
 
-def _distinct(results: list[LocalResult]) -> list[LocalResult]:
-    distinct: list[LocalResult] = []
-    for result in sorted(results, key=_rank):
-        if not any(_same(result, other) for other in distinct):
-            distinct.append(result)
-    return distinct
+# -- where descents start -------------------------------------------------------------------
 
 
-def _seen_all(results: list[LocalResult], problem: Problem) -> bool:
-    """Stopping rule of Boender and Rinnooy Kan."""
-    n, w = len(results), len(_distinct(results))
-    if n - w - 2 <= 0:
-        return False
-    return w * (n - 1) / (n - w - 2) < w + _UNSEEN
+def _places(problem: Problem, candidates: Iterable[Vector]) -> Iterator[tuple[int, Point | None]]:
+    """Points to descend from, each with the number of candidates that were tried until then.
+
+    None or points that have not reached the pose where a candidate led nowhere.
+    """
+    if problem.robot.is_loaded:
+        for tried, x in enumerate(candidates, 1):
+            problem.restart()  # each from rest
+            yield tried, reach(problem, x)
+        return
+    x = np.array(list(candidates))
+    if not len(x):
+        return
+    x, excess = reach_all(problem, x)
+    points = _evaluated(problem, x[excess <= 1])
+    if not points:
+        points = [problem.pose(row) for row in x[np.argsort(excess, kind="stable")]]
+        yield from ((len(x), point) for point in points)
+        return
+    points.sort(key=lambda point: _promise(problem, point))
+    for i in _unlike_first(problem, np.array([point.x for point in points])):
+        yield len(x), points[i]
+
+
+def _evaluated(problem: Problem, x: Vector) -> list[Point]:
+    """Points at pressures (N, n); those that came to the same place share one."""
+    same_place = np.abs(x[:, np.newaxis] - x).max(axis=2, initial=0.0) < NEXT_TO
+    first = same_place.argmax(axis=1).tolist() if len(x) else []
+    places = {i: problem.needed(x[i]) for i in dict.fromkeys(first)}
+    found = [places[i] for i in first]
+    return [point for point in found if point.is_finite and point.reached]
+
+
+def _promise(problem: Problem, point: Point) -> float:
+    """Objective at a point with a penalty on floors that are missed; the less the better."""
+    return problem.objective.value(point) + _PRICE_OF_FLOORS * violation(problem, point)
+
+
+def _unlike_first(problem: Problem, x: Vector) -> Iterator[int]:
+    """Indices of pressures (N, n), in order: those far from all before, then the others."""
+    range_ = problem.upper - problem.lower
+    apart = _UNLIKE**2 * float(range_ @ range_)
+    squares = np.einsum("ij,ij->i", x, x)
+    close = squares[:, np.newaxis] + squares - 2 * x @ x.T <= apart
+    passed_over = np.zeros(len(x), dtype=bool)
+    later: list[int] = []
+    for i in range(len(x)):
+        if passed_over[i]:
+            later.append(i)
+        else:
+            passed_over |= close[i]
+            yield i
+    yield from later

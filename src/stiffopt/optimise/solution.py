@@ -1,16 +1,20 @@
 """PressureSolution: what was found, judged from the model and from nothing else."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
+from stiffopt.optimise.functions import functions
+from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
+from stiffopt.optimise.program import Program
 from stiffopt.optimise.task import Task
-from stiffopt.optimise.terms import pose_errors
 
 Vector = NDArray[np.float64]
 Status = Literal["solved", "unreachable", "failed"]
@@ -100,6 +104,15 @@ class Sensitivities:
         _protect(self, "tip_jacobian", "stiffness_gradient")
 
 
+class Explanation(NamedTuple):
+    """What a solution says of itself beside its numbers; see `PressureSolution`."""
+
+    message: str
+    active_bounds: tuple[str, ...]
+    freedom: int
+    sensitivities: Sensitivities | None
+
+
 @dataclass(frozen=True)
 class PressureSolution:
     """Answer to a task.  Errors and stiffness are computed from the model at `pressures`.
@@ -133,6 +146,9 @@ class PressureSolution:
         Directions in pressure space in which the pose stays what it is.
     confidence : Confidence or None
     sensitivities : Sensitivities or None
+    counts : dict of str to int
+        Work that was done: starts, descents, iterations, evaluations of the pose and of everything
+        with gradients, quadratic programs.
     timings : dict of str to float
         Seconds.
     """
@@ -149,14 +165,39 @@ class PressureSolution:
     stiffness_unit: str | None = None
     stiffnesses: tuple[float, ...] = ()
     matrix_distance: float | None = None
-    active_bounds: tuple[str, ...] = ()
-    freedom: int = 0
+    active_bounds: tuple[str, ...] = field(default_factory=tuple)
+    freedom: int = field(default_factory=int)
     confidence: Confidence | None = None
-    sensitivities: Sensitivities | None = None
+    sensitivities: Sensitivities | None = field(default_factory=lambda: None)
+    counts: dict[str, int] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _protect(self, "pressures", "tip_pose", "compliance")
+
+    @classmethod
+    def explained_later(cls, explain: Callable[[], "Explanation"], **fields: Any) -> Self:
+        """A solution whose `Explanation` is made when one of its fields is first asked for.
+
+        Explaining takes longer than solving; whoever asks for pressures alone need not wait.
+        Arrays among the fields must be read-only.
+        """
+        solution = cls.__new__(cls)
+        solution.__dict__.update(fields, _explain=explain)
+        return solution
+
+    def __getattr__(self, name: str) -> Any:  # of what is not in __dict__
+        if name not in Explanation._fields or "_explain" not in self.__dict__:
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        explain = self.__dict__.pop("_explain")
+        self.__dict__.update(explain()._asdict())
+        return self.__dict__[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Support pickling: explain now."""
+        if "_explain" in self.__dict__:
+            self.__getattr__("message")
+        return self.__dict__
 
     @property
     def found(self) -> bool:
@@ -177,8 +218,7 @@ class PressureSolution:
         return quaternion
 
 
-@dataclass(frozen=True)
-class Judgement:
+class Judgement(NamedTuple):
     """A task's quantities at given pressures, from the model alone."""
 
     tip_pose: Vector
@@ -196,6 +236,62 @@ class Judgement:
         """Whether everything that the task asks for is so."""
         return self.pose_holds and self.limits_hold and self.demands_hold
 
+    @classmethod
+    def of(
+        cls,
+        program: Program,
+        goal: StiffnessGoal | None,
+        numbers: tuple[list[float], Vector, Vector, list[float]],
+        within: bool,
+    ) -> "Judgement":
+        """Judgement from what `Program.judge` gives.
+
+        Parameters
+        ----------
+        program, goal : of the task
+        numbers : tuple
+            Residuals (m,), tip pose (4, 4), compliance (6, 6), values of the measures (k,).
+        within : bool
+            Whether the pressures are within their limits.
+        """
+        residuals, tip_pose, compliance, values = numbers
+        errors: dict[str, float] = {}
+        holds, start = True, 0
+        for term in program.terms:
+            end = start + term.size
+            error = math.hypot(*residuals[start:end])
+            holds = holds and error <= term.radius
+            errors[term.name] = error
+            start = end
+        stiffnesses = [math.exp(value) for value in values]
+        distance, demands = None, True
+        if goal is not None:
+            if program.aim == "match matrix" and isinstance(goal.match, MatchMatrix):
+                distance = math.sqrt(values[0])
+                demands = distance <= goal.match.tolerance
+                stiffnesses = stiffnesses[1:]
+            elif isinstance(goal.match, MatchValue):
+                demands = abs(stiffnesses[0] / goal.match.value - 1) <= goal.match.tolerance
+            floored = stiffnesses[len(stiffnesses) - len(goal.at_least) :]
+            for floor, value in zip(goal.at_least, floored, strict=True):
+                demands = demands and value >= floor.value
+        return cls(
+            tip_pose=tip_pose,
+            position_error=errors.get("position"),
+            angle_error=errors.get("angle"),
+            compliance=compliance,
+            stiffnesses=tuple(stiffnesses),
+            matrix_distance=distance,
+            pose_holds=holds,
+            limits_hold=within,
+            demands_hold=bool(demands),
+        )
+
+
+def are_within(pressures: Vector, lower: Vector, upper: Vector) -> bool:
+    """Whether all pressures (n,) are within their limits."""
+    return bool(((pressures >= lower) & (pressures <= upper)).all())
+
 
 def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     """Judge pressures (n,) by the model of the arm (which carries the task's load).
@@ -205,34 +301,13 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     EquilibriumError
         If the arm has no equilibrium at these pressures that is reached from rest.
     """
-    tip_pose = robot.tip_pose(pressures)
-    errors = pose_errors(task.target, tip_pose)
+    program = Program.of(task.target, task.stiffness)
+    found = Evaluator(robot, functions(robot, program).judge)
+    residuals, pose, compliance, values = found(pressures, program.parameters)
     lower, upper = task.pressure_bounds(robot.description)
-    compliance = robot.tip_compliance(pressures)
-    demands = True
-    stiffnesses = [_stiffness(robot, pressures, measure) for measure in task.measures]
-    distance = None
-    goal = task.stiffness
-    if goal is not None:
-        if isinstance(goal.match, MatchMatrix):
-            distance = _distance(goal.match, compliance, tip_pose[:3, :3])
-            demands = distance <= goal.match.tolerance
-        elif goal.match is not None:
-            demands = abs(stiffnesses[0] / goal.match.value - 1) <= goal.match.tolerance
-        floored = stiffnesses[len(stiffnesses) - len(goal.at_least) :]
-        for floor, value in zip(goal.at_least, floored, strict=True):
-            demands = demands and value >= floor.value
-    return Judgement(
-        tip_pose=tip_pose,
-        position_error=errors["position"].error if "position" in errors else None,
-        angle_error=errors["angle"].error if "angle" in errors else None,
-        compliance=compliance,
-        stiffnesses=tuple(stiffnesses),
-        matrix_distance=distance,
-        pose_holds=all(ball.error <= ball.radius for ball in errors.values()),
-        limits_hold=bool((pressures >= lower).all() and (pressures <= upper).all()),
-        demands_hold=bool(demands),
-    )
+    within = are_within(pressures, lower, upper)
+    numbers = (residuals.ravel().tolist(), pose.T, compliance.T, values.ravel().tolist())
+    return Judgement.of(program, task.stiffness, numbers, within)
 
 
 def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str, tuple[int, int]]:
@@ -246,22 +321,3 @@ def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str
         elif pressures[index] <= lower[index] + PRESSURE_SLACK:
             found[f"{name} min"] = (index, -1)
     return found
-
-
-def _stiffness(robot: Manipulator, pressures: Vector, measure: StiffnessMeasure) -> float:
-    value: Any = robot.stiffness(
-        pressures, measure.direction, measure.kind, measure.boundary, measure.frame
-    )
-    return float(value)
-
-
-def _distance(match: MatchMatrix, compliance: Vector, rotation: Vector) -> float:
-    stiffness = (
-        np.linalg.inv(compliance)[:3, :3]
-        if match.boundary == "clamped"
-        else np.linalg.inv(compliance[:3, :3])
-    )
-    if match.frame == "base":
-        stiffness = rotation @ stiffness @ rotation.T
-    wanted = np.array(match.matrix)
-    return float(np.linalg.norm(stiffness - wanted) / np.linalg.norm(wanted))

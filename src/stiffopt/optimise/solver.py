@@ -1,8 +1,9 @@
 """From a task to the stiffest pressures: global search, judgement and diagnosis."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,15 +12,20 @@ from stiffopt.errors import EquilibriumError, InputError, shown
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer, checked_vector
 from stiffopt.optimise import diagnosis
+from stiffopt.optimise.fast import Answer, FastSolver
 from stiffopt.optimise.local import LocalResult, descend, reach
-from stiffopt.optimise.problem import BAR, Problem
-from stiffopt.optimise.search import SampleTable, Search, search, starts
+from stiffopt.optimise.prepared import prepared
+from stiffopt.optimise.problem import Problem
+from stiffopt.optimise.program import BAR, Program
+from stiffopt.optimise.search import Search, search, starts
 from stiffopt.optimise.solution import (
     Confidence,
+    Explanation,
     Judgement,
     PressureSolution,
     Sensitivities,
     active_bounds,
+    are_within,
     judge,
 )
 from stiffopt.optimise.target import Target
@@ -27,11 +33,6 @@ from stiffopt.optimise.task import Task
 from stiffopt.optimise.terms import pose_terms
 
 Vector = NDArray[np.float64]
-
-MOST_STARTS = 32
-"""Local searches at most, for an arm in closed form."""
-MOST_STARTS_LOADED = 12
-"""Local searches at most, for an arm under gravity or load."""
 
 _JUDGED = 5  # local optima that are tried in turn if the best does not hold from rest
 _PRICE_OF_NOTHING = 1e-9  # multipliers below are rounding
@@ -59,12 +60,10 @@ class PressureSolver:
             raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
         if not isinstance(task, Task):
             raise InputError(f"task must be a Task, see load_task; got {shown(task)}")
-        load = task.load
-        self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
         self.task = task
         self.seed = checked_integer("seed", seed, 0)
-        self._problem = Problem(self.robot, task)
-        self._samples: SampleTable | None = None
+        self._prepared = prepared(robot, task, self.seed)
+        self.robot = self._prepared.robot
 
     def solve(
         self, target: Target | None = None, guess: ArrayLike | None = None
@@ -82,26 +81,75 @@ class PressureSolver:
         if target is not None and not isinstance(target, Target):
             raise InputError(f"target must be a Target; got {shown(target)}")
         begin = perf_counter()
-        problem = self._problem if target is None else self._problem.at_target(target)
-        try:
-            solution = self._solve(problem, self._checked(guess))
-        except EquilibriumError as error:
-            solution = PressureSolution("failed", str(error), problem.task)
+        start = self._checked(guess)
+        task = self.task if target is None else self.task.model_copy(update={"target": target})
+        solution = self._compiled(task, start) or self._general(task, start)
         solution.timings["total"] = perf_counter() - begin
         return solution
+
+    def _compiled(self, task: Task, guess: Vector | None) -> PressureSolution | None:
+        """Answer of the compiled solver, if there is one that holds."""
+        fast = self._fast(task, guess)
+        if fast is None:
+            return None
+        solver, row, program = fast
+        return self._accepted(task, program, solver.solve(row))
+
+    def _fast(self, task: Task, guess: Vector | None) -> tuple[FastSolver, Vector, Program] | None:
+        """Compiled solver of a task, its row of numbers and its program."""
+        program = self._prepared.program(task.target)
+        fast = self._prepared.fast(program)
+        if fast is None:
+            return None
+        solver, row = fast
+        return solver, solver.with_target(row, task.target, program, guess), program
+
+    def _accepted(
+        self, task: Task, program: Program, answer: Answer | None
+    ) -> PressureSolution | None:
+        """Solution from an answer of the compiled solver, if it holds."""
+        if answer is None:
+            return None
+        p = answer.pressures
+        within = are_within(p, self._prepared.lower, self._prepared.upper)
+        judgement = Judgement.of(program, task.stiffness, answer.judged, within)
+        if not judgement.holds:
+            return None
+
+        def explain() -> Explanation:
+            problem = Problem(self.robot, task)
+            point = problem.point(p / BAR)
+            result = LocalResult.at(problem, point)
+            return self._explanation(problem, result, judgement, p)
+
+        return PressureSolution.explained_later(
+            explain,
+            status="solved",
+            **self._quantities(task, judgement),
+            pressures=p,
+            confidence=answer.confidence,
+            counts=answer.counts,
+            timings={},
+        )
+
+    def _general(self, task: Task, guess: Vector | None) -> PressureSolution:
+        try:
+            return self._solve(Problem(self.robot, task), guess)
+        except EquilibriumError as error:
+            return PressureSolution("failed", str(error), task)
 
     def _solve(self, problem: Problem, guess: Vector | None) -> PressureSolution:
         if guess is not None:
             nearby = self._from_guess(problem, guess)
             if nearby is not None:
                 return nearby
-        most = MOST_STARTS_LOADED if self.robot.is_loaded else MOST_STARTS
-        found = search(problem, self._starts(problem), most)
+        found = search(problem, self._starts(problem))
         if not found.results:
             return self._closest(problem, found)
-        if problem.floors and not found.results[0].holds_floors:
+        if len(problem.floors) and not found.results[0].holds_floors:
             return self._without_floors(problem, found)
-        return self._first_that_holds(problem, found)
+        at_once = self._judged(problem, found.results[0], found.confidence)
+        return at_once or self._first_that_holds(problem, found)
 
     def _from_guess(self, problem: Problem, guess: Vector) -> PressureSolution | None:
         problem.restart()
@@ -111,8 +159,22 @@ class PressureSolver:
         result = descend(problem, point)
         if not result.converged or not result.holds_floors:
             return None
-        solution = self._solution(problem, result, Confidence(1, 1, 1, 1, complete=False))
+        local = Confidence(1, 1, 1, 1, complete=False)
+        at_once = self._judged(problem, result, local)
+        if at_once is not None:
+            return at_once
+        solution = self._solution(problem, result, local)
         return solution if solution.found else None
+
+    def _judged(
+        self, problem: Problem, result: LocalResult, confidence: Confidence
+    ) -> PressureSolution | None:
+        """Solution of an arm without loads, if it holds; it is explained when that is asked for."""
+        if self.robot.is_loaded:
+            return None
+        p = np.clip(result.point.x * BAR, self._prepared.lower, self._prepared.upper)
+        answer = Answer(p, confidence, {}, problem.judged(p))
+        return self._accepted(problem.task, problem.program, answer)
 
     def _first_that_holds(self, problem: Problem, found: Search) -> PressureSolution:
         """Best local optimum that the model confirms from rest."""
@@ -137,7 +199,8 @@ class PressureSolver:
     def _closest(self, problem: Problem, found: Search) -> PressureSolution:
         """Closest configuration to a pose that no start came to."""
         near = sorted(found.nearest, key=lambda point: sum(b.error for b in point.balls))
-        candidates = [*self._nearest(problem, 16), *(point.x for point in near)]
+        anywhere = self._prepared.samples.x[:32]
+        candidates = [*(point.x for point in near), *self._nearest(problem, 16), *anywhere]
         results = diagnosis.closest_configurations(problem, candidates)
         if results and _reaches(problem, results[0]):
             again = search(problem, iter([results[0].point.x]), 1)
@@ -159,9 +222,9 @@ class PressureSolver:
 
     def _without_floors(self, problem: Problem, found: Search) -> PressureSolution:
         """Best that can be had where a stiffness that is demanded was not found."""
-        nearest = problem.changed(objective=problem.best_floors(), floors=())
+        nearest = problem.changed(problem.best_floors(), floors=False)
         candidates = (result.point.x for result in found.results)
-        best = search(nearest, candidates, len(found.results))
+        best = search(nearest, candidates)
         if best.results and best.results[0].value <= 0:
             again = search(problem, iter([best.results[0].point.x]), 1)
             if again.results and again.results[0].holds_floors:
@@ -174,42 +237,46 @@ class PressureSolver:
         self, problem: Problem, result: LocalResult, confidence: Confidence
     ) -> PressureSolution:
         """Judge a result and put it into words."""
-        lower, upper = problem.task.pressure_bounds(self.robot.description)
-        pressures = np.clip(result.point.x * BAR, lower, upper)
+        pressures = np.clip(result.point.x * BAR, self._prepared.lower, self._prepared.upper)
+        judgement = judge(self.robot, problem.task, pressures)
+        return PressureSolution(
+            status="solved" if judgement.holds else "unreachable",
+            **self._explanation(problem, result, judgement, pressures)._asdict(),
+            **self._quantities(problem.task, judgement),
+            pressures=pressures,
+            confidence=confidence,
+        )
+
+    def _quantities(self, task: Task, judgement: Judgement) -> dict[str, Any]:
+        """What a solution takes from its judgement."""
+        return {
+            "task": task,
+            "tip_pose": judgement.tip_pose,
+            "position_error": judgement.position_error,
+            "angle_error": judgement.angle_error,
+            "compliance": judgement.compliance,
+            "stiffness": judgement.stiffnesses[0] if judgement.stiffnesses else None,
+            "stiffness_unit": self._prepared.unit,
+            "stiffnesses": judgement.stiffnesses,
+            "matrix_distance": judgement.matrix_distance,
+        }
+
+    def _explanation(
+        self, problem: Problem, result: LocalResult, judgement: Judgement, pressures: Vector
+    ) -> Explanation:
+        """Put a judged result into words."""
         task = problem.task
-        judgement = judge(self.robot, task, pressures)
         active = active_bounds(self.robot, task, pressures)
         sensitivities = self._sensitivities(problem, result, judgement, pressures, active)
         freedom = diagnosis.freedom(problem, pressures / BAR)
-        if judgement.holds:
-            goal = task.stiffness
-            message = (
-                diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
-                if freedom == 0 and goal is not None
-                else ""
-            )
-        elif not judgement.pose_holds:
+        message = ""
+        if not judgement.pose_holds:
             message = diagnosis.unreachable_message(judgement, task, self._holding(result, active))
-        else:
+        elif not judgement.holds:
             message = diagnosis.demands_message(judgement, task)
-        return PressureSolution(
-            status="solved" if judgement.holds else "unreachable",
-            message=message,
-            task=task,
-            pressures=pressures,
-            tip_pose=judgement.tip_pose,
-            position_error=judgement.position_error,
-            angle_error=judgement.angle_error,
-            compliance=judgement.compliance,
-            stiffness=judgement.stiffnesses[0] if judgement.stiffnesses else None,
-            stiffness_unit=task.measures[0].unit if task.measures else None,
-            stiffnesses=judgement.stiffnesses,
-            matrix_distance=judgement.matrix_distance,
-            active_bounds=tuple(active),
-            freedom=freedom,
-            confidence=confidence,
-            sensitivities=sensitivities,
-        )
+        elif freedom == 0 and task.stiffness is not None:
+            message = diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
+        return Explanation(message, tuple(active), freedom, sensitivities)
 
     @staticmethod
     def _holding(result: LocalResult, active: dict[str, tuple[int, int]]) -> list[str]:
@@ -257,16 +324,11 @@ class PressureSolver:
     # -- starts -----------------------------------------------------------------------------
 
     def _starts(self, problem: Problem) -> Iterator[Vector]:
-        return starts(problem, self._table(problem))
-
-    def _table(self, problem: Problem) -> SampleTable:
-        if self._samples is None:
-            self._samples = SampleTable(self.robot, problem.lower, problem.upper, self.seed)
-        return self._samples
+        return starts(problem, self._prepared.samples)
 
     def _nearest(self, problem: Problem, count: int) -> list[Vector]:
         """Samples that are nearest to the target."""
-        table = self._table(problem)
+        table = self._prepared.samples
         order = table.nearest_first(problem.task.target, self.robot.length)
         return list(table.x[order[:count]])
 
@@ -285,6 +347,62 @@ def solve_pressure(
     closest configuration.  See `PressureSolver` for many similar tasks.
     """
     return PressureSolver(robot, task, seed=seed).solve(guess=guess)
+
+
+def solve_batch(
+    robot: Manipulator,
+    tasks: Iterable[Task],
+    guesses: Sequence[ArrayLike | None] | None = None,
+    *,
+    seed: int = 0,
+    threads: int | None = None,
+) -> list[PressureSolution]:
+    """Solve many tasks on one arm, on all cores: the solutions of `solve_pressure` one by one.
+
+    Parameters
+    ----------
+    robot : Manipulator
+    tasks : iterable of Task
+        They may differ in anything; those of the same structure share what is compiled.
+    guesses : sequence, optional
+        Pressures (n,) in Pa or None for each task, see `PressureSolver.solve`.
+    seed : int
+        Of the global search.
+    threads : int, optional
+        Instead of one for each core.  The solutions do not depend on it.
+
+    Raises
+    ------
+    InputError
+        If a task's pressure limits do not suit the robot; nothing is solved then.
+    """
+    begin = perf_counter()
+    tasks = list(tasks)
+    starts: Sequence[ArrayLike | None] = [None] * len(tasks) if guesses is None else guesses
+    if len(starts) != len(tasks):
+        raise InputError(
+            f"expected a guess or None for each of {len(tasks)} tasks; got {len(starts)}"
+        )
+    solvers = [PressureSolver(robot, task, seed=seed) for task in tasks]
+    checked = [solver._checked(guess) for solver, guess in zip(solvers, starts, strict=True)]
+    found: dict[int, PressureSolution | None] = {}
+    groups: dict[FastSolver, list[tuple[int, Vector, Program]]] = {}
+    for index, (solver, task, guess) in enumerate(zip(solvers, tasks, checked, strict=True)):
+        fast = solver._fast(task, guess)
+        if fast is not None:
+            groups.setdefault(fast[0], []).append((index, *fast[1:]))
+    for fast_solver, members in groups.items():
+        answers = fast_solver.solve_all(np.stack([row for _, row, _ in members]), threads)
+        for (index, _, program), answer in zip(members, answers, strict=True):
+            found[index] = solvers[index]._accepted(tasks[index], program, answer)
+    share = (perf_counter() - begin) / max(1, len(tasks))
+    solutions = []
+    for index, (solver, task, guess) in enumerate(zip(solvers, tasks, checked, strict=True)):
+        started = perf_counter()
+        solution = found.get(index) or solver._general(task, guess)
+        solution.timings["total"] = share + perf_counter() - started
+        solutions.append(solution)
+    return solutions
 
 
 def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> PressureSolution:

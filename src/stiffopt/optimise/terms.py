@@ -1,11 +1,17 @@
 """What a target asks of the tip's pose, term by term, as residuals with tolerances.
 
-To add a term, subclass `PoseTerm` and have `pose_terms` make it from the target.
+A term splits into its *structure*, for which functions are compiled, and its *parameters*, which
+are arguments of them.  To add a term, subclass `PoseTerm` and have `pose_terms` make it from the
+target.
 """
 
+import math
 from abc import ABC, abstractmethod
+from collections.abc import Hashable
 from dataclasses import dataclass
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +19,8 @@ from stiffopt import lie
 from stiffopt.optimise.target import Target
 
 Vector = NDArray[np.float64]
+
+_ALIGNED = 1e-8  # squared sine of an angle below which its series is used
 
 
 @dataclass(frozen=True)
@@ -37,7 +45,7 @@ class Ball:
     @property
     def error(self) -> float:
         """Length of the residual."""
-        return float(np.linalg.norm(self.residual))
+        return math.sqrt(self.residual @ self.residual)
 
 
 class PoseTerm(ABC):
@@ -49,21 +57,29 @@ class PoseTerm(ABC):
         "position" (its residual in m) or "angle" (in rad).
     radius : float
         Tolerance of the residual's length.
+    size : int
+        Number k of components of the residual.
     """
 
     name: str
+    size: int
 
     def __init__(self, radius: float) -> None:
         self.radius = radius
 
+    @property
     @abstractmethod
-    def residual(self, position: Vector, rotation: Vector) -> tuple[Vector, Vector]:
-        """Residual (k,) of a pose, and its derivative (k, 6) by a body twist of the tip."""
+    def structure(self) -> Hashable:
+        """What the compiled function depends on."""
 
-    def ball(self, position: Vector, rotation: Vector, jacobian: Vector) -> Ball:
-        """Residual of a pose whose body twist per variable is `jacobian` (6, n)."""
-        residual, per_twist = self.residual(position, rotation)
-        return Ball(self.name, residual, per_twist @ jacobian, self.radius)
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[float, ...]:
+        """Its arguments, always as many for one structure."""
+
+    @abstractmethod
+    def residual(self, position: Any, rotation: Any, parameters: Any) -> Any:
+        """Symbolic residual (k,) of a pose for symbolic parameters."""
 
 
 class PositionTerm(PoseTerm):
@@ -73,13 +89,23 @@ class PositionTerm(PoseTerm):
 
     def __init__(self, position: tuple[float | None, ...], radius: float) -> None:
         super().__init__(radius)
-        self._asked = [axis for axis, value in enumerate(position) if value is not None]
-        self._wanted = np.array([value for value in position if value is not None])
+        self.axes = tuple(axis for axis, value in enumerate(position) if value is not None)
+        self._wanted = tuple(value for value in position if value is not None)
+        self.size = len(self.axes)
 
-    def residual(self, position: Vector, rotation: Vector) -> tuple[Vector, Vector]:
+    @property
+    def structure(self) -> Hashable:
+        """The axes that are asked for."""
+        return ("position", self.axes)
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """The position along these axes."""
+        return self._wanted
+
+    def residual(self, position: Any, rotation: Any, parameters: Any) -> Any:
         """Difference to the wanted position; see `PoseTerm.residual`."""
-        per_twist = np.hstack([rotation, np.zeros((3, 3))])[self._asked]
-        return position[self._asked] - self._wanted, per_twist
+        return position[list(self.axes)] - parameters
 
 
 class PointingTerm(PoseTerm):
@@ -90,56 +116,66 @@ class PointingTerm(PoseTerm):
     """
 
     name = "angle"
+    size = 2
 
     def __init__(self, direction: tuple[float, ...], radius: float) -> None:
         super().__init__(radius)
-        self._wanted = np.array(direction)
-        self._across = np.linalg.svd(self._wanted[np.newaxis])[2][1:]  # (2, 3)
+        self._direction = direction
 
-    def residual(self, position: Vector, rotation: Vector) -> tuple[Vector, Vector]:
+    @property
+    def structure(self) -> Hashable:
+        """Nothing but its kind."""
+        return ("pointing",)
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """The direction, and two unit vectors across it."""
+        x, y, z = self._direction
+        # J. Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6 (2017)
+        sign = math.copysign(1.0, z)
+        a = -1.0 / (sign + z)
+        b = x * y * a
+        return (x, y, z, 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y)
+
+    def residual(self, position: Any, rotation: Any, parameters: Any) -> Any:
         """Unrolled axis (2,); see `PoseTerm.residual`."""
         axis = rotation[:, 2]
-        cosine = float(np.clip(self._wanted @ axis, -1.0, 1.0))
-        flat = self._across @ axis
-        sine = float(np.hypot(*flat))
-        if sine > 1e-4:
-            factor = np.arctan2(sine, cosine) / sine
-            slope = (cosine * factor - 1) / sine**2  # of the factor by the cosine
-        elif cosine > 0:
-            factor, slope = 1.0 + sine**2 / 6, -1 / 3
-        else:  # opposite: every way round is as good
-            return np.array([np.pi, 0.0]), self._across @ _axis_per_twist(rotation)
-        per_axis = factor * self._across + slope * np.outer(flat, self._wanted)
-        return factor * flat, per_axis @ _axis_per_twist(rotation)
+        cosine = ca.dot(parameters[:3], axis)
+        flat = ca.vertcat(ca.dot(parameters[3:6], axis), ca.dot(parameters[6:], axis))
+        square = ca.sumsqr(flat)
+        aligned = square < _ALIGNED
+        sine = ca.sqrt(ca.if_else(aligned, _ALIGNED, square))
+        factor = ca.if_else(aligned, 1 + square / 6, ca.atan2(sine, cosine) / sine)
+        # exactly opposite every way round is as good: take one
+        opposite = ca.logic_and(aligned, cosine < 0)
+        return factor * flat + ca.vertcat(ca.if_else(opposite, np.pi, 0), 0)
 
 
 class OrientationTerm(PoseTerm):
     """Orientation of the tip: the rotation vector from the wanted one."""
 
     name = "angle"
+    size = 3
 
     def __init__(self, quaternion: tuple[float, ...], radius: float) -> None:
         super().__init__(radius)
-        self._wanted = lie.rotation_from_quaternion(np.array(quaternion))
+        self._quaternion = quaternion
 
-    def residual(self, position: Vector, rotation: Vector) -> tuple[Vector, Vector]:
+    @property
+    def structure(self) -> Hashable:
+        """Nothing but its kind."""
+        return ("orientation",)
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """The wanted unit quaternion."""
+        return self._quaternion
+
+    def residual(self, position: Any, rotation: Any, parameters: Any) -> Any:
         """Rotation vector (3,); see `PoseTerm.residual`."""
-        q = lie.quaternion_from_rotation(self._wanted.T @ rotation)
-        vector = lie.rotation_vector_from_quaternion(q)
-        square = float(vector @ vector)
-        first, second, _ = lie.exponential_coefficients(max(square, 1e-12))
-        W = lie.hat(vector)
-        # inverse of the right Jacobian of SO(3)
-        factor = 1 / 12 if square < 1e-8 else (1 - first / (2 * second)) / square
-        per_turn = np.eye(3) + 0.5 * W + factor * (W @ W)
-        return vector, np.hstack([np.zeros((3, 3)), per_turn])
-
-
-def _axis_per_twist(rotation: Vector) -> Vector:
-    """Derivative (3, 6) of the tip's z axis by a body twist: a turn (a, b, c) adds b x - a y."""
-    x, y = rotation[:, 0], rotation[:, 1]
-    zero = np.zeros(3)
-    return np.column_stack([zero, zero, zero, -y, x, zero])
+        wanted = lie.rotation_from_quaternion(parameters)
+        turn = lie.quaternion_from_rotation(wanted.T @ rotation)
+        return lie.rotation_vector_from_quaternion(turn)
 
 
 def pose_terms(target: Target) -> tuple[PoseTerm, ...]:
@@ -157,8 +193,24 @@ def pose_terms(target: Target) -> tuple[PoseTerm, ...]:
 
 def pose_errors(target: Target, tip_pose: Vector) -> dict[str, Ball]:
     """Residuals of a tip pose (4, 4) from a target, by name."""
-    nothing = np.zeros((6, 0))
-    return {
-        term.name: term.ball(tip_pose[:3, 3], tip_pose[:3, :3], nothing)
-        for term in pose_terms(target)
-    }
+    found = {}
+    for term in pose_terms(target):
+        residual = _residual_function(term)(tip_pose[:3, 3], tip_pose[:3, :3], term.parameters)
+        none = np.zeros((term.size, 0))
+        found[term.name] = Ball(term.name, residual.full()[:, 0], none, term.radius)
+    return found
+
+
+_functions: dict[Hashable, ca.Function] = {}
+
+
+def _residual_function(term: PoseTerm) -> ca.Function:
+    """Residual of a pose as a function, one for each structure."""
+    if term.structure not in _functions:
+        position, rotation = ca.SX.sym("r", 3), ca.SX.sym("R", 3, 3)
+        parameters = ca.SX.sym("parameters", len(term.parameters))
+        residual = term.residual(position, rotation, parameters)
+        _functions[term.structure] = ca.Function(
+            "residual", [position, rotation, parameters], [ca.densify(residual)]
+        )
+    return _functions[term.structure]

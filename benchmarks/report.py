@@ -1,0 +1,110 @@
+"""The report in Markdown: bars, where a peer is better, environment, tables, limitations."""
+
+from collections.abc import Iterable, Sequence
+
+from counts import TOLERANCE, Difference
+from results import Section, Verdict, times
+
+METRICS = """\
+All times are wall times of whole calls from Python, in one process unless said otherwise. Calls
+that are compared are interleaved, task by task, in changing order; each is repeated and the
+median over the repetitions taken, then the median over the tasks. A *ratio* is the peer's time
+over stiffopt's, taken task by task, and its median: above 1 stiffopt is faster. What is built
+once (symbolic functions, `nlpsol`, compiled code, JIT) is built before the clock starts, for
+all; "First solution" has what it costs stiffopt. Every answer is judged by one model: its pose
+within the tolerance, its pressures within the limits."""
+
+LIMITATIONS = """\
+- Times are of one machine, with whatever else ran on it; the load is given. Ratios taken side
+  by side move less than times, but they move: tens of percent between runs on a busy machine.
+- Tens of tasks per arm do not prove shares of 98 or 99 %. "Best" is the best that was found
+  here, not a proof; `quality.py` has the reference that shares nothing with the optimiser.
+- Targets are poses of random pressures: regions that few pressures reach are seldom visited.
+- The peers were used as a careful user would, not as their authors might. IPOPT runs with MUMPS
+  and exact Hessians in CasADi's virtual machine; generating C for it would make its evaluations
+  faster. SLSQP has no warm start for multipliers.
+- pink solves an easier problem: no pressure limits, no choice among poses, and a local method
+  from one start.
+- soromox starts from strains, stiffopt from pressures. JAX may use all cores, as may stiffopt's
+  batches.
+- PyElastica is a dynamic simulator put to a static use, which is not what it is best at; its
+  time is the one after which the tip stays put, which only hindsight knows.
+- Cold times are of tasks whose structure was seen before; the first task of a structure pays
+  for building.
+- Loads are covered by two kinds of tasks on the two-segment arm."""
+
+
+def markdown(
+    sections: Sequence[Section],
+    differences: Sequence[Difference],
+    environment: dict[str, str],
+    loads: tuple[float, float],
+    seed: int,
+    quick: bool,
+    minutes: float,
+) -> str:
+    """The whole report."""
+    parts = ["# Results of the speed benchmarks", ""]
+    if quick:
+        parts += ["**Quick form: it shows that everything runs; its figures mean little.**", ""]
+    parts += [
+        f"Seed {seed}, {minutes:.1f} minutes. "
+        f"Load average {loads[0]:.2f} before, {loads[1]:.2f} after.",
+        "", "## Metrics", "", METRICS, "", "## Bars", "", *_bars(sections), "",
+        "## Where a peer is better", "", *_better(sections), "", "## Environment", "",
+        *_table(("", ""), environment.items()), "",
+    ]  # fmt: skip
+    for section in sections:
+        parts += [f"## {section.title}", "", section.text, ""]
+        if section.rows:
+            parts += [*_table(section.header, section.rows), ""]
+        parts += [f"Skipped: {name}: {why}." for name, why in section.skipped.items()]
+        parts += [""] if section.skipped else []
+    parts += ["## Counts", "", *_counts(differences), "", "## Limitations", "", LIMITATIONS, ""]
+    return "\n".join(parts)
+
+
+def summary(sections: Iterable[Section], differences: Iterable[Difference]) -> str:
+    """Few lines for the terminal."""
+    verdicts = [verdict for section in sections for verdict in section.verdicts]
+    missed = [v for v in verdicts if not v.met]
+    lines = [f"  missed: {v.what}: {v.measured}, bar {v.bar}" for v in missed]
+    lines += [f"  {difference}" for difference in differences if difference.fails]
+    return "\n".join([f"{len(verdicts) - len(missed)} of {len(verdicts)} bars met", *lines])
+
+
+def _bars(sections: Sequence[Section]) -> list[str]:
+    verdicts: list[Verdict] = [v for section in sections for v in section.verdicts]
+    met = sum(v.met for v in verdicts)
+    rows = [(v.what, v.bar, v.measured, "met" if v.met else "**not met**") for v in verdicts]
+    return [
+        f"{met} of {len(verdicts)} met.", "",
+        *_table(("figure", "bar", "measured", ""), rows),
+    ]  # fmt: skip
+
+
+def _better(sections: Sequence[Section]) -> list[str]:
+    found = [c for section in sections for c in section.comparisons if c.times_better < 1]
+    if not found:
+        return ["Nowhere in this run."]
+    rows = [(c.work, c.peer, c.measure, times(1 / c.times_better), c.remark) for c in found]
+    return _table(("work", "peer", "in", "how many times better", "remark"), rows)
+
+
+def _counts(differences: Sequence[Difference]) -> list[str]:
+    """The groups, and each count that is not the same."""
+    intro = (
+        "Compared with `results/counts.json`; tolerances: "
+        + ", ".join(f"{group} {100 * share:g} %" for group, share in TOLERANCE.items())
+        + f". {len(differences)} counts, {sum(d.fails for d in differences)} worse."
+    )
+    changed = [d for d in differences if d.state != "same"]
+    rows = [(d.group, d.name, str(d.expected), str(d.found), d.state) for d in changed]
+    if not rows:
+        return [intro, "", "All are within their tolerance."]
+    return [intro, "", *_table(("group", "count", "on record", "found", ""), rows)]
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    lines = [header, ["---"] * len(header), *rows]
+    return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]

@@ -1,0 +1,147 @@
+"""What needs processes of its own: first solutions, no compiler, the command line."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from time import perf_counter
+
+import settings as bars
+from results import Section, at_most, milliseconds, times
+from settings import Settings
+from timing import interleaved, median
+
+HERE = Path(__file__).resolve().parent.parent
+WORKER = HERE / "worker.py"
+TASK = HERE.parent / "problems" / "two_segment_stiff_x.yaml"
+IMPORTS = "import casadi, numpy, pint, pydantic, rich, typer"
+
+BUILD_TEXT = """\
+The first `solve_pressure` of a process, with an empty cache of compiled code and with a filled
+one. *Ratio*: over a later solution of the same process. What it takes to build is their
+difference."""
+COMPILER_TEXT = """\
+The full task, cold and warm as above, in a process that is told to use no C compiler
+(`STIFFOPT_COMPILER=none`), beside IPOPT in the same process."""
+COMMAND_TEXT = """\
+Wall time of `solve-pressure` on one two-segment task file, from the start of the process to its
+end, compiled code cached ("second run"), interleaved with a Python process that does nothing,
+and one that only imports the libraries which the command needs. *Ratio*: over the one that
+imports."""
+
+
+def build(sizes: Settings) -> Section:
+    """The table of first solutions."""
+    out = Section(
+        "First solution",
+        BUILD_TEXT,
+        (
+            "segments",
+            "cache empty, s",
+            "cache filled, s",
+            "later, ms",
+            "ratio, cache empty",
+            "code, kB",
+        ),
+    )
+    for segments in (2,) if sizes.quick else sizes.segments:
+        with tempfile.TemporaryDirectory() as cache:
+            first = _worker("first", segments, sizes, STIFFOPT_CACHE_DIR=cache)
+            second = _worker("first", segments, sizes, STIFFOPT_CACHE_DIR=cache)
+        relative = first["first_s"] / first["later_s"]
+        out.rows.append(
+            (
+                str(segments), f"{first['first_s']:.2f}", f"{second['first_s']:.2f}",
+                milliseconds(first["later_s"]), times(relative),
+                f"{first['code_bytes'] / 1e3:.0f}",
+            )
+        )  # fmt: skip
+        out.data[str(segments)] = {"empty": first, "filled": second}
+        if segments == 3:
+            took = first["first_s"] - first["later_s"]
+            out.verdicts.append(
+                at_most("building, 3 segments, empty cache", bars.COMPILE_SECONDS, took, "s")
+            )
+    return out
+
+
+def without_compiler(sizes: Settings) -> Section:
+    """The table of times in the CasADi virtual machine."""
+    out = Section(
+        "Without a C compiler",
+        COMPILER_TEXT,
+        ("segments", "cold, ms", "IPOPT's time over it", "warm, ms", "IPOPT's time over it"),
+    )
+    for segments in sizes.few_segments:
+        with tempfile.TemporaryDirectory() as cache:
+            found = _worker(
+                "full", segments, sizes, STIFFOPT_COMPILER="none", STIFFOPT_CACHE_DIR=cache
+            )
+        own, ipopt = found["stiffopt"], found["CasADi + IPOPT"]
+        out.rows.append(
+            (
+                str(segments), milliseconds(own["cold_s"]), times(ipopt["ratio_cold"]),
+                milliseconds(own["warm_s"]), times(ipopt["ratio_warm"]),
+            )
+        )  # fmt: skip
+        arm = f"no compiler, {segments} segment" + "s" * (segments > 1)
+        cold, warm = bars.VM_COLD_MS[segments], bars.VM_WARM_MS[segments]
+        out.verdicts += [
+            at_most(f"cold, {arm}", cold, own["cold_s"] * 1e3, "ms"),
+            at_most(f"warm, {arm}", warm, own["warm_s"] * 1e3, "ms"),
+        ]
+        out.data[str(segments)] = found
+    return out
+
+
+def command(sizes: Settings) -> Section:
+    """The table of the command line."""
+    out = Section("Command line", COMMAND_TEXT, ("process", "wall time, s", "ratio"))
+    with tempfile.TemporaryDirectory() as cache:
+        environment = _environment(STIFFOPT_CACHE_DIR=cache)
+        solve = [str(Path(sys.executable).parent / "solve-pressure"), str(TASK)]
+        if not Path(solve[0]).exists():
+            out.skipped["solve-pressure"] = "the command is not installed beside this Python"
+            return out
+        begin = perf_counter()
+        _run(solve, environment)
+        first = perf_counter() - begin
+        calls = {
+            "python -c pass": lambda _: _run([sys.executable, "-c", "pass"], environment),
+            "imports": lambda _: _run([sys.executable, "-c", IMPORTS], environment),
+            "solve-pressure": lambda _: _run(solve, environment),
+        }
+        taken = interleaved(calls, 1, sizes.repetitions * (1 if sizes.quick else 2))
+    base = median(taken["imports"])
+    labels = {"imports": f'python -c "{IMPORTS}"'}
+    out.rows.append(("`solve-pressure`, first run", f"{first:.2f}", times(first / base)))
+    for name, of_name in taken.items():
+        seconds = median(of_name)
+        out.rows.append((f"`{labels.get(name, name)}`", f"{seconds:.2f}", times(seconds / base)))
+        out.data[name] = seconds
+    wall = median(taken["solve-pressure"])
+    out.verdicts.append(at_most("solve-pressure, second run", bars.COMMAND_SECONDS, wall, "s"))
+    return out
+
+
+# -- processes ----------------------------------------------------------------------------------
+
+
+def _environment(**changes: str) -> dict[str, str]:
+    return {**os.environ, **changes}
+
+
+def _run(command: list[str], environment: dict[str, str]) -> str:
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return done.stdout
+
+
+def _worker(what: str, segments: int, sizes: Settings, **environment: str) -> dict[str, dict]:
+    """What `worker.py` measures in a process of its own."""
+    command = [sys.executable, str(WORKER), what, str(segments)]
+    command.append(json.dumps(asdict(sizes)))
+    lines = _run(command, _environment(**environment)).splitlines()
+    return dict(json.loads(lines[-1]))

@@ -1,0 +1,66 @@
+"""How much is measured, and the bars."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Sizes of a run.
+
+    Attributes
+    ----------
+    seed : of the tasks.
+    quick : the small form, which shows that all works but proves nothing.
+    segments : arms of the full task.
+    tasks : random tasks per arm, cold.
+    warm_tasks : of these, warm too.
+    slow_tasks : of these, for peers that take a second.
+    kind_tasks : tasks per kind.
+    repetitions : of each timed call.
+    reference_starts : random starts of IPOPT per task, for the best known answer.
+    most_seconds : per solver and table; a solver that needs more is timed on fewer tasks.
+    batch : rows of the batched evaluations.
+    batch_tasks : tasks of `solve_batch`.
+    growth : arms whose growth of cost is measured beside `segments`.
+    """
+
+    seed: int = 1
+    quick: bool = False
+    segments: tuple[int, ...] = (1, 2, 3, 5)
+    tasks: int = 40
+    warm_tasks: int = 20
+    slow_tasks: int = 4
+    kind_tasks: int = 10
+    repetitions: int = 5
+    reference_starts: int = 4
+    most_seconds: float = 3.0
+    batch: int = 60_000
+    batch_tasks: int = 2000
+    growth: tuple[int, ...] = (4, 6)
+
+    @property
+    def few_segments(self) -> tuple[int, ...]:
+        """Arms for what takes long to prepare or says little on more of them."""
+        return (2,) if self.quick else tuple(n for n in self.segments if n <= 3)
+
+
+def quick(seed: int) -> Settings:
+    """Everything once, small."""
+    return Settings(
+        seed=seed, quick=True, segments=(1, 2), tasks=3, warm_tasks=2, slow_tasks=1, kind_tasks=1,
+        repetitions=2, reference_starts=1, most_seconds=0.5, batch=2000, batch_tasks=10, growth=(),
+    )  # fmt: skip
+
+
+COLD_MS = {1: 0.5, 2: 1.0, 3: 2.0, 5: 8.0}
+WARM_MS = {1: 0.05, 2: 0.1, 3: 0.25, 5: 1.0}
+COLD_TIMES_IPOPT = {1: 7.0, 2: 17.0, 3: 23.0}
+VM_COLD_MS = {1: 2.0, 2: 5.0, 3: 12.0}
+VM_WARM_MS = {1: 1.0, 2: 2.0, 3: 4.0}
+NEAR_BEST = 5e-3
+SHARE_BEST = {1: 0.99, 2: 0.99, 3: 0.98}
+KIND_FACTOR, LOADED_FACTOR = 3.0, 10.0
+COMPILE_SECONDS = 3.0  # three segments
+COMMAND_SECONDS = 0.8
+BATCH_SOLVES = 1500.0  # per second, two segments
+BATCH_POSES, BATCH_STIFFNESSES = 1.5e6, 0.5e6  # per second, two segments

@@ -1,0 +1,109 @@
+"""The commands `stiffopt map ...`: `workspace` samples where the tip can be and how stiff."""
+
+from typing import Annotated
+
+import typer
+
+map_app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Map an arm: where its tip can be, and how stiff it can be made there.",
+)
+
+HELP = """\
+Sample the pressures of an arm and map its workspace.
+
+Space is divided into cells. For each cell that the tip reaches the map holds how many samples did,
+and for each direction the greatest and the least stiffness that they have, with the pressures.
+ROBOT is the name of a built-in robot or a robot file. With --out, the map is kept as a Zarr group;
+the same command continues a run that was interrupted.
+"""
+
+_EPILOG = """\
+\b
+Examples:
+  stiffopt map workspace stiff-flop-2 --out map.zarr --samples 10000000 --plot map.png
+  stiffopt map workspace my-arm.yaml --levels 6 --cell '5 mm' --direction x --direction 0,1,1
+  stiffopt map workspace stiff-flop-3 --out map.zarr --scheduler tcp://10.0.0.5:8786
+
+\b
+Exit codes:
+  0    the map is complete
+  2    bad input, or the map cannot be made or written
+  130  interrupted (Ctrl-C)
+"""
+
+
+@map_app.callback()
+def _map() -> None:
+    pass
+
+
+@map_app.command("workspace", help=HELP, epilog=_EPILOG)
+def workspace(
+    robot: Annotated[
+        str, typer.Argument(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml).")
+    ],
+    out: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.zarr", help="Keep the map in this folder, a Zarr group."),
+    ] = None,
+    samples: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=1,
+            help="Number of quasi-random samples; by default a million, with gravity 1000.",
+        ),
+    ] = None,
+    levels: Annotated[
+        int | None,
+        typer.Option(
+            metavar="K", min=2, help="Instead: all combinations of K levels of each channel."
+        ),
+    ] = None,
+    cell: Annotated[str, typer.Option(metavar="LENGTH", help="Size of a cell.")] = "10 mm",
+    direction: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="DIR",
+            help="x, y, z or a,b,c: direction of a stiffness; may be repeated. By default x, y, z.",
+        ),
+    ] = None,
+    kind: Annotated[
+        str, typer.Option(metavar="KIND", help="translation or rotation.")
+    ] = "translation",
+    boundary: Annotated[
+        str, typer.Option(metavar="BOUNDARY", help="free, guided or clamped.")
+    ] = "free",
+    frame: Annotated[
+        str, typer.Option(metavar="FRAME", help="base or tip: the axes of the directions.")
+    ] = "base",
+    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the quasi-random samples.")] = 0,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Have the workers of this Dask scheduler do it."),
+    ] = None,
+    plot: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.png", help="Draw sections through the workspace."),
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object in SI units instead of a table.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a map that is in the folder of --out.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print no table, notes and progress; errors only.")
+    ] = False,
+) -> None:
+    """Map a workspace."""
+    from stiffopt.cli.map_run import MapOptions, run  # here, so that --help waits for no numerics
+
+    options = MapOptions(
+        robot, out, samples, levels, cell, direction, kind, boundary, frame, seed, scheduler,
+        plot, as_json, overwrite, quiet,
+    )  # fmt: skip
+    raise typer.Exit(run(options))

@@ -1,0 +1,271 @@
+"""Compiler and cache directory: C code in, a shared library in its place out.
+
+Everything that fails here fails with a `BuildError` whose text a user can act on.
+"""
+
+import hashlib
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import casadi as ca
+
+FLAGS = ("-O1", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-w")
+"""No flag that changes results: they are those of the CasADi VM to the last bit."""
+
+_TIMEOUT = 120.0  # s, for one call of the compiler
+_ABANDONED_AFTER = 86400.0  # s
+_POLL = 0.02  # s
+_DEFAULT_COMPILERS = ("cc", "gcc", "clang")
+
+
+class BuildError(Exception):
+    """No machine code, and why; `expected` if the user wants none."""
+
+    def __init__(self, reason: str, *, expected: bool = False) -> None:
+        super().__init__(reason)
+        self.expected = expected
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C compiler as it is called, and what tells it from others."""
+
+    command: tuple[str, ...]
+    identity: tuple[str, ...]
+
+
+def cache_directory() -> Path:
+    """Directory of compiled code; it need not exist."""
+    if given := os.environ.get("STIFFOPT_CACHE_DIR"):
+        return Path(given).expanduser().absolute()
+    if sys.platform == "darwin":
+        base = Path("~/Library/Caches").expanduser()
+    else:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    return base.absolute() / "stiffopt"
+
+
+# -- compiler -------------------------------------------------------------------------------
+
+
+def find_compiler(cache: Path) -> Compiler:
+    """The compiler that ``STIFFOPT_COMPILER`` or ``CC`` names, or the first in ``PATH``."""
+    if os.name != "posix":
+        raise BuildError("code is compiled on Linux and macOS only")
+    for variable in ("STIFFOPT_COMPILER", "CC"):
+        words = _words(variable)
+        if not words:
+            continue
+        if variable == "STIFFOPT_COMPILER" and words == ["none"]:
+            raise BuildError("STIFFOPT_COMPILER is 'none'", expected=True)
+        found = shutil.which(words[0])
+        if found is None:
+            raise BuildError(f"the C compiler {words[0]!r} that {variable} names was not found")
+        return _identified([found, *words[1:]], cache)
+    for name in _DEFAULT_COMPILERS:
+        if (found := shutil.which(name)) is not None:
+            return _identified([found], cache)
+    raise BuildError(
+        "no C compiler was found; install one (Debian and Ubuntu: apt install gcc) or name one in "
+        "STIFFOPT_COMPILER"
+    )
+
+
+def _words(variable: str) -> list[str]:
+    value = os.environ.get(variable, "")
+    try:
+        return shlex.split(value)
+    except ValueError as error:
+        raise BuildError(f"{variable} cannot be read as a command: {value!r}") from error
+
+
+def _identified(command: list[str], cache: Path) -> Compiler:
+    command[0] = os.path.abspath(command[0])
+    identity = (*command, os.path.realpath(command[0]), _version(command[0], cache))
+    return Compiler(tuple(command), identity)
+
+
+def _version(compiler: str, cache: Path) -> str:
+    """First line of ``--version``, asked once per compiler and then read from the cache."""
+    stat = os.stat(compiler)
+    text = f"{compiler}\n{os.path.realpath(compiler)}\n{stat.st_mtime_ns}\n{stat.st_size}"
+    note = cache / f"compiler-{hashlib.sha256(text.encode()).hexdigest()[:16]}.txt"
+    with suppress(OSError, UnicodeError):
+        lines = note.read_text(encoding="utf-8").split("\n")
+        if len(lines) == 2:  # the line break comes last: the file is whole
+            return lines[0]
+    output = _run([[compiler, "--version"]], Path(tempfile.gettempdir()), timeout=10.0)
+    version = next(iter(output.splitlines()), "")
+    with suppress(OSError):
+        write_atomically(note, f"{version}\n".encode())
+    return version
+
+
+def _run(commands: Sequence[Sequence[str]], directory: Path, timeout: float = _TIMEOUT) -> str:
+    """Output of commands that run side by side; none outlives this call."""
+    processes = []
+    end = time.monotonic() + timeout
+    try:
+        for command in commands:
+            processes.append(_started(command, directory))
+        name = commands[0][0]
+        return "".join(_output(name, process, end, timeout) for process in processes)
+    finally:
+        for process in processes:
+            if process.returncode is None:
+                with suppress(OSError):
+                    os.killpg(process.pid, signal.SIGKILL)
+                process.communicate()
+
+
+def _started(command: Sequence[str], directory: Path) -> "subprocess.Popen[str]":
+    try:
+        return subprocess.Popen(
+            command,
+            cwd=directory,
+            env={**os.environ, "LC_ALL": "C"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+        )
+    except OSError as error:
+        raise BuildError(f"the C compiler {command[0]} cannot be run: {error.strerror}") from error
+
+
+def _output(name: str, process: "subprocess.Popen[str]", end: float, timeout: float) -> str:
+    try:
+        output, complaint = process.communicate(timeout=max(0.0, end - time.monotonic()))
+    except subprocess.TimeoutExpired as error:
+        raise BuildError(f"the C compiler {name} took more than {timeout:g} s") from error
+    if process.returncode != 0:
+        first = "\n".join((complaint or output).strip().splitlines()[:3])
+        raise BuildError(
+            f"the C compiler {name} failed with exit code {process.returncode}"
+            + (f":\n{first}" if first else "")
+        )
+    return output
+
+
+# -- DAQP -----------------------------------------------------------------------------------
+
+
+def daqp_parts() -> tuple[Path, Path]:
+    """Include directory and shared library of the DAQP that comes with CasADi."""
+    home = Path(ca.__file__).parent
+    include = home / "include"
+    for suffix in (".so", ".dylib"):
+        found = home / f"libdaqp{suffix}"
+        if found.is_file() and (include / "daqp" / "api.h").is_file():
+            return include, found
+    raise BuildError(f"the installed CasADi has no headers or no library of DAQP in {home}")
+
+
+# -- building -------------------------------------------------------------------------------
+
+
+def platform() -> str:
+    """What machine code made here is for."""
+    return f"{sys.platform} {os.uname().machine} {sys.maxsize}"
+
+
+def compile_library(
+    compiler: Compiler, texts: dict[str, str], sources: Sequence[str], daqp: bool, cache: Path
+) -> bytes:
+    """Machine code of C files given by name and text, and of further source files."""
+    cache.mkdir(mode=0o700, parents=True, exist_ok=True)
+    _sweep(cache)
+    directory = Path(tempfile.mkdtemp(prefix="build-", dir=cache))
+    try:
+        for name, text in texts.items():
+            (directory / name).write_text(text, encoding="utf-8")
+        includes, libraries = [f"-I{directory}"], ["-lm"]
+        for folder in dict.fromkeys(str(Path(source).parent) for source in sources):
+            includes.append(f"-I{folder}")
+        if daqp:
+            headers, shared = daqp_parts()
+            includes.append(f"-I{headers}")
+            libraries = [str(shared), f"-Wl,-rpath,{shared.parent}", *libraries]
+        inputs = [name for name in texts if name.endswith(".c")] + list(sources)
+        objects = [f"{k}.o" for k in range(len(inputs))]
+        calls = [
+            [*compiler.command, *FLAGS, *includes, "-c", source, "-o", target]
+            for source, target in zip(inputs, objects, strict=True)
+        ]
+        _run(calls, directory)
+        # a name of ours must not be taken for one of the same name elsewhere in the process
+        symbols = ["-Wl,-Bsymbolic"] if sys.platform.startswith("linux") else []
+        target = "library.so"
+        link = ["-shared", *symbols, *objects, *libraries, "-o", target]
+        _run([[*compiler.command, *FLAGS, *link]], directory)
+        return (directory / target).read_bytes()
+    finally:
+        shutil.rmtree(directory, ignore_errors=True)
+
+
+def _sweep(cache: Path) -> None:
+    """Remove what builds left behind that were killed."""
+    oldest = time.time() - _ABANDONED_AFTER
+    for pattern in ("build-*", "*.lock", "*.part"):
+        for path in cache.glob(pattern):
+            with suppress(OSError):
+                if path.stat().st_mtime < oldest:
+                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file that is there whole or not at all."""
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix="file-", suffix=".part", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        with suppress(OSError):
+            os.unlink(name)
+        raise
+
+
+@contextmanager
+def turn(path: Path, longest: float = _TIMEOUT) -> Iterator[None]:
+    """Wait while another process holds this lock file, but no longer than that.
+
+    The system frees the lock of a process that ends in whatever way.  It only saves work done
+    twice: without it, or after the wait, everything is still correct.
+    """
+    import fcntl
+
+    descriptor = None
+    with suppress(OSError):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    if descriptor is None:
+        yield
+        return
+    try:
+        end = time.monotonic() + longest
+        while time.monotonic() < end:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                time.sleep(_POLL)
+            except OSError:  # a file system without locks
+                break
+        yield
+    finally:
+        os.close(descriptor)

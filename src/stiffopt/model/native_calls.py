@@ -1,0 +1,287 @@
+"""Calls of functions on NumPy arrays: of machine code, or of the CasADi VM in the same way."""
+
+import ctypes
+import os
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.native_source import Signature
+
+Array = NDArray[np.float64]
+
+_CHUNK = 4096  # rows that a thread takes at a time
+_BLOCK = 256  # rows that the VM evaluates at a time
+
+
+class BatchFunction(ABC):
+    """A function of matrices that is called once, or for many rows.
+
+    Arguments and results are arrays (r, c), but an argument that is a column (k, 1) is given as
+    (k,).  Every function may be called from several threads at once.
+    """
+
+    def __init__(self, signature: Signature) -> None:
+        self.signature = signature
+
+    @abstractmethod
+    def __call__(self, *arguments: Any) -> list[Array]:
+        """Results, each (r, c), for one set of arguments."""
+
+    def many(self, *arguments: Array, threads: int | None = None) -> list[Array]:
+        """Results, each (N, r, c), for N rows, on all cores unless `threads` says otherwise.
+
+        An argument is (N, ...) or, where it is the same for all rows, without the leading axis;
+        the first one has it.
+        """
+        count = len(arguments[0])
+        inputs: list[Array] = []
+        strides: list[int] = []
+        for argument, (rows, columns) in zip(arguments, self.signature.inputs, strict=True):
+            size = rows * columns
+            values = np.ascontiguousarray(argument, dtype=float)
+            each = values.ndim > (1 if columns == 1 else 2) or not inputs
+            if values.size != (count * size if each else size):
+                raise ValueError(
+                    f"expected ({rows}, {columns}) for each of {count} rows; got {values.shape}"
+                )
+            inputs.append(values)
+            strides.append(size if each else 0)
+        outputs = [np.empty((count, *shape)) for shape in self.signature.outputs]
+        if count:
+            self._evaluate(inputs, strides, outputs, count, threads)
+        return outputs
+
+    @abstractmethod
+    def _evaluate(
+        self,
+        inputs: Sequence[Array],
+        strides: Sequence[int],
+        outputs: Sequence[Array],
+        count: int,
+        threads: int | None,
+    ) -> None:
+        """Fill outputs, each (count, r, c), from contiguous inputs."""
+
+
+class CompiledFunction(BatchFunction):
+    """A function in machine code."""
+
+    def __init__(self, rows: Callable[..., int], signature: Signature) -> None:
+        super().__init__(signature)
+        pointer = ctypes.c_void_p
+        self._rows = rows
+        self._rows.argtypes = [  # type: ignore[attr-defined]
+            pointer, pointer, pointer, ctypes.c_int64, ctypes.c_int64, pointer, pointer,
+        ]  # fmt: skip
+        self._inputs = [np.zeros(shape) for shape in signature.inputs]
+        self._targets = [
+            buffer[:, 0] if buffer.shape[1] == 1 else buffer for buffer in self._inputs
+        ]
+        self._outputs = [np.zeros(shape) for shape in signature.outputs]
+        self._arrays = _Pointers(self._inputs, [0] * len(self._inputs), self._outputs)
+        self._work = _Work(signature)
+        self._call = (*self._arrays.addresses, 0, 1, *self._work.addresses)
+        self._lock = threading.Lock()
+
+    def __call__(self, *arguments: Any) -> list[Array]:
+        """Results, each (r, c), for one set of arguments."""
+        with self._lock:
+            for target, argument in zip(self._targets, arguments, strict=True):
+                target[...] = argument
+            if self._rows(*self._call):
+                raise ArithmeticError("compiled code failed")
+            return [output.copy() for output in self._outputs]
+
+    def _evaluate(
+        self,
+        inputs: Sequence[Array],
+        strides: Sequence[int],
+        outputs: Sequence[Array],
+        count: int,
+        threads: int | None,
+    ) -> None:
+        arrays = _Pointers(inputs, strides, outputs)
+        failures: list[int] = []
+
+        def work(starts: Iterator[int]) -> None:
+            own = _Work(self.signature)
+            for start in starts:
+                end = min(start + _CHUNK, count)
+                if self._rows(*arrays.addresses, start, end, *own.addresses):
+                    failures.append(start)
+
+        in_parallel(work, range(0, count, _CHUNK), threads)
+        if failures:
+            raise ArithmeticError("compiled code failed")
+
+
+class InterpretedFunction(BatchFunction):
+    """A function in the CasADi VM, without the overhead of CasADi's own calls."""
+
+    def __init__(self, function: ca.Function) -> None:
+        super().__init__(Signature.of(function))
+        self._function = function
+        self._single = _Buffer(function, 1)
+        self._block: _Buffer | None = None
+        self._lock = threading.Lock()
+
+    def __call__(self, *arguments: Any) -> list[Array]:
+        """Results, each (r, c), for one set of arguments."""
+        single = self._single
+        with self._lock:
+            for target, argument in zip(single.targets, arguments, strict=True):
+                target[...] = argument
+            single.evaluate()
+            return [output.copy() for output in single.results]
+
+    def _evaluate(
+        self,
+        inputs: Sequence[Array],
+        strides: Sequence[int],
+        outputs: Sequence[Array],
+        count: int,
+        threads: int | None,
+    ) -> None:
+        with self._lock:
+            if self._block is None:
+                self._block = _Buffer(self._function, _BLOCK)
+            block = self._block
+            shapes = self.signature.inputs
+            for start in range(0, count, _BLOCK):
+                rows = min(_BLOCK, count - start)
+                for buffer, values, stride, shape in zip(
+                    block.targets, inputs, strides, shapes, strict=True
+                ):
+                    if stride:
+                        buffer[:rows] = values.reshape(count, *_own(shape))[start : start + rows]
+                    elif start == 0:
+                        buffer[...] = values.reshape(_own(shape))
+                block.evaluate()
+                for output, result in zip(outputs, block.results, strict=True):
+                    output[start : start + rows] = result[:rows]
+
+
+class _Buffer:
+    """A CasADi function, mapped over a number of rows, with memory of its own.
+
+    Attributes
+    ----------
+    targets, results : list of ndarray
+        Views (rows, r, c) of what goes in and comes out; no leading axis for one row, no last
+        one for a column that goes in.
+    evaluate : callable
+    """
+
+    def __init__(self, function: ca.Function, rows: int) -> None:
+        mapped = function if rows == 1 else function.map(rows)
+        buffer, self.evaluate = mapped.buffer()
+        self._keep: list[Any] = [mapped, buffer]
+        self.targets, self.results = [], []
+        for k in range(function.n_in()):
+            view = self._memory(rows, function.size_in(k), buffer.set_arg, k)
+            self.targets.append(view[..., 0] if view.shape[-1] == 1 else view)
+        for k in range(function.n_out()):
+            self.results.append(self._memory(rows, function.size_out(k), buffer.set_res, k))
+
+    def _memory(
+        self, rows: int, shape: tuple[int, int], register: Callable[..., None], index: int
+    ) -> Array:
+        memory = np.zeros((rows, shape[1], shape[0]))  # CasADi goes by columns
+        if memory.size:
+            register(index, memory.reshape(-1).data)
+        self._keep.append(memory)
+        view = memory.swapaxes(1, 2)
+        return view[0] if rows == 1 else view
+
+
+class _Pointers:
+    """Arrays as the loops in C take them."""
+
+    def __init__(
+        self, inputs: Sequence[Array], strides: Sequence[int], outputs: Sequence[Array]
+    ) -> None:
+        self._keep = (
+            np.array([array.ctypes.data for array in inputs] or [0], dtype=np.uint64),
+            np.array(strides or [0], dtype=np.int64),
+            np.array([array.ctypes.data for array in outputs] or [0], dtype=np.uint64),
+        )
+        self.addresses = tuple(array.ctypes.data for array in self._keep)
+
+
+class _Work:
+    """Work memory of one thread."""
+
+    def __init__(self, signature: Signature) -> None:
+        self._keep = (np.zeros(signature.sz_w + 1), np.zeros(signature.sz_iw + 1, dtype=np.int64))
+        self.addresses = tuple(array.ctypes.data for array in self._keep)
+
+
+def in_parallel(
+    work: Callable[[Iterator[int]], None], items: Sequence[int], threads: int | None = None
+) -> None:
+    """Have threads take items, one by one, from an iterator that they share.
+
+    The calling thread is one of them.  An exception in any of them is raised here, and the
+    others stop after the item that they are at.
+    """
+    count = min(available_cores() if threads is None else max(1, threads), len(items))
+    if count <= 1:
+        work(iter(items))
+        return
+    queue = _Queue(items)
+    failures: list[BaseException] = []
+
+    def guarded() -> None:
+        try:
+            work(queue)
+        except BaseException as error:
+            failures.append(error)
+            queue.stop()
+
+    helpers = [threading.Thread(target=guarded, daemon=True) for _ in range(count - 1)]
+    try:
+        for helper in helpers:
+            helper.start()
+        work(queue)
+    finally:
+        queue.stop()
+        for helper in helpers:
+            helper.join()
+    if failures:
+        raise failures[0]
+
+
+def available_cores() -> int:
+    """Number of cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+class _Queue(Iterator[int]):
+    """Items that several threads take, each once."""
+
+    def __init__(self, items: Sequence[int]) -> None:
+        self._items = iter(items)
+        self._lock = threading.Lock()
+        self._stopped = False
+
+    def stop(self) -> None:
+        """Give out no more."""
+        self._stopped = True
+
+    def __next__(self) -> int:
+        with self._lock:
+            if self._stopped:
+                raise StopIteration
+            return next(self._items)
+
+
+def _own(shape: tuple[int, int]) -> tuple[int, ...]:
+    return shape[:1] if shape[1] == 1 else shape

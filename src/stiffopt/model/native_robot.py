@@ -1,0 +1,240 @@
+"""The functions of an unloaded arm's tip, in machine code where that pays.
+
+What varies from call to call (direction, kind and boundary of a stiffness) is an argument of
+these functions, so that there is one library per robot.  Every function gives the margins of the
+strain laws beside its value, so that no second pass over a batch is needed to check them.
+"""
+
+import threading
+from collections.abc import Callable
+from functools import cached_property, lru_cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.arguments import Measure
+from stiffopt.model.compiled import BatchFunction, InterpretedFunction, Library, library
+from stiffopt.model.compliance import held_stiffness
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.kinematics import Actuation
+from stiffopt.model.native_source import dense
+from stiffopt.model.shape import FreeShape
+
+Vector = NDArray[np.float64]
+
+LOOKED_UP_FROM = 64
+"""Rows of a batch from which compiled code is used if there is any."""
+
+COMPILED_FROM = 50_000
+"""Rows, of all batches so far, from which code is compiled if there is none: as long as that
+takes, about a second, has then been spent in the VM or is about to be."""
+
+
+_BLOCK = 65_536  # rows
+
+_Call = Callable[..., list[Vector]]
+_Ends = tuple[list[ca.SX], list[ca.SX]]  # symbols and expressions
+
+
+class TipFunctions:
+    """Functions of the tip by name (see the methods of `_Formulas`), and what builds on them.
+
+    Values from machine code and from the VM are the same to the last bit, so that nobody needs
+    to know which it was.
+    """
+
+    def __init__(self, description: RobotDescription, actuation: Actuation) -> None:
+        self._description = description
+        self._formulas = _Formulas(description, actuation)
+        self._interpreted: dict[str, InterpretedFunction] = {}
+        self._library: Library | None = None
+        self._looked_up = self._tried = False
+        self._rows = 0
+        self._lock = threading.Lock()
+
+    def one(self, name: str, *arguments: Vector) -> list[Vector]:
+        """Results, each (r, c), for one set of arguments, the pressures (n,) first."""
+        if self._library is not None:
+            return self._library.function(name)(*arguments)
+        return (self._interpreted.get(name) or self._in_vm(name))(*arguments)
+
+    def many(self, name: str, *arguments: Vector) -> list[Vector]:
+        """Results, each (N, r, c), for rows of arguments; see `BatchFunction.many`."""
+        return self._best(name, len(arguments[0])).many(*arguments)
+
+    def evaluate(self, name: str, p: Vector, *parameters: Vector) -> list[Vector]:
+        """Value (..., r, c) and margins (..., segments, 1) at pressures (n,) or (N, n)."""
+        if p.ndim == 1:
+            return self.one(name, p, *parameters)
+        return self.many(name, p, *parameters)
+
+    def stiffness(self, p: Vector, measure: Measure) -> list[Vector]:
+        """A directional stiffness (..., 1, 1), and margins (..., segments, 1)."""
+        if measure.boundary == "free":
+            return self.evaluate("stiffness", p, _load(measure))
+        return self._in_blocks(self._held, p, measure)
+
+    def stiffness_gradient(self, p: Vector, measure: Measure) -> list[Vector]:
+        """Its derivative (..., 1, n) by the pressures, and margins (..., segments, 1)."""
+        if measure.boundary == "free":
+            return self.evaluate("stiffness_gradient", p, _load(measure), np.ones(1))
+        return self._in_blocks(self._held_gradient, p, measure)
+
+    def _held(self, call: _Call, p: Vector, measure: Measure) -> list[Vector]:
+        compliance, margins = call("tip_compliance", p)
+        pose, _ = call("tip_pose", p)
+        value, _ = call("held_stiffness", compliance, pose, _held(measure))
+        return [value, margins]
+
+    def _held_gradient(self, call: _Call, p: Vector, measure: Measure) -> list[Vector]:
+        """``k = D' C_held^-1 D`` by way of the wrench ``W`` that moves the held tip by ``D``.
+
+        Then ``dk = -W' dC W + 2 W' dD``, of which the former is that of a flexibility.
+        """
+        held = _held(measure)
+        compliance, margins = call("tip_compliance", p)
+        pose, _ = call("tip_pose", p)
+        jacobian, _ = call("tip_jacobian", p)
+        _, load = call("held_stiffness", compliance, pose, held)
+        slope, _ = call("stiffness_gradient", p, load[..., 0], np.zeros(1))
+        (gradient,) = call("held_stiffness_gradient", slope, jacobian, pose, load[..., 0], held)
+        return [gradient, margins]
+
+    def _in_blocks(
+        self, formula: Callable[[_Call, Vector, Measure], list[Vector]], p: Vector, measure: Measure
+    ) -> list[Vector]:
+        """A formula of several functions, with little memory for what goes between them."""
+        if p.ndim == 1:
+            return formula(self.one, p, measure)
+        ends = range(0, max(len(p), 1), _BLOCK)
+        blocks = [formula(self.many, p[start : start + _BLOCK], measure) for start in ends]
+        return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
+
+    def _in_vm(self, name: str) -> InterpretedFunction:
+        with self._lock:
+            if name not in self._interpreted:
+                self._interpreted[name] = InterpretedFunction(self._formulas.function(name))
+            return self._interpreted[name]
+
+    def _best(self, name: str, rows: int) -> BatchFunction:
+        if rows < LOOKED_UP_FROM:
+            return self._in_vm(name)
+        with self._lock:
+            self._rows += rows
+            missing = self._rows >= COMPILED_FROM and not self._tried
+            if self._library is None and (missing or not self._looked_up):
+                self._looked_up, self._tried = True, self._tried or missing
+                self._library = library(
+                    ("tip", self._description.model_dump_json()),
+                    self._formulas.functions,
+                    build_missing=missing,
+                )
+            if self._library is not None:
+                return self._library.function(name)
+        return self._in_vm(name)
+
+
+@lru_cache(maxsize=256)
+def _load(measure: Measure) -> Vector:
+    """Unit load (12,): a wrench in base axes and one in tip axes, of which one is zero."""
+    start = (0 if measure.frame == "base" else 6) + (0 if measure.kind == "translation" else 3)
+    load = np.zeros(12)
+    load[start : start + 3] = measure.direction
+    load.flags.writeable = False
+    return load
+
+
+@lru_cache(maxsize=256)
+def _held(measure: Measure) -> Vector:
+    """Unit direction (3,) in base axes and in tip axes, one of them zero, and two conditions."""
+    own, none = measure.direction, (0.0, 0.0, 0.0)
+    axes = (*own, *none) if measure.frame == "base" else (*none, *own)
+    conditions = (measure.kind == "rotation", measure.boundary == "clamped")
+    held = np.array([*axes, *conditions], dtype=float)
+    held.flags.writeable = False
+    return held
+
+
+class _Formulas:
+    """Functions of the tip, symbolically, each named as its method.
+
+    Those of the pressures end with the margins of the strain laws.
+    """
+
+    def __init__(self, description: RobotDescription, actuation: Actuation) -> None:
+        self._description = description
+        self._actuation = actuation
+
+    @cached_property
+    def _tip(self) -> FreeShape:
+        return FreeShape.of(self._description, self._actuation)
+
+    def functions(self) -> list[ca.Function]:
+        """All of them."""
+        return [self.function(name) for name in _NAMES]
+
+    def function(self, name: str) -> ca.Function:
+        """One of them, dense."""
+        formula: Callable[[], _Ends] = getattr(self, name)
+        inputs, outputs = formula()
+        return dense(ca.Function(name, inputs, ca.cse([ca.densify(part) for part in outputs])))
+
+    def tip_pose(self) -> _Ends:
+        return self._of_pressures(self._tip.transform)
+
+    def tip_jacobian(self) -> _Ends:
+        return self._of_pressures(self._tip.jacobian)
+
+    def tip_compliance(self) -> _Ends:
+        return self._of_pressures(self._tip.compliance)
+
+    def stiffness(self) -> _Ends:
+        """Of the free tip along a load (12,), see `_load`."""
+        load, flexibility = self._flexibility
+        return self._of_pressures(1 / flexibility, load)
+
+    def stiffness_gradient(self) -> _Ends:
+        """Gradient of it, or of minus the flexibility where the last argument is 0."""
+        load, flexibility = self._flexibility
+        inverted = ca.SX.sym("inverted")
+        factor = ca.if_else(inverted, 1 / flexibility**2, 1)
+        gradient = self._tip.total_jacobian(flexibility)
+        return self._of_pressures(-factor * gradient, load, inverted)
+
+    def held_stiffness(self) -> _Ends:
+        """From the compliance, pose and arguments of `_held` to the stiffness and the load."""
+        compliance, pose, held = ca.SX.sym("C", 6, 6), ca.SX.sym("T", 4, 4), ca.SX.sym("held", 8)
+        direction = pose[:3, :3].T @ held[:3] + held[3:6]
+        value, wrench = held_stiffness(compliance, direction, held[6], held[7])
+        return [compliance, pose, held], [value, ca.vertcat(ca.SX.zeros(6), wrench)]
+
+    def held_stiffness_gradient(self) -> _Ends:
+        """Gradient of it from minus that of the flexibility for its load, and how axes turn."""
+        n = self._description.n_pressures
+        slope, jacobian, pose = ca.SX.sym("g", 1, n), ca.SX.sym("J", 6, n), ca.SX.sym("T", 4, 4)
+        load, held = ca.SX.sym("load", 12), ca.SX.sym("held", 8)
+        own = ca.if_else(held[6], load[9:], load[6:9])
+        turned = ca.cross(own, pose[:3, :3].T @ held[:3])  # dD = D x omega in tip axes
+        gradient = slope + 2 * turned.T @ jacobian[3:, :]
+        return [slope, jacobian, pose, load, held], [gradient]
+
+    @cached_property
+    def _flexibility(self) -> tuple[ca.SX, ca.SX]:
+        load = ca.SX.sym("load", 12)
+        turned = self._tip.rotation.T @ ca.horzcat(load[:3], load[3:6])
+        return load, self._tip.flexibility(ca.vec(turned) + load[6:])
+
+    def _of_pressures(self, value: ca.SX, *parameters: ca.SX) -> _Ends:
+        return [self._tip.pressures, *parameters], [value, self._actuation.margin]
+
+
+_NAMES = (
+    "tip_pose",
+    "tip_jacobian",
+    "tip_compliance",
+    "stiffness",
+    "stiffness_gradient",
+    "held_stiffness",
+    "held_stiffness_gradient",
+)

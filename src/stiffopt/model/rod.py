@@ -1,0 +1,200 @@
+"""The rod's equations as small functions, for the integrator that is written in C.
+
+`stiffopt.model.shooting` writes whole chains of integration steps, which a compiler takes a minute
+for.  Here the equations at one point of the rod are functions of their own, one set for each kind
+of section; the steps, and what is carried along them, are loops in ``rod.h``.
+
+Orientation and moment are y = (q, m) (7,), padded to eight rows; position, which does not feed
+back, and a zero are four more.  Functions of kind k:
+
+* ``newton{k}``: (y, n, f, a) to y' (8,) and its derivatives by y (8, 7) and n (8, 3);
+* ``linear{k}``: (y, n, f, a, da) to (y', r') (12,) and their derivatives by y (12, 7), n (12, 3)
+  and the section's pressures (12, c);
+* ``adjoint{k}``: (y, n, f, a, da, dy, dn, l, dl) to the derivatives of ``l'y' + dl'(y', r')_dot``
+  by y (8,), n (3,), pressures (c,) and dy (8,), dn (3,), the dot along (dy, dn).
+
+`a` holds what of the section is not zero: strain, then compliance; `da` is its derivative by the
+section's own pressures.
+"""
+
+from collections.abc import Hashable
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from stiffopt import lie
+from stiffopt.model.actuation import SectionGeometry
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.kinematics import Actuation
+from stiffopt.model.shooting import Shooting, slopes
+
+MOST_KINDS = 4
+"""Kinds of sections that the integrator in C tells apart; mirrors ``rod.h``."""
+
+
+class RodPiece(NamedTuple):
+    """A stretch of arm, as ``rod.h`` has it; see there."""
+
+    kind: int
+    parts: int
+    slopes: int
+    channel: int
+    channels: int
+    steps: int
+    length: float
+    mass: float
+
+
+class Rod(NamedTuple):
+    """Functions of an arm for the integrator, and its pieces from tip to base."""
+
+    functions: list[ca.Function]
+    pieces: list[RodPiece]
+    parts: int
+    slopes: int
+
+
+def rod(description: RobotDescription, actuation: Actuation, resolution: int) -> Rod | None:
+    """Equations of an arm; None if it has more kinds of sections than can be told apart."""
+    shooting = Shooting(description, actuation, resolution)
+    kinds: dict[Hashable, int] = {}
+    functions: list[ca.Function] = []
+    own_kind, first_part, first_slope, first_channel = [], [], [], []
+    parts, derivatives = [], []
+    n_parts = n_slopes = start = 0
+    for segment, section in zip(description.segments, actuation.sections, strict=True):
+        own = actuation.pressures[start : start + segment.n_channels]
+        strain, compliance = ca.sparsify(section.strain), ca.sparsify(section.compliance)
+        centroid = SectionGeometry.of(segment).centroid
+        a = ca.vertcat(*strain.nonzeros(), *compliance.nonzeros())
+        key = (
+            repr(strain.sparsity()), tuple(compliance.sparsity().row()),
+            tuple(compliance.sparsity().colind()), tuple(strain.sparsity().row()),
+            segment.n_channels, centroid.tobytes(),
+        )  # fmt: skip
+        if key not in kinds:
+            if len(kinds) == MOST_KINDS:
+                return None
+            kinds[key] = len(kinds)
+            functions += _kind(
+                kinds[key], strain.sparsity(), compliance.sparsity(), centroid, segment.n_channels
+            )
+        own_kind.append(kinds[key])
+        first_part.append(n_parts)
+        first_slope.append(n_slopes)
+        first_channel.append(start)
+        parts.append(a)
+        derivatives.append(ca.vec(ca.densify(ca.jacobian(a, own))))
+        n_parts += a.numel()
+        n_slopes += a.numel() * segment.n_channels
+        start += segment.n_channels
+    sections = _function(
+        "sections", [actuation.pressures], [ca.vertcat(*parts), ca.vertcat(*derivatives)]
+    )
+    pieces = []
+    for piece in shooting.pieces([]):
+        k = piece.segment
+        if piece.rigid:
+            pieces.append(RodPiece(-1, 0, 0, 0, 0, 0, piece.length, 0.0))
+            continue
+        where = (own_kind[k], first_part[k], first_slope[k], first_channel[k])
+        channels, step = description.segments[k].n_channels, piece.length / piece.steps
+        pieces.append(RodPiece(*where, channels, piece.steps, step, shooting.weight(k)))
+    return Rod([sections, *functions, *_ends()], pieces, n_parts, n_slopes)
+
+
+def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
+    return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
+
+
+def _kind(
+    kind: int,
+    strain_pattern: ca.Sparsity,
+    compliance_pattern: ca.Sparsity,
+    centroid: np.ndarray,
+    channels: int,
+) -> list[ca.Function]:
+    """Functions of one kind of section."""
+    y, n, f = ca.SX.sym("y", 7), ca.SX.sym("n", 3), ca.SX.sym("f", 3)
+    size = strain_pattern.nnz() + compliance_pattern.nnz()
+    a, da = ca.SX.sym("a", size), ca.SX.sym("da", size, channels)
+    strain = ca.SX(strain_pattern, a[: strain_pattern.nnz()])
+    compliance = ca.SX(compliance_pattern, a[strain_pattern.nnz() :])
+    turning, tangent, moment = slopes(y[:4], y[4:], n, f, strain, compliance, centroid)
+    none = ca.SX.zeros(1)
+    short = ca.vertcat(turning, moment, none)
+    long = ca.vertcat(short, tangent, none)
+    newton = [short, ca.jacobian(short, y), ca.jacobian(short, n)]
+    linear = [long, ca.jacobian(long, y), ca.jacobian(long, n), ca.jacobian(long, a) @ da]
+    dy, dn, lam, dlam = (
+        ca.SX.sym("dy", 7), ca.SX.sym("dn", 3), ca.SX.sym("l", 8), ca.SX.sym("dl", 12)
+    )  # fmt: skip
+    dot = ca.jtimes(long, y, dy) + ca.jtimes(long, n, dn)
+    h = ca.dot(lam, short) + ca.dot(dlam, dot)
+    by_y, by_n, by_a, by_dy, by_dn = (ca.gradient(h, x) for x in (y, n, a, dy, dn))
+    adjoint = [ca.vertcat(by_y, none), by_n, da.T @ by_a, ca.vertcat(by_dy, none), by_dn]
+    return [
+        _function(f"newton{kind}", [y, n, f, a], newton),
+        _function(f"linear{kind}", [y, n, f, a, da], linear),
+        _function(f"adjoint{kind}", [y, n, f, a, da, dy, dn, lam, dlam], adjoint),
+    ]
+
+
+def _ends() -> list[ca.Function]:
+    """Functions of the loaded tip and of rigid connectors.
+
+    * ``tip``: (q, load, weight) to y (8,), n (3,), their derivatives by a turn of the tip (8, 3)
+      and (3, 3), and the rotation (3, 3);
+    * ``tip_adjoint``: (q, load, turn, wrench, l, ln, dl, dln, left) to the derivative by a turn
+      of the tip (3,) of ``l'y + ln'n + dl'y_dot + dln'n_dot + left'(0, R turn)``, the dot along
+      the turn (in body axes) and the added wrench;
+    * ``rigid``: (y, n, length) to what (y, r) gain (12,), and the derivatives (12, 7), (12, 3);
+    * ``rigid_adjoint``: (y, n, length, dy, dn, l, dl) to derivatives as in ``adjoint``.
+    """
+    q, load, weight, delta = (ca.SX.sym("x", size) for size in (4, 12, 3, 3))
+    turned = lie.quaternion_product(q, ca.vertcat(1, delta / 2))
+    turned = turned / ca.norm_2(turned)
+    R = lie.rotation_from_quaternion(turned)
+    n = load[:3] + R @ load[6:9] + weight
+    y = ca.vertcat(turned, load[3:6] + R @ load[9:], 0)
+    here = [ca.SX.zeros(3)]
+
+    def at_rest(*values: ca.SX) -> list[ca.SX]:
+        return list(ca.substitute(list(values), [delta], here))
+
+    tip = _function(
+        "tip", [q, load, weight],
+        at_rest(y, n, ca.jacobian(y, delta), ca.jacobian(n, delta), R),
+    )  # fmt: skip
+    turn, wrench, lam, lam_n, dlam, dlam_n, left = (
+        ca.SX.sym("x", size) for size in (3, 6, 8, 3, 8, 3, 6)
+    )
+    q_dot = lie.quaternion_product(turned, ca.vertcat(0, turn / 2))
+    q0 = ca.SX.sym("q0", 4)
+    R0 = lie.rotation_from_quaternion(q0)
+    follower = ca.vertcat(R0 @ load[6:9], R0 @ load[9:])
+    (follower_dot,) = ca.substitute([ca.jacobian(follower, q0)], [q0], [turned])
+    change = follower_dot @ q_dot + wrench
+    total = (
+        ca.dot(lam, y) + ca.dot(lam_n, n) + ca.dot(dlam, ca.vertcat(q_dot, change[3:], 0))
+        + ca.dot(dlam_n, change[:3]) + ca.dot(left[3:], R @ turn)
+    )  # fmt: skip
+    tip_adjoint = _function(
+        "tip_adjoint", [q, load, turn, wrench, lam, lam_n, dlam, dlam_n, left],
+        at_rest(ca.gradient(total, delta)),
+    )  # fmt: skip
+
+    y, n, length = ca.SX.sym("y", 7), ca.SX.sym("n", 3), ca.SX.sym("L")
+    reach = length * lie.rotation_from_quaternion(y[:4])[:, 2]
+    gain = ca.vertcat(ca.SX.zeros(4), ca.cross(reach, n), 0, reach, 0)
+    rigid = _function("rigid", [y, n, length], [gain, ca.jacobian(gain, y), ca.jacobian(gain, n)])
+    dy, dn, lam, dlam = (ca.SX.sym("x", size) for size in (7, 3, 8, 12))
+    dot = ca.jtimes(gain, y, dy) + ca.jtimes(gain, n, dn)
+    h = ca.dot(lam, gain[:8]) + ca.dot(dlam, dot)
+    by_y, by_n, by_dy, by_dn = (ca.gradient(h, x) for x in (y, n, dy, dn))
+    rigid_adjoint = _function(
+        "rigid_adjoint", [y, n, length, dy, dn, lam, dlam],
+        [ca.vertcat(by_y, 0), by_n, ca.vertcat(by_dy, 0), by_dn],
+    )  # fmt: skip
+    return [tip, tip_adjoint, rigid, rigid_adjoint]

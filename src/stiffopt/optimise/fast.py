@@ -1,0 +1,243 @@
+"""The compiled solver: a whole search in machine code, task by task or many at once.
+
+It is the method of `stiffopt.optimise.search` and `local` written in C (folder ``native``),
+compiled together with the functions of a task's structure; `stiffopt.optimise.loaded` adds what
+arms under gravity or loads need.  What it does not fit, or does not solve, is left to that general
+method.
+"""
+
+import ctypes
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.compiled import Library
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.native_calls import in_parallel
+from stiffopt.optimise.effort import effort
+from stiffopt.optimise.loaded import LoadedArm, loaded_effort
+from stiffopt.optimise.local import FIRST_RADIUS, INSIDE, LAST_RADIUS, MOST_ITERATIONS, TOUCHING
+from stiffopt.optimise.problem import FLOOR_MARGIN
+from stiffopt.optimise.program import Program
+from stiffopt.optimise.samples import SampleTable, nearness
+from stiffopt.optimise.search import SAME_OPTIMUM
+from stiffopt.optimise.solution import Confidence
+from stiffopt.optimise.target import Target
+
+Vector = NDArray[np.float64]
+
+_NEAR = 17  # numbers that say how near a sample is
+_COUNTS = 14  # numbers of an answer before its pressures
+_UNSOLVED = 0
+_CHUNK = 8  # tasks that a thread takes at a time
+
+_integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+class _Setup(ctypes.Structure):
+    """`Setup` of native/program.h."""
+
+    _fields_ = [
+        ("n", _integer),
+        ("rows", _integer),
+        ("balls", _integer),
+        ("ball_rows", _integer * 2),
+        ("terms", _integer),
+        ("floors", _integer),
+        ("values", _integer),
+        ("parameters", _integer),
+        ("samples", _integer),
+        ("nearest", _integer),
+        ("screened", _integer),
+        ("agreeing", _integer),
+        ("most_descents", _integer),
+        ("most_iterations", _integer),
+        ("scale", _double * 2),
+        ("first_radius", _double),
+        ("last_radius", _double),
+        ("precision", _double),
+        ("curvature", _double),
+        ("inside", _double),
+        ("touching", _double),
+        ("floor_slack", _double),
+        ("same", _double),
+        ("sample_x", _pointer),
+        ("sample_poses", _pointer),
+        ("state", _integer),
+        ("sample_states", _pointer),
+        ("rod", _pointer),
+    ]
+
+
+class Answer(NamedTuple):
+    """What the compiled solver found.
+
+    Attributes
+    ----------
+    pressures : ndarray (n,)
+        In Pa.
+    confidence : Confidence
+    counts : dict of str to int
+        Work that was done.
+    judged : tuple
+        What `Judgement.of` takes: residuals, tip pose, compliance and values at the pressures.
+    """
+
+    pressures: Vector
+    confidence: Confidence
+    counts: dict[str, int]
+    judged: tuple[list[float], Vector, Vector, list[float]]
+
+
+class FastSolver:
+    """Compiled solver of tasks of one structure and one set of limits on one arm.
+
+    Parameters
+    ----------
+    library : Library
+        Functions of the structure, with the compiled solver.
+    robot : Manipulator
+    program : Program
+        Any of that structure.
+    table : SampleTable
+        Where searches start.
+    arm : LoadedArm, optional
+        The arm if gravity or a load acts.
+    """
+
+    def __init__(
+        self,
+        library: Library,
+        robot: Manipulator,
+        program: Program,
+        table: SampleTable,
+        arm: LoadedArm | None = None,
+    ) -> None:
+        self._library, self._table, self._arm = library, table, arm  # what pointers below lead to
+        self._solve = library.cdll.stiffopt_solve
+        self._solve.argtypes = [
+            _pointer, _pointer, _integer, _pointer, _integer, _integer, _integer
+        ]  # fmt: skip
+        n, rows = robot.n_pressures, [term.size for term in program.terms]
+        scales = [robot.length if term.name == "position" else 1.0 for term in program.terms]
+        tries = effort(sum(rows)) if arm is None else loaded_effort(sum(rows))
+        self._length = robot.length
+        setup = _Setup(
+            n=n,
+            rows=sum(rows),
+            balls=len(rows),
+            ball_rows=(_integer * 2)(*rows),
+            terms=program.n_terms,
+            floors=program.n_floors,
+            values=len(program.measures),
+            parameters=program.n_parameters,
+            samples=len(table.x),
+            nearest=min(2 * tries.screened, len(table.x)),
+            screened=tries.screened,
+            agreeing=tries.agreeing,
+            most_descents=tries.most_descents,
+            most_iterations=MOST_ITERATIONS,
+            scale=(_double * 2)(*scales),
+            first_radius=FIRST_RADIUS,
+            last_radius=LAST_RADIUS,
+            precision=program.precision,
+            curvature=program.steepness,
+            inside=INSIDE,
+            touching=TOUCHING,
+            floor_slack=0.5 * FLOOR_MARGIN,
+            same=SAME_OPTIMUM,
+            sample_x=table.x.ctypes.data,
+            sample_poses=table.flat_poses.ctypes.data,
+        )
+        if arm is not None:
+            setup.state = arm.state_size
+            setup.sample_states = table.states.ctypes.data
+            setup.rod = arm.address
+        self._setup = setup
+        self._address = ctypes.addressof(setup)
+        targets = len(program.target_parameters)
+        self._targets = slice(0, targets)
+        self._radii = slice(program.n_parameters, program.n_parameters + len(rows))
+        limits = self._radii.stop + 2 * n
+        self._near = slice(limits + program.n_floors, limits + program.n_floors + _NEAR)
+        self._width = self._near.stop + 1 + n
+        ends = np.cumsum([_COUNTS + n, sum(rows), 16, 36, len(program.measures)]).tolist()
+        self._parts = [slice(start, end) for start, end in pairwise(ends)]
+        self._answer_width = ends[-1]
+
+    def row(self, program: Program, lower: Vector, upper: Vector, floors: Vector) -> Vector:
+        """Numbers of a task, its target and guess left out."""
+        row = np.zeros(self._width)
+        start = self._targets.stop
+        row[start : self._radii.start] = program.measure_parameters
+        row[self._radii.stop : self._near.start] = np.concatenate([lower, upper, floors])
+        return row
+
+    def with_target(
+        self, row: Vector, target: Target, program: Program, guess: Vector | None
+    ) -> Vector:
+        """The same task with a target and, if there is one, a guess (Pa)."""
+        row = row.copy()
+        row[self._targets] = program.target_parameters
+        row[self._radii] = [term.radius for term in program.terms]
+        row[self._near] = nearness(target, self._length)
+        if guess is not None:
+            row[self._near.stop] = 1.0
+            row[self._near.stop + 1 :] = guess
+        return row
+
+    def solve(self, row: Vector) -> Answer | None:
+        """Answer to one task; None if the general method is needed."""
+        numbers = np.empty(self._answer_width)
+        self._run(row, numbers, 0, 1)
+        return self._answer(numbers)
+
+    def solve_all(self, rows: Vector, threads: int | None = None) -> list[Answer | None]:
+        """Answers to many tasks, a row each, on all cores unless `threads` says otherwise."""
+        rows = np.ascontiguousarray(rows)
+        numbers = np.empty((len(rows), self._answer_width))
+
+        def work(starts: Iterator[int]) -> None:
+            for start in starts:
+                self._run(rows, numbers, start, min(start + _CHUNK, len(rows)))
+
+        in_parallel(work, range(0, len(rows), _CHUNK), threads)
+        return [self._answer(each) for each in numbers]
+
+    def _run(self, rows: Vector, answers: Vector, begin: int, end: int) -> None:
+        self._solve(
+            self._address, rows.ctypes.data, self._width,
+            answers.ctypes.data, self._answer_width, begin, end,
+        )  # fmt: skip
+
+    def _answer(self, numbers: Vector) -> Answer | None:
+        outcome, _, _, _, tried, reached, descents, agreeing, optima, complete, *work = map(
+            int, numbers[:_COUNTS].tolist()
+        )
+        if outcome == _UNSOLVED:
+            return None
+        numbers.flags.writeable = False
+        residuals, pose, compliance, values = self._parts
+        iterations, poses, points, programs = work
+        return Answer(
+            numbers[_COUNTS : residuals.start],
+            Confidence(tried, descents, agreeing, optima, complete == 1),
+            {
+                "starts": tried,
+                "reached": reached,
+                "descents": descents,
+                "iterations": iterations,
+                "poses": poses,
+                "points": points,
+                "programs": programs,
+            },
+            (
+                numbers[residuals].tolist(),
+                numbers[pose].reshape(4, 4),
+                numbers[compliance].reshape(6, 6),
+                numbers[values].tolist(),
+            ),
+        )

@@ -1,0 +1,232 @@
+"""An arm under gravity or loads for the compiled solver: its functions, rod and samples.
+
+The rod is integrated in C (``native/rod.h``) around the small functions of `stiffopt.model.rod`;
+pose terms and measures are functions of the tip, see `tip_functions`.
+"""
+
+import ctypes
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.compiled import Library, library
+from stiffopt.model.kinematics import Actuation
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.native_calls import in_parallel
+from stiffopt.model.rod import Rod, rod
+from stiffopt.optimise.effort import Effort
+from stiffopt.optimise.program import Program
+
+Vector = NDArray[np.float64]
+
+_SOURCES = (str(Path(__file__).with_name("native") / "loaded_solver.c"),)
+
+_CHUNK = 8  # equilibria that a thread settles at a time
+_PLACED = Effort(16, 3, 10)
+_LOOSE = Effort(40, 4, 16)
+
+_integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+def loaded_effort(rows: int) -> Effort:
+    """As `effort`: an evaluation takes a hundred times longer, and weight evens optima out."""
+    return _PLACED if rows >= 3 else _LOOSE
+
+
+class Tip:
+    """A tip as symbols of its own: a `Shape` of which all quantities are independent."""
+
+    def __init__(self, n_pressures: int) -> None:
+        self.position = ca.SX.sym("r", 3)
+        self.rotation = ca.SX.sym("R", 3, 3)
+        self.base_compliance = ca.SX.sym("C", 6, 6)
+        self.pressures = ca.SX.sym("p", n_pressures)
+
+    @property
+    def inputs(self) -> tuple[ca.SX, ...]:
+        """Position, rotation, compliance (6, 6) in base axes, pressures."""
+        return self.position, self.rotation, self.base_compliance, self.pressures
+
+    @property
+    def transform(self) -> ca.SX:
+        """Pose (4, 4)."""
+        return lie.transform(self.rotation, self.position)
+
+    @property
+    def jacobian(self) -> ca.SX:
+        """Not a symbol of its own."""
+        raise NotImplementedError
+
+    @property
+    def compliance(self) -> ca.SX:
+        """Compliance (6, 6) in the tip's axes."""
+        X = ca.diagcat(self.rotation, self.rotation)
+        return X.T @ self.base_compliance @ X
+
+    def flexibility(self, wrench: ca.SX) -> ca.SX:
+        """``w' C w`` of a wrench (6,) in the tip's axes."""
+        moved = ca.vertcat(self.rotation @ wrench[:3], self.rotation @ wrench[3:])
+        return moved.T @ self.base_compliance @ moved
+
+    def total_jacobian(self, values: ca.SX) -> ca.SX:
+        """Not known of the tip alone: zeros (k, n)."""
+        return ca.SX.zeros(values.numel(), self.pressures.numel())
+
+    def by_twist(self, values: ca.SX) -> ca.SX:
+        """Derivative (k, 6) of values by a twist of the tip in its own axes, the rest held."""
+        by_turn = [
+            ca.jtimes(values, ca.vec(self.rotation), ca.vec(self.rotation @ lie.hat(axis)))
+            for axis in ca.DM.eye(3).full()
+        ]
+        return ca.horzcat(ca.jacobian(values, self.position) @ self.rotation, *by_turn)
+
+
+def tip_functions(program: Program, n_pressures: int) -> list[ca.Function]:
+    """Functions of a tip (see `Tip`) and a program's parameters.
+
+    ``residuals``: values (m,) and derivative by a twist (m, 6); ``terms``: terms and floors
+    (k,), derivatives by a twist (k, 6), by the compliance (k, 36) and by pressures (k, n);
+    ``judge``: as `Program.judge`.
+    """
+    tip = Tip(n_pressures)
+    parameters = ca.SX.sym("parameters", program.n_parameters)
+    inputs = [*tip.inputs, parameters]
+    residuals, _, terms, _, floors, _ = program.point(tip, parameters)
+    terms = ca.vertcat(*terms.elements(), *(floors.elements() if program.n_floors else ()))
+
+    def function(name: str, outputs: list[Any]) -> ca.Function:
+        return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
+
+    return [
+        function("residuals", [residuals, tip.by_twist(residuals)]),
+        function(
+            "terms",
+            [
+                terms, tip.by_twist(terms),
+                ca.jacobian(terms, ca.vec(tip.base_compliance)), ca.jacobian(terms, tip.pressures),
+            ],
+        ),
+        function("judge", program.judge(tip, parameters)),
+    ]  # fmt: skip
+
+
+class _Piece(ctypes.Structure):
+    """`RodPiece` of native/rod.h."""
+
+    _fields_ = [
+        *((name, _integer) for name in ("kind", "parts", "slopes", "channel", "channels", "steps")),
+        ("length", _double),
+        ("mass", _double),
+    ]
+
+
+class _Rod(ctypes.Structure):
+    """`Rod` of native/rod.h."""
+
+    _fields_ = [
+        *((name, _integer) for name in ("n", "pieces", "steps", "parts", "slopes")),
+        ("piece", ctypes.POINTER(_Piece)),
+        ("gravity", _double * 3),
+        ("load", _double * 12),
+        ("tip_mass", _double),
+        ("hanging", _pointer),
+    ]
+
+
+def _equations(robot: Manipulator) -> Rod | None:
+    def make() -> Rod | None:
+        return rod(robot.description, Actuation.of(robot.description), robot.resolution)
+
+    return robot.kept("rod", make)
+
+
+def loaded_library(robot: Manipulator, program: Program) -> Library | None:
+    """Machine code for tasks of the program's structure on this arm under any load."""
+    equations = _equations(robot)
+    if equations is None:
+        return None
+    known: dict[object, Library] = robot.kept("loaded libraries", dict)
+    if program.structure in known:
+        return known[program.structure]
+    content = (
+        robot.description.model_dump_json(), robot.resolution, program.structure, "loaded"
+    )  # fmt: skip
+    found = library(
+        content,
+        lambda: [*equations.functions, *tip_functions(program, robot.n_pressures)],
+        _SOURCES,
+        daqp=True,
+    )
+    if found is not None:  # else another thread may be compiling
+        known[program.structure] = found
+    return found
+
+
+class LoadedArm:
+    """A loaded arm as the compiled solver sees it.
+
+    Attributes
+    ----------
+    address : int
+        Of its `Rod`.
+    state_size : int
+        Numbers of an equilibrium's state.
+
+    Raises
+    ------
+    EquilibriumError
+        If the unpressurised arm falls over.
+    """
+
+    def __init__(self, code: Library, robot: Manipulator) -> None:
+        equations = _equations(robot)
+        if equations is None:
+            raise EquilibriumError("this arm has no compiled equations")
+        self._library = code
+        pieces = (_Piece * len(equations.pieces))(*(_Piece(*p) for p in equations.pieces))
+        steps = sum(piece.steps for piece in equations.pieces)
+        self.state_size = robot.n_pressures + 4 + 7 * steps
+        self._hanging = np.zeros(self.state_size)
+        self._rod = _Rod(
+            n=robot.n_pressures,
+            pieces=len(equations.pieces),
+            steps=steps,
+            parts=equations.parts,
+            slopes=equations.slopes,
+            piece=pieces,
+            gravity=(_double * 3)(*robot.description.gravity),
+            load=(_double * 12)(*robot.tip_load),
+            tip_mass=robot.description.tip_mass,
+            hanging=self._hanging.ctypes.data,
+        )
+        self._pieces = pieces
+        self.address = ctypes.addressof(self._rod)
+        hang = code.cdll.stiffopt_hang
+        hang.argtypes = [_pointer, _pointer]
+        if not hang(self.address, self._hanging.ctypes.data):
+            raise EquilibriumError("the unpressurised arm falls over")
+        self._settle = code.cdll.stiffopt_settle
+        self._settle.argtypes = [_pointer] * 5 + [_integer] * 2
+
+    def settled(self, pressures: Vector) -> tuple[NDArray[np.bool_], Vector, Vector]:
+        """Which pressures (N, n) have an equilibrium, their states and poses (N, 12)."""
+        pressures = np.ascontiguousarray(pressures)
+        count = len(pressures)
+        states, poses = np.zeros((count, self.state_size)), np.zeros((count, 12))
+        found = np.zeros(count, dtype=np.int64)
+
+        def work(starts: Iterator[int]) -> None:
+            for start in starts:
+                self._settle(
+                    self.address, pressures.ctypes.data, states.ctypes.data, poses.ctypes.data,
+                    found.ctypes.data, start, min(start + _CHUNK, count),
+                )  # fmt: skip
+
+        in_parallel(work, range(0, count, _CHUNK))
+        return found != 0, states, poses

@@ -1,0 +1,301 @@
+/* Down the objective along the pose: the feasible-path SQP method of local.py. */
+#ifndef STIFFOPT_DESCEND_H
+#define STIFFOPT_DESCEND_H
+
+#include <daqp/api.h>
+
+#include "reach.h"
+
+#define NEXT_TO 0.05 /* bar */
+#define FAR 1e6 /* stands for no bound in the quadratic program */
+
+/* Prices of the constraints at a step: of the balls, the terms and the floors. */
+typedef struct {
+    double *balls, *terms, *floors;
+    int known;
+} Multipliers;
+
+typedef struct {
+    double value, violation;
+    int converged;
+    int64_t iterations;
+} Descent;
+
+/* Orthonormal axes (k, k) by rows, the first along a vector of length > 0. */
+static void axes_along(const double *first, int64_t k, double *axes) {
+    double length = sqrt(dot(first, first, k));
+    for (int64_t i = 0; i < k; i++) axes[i] = first[i] / length;
+    if (k == 2) {
+        axes[2] = -axes[1], axes[3] = axes[0];
+    } else if (k == 3) {
+        const double *a = axes;
+        double other[3] = {0, 0, 0};
+        int least = fabs(a[0]) <= fabs(a[1]) ? 0 : 1;
+        if (fabs(a[2]) < fabs(a[least])) least = 2;
+        other[least] = 1;
+        double *b = axes + 3, *c = axes + 6;
+        double along = a[least];
+        for (int i = 0; i < 3; i++) b[i] = other[i] - along * a[i];
+        length = sqrt(dot(b, b, 3));
+        for (int i = 0; i < 3; i++) b[i] /= length;
+        c[0] = a[1] * b[2] - a[2] * b[1];
+        c[1] = a[2] * b[0] - a[0] * b[2];
+        c[2] = a[0] * b[1] - a[1] * b[0];
+    }
+}
+
+/* Axes of the box around a ball, the first where it will bind, and the length of its pull. */
+static double box_axes(const Program *P, const Point *p, int64_t ball, int64_t row,
+                       const Multipliers *prices, const double *gradient, double *axes) {
+    int64_t n = P->setup->n, k = P->setup->ball_rows[ball];
+    double pull[3];
+    if (prices->known) {
+        memcpy(pull, prices->balls + row, (size_t)k * sizeof(double));
+    } else { /* least-squares estimate of the multiplier */
+        double A[9];
+        for (int64_t i = 0; i < k; i++) {
+            for (int64_t j = 0; j < k; j++)
+                A[i * k + j] = dot(p->J + (row + i) * n, p->J + (row + j) * n, n);
+            pull[i] = -dot(p->J + (row + i) * n, gradient, n);
+        }
+        double trace = 0;
+        for (int64_t i = 0; i < k; i++) trace += A[i * k + i];
+        for (int64_t i = 0; i < k; i++) A[i * k + i] += 1e-10 * trace;
+        if (!cholesky_solve(A, pull, k)) memset(pull, 0, sizeof pull);
+    }
+    double size = sqrt(dot(pull, pull, k));
+    const double *first = p->error[ball] > 0.9 * P->radius[ball] ? p->r + row : pull;
+    if (!(dot(first, first, k) > 0)) {
+        memset(axes, 0, (size_t)(k * k) * sizeof(double));
+        for (int64_t i = 0; i < k; i++) axes[i * k + i] = 1;
+    } else {
+        axes_along(first, k, axes);
+    }
+    return size;
+}
+
+/* Minimise z'Hz/2 + g'z with low <= (z, Az) <= high; 0 where there is no finite answer. */
+static int solve_qp(Program *P, int size, int constraints, double *H, double *g, double *A,
+                    double *low, double *high, double *z, double *dual) {
+    int sense[constraints];
+    memset(sense, 0, sizeof sense);
+    DAQPProblem qp = {size, constraints, size, H, g, A, high, low, sense};
+    DAQPSettings settings;
+    daqp_default_settings(&settings);
+    settings.primal_tol = 1e-9;
+    DAQPResult result = {.x = z, .lam = dual};
+    P->programs++;
+    if (!all_finite(H, (int64_t)size * size) || !all_finite(g, size) ||
+        !all_finite(A, (int64_t)(constraints - size) * size))
+        return 0;
+    daqp_quadprog(&result, &qp, &settings);
+    return result.exitflag > 0 && all_finite(z, size) && all_finite(dual, constraints);
+}
+
+/* One step of the method: d (n), the promised decrease of the merit, and new multipliers.
+ *
+ * The variables are the step d, the largest term t (if there are several) and the floors' slack
+ * (if there are any); each ball is a box whose curvature enters the Hessian.
+ */
+static int quadratic_step(Program *P, const Point *p, const double *B, double radius,
+                          double price, Multipliers *prices, double *d, double *promised) {
+    const Setup *s = P->setup;
+    int64_t n = s->n, terms = s->terms > 1 ? s->terms : 0, floors = s->floors;
+    int64_t size = n + (terms > 0) + (floors > 0), last = size - 1;
+    int64_t extra = terms + floors + s->rows, all = size + extra;
+    double H[size * size], g[size], A[extra * size], low[all], high[all], z[size], dual[all];
+    double axes[MOST_BALLS][9];
+    memset(H, 0, sizeof H), memset(g, 0, sizeof g), memset(A, 0, sizeof A);
+    for (int64_t i = 0; i < n; i++) {
+        memcpy(H + i * size, B + i * n, (size_t)n * sizeof(double));
+        low[i] = fmax(P->lower[i] - p->x[i], -radius);
+        high[i] = fmin(P->upper[i] - p->x[i], radius);
+    }
+    for (int64_t i = n; i < size; i++) H[i * size + i] = 1e-6;
+    double *row = A, *lo = low + size, *hi = high + size;
+    double top = objective(s, p);
+    int64_t steepest = 0;
+    for (int64_t i = 1; i < s->terms; i++)
+        if (p->f[i] > p->f[steepest]) steepest = i;
+    if (terms) {
+        g[n] = 1, low[n] = -FAR, high[n] = FAR;
+        for (int64_t i = 0; i < terms; i++, row += size) {
+            memcpy(row, p->df + i * n, (size_t)n * sizeof(double));
+            row[n] = -1, *lo++ = -FAR, *hi++ = top - p->f[i];
+        }
+    } else {
+        memcpy(g, p->df, (size_t)n * sizeof(double));
+    }
+    if (floors) {
+        g[last] = price, low[last] = 0, high[last] = FAR;
+        for (int64_t i = 0; i < floors; i++, row += size) {
+            memcpy(row, p->dg + i * n, (size_t)n * sizeof(double));
+            row[last] = 1, *lo++ = P->floor[i] - p->g[i], *hi++ = FAR;
+        }
+    }
+    for (int64_t ball = 0, first = 0; ball < s->balls; ball++) {
+        int64_t k = s->ball_rows[ball];
+        double rho = P->radius[ball] * s->inside;
+        double pull = box_axes(P, p, ball, first, prices, p->df + steepest * n, axes[ball]);
+        const double *J = p->J + first * n;
+        for (int64_t i = 0; i < n; i++)
+            for (int64_t j = 0; j < n; j++)
+                for (int64_t a = 0; a < k; a++)
+                    H[i * size + j] += pull / rho * J[a * n + i] * J[a * n + j];
+        for (int64_t a = 0; a < k; a++, row += size) {
+            const double *axis = axes[ball] + a * k;
+            double across = dot(axis, p->r + first, k) / rho;
+            for (int64_t b = 0; b < k; b++)
+                for (int64_t i = 0; i < n; i++) row[i] += axis[b] * J[b * n + i] / rho;
+            *lo++ = fmin(-1 - across, 0), *hi++ = fmax(1 - across, 0);
+        }
+        first += k;
+    }
+    double full_H[size * size], full_g[size];
+    memcpy(full_H, H, sizeof H), memcpy(full_g, g, sizeof g);
+    if (!solve_qp(P, (int)size, (int)all, H, g, A, low, high, z, dual)) return 0;
+    *promised = price * violation(P, p);
+    for (int64_t i = 0; i < size; i++)
+        *promised -= z[i] * (full_g[i] + 0.5 * dot(full_H + i * size, z, size));
+    memcpy(d, z, (size_t)n * sizeof(double));
+    const double *weight = dual + size;
+    prices->known = 1;
+    prices->terms[0] = 1;
+    for (int64_t i = 0; i < terms; i++) prices->terms[i] = *weight++;
+    for (int64_t i = 0; i < floors; i++) prices->floors[i] = -*weight++;
+    for (int64_t ball = 0, first = 0; ball < s->balls; ball++) {
+        int64_t k = s->ball_rows[ball];
+        for (int64_t b = 0; b < k; b++) {
+            double sum = 0;
+            for (int64_t a = 0; a < k; a++) sum += axes[ball][a * k + b] * weight[a];
+            prices->balls[first + b] = sum / (P->radius[ball] * s->inside);
+        }
+        weight += k, first += k;
+    }
+    return 1;
+}
+
+/* Gradient of the Lagrangian with the multipliers held, bounds left out. */
+static void lagrangian_slope(const Setup *s, const Point *p, const Multipliers *prices,
+                             double *slope) {
+    int64_t n = s->n;
+    memset(slope, 0, (size_t)n * sizeof(double));
+    for (int64_t i = 0; i < n; i++) {
+        for (int64_t k = 0; k < s->terms; k++) slope[i] += prices->terms[k] * p->df[k * n + i];
+        for (int64_t k = 0; k < s->floors; k++) slope[i] -= prices->floors[k] * p->dg[k * n + i];
+        for (int64_t k = 0; k < s->rows; k++) slope[i] += prices->balls[k] * p->J[k * n + i];
+    }
+}
+
+/* Powell's damped update, which keeps B positive definite. */
+static void update_hessian(double *B, const double *step, double *y, int64_t n) {
+    double Bs[n];
+    for (int64_t i = 0; i < n; i++) Bs[i] = dot(B + i * n, step, n);
+    double sBs = dot(step, Bs, n), sy = dot(step, y, n);
+    if (!(sBs >= 1e-16)) return;
+    if (sy < 0.2 * sBs) {
+        double theta = 0.8 * sBs / (sBs - sy);
+        for (int64_t i = 0; i < n; i++) y[i] = theta * y[i] + (1 - theta) * Bs[i];
+        sy = dot(step, y, n);
+    }
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < n; j++)
+            B[i * n + j] += y[i] * y[j] / sy - Bs[i] * Bs[j] / sBs;
+}
+
+/* The same point with pressures that all but touch a limit put onto it, if that holds. */
+static void snap(Program *P, Point *p) {
+    const Setup *s = P->setup;
+    int64_t n = s->n, moved = 0;
+    double lower[n], upper[n], d[n];
+    for (int64_t i = 0; i < n; i++) {
+        int low = p->x[i] < P->lower[i] + s->touching, high = p->x[i] > P->upper[i] - s->touching;
+        double x = low ? P->lower[i] : high ? P->upper[i] : p->x[i];
+        d[i] = x - p->x[i];
+        moved += d[i] != 0;
+        lower[i] = high ? P->upper[i] : P->lower[i];
+        upper[i] = low ? P->lower[i] : P->upper[i];
+    }
+    NEW_POINT(other, s);
+    if (!moved || !pulled_back(P, p, d, lower, upper, &other)) return;
+    if (violation(P, &other) <= violation(P, p) &&
+        objective(s, &other) - objective(s, p) < 100 * s->precision)
+        copy_point(s, &other, p);
+}
+
+/* Optima that are known already: a descent that comes next to one of them need not go on. */
+typedef struct {
+    int64_t count;
+    Descent *ends;
+    double *x; /* (count, n) */
+} Known;
+
+static const Descent *arrives(const Setup *s, const Point *p, const Known *known) {
+    double value = objective(s, p);
+    for (int64_t k = 0; k < known->count; k++) {
+        const double *x = known->x + k * s->n;
+        if (fabs(value - known->ends[k].value) > s->same) continue;
+        double far = 0;
+        for (int64_t i = 0; i < s->n; i++) far = fmax(far, fabs(p->x[i] - x[i]));
+        if (far < NEXT_TO) return known->ends + k;
+    }
+    return NULL;
+}
+
+/* Minimise the objective from a point that reaches the pose and was evaluated in full. */
+static Descent descend(Program *P, Point *p, const Known *known) {
+    const Setup *s = P->setup;
+    int64_t n = s->n;
+    double B[n * n], d[n], before[n], after[n], step[n];
+    double ball_prices[MOST_ROWS], term_prices[s->terms], floor_prices[s->floors + 1];
+    Multipliers prices = {ball_prices, term_prices, floor_prices, 0};
+    double radius = s->first_radius, price = 10, promised = 0;
+    Descent end = {0, 0, 0, 0};
+    memset(B, 0, sizeof B);
+    for (int64_t i = 0; i < n; i++) B[i * n + i] = s->curvature;
+    NEW_POINT(trial, s);
+    while (end.iterations++ < s->most_iterations) {
+        if (!quadratic_step(P, p, B, radius, price, &prices, d, &promised)) break;
+        for (int64_t i = 0; i < s->floors; i++) price = fmax(price, 2 * prices.floors[i]);
+        if (promised < s->precision) {
+            end.converged = 1;
+            break;
+        }
+        double length = largest(d, n);
+        if (!pulled_back(P, p, d, P->lower, P->upper, &trial)) {
+            radius = 0.3 * length;
+            if (radius < s->last_radius) break;
+            continue;
+        }
+        double gained = objective(s, p) + price * violation(P, p) - objective(s, &trial) -
+                        price * violation(P, &trial);
+        lagrangian_slope(s, p, &prices, before);
+        lagrangian_slope(s, &trial, &prices, after);
+        for (int64_t i = 0; i < n; i++) step[i] = trial.x[i] - p->x[i], after[i] -= before[i];
+        update_hessian(B, step, after, n);
+        double share = gained / promised;
+        if (share < 0.25)
+            radius = 0.4 * length;
+        else if (share > 0.7 && length > 0.8 * radius)
+            radius = fmin(2.5 * radius, 2);
+        if (gained > 0) {
+            copy_point(s, &trial, p);
+            const Descent *same = known ? arrives(s, p, known) : NULL;
+            if (same) {
+                int64_t iterations = end.iterations;
+                end = *same, end.iterations = iterations;
+                return end;
+            }
+        }
+        if (radius < s->last_radius) {
+            end.converged = fabs(promised) < 1e3 * s->precision;
+            break;
+        }
+    }
+    snap(P, p);
+    end.value = objective(s, p);
+    end.violation = violation(P, p);
+    return end;
+}
+
+#endif

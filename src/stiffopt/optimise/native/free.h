@@ -1,0 +1,51 @@
+/* A point of the program of an arm without loads, in closed form. */
+#ifndef STIFFOPT_FREE_H
+#define STIFFOPT_FREE_H
+
+#include "program.h"
+
+/* Residuals at p->x and, if full, terms and floors too; 0 where anything is not finite. */
+static int evaluate(Program *P, Point *p, int full) {
+    const Setup *s = P->setup;
+    double pressures[s->n];
+    for (int64_t i = 0; i < s->n; i++) pressures[i] = p->x[i] * BAR;
+    P->arg[0] = pressures, P->arg[1] = P->parameters;
+    P->res[0] = p->r, P->res[1] = p->J;
+    int64_t bad;
+    if (full) {
+        P->res[2] = p->f, P->res[3] = p->df, P->res[4] = p->g, P->res[5] = p->dg;
+        bad = point(P->arg, P->res, P->iw, P->w, 0);
+        multiply(p->df, BAR, s->terms * s->n);
+        multiply(p->dg, BAR, s->floors * s->n);
+        P->points++;
+    } else {
+        bad = pose(P->arg, P->res, P->iw, P->w, 0);
+        P->poses++;
+    }
+    multiply(p->J, BAR, s->rows * s->n);
+    int64_t size = s->n + s->rows * (1 + s->n);
+    if (bad || !all_finite(p->x, full ? value_count(s) : size)) return 0;
+    measure_balls(P, p);
+    return 1;
+}
+
+/* Judge pressures by the model alone: residuals, pose, compliance and values. */
+static int judge_at(Program *P, const double *pressures, double *answer) {
+    const Setup *s = P->setup;
+    P->arg[0] = pressures, P->arg[1] = P->parameters;
+    P->res[0] = answer, answer += s->rows;
+    P->res[1] = answer, answer += 16;
+    P->res[2] = answer, answer += 36;
+    P->res[3] = answer;
+    return !judge(P->arg, P->res, P->iw, P->w, 0);
+}
+
+/* What an evaluation needs beside the stack: nothing. */
+static int add_memory(Program *P) {
+    P->linear = NULL;
+    return 1;
+}
+
+static void free_memory(Program *P) { (void)P; }
+
+#endif

@@ -1,0 +1,163 @@
+"""WorkspaceMap: where the tip can be and how stiff it can be made there."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.workspace.plan import MapPlan, direction_name
+from stiffopt.workspace.table import CellTable
+
+Vector = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+Quantity = Literal["count", "best", "worst", "best_sample", "worst_sample"]
+
+FILL = {"count": 0, "best": np.nan, "worst": np.nan, "best_sample": -1, "worst_sample": -1}
+"""What stands in cells that no sample reached."""
+
+
+class Extreme(NamedTuple):
+    """The stiffest, or the softest, of all samples in one direction.
+
+    Attributes
+    ----------
+    stiffness : in N/m, for a rotation in N m/rad.
+    sample : number of the sample.
+    pressures : (n,) in Pa.
+    cell_centre : (3,) centre of the cell that the tip is in, in m.
+    """
+
+    stiffness: float
+    sample: int
+    pressures: Vector
+    cell_centre: Vector
+
+
+@dataclass(frozen=True)
+class WorkspaceMap:
+    """Cells of space that the tip reaches, and the range of stiffness in each.
+
+    Rows are the M cells that a sample reached, in the order of their indices; `grid` has them as
+    a box.
+
+    Attributes
+    ----------
+    plan : what was sampled.
+    table : what was found.
+    lost : samples at which the arm has no stable equilibrium.
+    low, high : (3,) least and greatest coordinates of the tip, in m; NaN if no sample has one.
+    path : where it is stored, or None.
+    evaluated : samples that were evaluated to make it now; fewer than all where it was resumed.
+    """
+
+    plan: MapPlan
+    table: CellTable
+    lost: int
+    low: Vector
+    high: Vector
+    path: Path | None = None
+    evaluated: int = 0
+
+    @property
+    def samples(self) -> int:
+        """Number of samples."""
+        return self.plan.total
+
+    @property
+    def direction_names(self) -> tuple[str, ...]:
+        """What the directions are called."""
+        return tuple(direction_name(measure.direction) for measure in self.plan.measures)
+
+    @property
+    def count(self) -> Numbers:
+        """Number of samples (M,) in each cell."""
+        return self.table.count
+
+    @property
+    def best(self) -> Vector:
+        """Greatest stiffness (m, M) that a sample has in each direction and cell."""
+        return self.table.best
+
+    @property
+    def worst(self) -> Vector:
+        """Least stiffness (m, M) that a sample has in each direction and cell."""
+        return self.table.worst
+
+    @property
+    def ratio(self) -> Vector:
+        """Greatest by least stiffness (m, M): how much of it can be chosen at a place."""
+        return np.asarray(self.best / self.worst)
+
+    @property
+    def best_sample(self) -> Numbers:
+        """Sample (m, M) that is the stiffest; see `pressures`."""
+        return self.table.best_sample
+
+    @property
+    def worst_sample(self) -> Numbers:
+        """Sample (m, M) that is the softest; see `pressures`."""
+        return self.table.worst_sample
+
+    @cached_property
+    def cells(self) -> Numbers:
+        """Indices (M, 3) of the cells; cell (i, j, k) is centred at (i, j, k) times its size."""
+        return self.table.cells
+
+    @property
+    def centres(self) -> Vector:
+        """Centres (M, 3) of the cells in the base frame, in m."""
+        return np.asarray(self.cells * self.plan.cell, dtype=np.float64)
+
+    @property
+    def volume(self) -> float:
+        """Volume of the cells that were reached, in m^3."""
+        return len(self.table) * self.plan.cell**3
+
+    @cached_property
+    def first_cell(self) -> Numbers:
+        """Least indices (3,) of a cell that was reached: the corner of `grid`."""
+        return self.cells.min(axis=0) if len(self.table) else np.zeros(3, np.int64)
+
+    @cached_property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of cells along each axis of the box that holds all cells."""
+        if not len(self.table):
+            return (0, 0, 0)
+        x, y, z = (self.cells.max(axis=0) - self.first_cell + 1).tolist()
+        return (x, y, z)
+
+    def pressures(self, sample: int) -> Vector:
+        """Pressures (n,) of a sample in Pa."""
+        return np.asarray(self.plan.sampling.pressures(int(sample), int(sample) + 1)[0])
+
+    def grid(self, name: Quantity) -> NDArray[np.generic]:
+        """A quantity in the box of all cells, (x, y, z) or (m, x, y, z).
+
+        Cells that no sample reached hold NaN, samples -1, counts 0.
+        """
+        values = getattr(self, name)
+        box = np.full((*values.shape[:-1], *self.shape), FILL[name], dtype=values.dtype)
+        box[..., *(self.cells - self.first_cell).T] = values
+        return box
+
+    def best_in(self, direction: int) -> Extreme | None:
+        """The stiffest sample in a direction, counted from 0; None if no tip was found."""
+        return self._extreme(-self.best[direction], self.best, self.best_sample, direction)
+
+    def worst_in(self, direction: int) -> Extreme | None:
+        """The softest sample in a direction, counted from 0; None if no tip was found."""
+        return self._extreme(self.worst[direction], self.worst, self.worst_sample, direction)
+
+    def _extreme(
+        self, ranks: Vector, values: Vector, samples: Numbers, direction: int
+    ) -> Extreme | None:
+        if not len(self.table):
+            return None
+        row = min(np.flatnonzero(ranks == ranks.min()), key=lambda r: samples[direction, r])
+        sample = int(samples[direction, row])
+        return Extreme(
+            float(values[direction, row]), sample, self.pressures(sample), self.centres[row]
+        )

@@ -1,0 +1,252 @@
+"""`map_workspace`: sample the workspace of an arm; the run goes on where another one stopped."""
+
+import os
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import FileError, InputError
+from stiffopt.model.compliance import Boundary, Frame, Kind
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.numeric import checked_integer
+from stiffopt.workspace.map import WorkspaceMap
+from stiffopt.workspace.plan import Block, MapPlan
+from stiffopt.workspace.store import MapStore, Progress, is_vacant, require_zarr
+from stiffopt.workspace.table import CellTable, Gathering
+from stiffopt.workspace.workers import Cluster, Threads, Workers, results
+
+Vector = NDArray[np.float64]
+Report = Callable[[int, int], None]
+
+_BETWEEN_CHECKPOINTS = 5.0  # s
+_CHECKPOINT_SHARE = 0.05  # of the time that checkpoints may take
+
+
+def map_workspace(
+    robot: Manipulator,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    directions: Iterable[ArrayLike] | None = None,
+    kind: Kind = "translation",
+    boundary: Boundary = "free",
+    frame: Frame = "base",
+    samples: int | None = None,
+    levels: int | None = None,
+    cell: float = 0.01,
+    seed: int = 0,
+    scheduler: str | None = None,
+    threads: int | None = None,
+    overwrite: bool = False,
+    progress: Report | None = None,
+) -> WorkspaceMap:
+    """Sample an arm's pressures into reach and the range of stiffness of each cell of space.
+
+    The same arguments give the same map to the last bit, whoever does the work and however often
+    it was interrupted.
+
+    Parameters
+    ----------
+    robot : Manipulator
+        The arm, with any load at its tip.
+    path : path, optional
+        Folder of the map, a Zarr group. A map that is there and unfinished is continued; one
+        that is complete is returned as it is. Without a path nothing is stored.
+    directions : list of (3,), optional
+        Of the stiffnesses; need not be of unit length. By default the axes x, y and z.
+    kind, boundary, frame
+        Of the stiffnesses, as in `Manipulator.stiffness`.
+    samples : int, optional
+        Number of quasi-random samples; by default a million, for an arm with gravity or load 1000.
+    levels : int, optional
+        Instead of `samples`, a full grid with so many levels of each channel, limits included.
+    cell : float
+        Size of a cell in m.
+    seed : int
+        Of the quasi-random samples.
+    scheduler : str, optional
+        Address of a Dask scheduler; its workers do the sampling.
+    threads : int, optional
+        Of this process; by default one for each core. Without effect on the result.
+    overwrite : bool
+        Replace a map that is at the path.
+    progress : callable, optional
+        Called now and then with the number of samples done and of all samples. What it raises
+        stops the run, which can then be resumed.
+
+    Returns
+    -------
+    WorkspaceMap
+
+    Raises
+    ------
+    InputError
+        An argument is wrong, or the cells are too small.
+    FileError
+        The path cannot be used, or holds something else.
+    MissingExtraError
+        Zarr (extra ``map``) or distributed (extra ``dask``) is needed and not installed.
+    ClusterError
+        The cluster cannot be reached, or failed.
+    """
+    plan = MapPlan.of(
+        robot, directions=directions, kind=kind, boundary=boundary, frame=frame, samples=samples,
+        levels=levels, cell=cell, seed=seed,
+    )  # fmt: skip
+    if threads is not None:
+        checked_integer("threads", threads, 1)
+        if scheduler is not None:
+            raise InputError("give threads or a scheduler, not both")
+    with ExitStack() as stack:
+        store = None if path is None else _opened(path, plan, overwrite, stack)
+        if store is not None and store.is_complete:
+            store.tidy()
+            return _as_map(plan, store.read(), store.path, evaluated=0)
+        begun = None if store is None else store.load()
+        run = _Run(plan, store, begun, progress or (lambda done, total: None))
+        workers: Threads | Cluster = (
+            stack.enter_context(Threads(plan, threads))
+            if scheduler is None
+            else stack.enter_context(Cluster(plan, scheduler))
+        )
+        return run.finish(workers)
+
+
+def open_workspace_map(path: str | os.PathLike[str]) -> WorkspaceMap:
+    """Complete map in a folder.
+
+    Raises
+    ------
+    FileError
+        There is none, or it is not complete.
+    MissingExtraError
+        Zarr (extra ``map``) is not installed.
+    """
+    require_zarr()
+    store = MapStore(path)
+    if not store.is_complete:
+        raise FileError(path, "is not complete; run what made it again, and it goes on")
+    return _as_map(_plan_of(store), store.read(), store.path, evaluated=0)
+
+
+def _opened(
+    path: str | os.PathLike[str], plan: MapPlan, overwrite: bool, stack: ExitStack
+) -> MapStore:
+    """Store at a path, locked: one to go on with, or a new one."""
+    require_zarr()
+    parent = Path(path).resolve().parent
+    if not parent.is_dir():
+        raise FileError(path, f"cannot be written: there is no folder '{parent}'")
+    if not is_vacant(path):
+        store = MapStore(path)
+        if not overwrite:
+            store.check(plan.record)
+            stack.enter_context(store.locked())
+            return MapStore(path)  # as it is now that no one else is at work
+        with store.locked():
+            store = MapStore.create(path, plan.record, overwrite=True)
+    else:
+        store = MapStore.create(path, plan.record, overwrite=False)
+    stack.enter_context(store.locked())
+    return store
+
+
+class _Run:
+    """The sampling, from where it was left to its end."""
+
+    def __init__(
+        self, plan: MapPlan, store: MapStore | None, begun: Progress | None, report: Report
+    ) -> None:
+        if begun is None:
+            none = CellTable.empty(len(plan.measures))
+            begun = Progress(0, 0, np.full(3, np.inf), np.full(3, -np.inf), none)
+        self._plan, self._store, self._report = plan, store, report
+        self._state, self._begun = begun, begun.blocks
+        self._gathering = Gathering(begun.table)
+        self._saved = begun.blocks
+        self._whole = True  # an interrupt may come in the middle of a step
+        self._next_save = monotonic() + _BETWEEN_CHECKPOINTS
+
+    def finish(self, workers: Workers) -> WorkspaceMap:
+        """Evaluate what is missing and complete the map."""
+        plan = self._plan
+        self._tell()
+        try:
+            for block in results(workers, range(self._begun, plan.n_blocks), self._tell):
+                self._take(block)
+                if monotonic() > self._next_save:
+                    self._save()
+                self._tell()
+        except BaseException:
+            self._save()
+            raise
+        evaluated = plan.total - plan.samples_in(self._begun)
+        self._save()
+        state = self._state._replace(table=self._gathering.table())
+        path = None if self._store is None else self._store.path
+        done = _as_map(plan, state, path, evaluated)
+        if self._store is not None:
+            self._store.finish(done)
+        return done
+
+    def _take(self, block: Block) -> None:
+        state, self._whole = self._state, False
+        self._gathering.add(block.table)
+        self._state = state._replace(
+            blocks=state.blocks + 1,
+            lost=state.lost + block.lost,
+            low=np.minimum(state.low, block.low),
+            high=np.maximum(state.high, block.high),
+        )
+        self._whole = True
+
+    def _tell(self) -> None:
+        self._report(self._plan.samples_in(self._state.blocks), self._plan.total)
+
+    def _save(self) -> None:
+        """Write a checkpoint if there is anything new, and nothing half done, to write."""
+        if self._store is None or self._state.blocks == self._saved or not self._whole:
+            return
+        begin = monotonic()
+        self._whole = False
+        table = self._gathering.table()
+        self._whole = True
+        self._store.save(self._state._replace(table=table))
+        self._saved = self._state.blocks
+        took = monotonic() - begin
+        self._next_save = monotonic() + max(_BETWEEN_CHECKPOINTS, took / _CHECKPOINT_SHARE)
+
+
+def _as_map(plan: MapPlan, state: Progress, path: Path | None, evaluated: int) -> WorkspaceMap:
+    low, high = (np.where(np.isfinite(end), end, np.nan) for end in (state.low, state.high))
+    return WorkspaceMap(plan, state.table, state.lost, low, high, path, evaluated)
+
+
+def _plan_of(store: MapStore) -> MapPlan:
+    """Plan that a map was made by."""
+    said: dict[str, Any] = store.attributes
+    try:
+        load = np.array(said["tip_load"], dtype=float)
+        follows = bool(load[6:].any())
+        wrench = load[6:] if follows else load[:6]
+        robot = Manipulator(
+            RobotDescription.model_validate(said["robot_description"], strict=False),
+            force=wrench[:3],
+            moment=wrench[3:],
+            load_frame="tip" if follows else "base",
+            resolution=said["resolution"],
+        )
+        grid = said["sampling"] == "grid"
+        return MapPlan.of(
+            robot, directions=said["directions"], kind=said["kind"], boundary=said["boundary"],
+            frame=said["frame"], samples=None if grid else said["samples"],
+            levels=said["levels"] if grid else None, cell=said["cell_m"],
+            seed=0 if grid else said["seed"],
+        )  # fmt: skip
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileError(store.path, f"is damaged: {error}") from None

@@ -1,0 +1,160 @@
+"""Cells of space and what was found in each; tables of them are merged in any order.
+
+Cell (i, j, k) of size c is centred at (i, j, k) c in the base frame.  Numbers of samples are added
+up; the best stiffness is the greatest, the worst the least, each with the lowest sample that
+attains it.  So the outcome does not depend on how samples are grouped.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import InputError
+
+Vector = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+_BITS = 20
+_HALF = 1 << (_BITS - 1)
+FARTHEST = _HALF - 1
+"""Largest number of a cell along an axis."""
+MOST_CELLS = 1_500_000
+"""Cells that one map may fill; they are held in memory, about 0.5 kB each while it is made."""
+
+_NO_SAMPLE = np.iinfo(np.int64).max
+
+
+@dataclass(frozen=True)
+class CellTable:
+    """The cells that samples fell into, for m directions, in the order of their keys.
+
+    Attributes
+    ----------
+    key : (M,) packed indices of the cell, ascending.
+    count : (M,) number of samples.
+    best, worst : (m, M) greatest and least stiffness.
+    best_sample, worst_sample : (m, M) the lowest sample that has it.
+    """
+
+    key: Numbers
+    count: Numbers
+    best: Vector
+    worst: Vector
+    best_sample: Numbers
+    worst_sample: Numbers
+
+    @classmethod
+    def empty(cls, m: int) -> "CellTable":
+        """No cells, for m directions."""
+        none, values = np.empty(0, np.int64), np.empty((m, 0))
+        return cls(none, none, values, values, values.astype(np.int64), values.astype(np.int64))
+
+    @classmethod
+    def of_samples(cls, key: Numbers, stiffness: Vector, sample: Numbers) -> "CellTable":
+        """Table of samples in cells (k,), with stiffnesses (m, k), in ascending order."""
+        each = np.broadcast_to(sample, stiffness.shape)
+        return _reduced(cls(key, np.ones(len(key), np.int64), stiffness, stiffness, each, each))
+
+    def __len__(self) -> int:
+        return len(self.key)
+
+    @property
+    def cells(self) -> Numbers:
+        """Indices (M, 3) of the cells."""
+        mask = (1 << _BITS) - 1
+        parts = [self.key >> (2 * _BITS), (self.key >> _BITS) & mask, self.key & mask]
+        return np.stack(parts, axis=1) - _HALF
+
+    @property
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """All columns by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def cell_indices(position: Vector, cell: float) -> Numbers:
+    """Indices (k, 3) of the cells that positions (k, 3) are in."""
+    return np.asarray(np.floor(position / cell + 0.5), dtype=np.int64)
+
+
+def cell_keys(indices: Numbers) -> Numbers:
+    """Indices (k, 3) of cells packed into one number each; they sort alike."""
+    shifted = indices + _HALF
+    return np.asarray(
+        (shifted[:, 0] << (2 * _BITS)) | (shifted[:, 1] << _BITS) | shifted[:, 2], dtype=np.int64
+    )
+
+
+def merged(tables: Sequence[CellTable]) -> CellTable:
+    """One table of all that several say."""
+    if len(tables) == 1:
+        return tables[0]
+    names = [field.name for field in fields(CellTable)]
+    columns = [np.concatenate([getattr(t, name) for t in tables], axis=-1) for name in names]
+    return _reduced(CellTable(*columns))
+
+
+class Gathering:
+    """A table that grows: what is added is merged when there is enough of it to be worth it."""
+
+    _ENOUGH = 1 << 18  # rows
+
+    def __init__(self, table: CellTable) -> None:
+        self._table = table
+        self._waiting: list[CellTable] = []
+        self._rows = 0
+
+    def add(self, table: CellTable) -> None:
+        """Add what another table says."""
+        self._waiting.append(table)
+        self._rows += len(table)
+        if self._rows > max(len(self._table) // 2, self._ENOUGH):
+            self.table()
+
+    def table(self) -> CellTable:
+        """All that was added so far.
+
+        Raises
+        ------
+        InputError
+            If there are more cells than a map may have.
+        """
+        self._table = merged([self._table, *self._waiting])
+        self._waiting, self._rows = [], 0
+        if len(self._table) > MOST_CELLS:
+            raise InputError(
+                f"the workspace fills more than {MOST_CELLS:,} cells, which is more than a map "
+                "may have; choose larger cells"
+            )
+        return self._table
+
+
+def _reduced(rows: CellTable) -> CellTable:
+    """Rows with each key once, in ascending order."""
+    if not len(rows.key):
+        return rows
+    order = _order(rows.key)
+    key = rows.key[order]
+    first = np.concatenate([[True], key[1:] != key[:-1]])
+    starts = np.flatnonzero(first)
+    group = np.cumsum(first) - 1
+    worst, worst_sample = _least(rows.worst, rows.worst_sample, order, starts, group)
+    best, best_sample = _least(-rows.best, rows.best_sample, order, starts, group)
+    count = np.add.reduceat(rows.count[order], starts)
+    return CellTable(key[starts], count, -best, worst, best_sample, worst_sample)
+
+
+def _order(key: Numbers) -> NDArray[np.intp]:
+    """Order that sorts keys."""
+    return np.argsort(key, kind="stable")
+
+
+def _least(
+    values: Vector, samples: Numbers, order: NDArray[np.intp], starts: Numbers, group: Numbers
+) -> tuple[Vector, Numbers]:
+    """Least value (m, M) of each group and the lowest sample that has it."""
+    values = values[:, order]
+    least = np.minimum.reduceat(values, starts, axis=1)
+    holders = np.where(values == least[:, group], samples[:, order], _NO_SAMPLE)
+    return least, np.minimum.reduceat(holders, starts, axis=1)

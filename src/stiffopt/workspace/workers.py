@@ -1,0 +1,271 @@
+"""Who evaluates the blocks of a plan: threads of this process, or a Dask cluster.
+
+Results come back in the order of the blocks, each exactly once, however often the work behind it
+had to be repeated; a bounded number of blocks is on its way at a time.
+"""
+
+import os
+import pickle
+import queue
+import threading
+import uuid
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from importlib.util import find_spec
+from time import monotonic
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+from stiffopt.errors import InputError, MissingExtraError, StiffoptError
+from stiffopt.workspace.plan import Block, MapPlan
+
+_POLL = 0.2  # s
+_PATIENCE = 30.0  # s to wait for a scheduler to answer, and for workers while there are none
+_RETRIES = 3  # of a block that fails for a passing reason, such as a worker that is gone
+
+
+class ClusterError(StiffoptError):
+    """The cluster cannot be reached, or failed; what was done so far is kept."""
+
+
+class Workers(Protocol):
+    """Evaluate blocks of a plan."""
+
+    @property
+    def width(self) -> int:
+        """Number of blocks to have on their way."""
+
+    def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
+        """Have a block evaluated; `done` is called with it and its future, from any thread."""
+
+    def result(self, future: Any) -> Block:
+        """Result of a future that is done."""
+
+    def check(self) -> None:
+        """Raise if nothing will ever come."""
+
+
+def results(
+    workers: Workers, blocks: range, poll: Callable[[], None] = lambda: None
+) -> Iterator[Block]:
+    """Results of blocks in their order; `poll` is called now and then while there is none."""
+    finished: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
+    ready: dict[int, Block] = {}
+    following = blocks.start
+    for index in blocks:
+        while index not in ready:
+            while following < min(blocks.stop, index + workers.width):
+                workers.submit(following, lambda number, future: finished.put((number, future)))
+                following += 1
+            try:
+                number, future = finished.get(timeout=_POLL)
+            except queue.Empty:
+                poll()
+                workers.check()
+            else:
+                ready[number] = workers.result(future)
+        yield ready.pop(index)
+
+
+class Threads(AbstractContextManager["Threads"]):
+    """Threads of this process.
+
+    Parameters
+    ----------
+    plan : MapPlan
+    count : int, optional
+        By default one for each core; one for an arm with loads, as its equilibria are found in
+        Python, which has no use for more.
+    """
+
+    def __init__(self, plan: MapPlan, count: int | None = None) -> None:
+        self._plan = plan
+        plan.prepare()
+        self._count = count or (1 if plan.robot.is_loaded else os.cpu_count() or 1)
+        self._pool = ThreadPoolExecutor(self._count, thread_name_prefix="map")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def width(self) -> int:
+        """Number of blocks to have on their way."""
+        return 2 * self._count
+
+    def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
+        """Have a block evaluated."""
+        future = self._pool.submit(self._plan.evaluate, index)
+        future.add_done_callback(lambda finished: done(index, finished))
+
+    def result(self, future: Any) -> Block:
+        """Result of a future that is done."""
+        block: Block = future.result()
+        return block
+
+    def check(self) -> None:
+        """Threads do not get lost."""
+
+
+class Cluster(AbstractContextManager["Cluster"]):
+    """Workers of a Dask cluster; stiffopt must be installed there in the same version.
+
+    Parameters
+    ----------
+    plan : MapPlan
+    address : str
+        Of the scheduler, for example ``tcp://10.0.0.5:8786``.
+
+    Raises
+    ------
+    MissingExtraError
+        If distributed is not installed.
+    InputError
+        If the address is no address.
+    ClusterError
+        If no scheduler answers there, or it has no workers.
+    """
+
+    def __init__(self, plan: MapPlan, address: str) -> None:
+        self._client = _client(address)
+        try:
+            self._payload = pickle.dumps(plan)
+            self._token = plan.token
+            self._run = uuid.uuid4().hex  # no other run's results are taken for ours
+            self._futures: set[Any] = set()
+            self._seen = monotonic()
+            self._threads = self._count_threads(wait=_PATIENCE)
+        except BaseException:
+            self._client.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self._client.cancel(list(self._futures), force=True)
+        except Exception:  # a cluster that is gone has nothing left to cancel
+            pass
+        finally:
+            self._futures.clear()
+            self._client.close(timeout=5)
+
+    @property
+    def width(self) -> int:
+        """Number of blocks to have on their way."""
+        return 3 * self._threads + 2
+
+    def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
+        """Have a block evaluated."""
+        future = self._client.submit(
+            _evaluate_on_worker, self._token, self._payload, index,
+            key=f"stiffopt-map-{self._run}-{index}", pure=False, retries=_RETRIES,
+        )  # fmt: skip
+        self._futures.add(future)
+        future.add_done_callback(lambda finished: done(index, finished))
+
+    def result(self, future: Any) -> Block:
+        """Result of a future that is done.
+
+        Raises
+        ------
+        ClusterError
+            If the cluster gave up on it.
+        """
+        self._futures.discard(future)
+        try:
+            token, block = future.result(timeout=_PATIENCE)
+        except StiffoptError:
+            raise
+        except (Exception, CancelledError) as error:
+            raise ClusterError(
+                f"the cluster failed: {type(error).__name__}: {str(error) or 'no reason given'}"
+            ) from error
+        if token != self._token:
+            raise ClusterError(
+                "the cluster's workers understand the map otherwise than this process does; "
+                "install the same version of stiffopt everywhere"
+            )
+        self._seen = monotonic()
+        result: Block = block
+        return result
+
+    def check(self) -> None:
+        """Raise if nothing will ever come."""
+        if self._client.status != "running" and monotonic() - self._seen > _PATIENCE:
+            raise ClusterError(
+                "the connection to the scheduler is lost"
+            )  # distributed reconnects for a while
+        if monotonic() - self._seen > _PATIENCE:
+            self._threads = self._count_threads(wait=0.0)
+            self._seen = monotonic()
+
+    def _count_threads(self, wait: float) -> int:
+        """Threads of all workers; there must be some, after a while at most."""
+        try:
+            if wait:
+                self._client.wait_for_workers(1, timeout=wait)
+            count = int(sum(self._client.nthreads().values()))
+        except (OSError, TimeoutError, RuntimeError) as error:
+            raise ClusterError(
+                f"the scheduler has no workers: {error}; start some and run again"
+            ) from None
+        if not count:
+            raise ClusterError("the scheduler has lost all its workers; start some and run again")
+        return count
+
+
+def _client(address: str) -> Any:
+    try:
+        missing = find_spec("distributed") is None
+    except ValueError:  # a placeholder in sys.modules
+        missing = True
+    if missing:
+        raise MissingExtraError("distributed", "dask")
+    import distributed
+
+    connect: Any = distributed.Client
+    try:
+        return connect(address, timeout=_PATIENCE, set_as_default=False, name="stiffopt-map")
+    except ValueError as error:
+        raise InputError(
+            f"'{address}' is not the address of a scheduler ({error}); "
+            "expected one such as tcp://10.0.0.5:8786"
+        ) from None
+    except (OSError, TimeoutError) as error:
+        raise ClusterError(
+            f"no scheduler answers at {address}: {str(error).splitlines()[0] if str(error) else ''}"
+        ) from None
+
+
+_plans: OrderedDict[str, MapPlan] = OrderedDict()
+_plans_lock = threading.Lock()
+_PLANS_KEPT = 4
+
+
+def _evaluate_on_worker(token: str, payload: bytes, index: int) -> tuple[str, Block]:
+    """Result of a block, and the worker's name for the plan; runs on a worker.
+
+    The plan with what was compiled for it is kept for the next block.
+    """
+    with _plans_lock:
+        if token not in _plans:
+            plan = pickle.loads(payload)
+            plan.prepare()
+            _plans[token] = plan
+            while len(_plans) > _PLANS_KEPT:
+                _plans.popitem(last=False)
+        plan = _plans[token]
+    return plan.token, plan.evaluate(index)
