@@ -100,7 +100,7 @@ def test_table_says_all_that_matters(write: Write) -> None:
     assert "1.445 N/m  (plain: 1.308, +10 %)\n" in text
     assert "against translation along (1, 0, 0), base axes, free" in text
     assert "N/m per mm of position tolerance" in text
-    assert "starts agree" in text
+    assert "descents agree" in text
 
 
 def test_table_says_what_a_limit_is_worth(write: Write) -> None:

@@ -47,7 +47,7 @@ def _in_root(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
 
 
-@pytest.mark.usefixtures("_in_root")
+@pytest.mark.usefixtures("_in_root", "compiled")
 def test_python_examples_print_what_stands_below_them() -> None:
     pairs = re.findall(r"^```python\n(.*?)^```\n\n```text\n(.*?)^```", README, re.M | re.S)
     assert len(pairs) == len(blocks("python")) == len(blocks("text"))
@@ -59,6 +59,7 @@ def test_python_examples_print_what_stands_below_them() -> None:
         assert_same_text(printed.getvalue(), promised)
 
 
+@pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("block", blocks("console"))
 def test_command_prints_what_stands_below_it(block: str) -> None:
     first, _, promised = block.partition("\n")

@@ -132,7 +132,9 @@ class Arm:
         """Symbolic function of the inputs of the tip's shape and of parameters, dense."""
         tip = self._symbolic(None)
         parameters = type(tip.position).sym("parameters", n_parameters)
-        found = ca.cse([ca.densify(output) for output in outputs(tip, parameters)])
+        found = [ca.densify(output) for output in outputs(tip, parameters)]
+        if not self.is_loaded:  # there it takes seconds and finds little
+            found = ca.cse(found)
         return dense(ca.Function(name, [*tip.inputs, parameters], found))
 
     def evaluator(

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 
 _CHUNK = 4096  # rows that a thread takes at a time
 _BLOCK = 256  # rows that the VM evaluates at a time
+_SMALL_BLOCK = 16  # where there are fewer
 
 
 class BatchFunction(ABC):
@@ -128,7 +129,7 @@ class InterpretedFunction(BatchFunction):
         super().__init__(Signature.of(function))
         self._function = function
         self._single = _Buffer(function, 1)
-        self._block: _Buffer | None = None
+        self._blocks: dict[int, _Buffer] = {}
         self._lock = threading.Lock()
 
     def __call__(self, *arguments: Any) -> list[Array]:
@@ -149,12 +150,13 @@ class InterpretedFunction(BatchFunction):
         threads: int | None,
     ) -> None:
         with self._lock:
-            if self._block is None:
-                self._block = _Buffer(self._function, _BLOCK)
-            block = self._block
+            size = _BLOCK if count >= _BLOCK else _SMALL_BLOCK
+            if size not in self._blocks:
+                self._blocks[size] = _Buffer(self._function, size)
+            block = self._blocks[size]
             shapes = self.signature.inputs
-            for start in range(0, count, _BLOCK):
-                rows = min(_BLOCK, count - start)
+            for start in range(0, count, size):
+                rows = min(size, count - start)
                 for buffer, values, stride, shape in zip(
                     block.targets, inputs, strides, shapes, strict=True
                 ):

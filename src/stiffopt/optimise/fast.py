@@ -117,6 +117,10 @@ class FastSolver:
         arm: LoadedArm | None = None,
     ) -> None:
         self._library, self._table, self._arm = library, table, arm  # what pointers below lead to
+        size = library.cdll.stiffopt_setup_size
+        size.restype = _integer
+        if size() != ctypes.sizeof(_Setup):
+            raise RuntimeError("the compiled solver and this file disagree on their interface")
         self._solve = library.cdll.stiffopt_solve
         self._solve.argtypes = [
             _pointer, _pointer, _integer, _pointer, _integer, _integer, _integer
@@ -208,10 +212,12 @@ class FastSolver:
         return [self._answer(each) for each in numbers]
 
     def _run(self, rows: Vector, answers: Vector, begin: int, end: int) -> None:
-        self._solve(
+        failed = self._solve(
             self._address, rows.ctypes.data, self._width,
             answers.ctypes.data, self._answer_width, begin, end,
         )  # fmt: skip
+        if failed:
+            raise MemoryError("no memory is left for the compiled solver")
 
     def _answer(self, numbers: Vector) -> Answer | None:
         outcome, _, _, _, tried, reached, descents, agreeing, optima, complete, *work = map(

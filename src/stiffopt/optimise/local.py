@@ -224,7 +224,7 @@ def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vecto
     would leave their range are put on its end and the rest is solved again.
     """
     Jt = J.swapaxes(-1, -2)
-    y = np.linalg.solve(J @ Jt + D, wanted[..., np.newaxis])
+    y = _solved(J @ Jt + D, wanted[..., np.newaxis])
     d = (Jt @ y)[..., 0]
     leaving = (d < low) | (d > high)
     held = leaving
@@ -233,7 +233,7 @@ def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vecto
         free = J * ~held[..., np.newaxis, :]
         rest = wanted[..., np.newaxis] - J @ d[..., np.newaxis]
         free_t = free.swapaxes(-1, -2)
-        d = d + (free_t @ np.linalg.solve(free @ free_t + D, rest))[..., 0]
+        d = d + (free_t @ _solved(free @ free_t + D, rest))[..., 0]
         leaving = ((d < low) | (d > high)) & ~held
         held = held | leaving
     return d
@@ -241,9 +241,17 @@ def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vecto
 
 def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
     """The same for one row, which is most of the cost of small steps."""
-    d = np.linalg.solve(J.dot(J.T) + D, wanted).dot(J)
+    d = _solved(J.dot(J.T) + D, wanted).dot(J)
     leaving = (d < low) | (d > high)
     return bounded_steps(J, wanted, D, low, high) if leaving.any() else d
+
+
+def _solved(A: Vector, b: Vector) -> Vector:
+    """Solution of A y = b with A positive definite, but for rounding: then that of least length."""
+    try:
+        return np.linalg.solve(A, b)
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.pinv(A, hermitian=True) @ b)
 
 
 def _misfit(residual: Vector) -> float:

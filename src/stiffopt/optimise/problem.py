@@ -197,16 +197,8 @@ class Problem:
 
     def poses(self, x: Vector) -> tuple[Vector, Vector]:
         """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads."""
-        m = self.spheres[-1].end
-        residuals, jacobians = np.empty((len(x), m)), np.empty((len(x), m, x.shape[1]))
-        evaluate, parameters = self._functions.pose, self.parameters
-        # one by one: rows are few, and a call costs little more than its work
-        for row, p in enumerate(x * BAR):
-            residual, jacobian = evaluate(p, parameters)
-            residuals[row] = residual[:, 0]
-            jacobians[row] = jacobian.T
-        jacobians *= BAR
-        return residuals, jacobians
+        residuals, jacobians = self._functions.pose.many(x * BAR, self.parameters, threads=1)
+        return residuals[:, :, 0], jacobians.swapaxes(1, 2) * BAR
 
     def point(self, x: Vector) -> Point:
         """Everything at pressures x."""
@@ -232,6 +224,17 @@ class Problem:
         """As much as objective and floors take at pressures x."""
         of_pose = self.objective.of_pose and not len(self.floors)
         return self.pose(x) if of_pose else self.point(x)
+
+    def worth(self, x: Vector) -> Point:
+        """Enough of a point at pressures x that reach the pose to rank it by its objective."""
+        worth = self._functions.worth
+        if self.objective.of_pose or worth is None:
+            return self.needed(x)
+        terms, floors = worth(x * BAR, self.parameters)
+        at_target = np.zeros(self.spheres[-1].end)
+        none = np.zeros((0, len(x)))
+        floors = floors[:, 0] if floors.size else _NONE
+        return Point(x, at_target, none, self.spheres, terms[:, 0], none, floors, none)
 
     def judged(self, pressures: Vector) -> tuple[list[float], Vector, Vector, list[float]]:
         """What `Judgement.of` takes, at pressures (n,) in Pa of an arm without loads."""

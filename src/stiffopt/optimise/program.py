@@ -152,6 +152,14 @@ class Program:
         parts = (terms, slopes.T, values[first:], gradients[first:, :].T)
         return [*self.pose(tip, parameters), *(ca.densify(part) for part in parts)]
 
+    def worth(self, tip: Shape, parameters: Any) -> list[Any]:
+        """The objective's terms (t,) and the floors' values (f,) alone."""
+        values = self._values(tip, parameters)
+        first = len(self.measures) - self.n_floors
+        none = type(tip.pressures)(first, tip.pressures.numel())
+        terms, _ = self._terms(values[:first], none, tip, parameters[-1])
+        return [ca.densify(terms), ca.densify(values[first:])]
+
     def judge(self, tip: Shape, parameters: Any) -> list[Any]:
         """Residuals, pose (4, 4) and compliance (6, 6), transposed, and values of the measures."""
         return [

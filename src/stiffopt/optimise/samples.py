@@ -78,15 +78,20 @@ class SampleTable:
         columns = self.poses[:, :3, [3, 0, 1, 2]].swapaxes(1, 2)
         return np.ascontiguousarray(columns.reshape(-1, 12))
 
-    def nearest_first(self, target: Target, length: float) -> NDArray[np.intp]:
-        """Indices of the samples, those with the smallest pose error first (see `nearness`)."""
+    def nearest_first(
+        self, target: Target, length: float, most: int | None = None
+    ) -> NDArray[np.intp]:
+        """Indices of the samples with the smallest pose errors (see `nearness`), in order."""
         near = np.array(nearness(target, length))
         apart = near[:3] * (self.flat_poses[:, :3] - near[3:6])
         errors = np.sqrt(np.einsum("ij,ij->i", apart, apart))
         if near[6]:
             square = np.maximum(near[7] - self.flat_poses[:, 3:] @ near[8:], 0.0)
             errors += near[6] * np.sqrt(square)
-        return np.argsort(errors, kind="stable")
+        if most is None or most >= len(errors):
+            return np.argsort(errors, kind="stable")
+        nearest = np.sort(np.argpartition(errors, most)[:most])
+        return nearest[np.argsort(errors[nearest], kind="stable")]
 
 
 def nearness(target: Target, length: float) -> tuple[float, ...]:

@@ -39,9 +39,10 @@ def starts(problem: Problem, table: SampleTable) -> Iterator[Vector]:
 
     Under load, where few are tried, near ones and any are given in turn, unlike each other.
     """
-    order = table.nearest_first(problem.task.target, problem.robot.length)
+    target, length = problem.task.target, problem.robot.length
     if not problem.robot.is_loaded:
-        return iter(table.x[order[: _effort(problem).screened]])
+        return iter(table.x[table.nearest_first(target, length, _effort(problem).screened)])
+    order = table.nearest_first(target, length)
     mixed = [i for pair in zip(order, range(len(order)), strict=True) for i in pair]
     x = table.x[list(dict.fromkeys(mixed))]
     return islice((x[i] for i in _unlike_first(problem, x)), MOST_STARTS_LOADED)
@@ -149,17 +150,16 @@ def _rank(result: LocalResult) -> tuple[float, float]:
 def _effort(problem: Problem) -> Effort:
     """Less than that of compiled code for an arm without loads, since all takes longer here.
 
-    A quarter of the samples and two agreeing descents less halve the time with up to six pressures
-    and overlook the best optimum of about one task in a hundred, where its basin is small; with
-    more pressures there are more optima, so that more is screened.
+    Half of the descents that must agree: what is screened decides more about what is overlooked.
+    With up to six pressures, where there are few optima, half of the samples too.
     """
     full = effort(problem.spheres[-1].end)
-    screened, agreeing, most = full
     if problem.robot.is_loaded:
         return full
-    if len(problem.lower) <= 6:
-        return Effort(screened // 4, agreeing - 2, most)
-    return Effort(screened // 2, agreeing - 1, most)
+    few = len(problem.lower) <= 6
+    return full._replace(
+        screened=full.screened // 2 if few else full.screened, agreeing=full.agreeing // 2
+    )
 
 
 # -- where descents start -------------------------------------------------------------------
@@ -179,28 +179,35 @@ def _places(problem: Problem, candidates: Iterable[Vector]) -> Iterator[tuple[in
     if not len(x):
         return
     x, excess = reach_all(problem, x)
-    points = _evaluated(problem, x[excess <= 1])
-    if not points:
+    come = x[excess <= 1]
+    if not len(come):
         points = [problem.pose(row) for row in x[np.argsort(excess, kind="stable")]]
         yield from ((len(x), point) for point in points)
         return
-    points.sort(key=lambda point: _promise(problem, point))
-    for i in _unlike_first(problem, np.array([point.x for point in points])):
-        yield len(x), points[i]
+    place = _first_at_same_place(come)
+    promise = {i: _promise(problem, come[i]) for i in set(place)}
+    ranked = sorted(range(len(come)), key=lambda i: promise[place[i]])
+    points_at: dict[int, Point] = {}
+    for i in _unlike_first(problem, come[ranked]):
+        at = place[ranked[i]]
+        if at not in points_at:
+            points_at[at] = problem.needed(come[at])
+        point = points_at[at]
+        yield len(x), point if point.is_finite and point.reached else None
 
 
-def _evaluated(problem: Problem, x: Vector) -> list[Point]:
-    """Points at pressures (N, n); those that came to the same place share one."""
-    same_place = np.abs(x[:, np.newaxis] - x).max(axis=2, initial=0.0) < NEXT_TO
-    first = same_place.argmax(axis=1).tolist() if len(x) else []
-    places = {i: problem.needed(x[i]) for i in dict.fromkeys(first)}
-    found = [places[i] for i in first]
-    return [point for point in found if point.is_finite and point.reached]
+def _first_at_same_place(x: Vector) -> list[int]:
+    """For each of some pressures (N, n) the first that are the same but for little."""
+    same_place = np.abs(x[:, np.newaxis] - x).max(axis=2) < NEXT_TO
+    first: list[int] = same_place.argmax(axis=1).tolist()
+    return first
 
 
-def _promise(problem: Problem, point: Point) -> float:
-    """Objective at a point with a penalty on floors that are missed; the less the better."""
-    return problem.objective.value(point) + _PRICE_OF_FLOORS * violation(problem, point)
+def _promise(problem: Problem, x: Vector) -> float:
+    """Objective at pressures (n,) with a penalty on floors that are missed; less is better."""
+    point = problem.worth(x)
+    value = problem.objective.value(point) + _PRICE_OF_FLOORS * violation(problem, point)
+    return value if np.isfinite(value) else np.inf
 
 
 def _unlike_first(problem: Problem, x: Vector) -> Iterator[int]:

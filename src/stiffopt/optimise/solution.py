@@ -40,17 +40,16 @@ class Confidence:
     Attributes
     ----------
     starts : int
-        Local optimisations that were run from different pressures.
+        Configurations that were brought towards the pose.
     reached : int
-        Those that ended at the pose and converged.
+        Descents from such as reached it that converged.
     agreeing : int
         Those that ended within 0.1 % of the best.
     optima : int
         Distinct local optima among them.
     complete : bool
-        Whether the stopping rule was met: by the Bayesian estimate of Boender and Rinnooy Kan
-        fewer than a quarter of an optimum is expected to be unseen.  False: the search ended at its
-        largest number of starts.
+        Whether the search ended because so many descents in a row found nothing new (see
+        `stiffopt.optimise.effort`).  False: it ran out of starts.
     """
 
     starts: int
@@ -64,10 +63,10 @@ class Confidence:
             return f"none of {self.starts} starts came to the pose"
         if self.starts == 1:
             return "local answer from the given guess"
-        sure = "search complete" if self.complete else "search stopped at its limit of starts"
+        sure = "search complete" if self.complete else "search ran out of starts"
         optima = "optimum" if self.optima == 1 else "optima"
         return (
-            f"{self.agreeing} of {self.reached} starts agree on the best of {self.optima} local "
+            f"{self.agreeing} of {self.reached} descents agree on the best of {self.optima} local "
             f"{optima} ({sure})"
         )
 

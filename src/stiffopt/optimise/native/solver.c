@@ -54,7 +54,10 @@ static void solve_row(Program *P, const double *task, double *answer) {
         answer[0] = NEEDS_GENERAL_METHOD;
 }
 
-/* Solve tasks begin to end - 1 of rows of the given widths. */
+/* For the caller to check that it has the same idea of a Setup. */
+int64_t stiffopt_setup_size(void) { return sizeof(Setup); }
+
+/* Solve tasks begin to end - 1 of rows of the given widths; not 0 if memory is short. */
 int stiffopt_solve(const Setup *setup, const double *tasks, int64_t task_width, double *answers,
                    int64_t answer_width, int64_t begin, int64_t end) {
     const double *arg[WORK_ARG];
