@@ -9,7 +9,6 @@ import pytest
 import stiffopt as so
 from stiffopt.model import native_build
 from stiffopt.optimise import prepared as preparation
-from stiffopt.optimise.fast import FastSolver
 
 KINDS = {
     "position": {},
@@ -256,15 +255,14 @@ def test_without_a_compiler_there_is_one_notice(task, monkeypatch, tmp_path):
     monkeypatch.setenv("STIFFOPT_COMPILER", str(tmp_path / "missing"))
     monkeypatch.setattr("stiffopt.model.compiled._notified", False)
     robot = so.load_robot("stiff-flop-2")
+    blind = task.model_copy(update={"stiffness": None})
     with pytest.warns(so.SlowWarning, match="was not found") as notices:
-        assert so.solve_pressure(robot, task).found
-        blind = task.model_copy(update={"stiffness": None})
-        assert so.solve_pressure(robot, blind).found
+        solutions = so.solve_batch(robot, [task, blind])
+    assert all(solution.found for solution in solutions)
     assert len(notices) == 1
 
 
-def test_setup_has_the_size_that_the_code_expects(robot, task):
-    program = so.PressureSolver(robot, task)._prepared.program(task.target)
-    fast = preparation.prepared(robot, task, 0).fast(program)
-    assert fast is not None
-    assert isinstance(fast[0], FastSolver)
+def test_an_interface_that_changed_is_noticed(robot, task, monkeypatch):
+    monkeypatch.setattr("ctypes.sizeof", lambda _: 1)
+    with pytest.raises(RuntimeError, match="disagree"):
+        so.solve_pressure(robot, task)

@@ -26,6 +26,7 @@ class Closed(Exception):  # noqa: N818 - no error: the reader has had enough
 
 
 def console_on(*, stderr: bool = False) -> Console:
+    """Console on stdout or stderr that takes text as it is."""
     from rich.console import Console
 
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)

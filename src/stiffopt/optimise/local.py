@@ -249,7 +249,7 @@ def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector
 def _solved(A: Vector, b: Vector) -> Vector:
     """Solution of A y = b with A positive definite, but for rounding: then that of least length."""
     try:
-        return np.linalg.solve(A, b)
+        return np.asarray(np.linalg.solve(A, b), dtype=float)
     except np.linalg.LinAlgError:
         return np.asarray(np.linalg.pinv(A, hermitian=True) @ b)
 

@@ -179,10 +179,11 @@ class PressureSolution:
         """A solution whose `Explanation` is made when one of its fields is first asked for.
 
         Explaining takes longer than solving; whoever asks for pressures alone need not wait.
-        Arrays among the fields must be read-only.
         """
         solution = cls.__new__(cls)
         solution.__dict__.update(fields, _explain=explain)
+        for name in ("pressures", "tip_pose", "compliance"):
+            fields[name].flags.writeable = False
         return solution
 
     def __getattr__(self, name: str) -> Any:  # of what is not in __dict__
