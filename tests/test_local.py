@@ -10,9 +10,10 @@ import pytest
 
 import stiffopt as so
 from stiffopt.optimise import local
-from stiffopt.optimise.local import descend, reach, reach_all
+from stiffopt.optimise.local import descend
 from stiffopt.optimise.prepared import Prepared
 from stiffopt.optimise.problem import Problem
+from stiffopt.optimise.reach import bounded_steps, reach, reach_all
 from stiffopt.optimise.search import search, starts
 from stiffopt.optimise.solver import PressureSolver
 
@@ -112,10 +113,10 @@ def test_bounded_steps_fit_as_well_as_bounds_allow(shape):
     rng = np.random.default_rng(0)
     J, wanted = rng.normal(size=(*shape, 3, 6)), rng.normal(size=(*shape, 3))
     D, wide = 1e-9 * np.eye(3), np.full((*shape, 6), 1e3)
-    d = local.bounded_steps(J, wanted, D, -wide, wide)
+    d = bounded_steps(J, wanted, D, -wide, wide)
     assert (J @ d[..., np.newaxis])[..., 0] == pytest.approx(wanted, abs=1e-6)
     low, high = np.full((*shape, 6), -0.05), np.full((*shape, 6), 0.3)
-    d = local.bounded_steps(J, wanted, D, low, high)
+    d = bounded_steps(J, wanted, D, low, high)
     assert (d >= low - 1e-12).all()
     assert (d <= high + 1e-12).all()
 

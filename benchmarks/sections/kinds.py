@@ -59,9 +59,8 @@ def _table(out: Section, kinds: list[str], segments: int, sizes: Settings) -> No
         ready[kind, item] = lambda: again(target)
 
     for kind in kinds:
-        if kind not in tasks.LOADED_KINDS:  # there it is a small part of one solution
-            for item in range(count):  # tasks of one kind may differ in structure
-                cold_call(kind)(item)  # what is built once
+        for item in range(count):  # tasks of one kind may differ in structure
+            cold_call(kind)(item)  # what is built once
     cold = interleaved(
         {kind: cold_call(kind) for kind in kinds}, count, sizes.repetitions, sizes.most_seconds
     )

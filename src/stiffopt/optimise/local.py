@@ -1,10 +1,9 @@
 """Local optimisation that stays on the pose: a feasible-path SQP method.
 
-`reach` brings pressures to the pose (Levenberg-Marquardt steps that mind the limits), `reach_all`
-many at once; `descend` goes down the objective from there.  Each step solves a convex quadratic
-program within a trust region and is then pulled back into the pose's balls, so that every iterate
-reaches the target and progress is judged by the objective alone: no merit function between pose
-and stiffness is needed.
+From a point on the pose (`stiffopt.optimise.reach`) `descend` goes down the objective.  Each
+step solves a convex quadratic program within a trust region and is then pulled back into the
+pose's balls, so that every iterate reaches the target and progress is judged by the objective
+alone: no merit function between pose and stiffness is needed.
 
 A ball |r| <= rho enters the quadratic program as a box around it whose first axis points where
 the multiplier pulls, together with the curvature mu/rho J'J of the sphere; both are exact to
@@ -14,16 +13,17 @@ The folder ``native`` holds the same method in C.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import EquilibriumError
+from stiffopt.optimise.prices import Multipliers, prices_at
 from stiffopt.optimise.problem import FLOOR_MARGIN, Objective, Point, Problem
+from stiffopt.optimise.quadratic import FAR, solve_qp
+from stiffopt.optimise.reach import attempt, bounded_step, within
 
 Vector = NDArray[np.float64]
 
@@ -33,32 +33,7 @@ LAST_RADIUS = 1e-6
 INSIDE = 1 - 1e-7  # share of a ball's radius that is used, so that rounding stays within
 TOUCHING = 1e-5  # bar; a pressure that near to a limit is meant to be at it
 NEXT_TO = 0.05  # bar; a descent that near to an optimum of the same value is on its way there
-_BINDING = 1e-4  # how nearly, relatively, a constraint must hold to count as binding
-_BEYOND = 1e-3  # bar; where the price of a limit is taken, outside of it
 _CURVED = 2.0  # second-order error of a correction, for the squared first order over a scale
-_FAR = 1e6  # stands for no bound in the quadratic program
-
-
-@dataclass(frozen=True)
-class Multipliers:
-    """Prices at a solution: what the objective would gain per unit of each constraint.
-
-    Attributes
-    ----------
-    bounds : ndarray (n,)
-        Per bar; positive where the upper bound holds back, negative where the lower does.
-    balls : dict of str to ndarray
-        Vector per ball, per m or rad; its length is the price of the radius.
-    terms : ndarray (m,)
-        Weights of the objective's terms, which sum to one.
-    floors : ndarray
-        Per unit of each floor's logarithm.
-    """
-
-    bounds: Vector
-    balls: dict[str, Vector]
-    terms: Vector
-    floors: Vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +78,7 @@ class LocalResult:
         if not self.is_optimum:
             return None
         self.problem.restart()
-        return _prices(self.problem, self.point)
+        return prices_at(self.problem, self.point)
 
     @property
     def holds_floors(self) -> bool:
@@ -116,168 +91,6 @@ def violation(problem: Problem, point: Point) -> float:
     if not len(problem.floors):
         return 0.0
     return float(np.maximum(problem.floors - point.floors, 0.0).sum())
-
-
-def solve_qp(
-    H: Vector, g: Vector, A: Vector, low: Vector, high: Vector
-) -> tuple[Vector, Vector] | None:
-    """Minimise ``z'Hz/2 + g'z`` with ``low <= (z, Az) <= high``: solution and multipliers.
-
-    The arrays are contiguous.  None where the solver's answer is not finite or not marked as
-    optimal.
-    """
-    sense = np.zeros(len(low), dtype=np.int32)
-    z, _, flag, info = daqp.solve(H, g, A, high, low, sense, primal_tol=1e-9)
-    z, multipliers = np.asarray(z), np.asarray(info["lam"])
-    if flag < 1 or not math.isfinite(z.dot(z) + multipliers.dot(multipliers)):
-        return None
-    return z, multipliers
-
-
-# -- onto the pose --------------------------------------------------------------------------
-
-
-def reach(problem: Problem, x: Vector, most_iterations: int = 40) -> Point | None:
-    """Bring pressures to the pose; the point nearest to it that was found otherwise.
-
-    None if the arm has no equilibrium at the start.
-    """
-    point = _attempt(problem.pose, x)
-    if point is None:
-        return None
-    rows, scale = problem.bounding.rows, problem.bounding.scale
-    damping = 1e-4
-    before = _misfit(point.residual[rows] / scale)
-    for _ in range(most_iterations):
-        if point.reached:
-            return point
-        residual, jacobian = point.residual[rows], point.jacobian[rows]
-        d = bounded_step(
-            jacobian,
-            -residual,
-            damping * problem.bounding.far_damping,
-            np.maximum(problem.lower - point.x, -1.0),
-            np.minimum(problem.upper - point.x, 1.0),
-        )
-        promised = before - _misfit((residual + jacobian @ d) / scale)
-        if not promised >= 1e-9 * before:
-            return point
-        trial = _attempt(problem.pose, _within(problem.lower, point.x + d, problem.upper))
-        after = math.inf if trial is None else _misfit(trial.residual[rows] / scale)
-        gained = before - after
-        if trial is not None and gained > 0.1 * promised:
-            point, before = trial, after
-            damping = max(damping * (0.1 if gained > 0.7 * promised else 1.0), 1e-10)
-        else:
-            damping *= 10
-            if damping > 1e6:
-                return point
-    return point
-
-
-def reach_all(problem: Problem, x: Vector, most_iterations: int = 20) -> tuple[Vector, Vector]:
-    """Bring pressures (N, n) of an arm without loads to the pose, all at once.
-
-    Returns where they came to, and by how much (N,) the worst residual there exceeds its radius,
-    as a ratio: at most one where the pose was reached.
-    """
-    bounding = problem.bounding
-    x = _within(problem.lower, x, problem.upper)
-    if not bounding.spheres:
-        return x, np.zeros(len(x))
-    rows, scale = bounding.rows, bounding.scale
-    residual, jacobian = (part[:, rows] for part in problem.poses(x))
-    before = _misfits(residual / scale)
-    ratio = bounding.errors(residual)
-    damping = np.full(len(x), 1e-4)
-    going = np.flatnonzero((ratio > 1) & np.isfinite(before))
-    for _ in range(most_iterations):
-        if not len(going):
-            break
-        here, r, J, misfit = x[going], residual[going], jacobian[going], before[going]
-        low = np.maximum(problem.lower - here, -1.0)
-        high = np.minimum(problem.upper - here, 1.0)
-        D = damping[going, np.newaxis, np.newaxis] * bounding.far_damping
-        d = bounded_steps(J, -r, D, low, high)
-        left = _misfits((r + np.matmul(J, d[..., np.newaxis])[..., 0]) / scale)
-        promised = misfit - left
-        trial = _within(problem.lower, here + d, problem.upper)
-        new_residual, new_jacobian = (part[:, rows] for part in problem.poses(trial))
-        after = _misfits(new_residual / scale)
-        gained = misfit - after
-        better = gained > 0.1 * promised
-        taken = going[better]
-        x[taken], before[taken] = trial[better], after[better]
-        residual[taken], jacobian[taken] = new_residual[better], new_jacobian[better]
-        ratio[taken] = bounding.errors(new_residual[better])
-        change = np.where(better, np.where(gained > 0.7 * promised, 0.1, 1.0), 10.0)
-        damping[going] = np.maximum(damping[going] * change, 1e-10)
-        hopeful = (promised >= 1e-9 * misfit) & (damping[going] <= 1e6)
-        going = going[hopeful & (ratio[going] > 1)]
-    return x, ratio
-
-
-def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
-    """Steps d (..., n) within [low, high] that make ``|W (J d - wanted)|^2 + |d|^2`` small.
-
-    J (..., m, n), wanted (..., m), and D (..., m, m), the inverse of ``W^2``.  Components that
-    would leave their range are put on its end and the rest is solved again.
-    """
-    Jt = J.swapaxes(-1, -2)
-    y = _solved(J @ Jt + D, wanted[..., np.newaxis])
-    d = (Jt @ y)[..., 0]
-    leaving = (d < low) | (d > high)
-    held = leaving
-    while leaving.any():
-        d = np.where(held, _within(low, d, high), 0.0)
-        free = J * ~held[..., np.newaxis, :]
-        rest = wanted[..., np.newaxis] - J @ d[..., np.newaxis]
-        free_t = free.swapaxes(-1, -2)
-        d = d + (free_t @ _solved(free @ free_t + D, rest))[..., 0]
-        leaving = ((d < low) | (d > high)) & ~held
-        held = held | leaving
-    return d
-
-
-def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
-    """The same for one row, which is most of the cost of small steps."""
-    d = _solved(J.dot(J.T) + D, wanted).dot(J)
-    leaving = (d < low) | (d > high)
-    return bounded_steps(J, wanted, D, low, high) if leaving.any() else d
-
-
-def _solved(A: Vector, b: Vector) -> Vector:
-    """Solution of A y = b with A positive definite, but for rounding: then that of least length."""
-    try:
-        return np.asarray(np.linalg.solve(A, b), dtype=float)
-    except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.pinv(A, hermitian=True) @ b)
-
-
-def _misfit(residual: Vector) -> float:
-    return float(residual.dot(residual))
-
-
-def _misfits(residuals: Vector) -> Vector:
-    """Squared lengths (N,) of residuals (N, m), infinite where anything is not finite."""
-    squares = np.einsum("ij,ij->i", residuals, residuals)
-    return np.where(np.isfinite(squares), squares, np.inf)
-
-
-def _within(low: Vector, x: Vector, high: Vector) -> Vector:
-    return np.minimum(np.maximum(x, low), high)
-
-
-def _attempt(evaluate: Callable[[Vector], Point], x: Vector) -> Point | None:
-    """Evaluate; None where the arm has no stable equilibrium or anything is not finite."""
-    try:
-        point = evaluate(x)
-    except EquilibriumError:
-        return None
-    return point if point.is_finite else None
-
-
-# -- down the objective ---------------------------------------------------------------------
 
 
 class _Place:
@@ -318,7 +131,7 @@ def descend(
     """
     point: Point | None = start
     if not len(start.terms):
-        point = _attempt(problem.needed, start.x)
+        point = attempt(problem.needed, start.x)
     if point is None:
         return LocalResult(problem, start, math.inf, math.inf, converged=False)
     here = _Place(problem, point)
@@ -404,18 +217,18 @@ def _pulled_back(
 ) -> Point | None:
     """Point near x + d within all balls, evaluated as needed; None if there is none near."""
     bounding = problem.bounding
-    x = _within(lower, point.x + d, upper)
+    x = within(lower, point.x + d, upper)
     if not bounding.spheres:
-        return _attempt(problem.needed, x)
+        return attempt(problem.needed, x)
     allowed = 2 * float(np.abs(d).max()) + 1e-4
-    trial, complete = _attempt(problem.pose, x), False
+    trial, complete = attempt(problem.pose, x), False
     for _ in range(8):
         if trial is None:
             return None
         if trial.reached:
             if complete:
                 return trial
-            trial = _attempt(problem.needed, x)
+            trial = attempt(problem.needed, x)
             return trial if trial is not None and trial.reached else None
         wanted = trial.residual[bounding.rows].copy()
         for index, (_, first, end, radius) in zip(bounding.indices, bounding.spheres, strict=True):
@@ -436,9 +249,9 @@ def _pulled_back(
         )
         if not np.abs(back).max() <= allowed:
             return None
-        x = _within(lower, x + back, upper)
+        x = within(lower, x + back, upper)
         # one correction is enough most of the time, so the rest is evaluated at once
-        trial, complete = _attempt(problem.needed, x), True
+        trial, complete = attempt(problem.needed, x), True
     return None
 
 
@@ -481,8 +294,8 @@ class _Subproblem:
         self._H, self._g = np.zeros((size, size)), np.zeros(size)
         self._A = np.zeros((above + rows, size))
         self._low, self._high = (
-            np.full(size + above + rows, -_FAR),
-            np.full(size + above + rows, _FAR),
+            np.full(size + above + rows, -FAR),
+            np.full(size + above + rows, FAR),
         )
         self._ball_rows = slice(above, above + rows)
         self._H[range(n, size), range(n, size)] = 1e-6
@@ -584,62 +397,3 @@ def _axes_along(vector: list[float]) -> list[list[float]]:
     b = [value / length for value in b]
     c = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     return [a, b, c]
-
-
-# -- prices ---------------------------------------------------------------------------------
-
-
-def _prices(problem: Problem, point: Point) -> Multipliers | None:
-    """Multipliers at a solution: those that leave the least of the Lagrangian's gradient.
-
-    Each constraint that binds pulls with a weight that is not negative; the weights of the
-    objective's largest terms sum to one.
-    """
-    values, gradients = problem.objective.terms(point)
-    n = len(point.x)
-    columns: list[Vector] = []
-    top = [i for i, value in enumerate(values) if value > values.max() - _BINDING]
-    columns += [gradients[i] for i in top]
-    floors = [i for i, bound in enumerate(problem.floors) if point.floors[i] < bound + _BINDING]
-    columns += [-point.floor_gradients[i] for i in floors]
-    balls = [ball for ball in point.constraints if ball.error > (1 - _BINDING) * ball.radius]
-    columns += [ball.residual / ball.error @ ball.jacobian for ball in balls]
-    sides = [(i, -1.0) for i in range(n) if point.x[i] <= problem.lower[i]]
-    sides += [(i, 1.0) for i in range(n) if point.x[i] >= problem.upper[i]]
-    columns += [side * np.eye(n)[i] for i, side in sides]
-    A = np.array(columns).T
-    total = (np.arange(len(columns)) < len(top)).astype(float)[np.newaxis]
-    low = np.concatenate([np.zeros(len(columns)), [1.0]])
-    high = np.concatenate([np.full(len(columns), _FAR), [1.0]])
-    H = A.T @ A
-    H += 1e-12 * np.trace(H) * np.eye(len(H)) + 1e-300 * np.eye(len(H))
-    answer = solve_qp(H, np.zeros(len(columns)), total, low, high)
-    if answer is None:
-        return None
-    weights = iter(np.maximum(answer[0], 0.0))
-    terms, held, bounds = np.zeros(len(values)), np.zeros(len(problem.floors)), np.zeros(n)
-    for i in top:
-        terms[i] = next(weights)
-    for i in floors:
-        held[i] = next(weights)
-    pulls = {ball.name: np.zeros(len(ball.residual)) for ball in point.constraints}
-    for ball in balls:
-        pulls[ball.name] = next(weights) * ball.residual / ball.error
-    prices = Multipliers(bounds, pulls, terms, held)
-    for (i, side), weight in zip(sides, weights, strict=True):
-        # a little beyond the limit: the norm law has a kink where a segment is unpressurised
-        beyond = point.x + side * _BEYOND * np.eye(n)[i]
-        moved = _attempt(problem.needed, beyond)
-        slope = _slope(problem, moved, prices)[i] if moved is not None else -side * weight
-        bounds[i] += side * max(0.0, -side * float(slope))
-    return prices
-
-
-def _slope(problem: Problem, point: Point, multipliers: Multipliers) -> Vector:
-    """Gradient of the Lagrangian with the multipliers held, bounds left out."""
-    slope = multipliers.terms @ problem.objective.terms(point)[1]
-    if len(problem.floors):
-        slope = slope - multipliers.floors @ point.floor_gradients
-    for ball in point.constraints:
-        slope = slope + multipliers.balls[ball.name] @ ball.jacobian
-    return slope

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.optimise.effort import Effort, effort
-from stiffopt.optimise.local import NEXT_TO, LocalResult, descend, reach, reach_all, violation
+from stiffopt.optimise.local import NEXT_TO, LocalResult, descend, violation
 from stiffopt.optimise.problem import Point, Problem
+from stiffopt.optimise.reach import reach, reach_all
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.solution import Confidence
 

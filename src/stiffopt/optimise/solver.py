@@ -13,10 +13,11 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer, checked_vector
 from stiffopt.optimise import diagnosis
 from stiffopt.optimise.fast import Answer, FastSolver
-from stiffopt.optimise.local import LocalResult, descend, reach
+from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prepared import prepared
 from stiffopt.optimise.problem import Problem
 from stiffopt.optimise.program import BAR, Program
+from stiffopt.optimise.reach import reach
 from stiffopt.optimise.search import Search, search, starts
 from stiffopt.optimise.solution import (
     Confidence,

@@ -1,0 +1,28 @@
+"""Convex quadratic programs of a few variables, by daqp."""
+
+import math
+
+import daqp
+import numpy as np
+from numpy.typing import NDArray
+
+Vector = NDArray[np.float64]
+
+FAR = 1e6
+"""Stands for no bound."""
+
+
+def solve_qp(
+    H: Vector, g: Vector, A: Vector, low: Vector, high: Vector
+) -> tuple[Vector, Vector] | None:
+    """Minimise ``z'Hz/2 + g'z`` with ``low <= (z, Az) <= high``: solution and multipliers.
+
+    The arrays are contiguous.  None where the solver's answer is not finite or not marked as
+    optimal.
+    """
+    sense = np.zeros(len(low), dtype=np.int32)
+    z, _, flag, info = daqp.solve(H, g, A, high, low, sense, primal_tol=1e-9)
+    z, multipliers = np.asarray(z), np.asarray(info["lam"])
+    if flag < 1 or not math.isfinite(z.dot(z) + multipliers.dot(multipliers)):
+        return None
+    return z, multipliers
