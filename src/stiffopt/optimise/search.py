@@ -151,15 +151,15 @@ def _rank(result: LocalResult) -> tuple[float, float]:
 def _effort(problem: Problem) -> Effort:
     """Less than that of compiled code for an arm without loads, since all takes longer here.
 
-    Half of the descents that must agree: what is screened decides more about what is overlooked.
-    With up to six pressures, where there are few optima, half of the samples too.
+    One descent less that must agree and, with up to six pressures, where there are few optima, half
+    of the samples.
     """
     full = effort(problem.spheres[-1].end)
     if problem.robot.is_loaded:
         return full
     few = len(problem.lower) <= 6
     return full._replace(
-        screened=full.screened // 2 if few else full.screened, agreeing=full.agreeing // 2
+        screened=full.screened // 2 if few else full.screened, agreeing=full.agreeing - 1
     )
 
 
