@@ -131,6 +131,23 @@ def test_explains_itself_when_asked(robot, task, monkeypatch):
         _ = fast.pressure
 
 
+def test_several_threads_may_ask_at_once(robot, task):
+    for _ in range(5):
+        solution = so.solve_pressure(robot, task)
+        with ThreadPoolExecutor(8) as pool:
+            freedoms = list(pool.map(lambda _, s=solution: s.freedom, range(16)))
+        assert freedoms == [3] * 16
+
+
+def test_an_explanation_that_failed_can_be_asked_for_again(robot, task, monkeypatch):
+    solution = so.solve_pressure(robot, task)
+    with monkeypatch.context() as patch:
+        patch.setattr("stiffopt.optimise.diagnosis.freedom", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            _ = solution.freedom
+    assert solution.freedom == 3
+
+
 def test_can_be_pickled_before_it_was_asked(robot, task):
     solution = so.solve_pressure(robot, task)
     again = pickle.loads(pickle.dumps(solution))
@@ -178,6 +195,25 @@ def test_preparations_are_forgotten(robot):
     so.solve_batch(robot, tasks)
     assert len(robot.kept("prepared", dict)) <= preparation._MOST_KEPT
     np.testing.assert_array_equal(so.solve_pressure(robot, tasks[0]).pressures, first)
+
+
+def test_varying_limits_do_not_fill_the_memory(robot, task):
+    first = so.solve_pressure(robot, task).pressures
+    for step in range(preparation._MOST_KEPT + 3):
+        limits = so.Task.model_fields["pressure"].annotation(max=1.4e5 + step)
+        limited = task.model_copy(update={"pressure": limits})
+        assert so.solve_pressure(robot, limited, guess=first).found
+    for group in ("prepared", "samples", "fast solvers"):
+        assert len(robot.kept(group, dict)) <= preparation._MOST_KEPT
+
+
+def test_many_stiffnesses_are_left_to_the_general_method(robot, task):
+    rng = np.random.default_rng(6)
+    measures = [so.StiffnessMeasure(direction=tuple(d)) for d in rng.normal(size=(9, 3))]
+    many = task.model_copy(update={"stiffness": so.StiffnessGoal(maximise=measures)})
+    solution = so.solve_pressure(robot, many)
+    assert solution.found
+    assert len(solution.stiffnesses) == 9
 
 
 def test_limits_of_the_task(robot, task, no_general_method):
@@ -240,6 +276,13 @@ def test_batch_with_guesses(robot, task):
     with pytest.raises(so.InputError, match="task must be a Task"):
         so.solve_batch(robot, [task, "problem.yaml"])
     assert so.solve_batch(robot, []) == []
+    assert so.solve_batch(robot, (own for own in [task]), (None for _ in range(1)))[0].found
+    for wrong in ({"threads": 0}, {"threads": 1.5}, {"threads": True}, {"guesses": 5}):
+        with pytest.raises(so.InputError, match=next(iter(wrong))):
+            so.solve_batch(robot, [task], **wrong)
+    for wrong in (None, task):
+        with pytest.raises(so.InputError, match="several tasks"):
+            so.solve_batch(robot, wrong)
 
 
 def test_threads_may_share_a_robot(robot, task):

@@ -100,8 +100,8 @@ def library(
         None where code cannot be had; the first time in a process a `SlowWarning` says why.
     """
     with _lock:
-        cache = build.cache_directory()
         try:
+            cache = build.cache_directory()
             compiler = build.find_compiler(cache)
             key = _key(content, compiler, sources, daqp)
         except build.BuildError as error:

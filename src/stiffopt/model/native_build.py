@@ -45,7 +45,22 @@ class Compiler:
 
 
 def cache_directory() -> Path:
-    """Directory of compiled code; it need not exist."""
+    """Directory of compiled code; it need not exist.
+
+    Raises
+    ------
+    BuildError
+        If it would be in a home directory, and there is none.
+    """
+    try:
+        return _cache_directory()
+    except RuntimeError as error:
+        raise BuildError(
+            f"there is no place to keep it ({error}); name one in STIFFOPT_CACHE_DIR"
+        ) from None
+
+
+def _cache_directory() -> Path:
     if given := os.environ.get("STIFFOPT_CACHE_DIR"):
         return Path(given).expanduser().absolute()
     if sys.platform == "darwin":

@@ -12,6 +12,7 @@ from stiffopt.optimise.program import Program
 
 _SOURCES = (str(Path(__file__).with_name("native") / "solver.c"),)
 _COMPILED = ("pose", "point", "judge")
+_MOST_MEASURES = 6  # of more, code takes too long to compile: the general method serves them
 
 
 class Functions:
@@ -29,7 +30,7 @@ class Functions:
         self._robot = robot
         self._program = program
         self.library: Library | None = None
-        if not robot.is_loaded:
+        if not robot.is_loaded and len(program.measures) <= _MOST_MEASURES:
             content = (robot.description.model_dump_json(), program.structure)
             self.library = library(content, self._symbolic, _SOURCES, daqp=True)
 

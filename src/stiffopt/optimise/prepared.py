@@ -1,6 +1,8 @@
 """What tasks have in common that differ in their target only: prepared once, kept by the robot."""
 
+from collections.abc import Callable, Hashable
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,9 @@ from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 
-_MOST_KEPT = 64  # preparations; each holds little
+_MOST_KEPT = 64  # of each kind of thing that varies from task to task
+
+Made = TypeVar("Made")
 
 
 class Prepared:
@@ -65,10 +69,10 @@ class Prepared:
                 self._rows[structure] = self._loaded(library, program)
                 return self._rows[structure]
             limits = (self.lower.tobytes(), self.upper.tobytes(), self._seed)
-            solver = self.robot.kept(
-                ("fast", structure, limits),
+            solver = _recent(
+                self.robot, "fast solvers", (structure, limits),
                 lambda: FastSolver(library, self.robot, program, self.samples),
-            )
+            )  # fmt: skip
             row = solver.row(program, self.lower, self.upper, self._floors)
             self._rows[structure] = (solver, row)
         return self._rows[structure]
@@ -84,30 +88,26 @@ class Prepared:
 
     def _loaded_start(self, library: Library) -> tuple[LoadedArm, SampleTable] | None:
         """The arm under its load and its samples; None if it does not stand at rest."""
-        recent: dict[object, tuple[LoadedArm, SampleTable] | None] = self.robot.kept(
-            "loaded arms", dict
-        )
         lower, upper = self.lower / BAR, self.upper / BAR
         key = (self.robot.tip_load, lower.tobytes(), upper.tobytes(), self._seed)
-        if key not in recent:
+
+        def make() -> tuple[LoadedArm, SampleTable] | None:
             try:
                 arm = LoadedArm(library, self.robot)
                 table = SampleTable(self.robot, lower, upper, self._seed, arm.settled)
-                found = (arm, table) if len(table.x) else None
             except EquilibriumError:
-                found = None
-            recent[key] = found
-            if len(recent) > _MOST_KEPT:
-                recent.pop(next(iter(recent)), None)
-        return recent[key]
+                return None
+            return (arm, table) if len(table.x) else None
+
+        return _recent(self.robot, "loaded arms", key, make)
 
     @cached_property
     def samples(self) -> SampleTable:
         """Configurations that searches start from."""
         lower, upper = self.lower / BAR, self.upper / BAR
-        return self.robot.kept(
-            ("samples", self.robot.tip_load, lower.tobytes(), upper.tobytes(), self._seed),
-            lambda: SampleTable(self.robot, lower, upper, self._seed),
+        key = (self.robot.tip_load, lower.tobytes(), upper.tobytes(), self._seed)
+        return _recent(
+            self.robot, "samples", key, lambda: SampleTable(self.robot, lower, upper, self._seed)
         )
 
     def problem(self, task: Task) -> Problem:
@@ -123,11 +123,19 @@ def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:
     InputError
         If the task's pressure limits do not suit the robot.
     """
-    recent: dict[object, Prepared] = robot.kept("prepared", dict)
     key = (task.stiffness, task.load, task.pressure, robot.tip_load, seed)
-    found = recent.get(key)
+    return _recent(robot, "prepared", key, lambda: Prepared(robot, task, seed))
+
+
+def _recent(robot: Manipulator, group: str, key: Hashable, make: Callable[[], Made]) -> Made:
+    """One of the things that were made last for this arm, or a new one.
+
+    A planner that varies limits, loads or directions must not fill the memory.
+    """
+    kept: dict[Hashable, tuple[Made]] = robot.kept(group, dict)
+    found = kept.get(key)
     if found is None:
-        found = recent[key] = Prepared(robot, task, seed)
-        if len(recent) > _MOST_KEPT:
-            recent.pop(next(iter(recent)), None)
-    return found
+        found = kept[key] = (make(),)
+        if len(kept) > _MOST_KEPT:
+            kept.pop(next(iter(kept)), None)
+    return found[0]

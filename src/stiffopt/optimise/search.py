@@ -137,7 +137,8 @@ class _Trail:
     def outcome(self) -> Search:
         """All of it, the best first."""
         results = sorted(self._results, key=_rank)
-        agreeing = sum(self._agree(result, results[0]) for result in self._converged)
+        best = min(self._converged, key=_rank, default=None)
+        agreeing = sum(best is not None and self._agree(result, best) for result in self._converged)
         confidence = Confidence(
             self.starts, len(self._converged), agreeing, len(self.optima), self.is_complete
         )

@@ -1,6 +1,7 @@
 """PressureSolution: what was found, judged from the model and from nothing else."""
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, Self
@@ -18,6 +19,8 @@ from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 Status = Literal["solved", "unreachable", "failed"]
+
+_explaining = threading.RLock()
 
 PRESSURE_SLACK = 1e-3
 """How far from a limit a pressure still counts as at it, in Pa."""
@@ -112,7 +115,7 @@ class Explanation(NamedTuple):
     sensitivities: Sensitivities | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PressureSolution:
     """Answer to a task.  Errors and stiffness are computed from the model at `pressures`.
 
@@ -187,17 +190,20 @@ class PressureSolution:
         return solution
 
     def __getattr__(self, name: str) -> Any:  # of what is not in __dict__
-        if name not in Explanation._fields or "_explain" not in self.__dict__:
-            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
-        explain = self.__dict__.pop("_explain")
-        self.__dict__.update(explain()._asdict())
-        return self.__dict__[name]
+        if name in Explanation._fields:
+            with _explaining:  # several threads may ask at once
+                own = self.__dict__
+                if name not in own and "_explain" in own:
+                    own.update(own["_explain"]()._asdict())
+                    del own["_explain"]
+                if name in own:
+                    return own[name]
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Support pickling: explain now."""
-        if "_explain" in self.__dict__:
-            self.__getattr__("message")
-        return self.__dict__
+        """Support pickling and copying: explain now."""
+        _ = self.message
+        return dict(self.__dict__)
 
     @property
     def found(self) -> bool:

@@ -1,6 +1,6 @@
 """From a task to the stiffest pressures: global search, judgement and diagnosis."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from itertools import islice
 from time import perf_counter
 from typing import Any
@@ -353,7 +353,7 @@ def solve_pressure(
 def solve_batch(
     robot: Manipulator,
     tasks: Iterable[Task],
-    guesses: Sequence[ArrayLike | None] | None = None,
+    guesses: Iterable[ArrayLike | None] | None = None,
     *,
     seed: int = 0,
     threads: int | None = None,
@@ -365,7 +365,7 @@ def solve_batch(
     robot : Manipulator
     tasks : iterable of Task
         They may differ in anything; those of the same structure share what is compiled.
-    guesses : sequence, optional
+    guesses : iterable, optional
         Pressures (n,) in Pa or None for each task, see `PressureSolver.solve`.
     seed : int
         Of the global search.
@@ -375,11 +375,18 @@ def solve_batch(
     Raises
     ------
     InputError
-        If a task's pressure limits do not suit the robot; nothing is solved then.
+        If an argument is wrong or a task's pressure limits do not suit the robot; nothing is
+        solved then.
     """
     begin = perf_counter()
+    if threads is not None:
+        threads = checked_integer("threads", threads, 1)
+    if isinstance(tasks, Task) or not isinstance(tasks, Iterable):
+        raise InputError(f"tasks must be several tasks, in a list for example; got {shown(tasks)}")
+    if guesses is not None and not isinstance(guesses, Iterable):
+        raise InputError(f"guesses must be one for each task; got {shown(guesses)}")
     tasks = list(tasks)
-    starts: Sequence[ArrayLike | None] = [None] * len(tasks) if guesses is None else guesses
+    starts = [None] * len(tasks) if guesses is None else list(guesses)
     if len(starts) != len(tasks):
         raise InputError(
             f"expected a guess or None for each of {len(tasks)} tasks; got {len(starts)}"

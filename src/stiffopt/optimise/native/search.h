@@ -97,8 +97,9 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
         Point p = point_in(s, memory + ranked * size);
         memcpy(p.x, s->sample_x + nearest[i].index * s->n, (size_t)s->n * sizeof(double));
         for (int64_t k = 0; k < s->n; k++) p.x[k] = clip(p.x[k], P->lower[k], P->upper[k]);
-        memcpy(p.state, s->sample_states + nearest[i].index * s->state,
-               (size_t)s->state * sizeof(double));
+        if (s->state)
+            memcpy(p.state, s->sample_states + nearest[i].index * s->state,
+                   (size_t)s->state * sizeof(double));
         found->tried++;
         if (!reach(P, &p, 20) || !evaluate(P, &p, 1)) continue;
         screened[ranked] = (Ranked){objective(s, &p) + 10 * violation(P, &p), ranked};
