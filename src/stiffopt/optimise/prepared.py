@@ -13,7 +13,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.fast import FastSolver
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.loaded import LoadedArm, loaded_library
-from stiffopt.optimise.problem import Problem, floor_bounds
+from stiffopt.optimise.problem import floor_bounds
 from stiffopt.optimise.program import BAR, Program, Structure
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.target import Target
@@ -109,10 +109,6 @@ class Prepared:
         return _recent(
             self.robot, "samples", key, lambda: SampleTable(self.robot, lower, upper, self._seed)
         )
-
-    def problem(self, task: Task) -> Problem:
-        """Nonlinear program of a task for the general method."""
-        return Problem(self.robot, task)
 
 
 def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:

@@ -21,7 +21,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.goal import StiffnessGoal
 from stiffopt.optimise.program import BAR, Program
-from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.terms import Ball
 
@@ -302,13 +301,6 @@ class Problem:
             other.floors = np.zeros(0)
         other.radii = {**self.radii, **radii}
         other._set_spheres()
-        return other
-
-    def at_target(self, target: Target) -> "Problem":
-        """The same program for another target."""
-        other = copy(self)
-        other.task = self.task.model_copy(update={"target": target})
-        other._set_program(Program.of(target, self.task.stiffness))
         return other
 
 
