@@ -94,12 +94,16 @@ _NAMES = {
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 _MODULES = (
+    "directions",
     "documents",
     "errors",
+    "experiments",
     "files",
     "lie",
+    "logs",
     "model",
     "optimise",
+    "rig",
     "schema",
     "units",
     "workspace",

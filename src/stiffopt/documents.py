@@ -20,7 +20,7 @@ import yaml
 
 from stiffopt.errors import FileError, InputError, Loc, dotted, shown
 
-__all__ = ["Document", "read_document", "write_file"]
+__all__ = ["Document", "read_document", "to_yaml", "write_file"]
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 20
@@ -45,6 +45,13 @@ def read_document(path: str | os.PathLike[str]) -> Document:
     return _Composer(name, _read_text(name)).document()
 
 
+def to_yaml(data: Mapping[str, Any]) -> str:
+    """Return data as the YAML text that `read_document` reads back as they were."""
+    return str(
+        yaml.dump(_plain(data), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    )
+
+
 def write_file(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
     """Write data as YAML that `read_document` reads back as they were.
 
@@ -57,7 +64,7 @@ def write_file(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
     data :
         Text, numbers, booleans, None, lists, tuples, arrays and mappings with text as keys.
     """
-    text = yaml.dump(_plain(data), Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100)
+    text = to_yaml(data)
     target = Path(path)
     try:
         if target.exists() and not target.is_file():

@@ -96,6 +96,14 @@ class MissingExtraError(StiffoptError):
         )
 
 
+class DeviceError(StiffoptError):
+    """A device of the rig cannot be reached, does not answer or answers nonsense."""
+
+
+class CommandError(InputError):
+    """A command to the rig is refused; nothing was written to any device."""
+
+
 class SlowWarning(UserWarning):
     """Machine code cannot be made or kept here; the same results come more slowly."""
 

@@ -15,12 +15,12 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from stiffopt.documents import Document, read_document, write_file
+from stiffopt.documents import Document, read_document, to_yaml, write_file
 from stiffopt.errors import FileError, Loc, dotted, shown
 from stiffopt.schema import Schema, explain
 from stiffopt.units import FROM_FILE
 
-__all__ = ["line_of", "read_file", "save_file"]
+__all__ = ["file_text", "line_of", "read_file", "save_file"]
 
 MAX_MISTAKES = 10  # told at once
 VERSIONS = {"robot": 1, "task": 1, "rig": 1}
@@ -71,8 +71,17 @@ def save_file(path: str | os.PathLike[str], kind: str, schema: Schema) -> None:
 
     Quantities are written with units; what is None or an empty list is left out.
     """
+    write_file(path, _as_file(kind, schema))
+
+
+def file_text(kind: str, schema: Schema) -> str:
+    """Return what `save_file` writes."""
+    return to_yaml(_as_file(kind, schema))
+
+
+def _as_file(kind: str, schema: Schema) -> dict[str, Any]:
     data = _without_empty_lists(schema.model_dump(mode="json", exclude_none=True))
-    write_file(path, {"format": f"stiffopt-{kind}/{VERSIONS.get(kind, 1)}", **data})
+    return {"format": f"stiffopt-{kind}/{VERSIONS.get(kind, 1)}", **data}
 
 
 def _check_format(document: Document, kind: str) -> None:

@@ -31,6 +31,7 @@ __all__ = [
     "Density",
     "Duration",
     "Force",
+    "ForcePerVoltage",
     "Frequency",
     "Length",
     "Mass",
@@ -42,6 +43,7 @@ __all__ = [
     "RotationalStiffness",
     "Speed",
     "TranslationalStiffness",
+    "Voltage",
     "finite_number",
     "format_quantity",
     "parse_quantity",
@@ -81,11 +83,14 @@ _ROTATIONAL = _Kind("N*m/rad", "rotational stiffness", "0.2 N*m/rad", "N*m/rad")
 _DURATION = _Kind("s", "duration", "20 ms", "s")
 _FREQUENCY = _Kind("Hz", "frequency", "50 Hz", "Hz")
 _SPEED = _Kind("m/s", "speed", "10 mm/s", "mm/s")
+_VOLTAGE = _Kind("V", "voltage", "10 V", "V")
+_FORCE_PER_VOLTAGE = _Kind("N/V", "force per voltage", "0.5 N/V", "N/V")
 _RATIO = _Kind("", "ratio", "1 %", "")
 
 _KINDS = (
     *(_LENGTH, _ANGLE, _PRESSURE, _PRESSURE_RATE, _MASS, _DENSITY, _ACCELERATION, _FORCE),
     *(_MOMENT, _TRANSLATIONAL, _ROTATIONAL, _DURATION, _FREQUENCY, _SPEED, _RATIO),
+    *(_VOLTAGE, _FORCE_PER_VOLTAGE),
 )
 _EXAMPLES = {kind.unit: kind.example for kind in _KINDS}
 
@@ -109,6 +114,8 @@ _COMMON = {
     "s": {"s": "1", "ms": "0.001"},
     "Hz": {"Hz": "1"},
     "m/s": {"m/s": "1", "mm/s": "0.001"},
+    "V": {"V": "1", "mV": "0.001"},
+    "N/V": {"N/V": "1"},
     "": {"%": "0.01"},
 }
 
@@ -312,3 +319,9 @@ Frequency = Annotated[float, _reader(_FREQUENCY), _writer(_FREQUENCY), _FINITE]
 """In Hz."""
 Speed = Annotated[float, _reader(_SPEED), _writer(_SPEED), _FINITE]
 """In m/s."""
+Voltage = Annotated[float, _reader(_VOLTAGE), _writer(_VOLTAGE), _FINITE]
+"""In V."""
+ForcePerVoltage = Annotated[
+    float, _reader(_FORCE_PER_VOLTAGE), _writer(_FORCE_PER_VOLTAGE), _FINITE
+]
+"""In N/V."""

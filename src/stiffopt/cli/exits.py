@@ -6,6 +6,8 @@ SOLVED = 0
 BAD_INPUT = 2
 UNREACHABLE = 3
 FAILED = 4
+FAULT = 5
+"""The rig failed; it was vented."""
 INTERRUPTED = 130
 """Ctrl-C."""
 CLOSED_PIPE = 141

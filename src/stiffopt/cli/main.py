@@ -10,6 +10,8 @@ import typer
 
 from stiffopt.cli.console import Closed, report_error
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
+from stiffopt.cli.experiment import experiment_app
+from stiffopt.cli.lab import LAB_EPILOG, LAB_HELP, lab
 from stiffopt.cli.map import map_app
 from stiffopt.cli.robots import robots
 from stiffopt.cli.solve import HELP, examples, solve
@@ -34,6 +36,8 @@ app = _application()
 app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
 app.command("robots")(robots)
 app.add_typer(map_app, name="map")
+app.add_typer(experiment_app, name="experiment")
+app.command("lab", help=LAB_HELP, epilog=LAB_EPILOG)(lab)
 
 solve_pressure_app = _application()
 solve_pressure_app.command("solve-pressure", help=HELP, epilog=examples("solve-pressure"))(solve)

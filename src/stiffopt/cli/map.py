@@ -1,4 +1,7 @@
-"""The commands `stiffopt map ...`: `workspace` samples where the tip can be and how stiff."""
+"""The commands `stiffopt map ...`.
+
+`workspace` samples where the tip can be and how stiff, `arm` maps the stiffness along an arm.
+"""
 
 from typing import Annotated
 
@@ -8,7 +11,7 @@ map_app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    help="Map an arm: where its tip can be, and how stiff it can be made there.",
+    help="Map an arm: where its tip can be, how stiff it is there, and how stiff along its length.",
 )
 
 HELP = """\
@@ -105,5 +108,86 @@ def workspace(
     options = MapOptions(
         robot, out, samples, levels, cell, direction, kind, boundary, frame, seed, scheduler,
         plot, as_json, overwrite, quiet,
+    )  # fmt: skip
+    raise typer.Exit(run(options))
+
+
+ARM_HELP = """\
+Map the stiffness along an arm, from near its base to its tip, as in figure 6 of the paper.
+
+Groups of channels are pressurised to several pressures: by default the first pair of each segment,
+then the first two. With --over 1,2 instead the stiffness of the tip over the pressures of these two
+channels. ROBOT is the name of a built-in robot or a robot file.
+"""
+
+_ARM_EPILOG = """\
+\b
+Examples:
+  stiffopt map arm stiff-flop-1 --plot arm.png
+  stiffopt map arm stiff-flop-2 --channels 1 --channels 4 --pressures '0:1.5:0.5 bar'
+  stiffopt map arm stiff-flop-1 --over 1,2 --plot tip.png --csv tip.csv
+
+\b
+Exit codes:
+  0    the map is complete
+  2    bad input, or the map cannot be made or written
+  130  interrupted (Ctrl-C)
+"""
+
+
+@map_app.command("arm", help=ARM_HELP, epilog=_ARM_EPILOG)
+def arm(
+    robot: Annotated[
+        str, typer.Argument(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml).")
+    ],
+    channels: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="LIST",
+            help="Channels (counted from 1) that are pressurised together, such as 1 or 1,2; may "
+            "be repeated.",
+        ),
+    ] = None,
+    pressures: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="To which: '0,0.5,1 bar' or '0:1.5:0.5 bar'; by default seven up to the limit.",
+        ),
+    ] = None,
+    points: Annotated[
+        int | None, typer.Option(metavar="N", min=2, help="Along the arm; by default 25.")
+    ] = None,
+    over: Annotated[
+        str | None,
+        typer.Option(metavar="A,B", help="Instead: the tip over the pressures of two channels."),
+    ] = None,
+    levels: Annotated[
+        int | None,
+        typer.Option(metavar="K", min=2, help="With --over: of each channel; by default 31."),
+    ] = None,
+    boundary: Annotated[
+        str, typer.Option(metavar="BOUNDARY", help="free, guided or clamped.")
+    ] = "free",
+    frame: Annotated[
+        str, typer.Option(metavar="FRAME", help="base or tip: the axes of the directions.")
+    ] = "base",
+    plot: Annotated[str | None, typer.Option(metavar="FILE.png", help="Draw the map.")] = None,
+    csv: Annotated[
+        str | None, typer.Option(metavar="FILE.csv", help="Write the map as a table, in SI units.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object in SI units instead of a table.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print no table, notes and progress; errors only.")
+    ] = False,
+) -> None:
+    """Map the stiffness along an arm."""
+    from stiffopt.cli.map_arm import ArmOptions, run
+
+    options = ArmOptions(
+        robot, channels, pressures, points, over, levels, boundary, frame, plot, csv, as_json,
+        quiet,
     )  # fmt: skip
     raise typer.Exit(run(options))

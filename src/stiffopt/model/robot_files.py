@@ -12,7 +12,7 @@ from stiffopt.errors import InputError, shown
 from stiffopt.files import read_file
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["builtin_robots", "load_description"]
+__all__ = ["builtin_robots", "load_description", "robot_path"]
 
 
 @cache
@@ -57,6 +57,11 @@ def load_description(
         )
     with as_file(files("stiffopt").joinpath("robots", f"{text}.yaml")) as path:
         return read_file(path, "robot", RobotDescription)
+
+
+def robot_path(name_or_path: str, base: str | os.PathLike[str]) -> str:
+    """Return what names the same robot in a file of any folder: its name, or an absolute path."""
+    return str((Path(base) / name_or_path).resolve()) if _is_path(name_or_path) else name_or_path
 
 
 def _is_path(text: str) -> bool:

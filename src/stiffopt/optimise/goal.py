@@ -17,8 +17,8 @@ from pydantic import (
     model_validator,
 )
 
+from stiffopt.directions import Direction, Frame
 from stiffopt.errors import InputError
-from stiffopt.optimise.directions import Direction, Frame
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import (
     Number,

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, model_validator
 
-from stiffopt.optimise.directions import Direction, Quaternion
+from stiffopt.directions import Direction, Quaternion
 from stiffopt.schema import BadKeyError, Schema, Vector
 from stiffopt.units import Angle, Length, format_quantity, within
 

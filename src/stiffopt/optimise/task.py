@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationInfo, field_validator
 from pydantic_core import PydanticKnownError
 
+from stiffopt.directions import Frame
 from stiffopt.errors import FileError, InputError
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
-from stiffopt.optimise.directions import Frame
 from stiffopt.optimise.goal import MatchValue, StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector

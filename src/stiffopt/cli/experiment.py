@@ -1,0 +1,167 @@
+"""The commands `stiffopt experiment ...`: the paper's experiments on any rig."""
+
+from typing import Annotated
+
+import typer
+
+experiment_app = typer.Typer(
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="Do the paper's experiments on a rig, real or simulated.",
+)
+
+_CODES = """
+\b
+Exit codes:
+  0    done
+  2    bad input: a file, an option, or a rig that cannot do it; nothing has moved
+  5    stopped by a fault of the rig; what was recorded is kept
+  130  interrupted (Ctrl-C); the arm is vented, what was recorded is kept
+"""
+
+KINEMATICS_HELP = """\
+Ramp each channel in turn up and down and record the tip, as in Experiment 1 of the paper.
+
+Each channel has a tooth for each pressure; the whole sequence is repeated. Recordings (log v1 as
+CSV, and MCAP), a report and a figure against the model go into a folder. RIG is a rig file.
+"""
+
+_KINEMATICS_EPILOG = f"""\
+\b
+Examples:
+  stiffopt experiment kinematics rig/sim.yaml
+  stiffopt experiment kinematics rig/sim.yaml --pressures '0.5,1 bar' --repetitions 2 --out first
+  stiffopt experiment kinematics rig/sim.yaml --resume first
+{_CODES}"""
+
+STIFFNESS_HELP = """\
+Push the tip with a probe at several pressures, as in Experiment 2 of the paper.
+
+At each pressure of one channel the probe displaces the tip along each direction in steps, there and
+back; the slope of the force is the stiffness. Recordings, all points, a table of stiffness with its
+uncertainty, a report and a figure against the model go into a folder. RIG is a rig file.
+"""
+
+_STIFFNESS_EPILOG = f"""\
+\b
+Examples:
+  stiffopt experiment stiffness rig/sim.yaml
+  stiffopt experiment stiffness rig/sim.yaml --pressures '0:1.5:0.5 bar' --repetitions 2 --out k
+  stiffopt experiment stiffness rig/sim.yaml --resume k
+{_CODES}"""
+
+RigFile = Annotated[str, typer.Argument(metavar="RIG", help="A rig file (.yaml).")]
+Out = Annotated[
+    str | None,
+    typer.Option(
+        metavar="DIR",
+        help="The folder of the experiment, made here; by default a new one in the rig's log "
+        "folder.",
+    ),
+]
+Resume = Annotated[
+    str | None,
+    typer.Option(metavar="DIR", help="Go on with the experiment in this folder: what is missing."),
+]
+Model = Annotated[
+    str | None,
+    typer.Option(metavar="ROBOT", help="Compare with this robot instead of that of the rig file."),
+]
+Repetitions = Annotated[
+    int | None, typer.Option(metavar="N", min=1, max=1000, help="By default 5.")
+]
+NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print no report, notes and progress; errors only.")
+]
+
+
+@experiment_app.callback()
+def _experiment() -> None:
+    pass
+
+
+@experiment_app.command("kinematics", help=KINEMATICS_HELP, epilog=_KINEMATICS_EPILOG)
+def kinematics(
+    rig: RigFile,
+    out: Out = None,
+    pressures: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="Peaks of the teeth: '0.4,0.8,1.0 bar' (the default) or '0.2:1:0.2 bar'.",
+        ),
+    ] = None,
+    period: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Of a tooth, up and down; by default 40 s / 9."),
+    ] = None,
+    repetitions: Repetitions = None,
+    resume: Resume = None,
+    model: Model = None,
+    no_plot: NoPlot = False,
+    quiet: Quiet = False,
+) -> None:
+    """Do Experiment 1."""
+    from stiffopt.cli import experiment_run  # here, so that --help waits for no numerics
+
+    given = {"pressures": pressures, "period": period, "repetitions": repetitions}
+    options = experiment_run.Options(rig, out, resume, model, not no_plot, quiet, given)
+    raise typer.Exit(experiment_run.run("kinematics", options))
+
+
+@experiment_app.command("stiffness", help=STIFFNESS_HELP, epilog=_STIFFNESS_EPILOG)
+def stiffness(
+    rig: RigFile,
+    out: Out = None,
+    pressures: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST", help="Of the channel: '0:1.5:0.25 bar' (the default) or '0,0.5,1 bar'."
+        ),
+    ] = None,
+    channel: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, help="The one that is pressurised; by default 1."),
+    ] = None,
+    directions: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="Along which the probe pushes, of x, y, z, -x, -y, -z; by default x,y,-z.",
+        ),
+    ] = None,
+    displacement: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="Of the tip; by default 3 mm.")
+    ] = None,
+    force: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FORCE",
+            help="Displace it less where the model expects more force than this; by default 0.2 N.",
+        ),
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(metavar="N", min=2, max=1000, help="Each way; by default 5.")
+    ] = None,
+    repetitions: Repetitions = None,
+    settle: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="How long the arm may take to rest; by default 60 s."),
+    ] = None,
+    resume: Resume = None,
+    model: Model = None,
+    no_plot: NoPlot = False,
+    quiet: Quiet = False,
+) -> None:
+    """Do Experiment 2."""
+    from stiffopt.cli import experiment_run
+
+    given = {
+        "pressures": pressures, "channel": channel, "directions": directions,
+        "displacement": displacement, "force": force, "steps": steps, "repetitions": repetitions,
+        "settle": settle,
+    }  # fmt: skip
+    options = experiment_run.Options(rig, out, resume, model, not no_plot, quiet, given)
+    raise typer.Exit(experiment_run.run("stiffness", options))

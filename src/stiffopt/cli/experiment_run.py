@@ -1,0 +1,300 @@
+"""What `stiffopt experiment` does with its arguments."""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from stiffopt.cli import experiment_report, quantities
+from stiffopt.cli.console import report_error, report_note, show, warnings_as_notes
+from stiffopt.cli.exits import BAD_INPUT, FAULT, INTERRUPTED, SOLVED
+from stiffopt.cli.experiment_display import Display
+from stiffopt.cli.stopping import Stopping
+from stiffopt.errors import DeviceError, FileError, InputError, StiffoptError
+from stiffopt.experiments import (
+    KinematicsSettings,
+    StiffnessSettings,
+    evaluate_kinematics,
+    evaluate_stiffness,
+    run_kinematics,
+    run_stiffness,
+)
+from stiffopt.experiments.folder import check_same, create_folder, open_folder, remove_folder
+from stiffopt.experiments.kinematics import missing_repetitions, sequence_for
+from stiffopt.experiments.kinematics_result import read_recordings
+from stiffopt.experiments.stiffness import check_stiffness, missing_series
+from stiffopt.logs import require_mcap, write_stiffness_table
+from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.rig.interface import Rig
+
+REPORT, FIGURE, TABLE = "report.md", "figure.png", "stiffness.csv"
+
+Settings = KinematicsSettings | StiffnessSettings
+
+
+@dataclass(frozen=True)
+class Options:
+    """The arguments of a command; `given` are those that say what is done, None where absent."""
+
+    rig: str
+    out: str | None
+    resume: str | None
+    model: str | None
+    plot: bool
+    quiet: bool
+    given: Mapping[str, str | int | None]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """Everything that was checked before anything moves."""
+
+    rig: Rig
+    rate: float
+    folder: Path
+    settings: Settings
+    model: Manipulator
+    is_new: bool
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether nothing is left to do."""
+        if isinstance(self.settings, KinematicsSettings):
+            return not missing_repetitions(self.folder, self.settings)
+        return not missing_series(self.folder, self.settings)
+
+
+def run(experiment: str, options: Options) -> int:
+    """Do an experiment, or go on with it; report and draw; return the exit code."""
+    try:
+        plan = _planned(experiment, options)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except StiffoptError as error:
+        report_error(str(error))
+        return BAD_INPUT
+    try:
+        with warnings_as_notes(quiet=options.quiet):
+            _do(plan, options)
+            _tell(plan, options)
+    except KeyboardInterrupt:
+        _say_where(experiment, plan, options)
+        return INTERRUPTED
+    except _NoRigError as error:
+        report_error(str(error))
+        return FAULT
+    except _FaultError as error:
+        report_error(str(error))
+        _say_where(experiment, plan, options)
+        return FAULT
+    except StiffoptError as error:
+        report_error(str(error))
+        return BAD_INPUT
+    return SOLVED
+
+
+class _FaultError(StiffoptError):
+    """The rig was opened, and something went wrong."""
+
+
+class _NoRigError(StiffoptError):
+    """The rig could not be opened."""
+
+
+# -- before anything moves ------------------------------------------------------------------------
+
+
+def _planned(experiment: str, options: Options) -> _Plan:
+    if options.plot:
+        from stiffopt.plots import require_matplotlib
+
+        require_matplotlib()
+    require_mcap()
+    if options.resume is not None and options.out is not None:
+        raise InputError("give --out for a new experiment or --resume for an old one, not both")
+    rig, name, rate, log_folder = _rig(options.rig)
+    settings, folder = _settings(experiment, options, rig, name, log_folder)
+    model = load_robot(rig.robot if options.model is None else options.model)
+    if model.n_pressures != rig.supply.n:
+        raise InputError(
+            f"the robot '{model.description.name}' has {model.n_pressures} channels, the rig has "
+            f"{rig.supply.n}"
+        )
+    if rig.tracker is None:
+        raise InputError("this rig has no tracker; the experiments need one")
+    if isinstance(settings, KinematicsSettings):
+        sequence_for(rig, settings)
+    else:
+        check_stiffness(rig, settings)
+    is_new = options.resume is None
+    if is_new:
+        create_folder(folder, settings)
+    return _Plan(rig, rate, folder, settings, model, is_new)
+
+
+def _rig(path: str) -> tuple[Rig, str, float, str]:
+    """The rig of a file, its name, its rate and its log folder."""
+    from stiffopt.rig.config import load_rig_description, open_rig
+
+    description = load_rig_description(path)
+    return open_rig(path), description.name, description.rate, description.log.folder
+
+
+def _settings(
+    experiment: str, options: Options, rig: Rig, name: str, log_folder: str
+) -> tuple[Settings, Path]:
+    """What shall be done, and where."""
+    schema = KinematicsSettings if experiment == "kinematics" else StiffnessSettings
+    given = {key: value for key, value in options.given.items() if value is not None}
+    if options.resume is not None:
+        if given:
+            raise InputError(
+                f"--{next(iter(given))} cannot be changed when an experiment is resumed; "
+                f"{options.resume} says what is done"
+            )
+        folder = Path(options.resume)
+        settings: Settings = (
+            open_folder(folder, KinematicsSettings)
+            if experiment == "kinematics"
+            else open_folder(folder, StiffnessSettings)
+        )
+        check_same("the robot", rig.robot.name, settings.robot)
+        check_same("the number of channels", rig.supply.n, settings.channels)
+        return settings, folder
+    about = {"rig": name, "robot": rig.robot.name, "channels": rig.supply.n}
+    settings = schema(**about, **{key: _read(key, value) for key, value in given.items()})
+    if options.out is not None:
+        return settings, Path(options.out)
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    safe = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "rig"
+    return settings, Path(log_folder) / f"{experiment}_{safe}_{stamp}"
+
+
+_QUANTITIES = {
+    "period": ("s", "duration"),
+    "settle": ("s", "duration"),
+    "displacement": ("m", "length"),
+    "force": ("N", "force"),
+}
+
+
+def _read(key: str, value: str | int) -> Any:
+    """Value of an option."""
+    if not isinstance(value, str):
+        return value
+    option = f"--{key}"
+    if key == "pressures":
+        return quantities.pressures(option, value)
+    if key == "directions":
+        return quantities.directions(option, value)
+    return quantities.quantity(option, value, *_QUANTITIES[key])
+
+
+# -- on the rig -----------------------------------------------------------------------------------
+
+
+def _do(plan: _Plan, options: Options) -> None:
+    if plan.is_complete:
+        if not options.quiet:
+            report_note(f"{plan.folder} is complete; nothing was left to do")
+        return
+    stopping, display = Stopping(), Display(quiet=options.quiet)
+    common: dict[str, Any] = {
+        "rate": plan.rate, "progress": display.report, "check": stopping.check,
+    }  # fmt: skip
+
+    def work() -> list[str]:
+        if isinstance(plan.settings, KinematicsSettings):
+            return run_kinematics(plan.rig, plan.folder, plan.settings, **common)
+        return run_stiffness(
+            plan.rig,
+            plan.folder,
+            plan.settings,
+            plan.model,
+            aside=lambda: display.aside(stopping.at_once()),
+            **common,
+        )
+
+    with stopping.handled(), display.shown():
+        _open(plan)
+        notes = _on_rig(plan.rig, work, stopping)
+    if not options.quiet:
+        for note in notes:
+            report_note(note)
+
+
+def _open(plan: _Plan) -> None:
+    """Open the rig; leave no folder behind if there is none."""
+    try:
+        plan.rig.open()
+    except StiffoptError as error:
+        if plan.is_new:
+            remove_folder(plan.folder)
+        raise _NoRigError(str(error)) if isinstance(error, DeviceError) else error from error
+
+
+def _on_rig(rig: Rig, work: Callable[[], list[str]], stopping: Stopping) -> list[str]:
+    """Work, and vent and close the rig whatever happens."""
+    failure: BaseException | None = None
+    notes: list[str] = []
+    try:
+        notes = work()
+    except BaseException as error:
+        failure = error
+    stopping.hold()
+    try:
+        rig.close()
+    except StiffoptError as error:
+        first = f" (after: {failure})" if isinstance(failure, StiffoptError) else ""
+        raise _FaultError(f"THE ARM MAY STILL BE UNDER PRESSURE: {error}{first}") from error
+    if isinstance(failure, StiffoptError):
+        raise _FaultError(f"{failure}; the arm is vented") from failure
+    if failure is not None:
+        raise failure
+    return notes
+
+
+def _say_where(experiment: str, plan: _Plan, options: Options) -> None:
+    if not options.quiet:
+        report_note(
+            f"what was recorded is in {plan.folder}; go on with: "
+            f"stiffopt experiment {experiment} {options.rig} --resume {plan.folder}"
+        )
+
+
+# -- afterwards -----------------------------------------------------------------------------------
+
+
+def _tell(plan: _Plan, options: Options) -> None:
+    """Evaluate, report, draw."""
+    settings, folder, model = plan.settings, plan.folder, plan.model
+    if isinstance(settings, KinematicsSettings):
+        kinematics = evaluate_kinematics(read_recordings(folder, settings), model)
+        facts = experiment_report.kinematics_facts(kinematics, settings, model)
+    else:
+        stiffness = evaluate_stiffness(folder, settings, model)
+        write_stiffness_table(folder / TABLE, stiffness.table())
+        facts = experiment_report.stiffness_facts(stiffness, model)
+    _write(folder / REPORT, experiment_report.markdown(facts))
+    if options.plot:
+        from stiffopt.plots import save_figure
+        from stiffopt.plots.experiments import plot_kinematics, plot_stiffness
+
+        title = facts.title
+        figure = (
+            plot_kinematics(kinematics, title=title)
+            if isinstance(settings, KinematicsSettings)
+            else plot_stiffness(stiffness, title=title)
+        )
+        save_figure(figure, folder / FIGURE)
+    if not options.quiet:
+        show(experiment_report.renderable(facts, str(folder)))
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None

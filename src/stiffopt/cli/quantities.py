@@ -1,0 +1,91 @@
+"""Quantities on the command line: lists and ranges with a unit, directions by name."""
+
+import re
+
+from stiffopt.errors import InputError, shown
+from stiffopt.units import parse_quantity
+
+_LIST = re.compile(r"\s*([-+0-9.,:eE\s]*[0-9.])\s*([A-Za-z].*?)\s*")
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+_MOST = 1000  # values of a range
+
+
+def quantity(option: str, text: str, unit: str, what: str) -> float:
+    """Return one quantity in SI, or an error that names the option."""
+    try:
+        return parse_quantity(text, unit, what)
+    except InputError as error:
+        raise InputError(f"{option}: {error}") from None
+
+
+def pressures(option: str, text: str) -> tuple[float, ...]:
+    """Return pressures in Pa from ``0.4,0.8,1.0 bar`` or, ends included, ``0:1.5:0.25 bar``.
+
+    Raises
+    ------
+    InputError
+        It is neither.
+    """
+    example = "expected pressures such as '0.4,0.8,1.0 bar' or '0:1.5:0.25 bar'"
+    found = _LIST.fullmatch(text)
+    if found is None:
+        raise InputError(f"{option}: {shown(text)} is no list of pressures; {example}")
+    numbers, unit = found.groups()
+    separator = ":" if ":" in numbers else ","
+    parts = [
+        quantity(option, f"{part.strip()} {unit}", "Pa", "pressure")
+        for part in numbers.split(separator)
+    ]
+    if separator == ",":
+        if len(set(parts)) < len(parts):
+            raise InputError(f"{option}: a pressure is there twice")
+        return tuple(parts)
+    if len(parts) != 3:
+        raise InputError(f"{option}: a range has a start, an end and a step; {example}")
+    start, end, step = parts
+    if step <= 0 or end < start:
+        raise InputError(f"{option}: a range goes up, in steps above 0; {example}")
+    count = int((end - start) / step * (1 + 1e-9)) + 1
+    if count > _MOST:
+        raise InputError(f"{option}: that are {count} pressures; at most {_MOST} make sense")
+    return tuple(round(start + step * k, 6) for k in range(count))
+
+
+def directions(option: str, text: str) -> tuple[tuple[float, ...], ...]:
+    """Return unit vectors from names such as ``x,y,-z``.
+
+    Raises
+    ------
+    InputError
+        A name is unknown, or there twice.
+    """
+    found = []
+    for part in text.split(","):
+        name = part.strip()
+        vector = _AXES.get(name.removeprefix("-").removeprefix("+"))
+        if vector is None:
+            raise InputError(
+                f"{option}: {shown(name)} is no direction; expected some of x, y, z, -x, -y, -z"
+            )
+        sign = -1.0 if name.startswith("-") else 1.0
+        found.append(tuple(sign * component + 0.0 for component in vector))
+    if len(set(found)) < len(found):
+        raise InputError(f"{option}: a direction is there twice")
+    return tuple(found)
+
+
+def channels(option: str, text: str) -> tuple[int, ...]:
+    """Return channel numbers, counted from 1, from ``1,2``.
+
+    Raises
+    ------
+    InputError
+        Something else is there, or one twice.
+    """
+    parts = [part.strip() for part in text.split(",")]
+    if not all(part.isdecimal() and int(part) > 0 for part in parts):
+        raise InputError(f"{option}: {shown(text)} are no channels; expected numbers such as 1,2")
+    found = tuple(int(part) for part in parts)
+    if len(set(found)) < len(found):
+        raise InputError(f"{option}: a channel is there twice")
+    return found

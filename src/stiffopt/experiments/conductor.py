@@ -1,0 +1,273 @@
+"""Conductor: commands the pressures of a rig open loop and collects what its devices say."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import DeviceError, InputError
+from stiffopt.logs import LogRow
+from stiffopt.rig.interface import PoseSample, PressureCommand, Rig
+
+__all__ = ["Conductor", "Row", "at_rest", "check_pressures"]
+
+Array = NDArray[np.float64]
+
+LOST = 2.0
+"""Seconds without sight of the tip after which an experiment is given up."""
+GENTLE = 5e4
+"""Rate in Pa/s at which pressures are brought to where an experiment wants them."""
+_FIRST = 5.0  # s that a tracker may take to see the tip for the first time
+_LONGEST_STEP = 0.1  # s; a loop that was held up does not catch up with a jump
+_LOOK = 0.1  # s between two looks at whether something has settled
+_KEPT = 4096  # rows and moments
+_STEEPEST = 1e12  # Pa/s, in place of no limit
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was so when the tracker looked: tip, pressures, and the probe if it is in use.
+
+    Times are those of the rig's clock; positions are those of the tip in the base frame.
+    """
+
+    time: float
+    position: Array
+    quaternion: Array | None
+    commanded: Array
+    measured: Array
+    force: float
+    stage: float
+
+    @property
+    def visible(self) -> bool:
+        """Whether the tip was seen."""
+        return bool(np.isfinite(self.position).all())
+
+    def logged(self, begin: float) -> LogRow:
+        """Return the row of a log whose time 0 is `begin`."""
+        return LogRow(
+            time=self.time - begin,
+            commanded=self.commanded,
+            measured=self.measured,
+            position=self.position,
+            quaternion=self.quaternion,
+            force=self.force,
+            stage=self.stage,
+        )
+
+
+@dataclass(frozen=True)
+class _Moment:
+    time: float
+    commanded: Array
+    measured: Array
+    force: float
+    stage: float
+
+
+class Conductor:
+    """Steps a rig at a fixed rate: a command, a look at all devices, a wait for the next moment.
+
+    Commands never change faster than the rig's slew and are within its limits.
+
+    Parameters
+    ----------
+    rig : Rig
+        Open, with a tracker.
+    rate : float
+        Steps a second.
+    check : callable, optional
+        Called at each step; raises to stop the experiment.
+
+    Attributes
+    ----------
+    rows : deque of Row
+        The latest of what was seen, one for each frame of the tracker.
+    sink : callable or None
+        Is given every new row.
+    probing : bool
+        Whether the probe is read at each step.
+    """
+
+    def __init__(self, rig: Rig, rate: float, check: Callable[[], None] = lambda: None) -> None:
+        if rig.tracker is None:
+            raise InputError("this rig has no tracker; the experiment needs one")
+        self.rig = rig
+        self.tracker = rig.tracker
+        self.clock = rig.clock
+        self.rows: deque[Row] = deque(maxlen=_KEPT)
+        self.sink: Callable[[Row], None] | None = None
+        self.probing = False
+        self._period = 1.0 / rate
+        self._check = check
+        self._slew = np.minimum(rig.slew, _STEEPEST)
+        self._setpoint = np.array(rig.supply.commanded, dtype=float)
+        self._moments: deque[_Moment] = deque(maxlen=_KEPT)
+        self._last = self._deadline = self.clock.now()
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return self.rig.supply.n
+
+    def start(self) -> None:
+        """Let commands have an effect, and wait for the tracker.
+
+        Raises
+        ------
+        DeviceError
+            The tracker does not see the tip.
+        """
+        self.rig.supply.arm()
+        self._last = begin = self.clock.now()
+        while not any(row.visible for row in self.rows):
+            if self.clock.now() - begin > _FIRST:
+                raise DeviceError(
+                    f"the tracker has not seen the tip for {_FIRST:g} s; "
+                    "is it connected, is the sensor in its field?"
+                )
+            self.tick(self._setpoint)
+
+    def tick(self, target: ArrayLike, slew: float | None = None) -> None:
+        """Command pressures (n,), as far as the slew lets them go, and wait for the next step.
+
+        Raises
+        ------
+        DeviceError
+            A device fails, or the tracker has lost the tip.
+        """
+        self._check()
+        now = self.clock.now()
+        reach = self._slew if slew is None else np.minimum(self._slew, slew)
+        reach = reach * min(max(now - self._last, 0.0), _LONGEST_STEP)
+        limits, target = self.rig.supply.limits, np.asarray(target, dtype=float)
+        wanted = np.clip(target, self._setpoint - reach, self._setpoint + reach)
+        wanted = np.where((target == 0) & (wanted < limits.low), 0.0, wanted)
+        self._setpoint = limits.clamp(wanted)
+        self._last = now
+        reading = self.rig.supply.exchange(PressureCommand(self._setpoint, now))
+        force, stage = np.nan, np.nan
+        if self.probing and self.rig.probe is not None:
+            felt = self.rig.probe.sample()
+            force, stage = felt.force, felt.position
+        self._moments.append(_Moment(now, self._setpoint, reading.pressures, force, stage))
+        for sample in self.tracker.read():
+            self._take(sample)
+        if LOST < self.tracker.age() < np.inf:
+            raise DeviceError(f"the tracker has not seen the tip for {LOST:g} s")
+        self._deadline += self._period
+        if self._deadline <= self.clock.now():
+            self._deadline = self.clock.now() + self._period
+        self.clock.sleep_until(self._deadline)
+
+    def _take(self, sample: PoseSample) -> None:
+        """Put a frame together with what held when it was captured."""
+        if self.rows and sample.time <= self.rows[-1].time:
+            return  # a frame that came twice
+        held, nearest = self._moment(sample.time)
+        row = Row(
+            time=sample.time,
+            position=sample.position,
+            quaternion=sample.quaternion,
+            commanded=held.commanded,
+            measured=nearest.measured,
+            force=nearest.force,
+            stage=nearest.stage,
+        )
+        self.rows.append(row)
+        if self.sink is not None:
+            self.sink(row)
+
+    def _moment(self, time: float) -> tuple[_Moment, _Moment]:
+        """Return the moments whose command held at a time, and whose readings are nearest."""
+        recent = [self._moments[-k] for k in range(min(len(self._moments), 200), 0, -1)]
+        after = bisect_right([moment.time for moment in recent], time)
+        held = recent[max(after - 1, 0)]
+        return held, min(recent[max(after - 1, 0) : after + 1], key=lambda m: abs(m.time - time))
+
+    # -- longer manoeuvres ------------------------------------------------------------------
+
+    def ramp(self, target: ArrayLike, slew: float = GENTLE) -> None:
+        """Bring the pressures (n,) somewhere; from what is measured, should they have fallen."""
+        target = self.rig.supply.limits.clamp(np.asarray(target, dtype=float))
+        measured = self._moments[-1].measured if self._moments else self._setpoint
+        fallen = np.isfinite(measured) & (measured < self._setpoint - 0.1e5)
+        self._setpoint = np.where(fallen, np.maximum(measured, 0.0), self._setpoint)
+        while not np.array_equal(self._setpoint, target):
+            self.tick(target, slew)
+
+    def settle(
+        self, target: ArrayLike, settled: Callable[[Sequence[Row]], bool], timeout: float
+    ) -> bool:
+        """Hold pressures (n,) until rows seen since then satisfy a condition; say if they did."""
+        begin = looked = self.clock.now()
+        while (now := self.clock.now()) - begin < timeout:
+            self.tick(target)
+            if now - looked >= _LOOK:
+                looked = now
+                if settled(self.since(begin)):
+                    return True
+        return False
+
+    def since(self, begin: float) -> list[Row]:
+        """Rows whose time is not before `begin`, in order."""
+        found = []
+        for row in reversed(self.rows):
+            if row.time < begin:
+                break
+            found.append(row)
+        return found[::-1]
+
+
+def at_rest(
+    rows: Sequence[Row], window: float = 1.0, tolerance: float = 5e-5, parts: int = 4
+) -> bool:
+    """Whether the tip has come to rest: the means of the parts of a window agree.
+
+    Means, since a tracker's noise is of the size of the tolerance; four of them, so that a slow
+    swing shows.
+    """
+    groups = split_window([row for row in rows if row.visible], window, parts)
+    if groups is None:
+        return False
+    means = np.array([np.mean([row.position for row in group], axis=0) for group in groups])
+    return float(np.linalg.norm(np.ptp(means, axis=0))) <= tolerance
+
+
+def split_window(rows: Sequence[Row], window: float, parts: int) -> list[list[Row]] | None:
+    """Rows of the last `window` s in equal parts, or None while there are too few."""
+    if not rows or rows[-1].time - rows[0].time < 0.95 * window:
+        return None
+    begin = rows[-1].time - window
+    groups: list[list[Row]] = [[] for _ in range(parts)]
+    for row in reversed(rows):
+        if row.time < begin:
+            break
+        place = int((row.time - begin) / window * parts)
+        groups[min(place, parts - 1)].append(row)
+    return groups if all(len(group) >= 2 for group in groups) else None
+
+
+def check_pressures(rig: Rig, pressures: ArrayLike, channels: Sequence[int]) -> None:
+    """Refuse pressures (any number) that channels (counted from 0) may not have.
+
+    Raises
+    ------
+    InputError
+        It names the channel and its limits.
+    """
+    limits = rig.supply.limits
+    for channel in channels:
+        for p in np.ravel(pressures):
+            low, high = limits.low[channel], limits.high[channel]
+            if not (low <= p <= high * (1 + 1e-9) or p == 0):
+                raise InputError(
+                    f"channel {channel + 1} cannot have {p * 1e-5:g} bar; the limits of this rig "
+                    f"are {low * 1e-5:g} to {high * 1e-5:g} bar"
+                )

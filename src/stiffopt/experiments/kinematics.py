@@ -1,0 +1,232 @@
+"""Experiment 1 of the paper: the tip while each channel in turn is ramped up and down.
+
+The pressure sequence is that of figure 5a: pair after pair, three sawteeth each, to 0.4, 0.8 and
+1.0 bar, nine teeth in 40 s for one segment. The arm is at rest before each repetition.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import Field
+
+from stiffopt.experiments.conductor import Array, Conductor, Row, at_rest, check_pressures
+from stiffopt.experiments.folder import Recording
+from stiffopt.logs import LogLayout
+from stiffopt.rig.interface import Rig
+from stiffopt.schema import Items, Schema
+from stiffopt.units import Duration, Pressure
+
+__all__ = ["KinematicsSettings", "PressureSequence", "recording_name", "run_kinematics"]
+
+SETTLE = 20.0
+"""Seconds for which the arm may take to come to rest before a repetition."""
+_TAIL = 1.0  # s that the last frames may take to arrive
+_AFTER = 0.2  # s that are recorded after the last tooth
+
+Progress = Callable[[float, float, str], None]
+
+
+class KinematicsSettings(Schema):
+    """What is done.
+
+    Attributes
+    ----------
+    experiment : says which.
+    rig, robot : names, for people.
+    channels : number of channels.
+    pressures : peaks of the teeth of each channel, in Pa.
+    period : of a tooth, up and down, in s.
+    repetitions : of the whole sequence.
+    """
+
+    experiment: Literal["kinematics"] = "kinematics"
+    rig: str = "rig"
+    robot: str = "robot"
+    channels: Annotated[int, Field(ge=1)]
+    pressures: Annotated[Items[Annotated[Pressure, Field(gt=0)]], Field(min_length=1)] = (
+        0.4e5,
+        0.8e5,
+        1.0e5,
+    )
+    period: Annotated[Duration, Field(gt=0)] = 40.0 / 9.0
+    repetitions: Annotated[int, Field(ge=1, le=1000)] = 5
+
+
+@dataclass(frozen=True, eq=False)
+class PressureSequence:
+    """Pressures that change linearly between moments.
+
+    Attributes
+    ----------
+    times : ndarray
+        (K,), in s, increasing from 0.
+    pressures : ndarray
+        (K, n), in Pa.
+    """
+
+    times: Array
+    pressures: Array
+
+    @classmethod
+    def sawtooth(
+        cls, base: ArrayLike, peaks: Sequence[float], period: float, slew: ArrayLike
+    ) -> PressureSequence:
+        """Return the teeth of each channel in turn.
+
+        Parameters
+        ----------
+        base : (n,)
+            Pressures between the teeth, in Pa.
+        peaks :
+            Of the teeth of each channel, in Pa.
+        period :
+            Of a tooth, in s; a tooth for which a channel is too slow takes longer.
+        slew : (n,)
+            Greatest rate of change, in Pa/s.
+        """
+        base = np.asarray(base, dtype=float)
+        slew = np.broadcast_to(np.asarray(slew, dtype=float), base.shape)
+        times, knots = [0.0], [base]
+        for channel in range(len(base)):
+            for peak in peaks:
+                half = max(period / 2, abs(peak - base[channel]) / slew[channel])
+                top = base.copy()
+                top[channel] = peak
+                times += [times[-1] + half, times[-1] + 2 * half]
+                knots += [top, base]
+        return cls(np.array(times), np.array(knots))
+
+    @property
+    def duration(self) -> float:
+        """In s."""
+        return float(self.times[-1])
+
+    def at(self, times: ArrayLike) -> Array:
+        """Pressures (n,) at a time or (N, n) at times (N,), in Pa; the ends last for ever."""
+        t = np.asarray(times, dtype=float)
+        columns = [np.interp(t, self.times, column) for column in self.pressures.T]
+        return np.stack(columns, axis=-1)
+
+
+def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
+    """Return the sequence as this rig can follow it.
+
+    Raises
+    ------
+    InputError
+        A pressure is beyond the rig's limits.
+    """
+    limits = rig.supply.limits
+    check_pressures(rig, settings.pressures, range(limits.n))
+    base = limits.clamp(np.clip(0.0, limits.low, limits.high))
+    return PressureSequence.sawtooth(base, settings.pressures, settings.period, rig.slew)
+
+
+def recording_name(repetition: int) -> str:
+    """Return the name of a recording, without ending; repetitions count from 1."""
+    return f"kinematics_{repetition}"
+
+
+def missing_repetitions(folder: Path, settings: KinematicsSettings) -> list[int]:
+    """Repetitions that are not complete in a folder, counted from 1."""
+    every = range(1, settings.repetitions + 1)
+    return [k for k in every if not (folder / f"{recording_name(k)}.csv").exists()]
+
+
+def run_kinematics(
+    rig: Rig,
+    folder: Path,
+    settings: KinematicsSettings,
+    *,
+    rate: float,
+    progress: Progress = lambda done, total, text: None,
+    check: Callable[[], None] = lambda: None,
+) -> list[str]:
+    """Record the repetitions that a folder lacks.
+
+    Parameters
+    ----------
+    rig : Rig
+        Open.
+    folder : Path
+        Gets ``kinematics_1.csv`` (log v1), ``kinematics_1.mcap`` and so on; one that is not
+        complete is called ``kinematics_1.part.csv``.
+    settings : KinematicsSettings
+    rate : float
+        Of the commands, in Hz.
+    progress : callable
+        Is told seconds done, seconds in all and what goes on.
+    check : callable
+        Called often; raises to stop.
+
+    Returns
+    -------
+    list of str
+        What a user should know.
+
+    Raises
+    ------
+    InputError
+        A pressure is beyond the limits; nothing has moved.
+    DeviceError
+        A device fails; what was recorded is kept.
+    """
+    sequence = sequence_for(rig, settings)
+    conductor = Conductor(rig, rate, check)
+    todo = missing_repetitions(folder, settings)
+    notes: list[str] = []
+    if todo:
+        conductor.start()
+    for count, repetition in enumerate(todo):
+        text = f"repetition {repetition} of {settings.repetitions}"
+        total = sequence.duration * len(todo)
+
+        def tell(t: float, done: float = sequence.duration * count, text: str = text) -> None:
+            progress(done + t, total, text)  # noqa: B023 - the same for all
+
+        tell(0.0)
+        conductor.ramp(sequence.at(0.0))
+        if not conductor.settle(sequence.at(0.0), at_rest, SETTLE):
+            notes.append(
+                f"before repetition {repetition} the arm was not at rest within {SETTLE:g} s"
+            )
+        about = {"experiment": "kinematics", "repetition": str(repetition), "rig": settings.rig}
+        _record(conductor, sequence, folder, recording_name(repetition), about, tell)
+    return notes
+
+
+def _record(
+    conductor: Conductor,
+    sequence: PressureSequence,
+    folder: Path,
+    name: str,
+    about: dict[str, str],
+    tell: Callable[[float], None],
+) -> None:
+    clock = conductor.clock
+    turns = any(row.quaternion is not None for row in conductor.rows)
+    layout = LogLayout(n=conductor.n, measured=True, tip_quaternion=turns)
+    end = sequence.duration + _AFTER
+    begin = clock.now()
+    with Recording(folder, name, layout, begin, about) as recording:
+
+        def keep(row: Row) -> None:
+            if 0 <= row.time - begin <= end:
+                recording.append(row.logged(begin))
+
+        conductor.sink = keep
+        try:
+            while (t := clock.now() - begin) < end + _TAIL:
+                conductor.tick(sequence.at(t))
+                tell(min(t, sequence.duration))
+                if t > end and conductor.rows[-1].time - begin > end:
+                    break  # all frames have arrived
+        finally:
+            conductor.sink = None
+        recording.complete()

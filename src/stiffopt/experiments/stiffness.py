@@ -1,0 +1,331 @@
+"""Experiment 2 of the paper: a probe displaces the tip at several pressures of one channel.
+
+At each pressure the arm settles; then the probe is aligned with each direction in turn, touches
+the tip, displaces it in steps, there and back, and waits at each until the force has come to rest.
+All of it is repeated. The slope of force over displacement is the stiffness.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from stiffopt.directions import Direction
+from stiffopt.errors import InputError
+from stiffopt.experiments.conductor import Array, Conductor, Row, at_rest, check_pressures
+from stiffopt.experiments.points import PointsFile, SeriesKey
+from stiffopt.experiments.probing import Probing, Series
+from stiffopt.logs import LogLayout, LogWriter, McapLogWriter
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.rig.interface import Rig
+from stiffopt.schema import Items, Schema
+from stiffopt.units import Duration, Force, Length, Pressure
+
+__all__ = ["StiffnessSettings", "direction_name", "run_stiffness"]
+
+HARD_STOP = 5.0
+"""Times the force that is meant not to be exceeded, at which a series ends."""
+_REST_WINDOW = 4.0  # s
+_PAUSE = 1.0  # s between the times of two runs that share a file
+
+Progress = Callable[[float, float, str], None]
+
+
+class StiffnessSettings(Schema):
+    """What is done.
+
+    Attributes
+    ----------
+    experiment : says which.
+    rig, robot : names, for people.
+    channels : number of channels.
+    channel : which of them is pressurised, counted from 1.
+    pressures : of that channel, in Pa.
+    directions : along which the probe pushes, in the base frame.
+    displacement : of the stage beyond the first contact, in m.
+    force : that steps are kept small for, where the model expects more, in N.
+    steps : of a series, each way.
+    repetitions : of all.
+    settle : seconds for which the arm may take to come to rest.
+    reach : how far the stage looks for the tip, in m.
+    """
+
+    experiment: Literal["stiffness"] = "stiffness"
+    rig: str = "rig"
+    robot: str = "robot"
+    channels: Annotated[int, Field(ge=1)]
+    channel: Annotated[int, Field(ge=1)] = 1
+    pressures: Annotated[Items[Pressure], Field(min_length=1)] = (
+        0.0,
+        0.25e5,
+        0.5e5,
+        0.75e5,
+        1.0e5,
+        1.25e5,
+        1.5e5,
+    )
+    directions: Annotated[Items[Direction], Field(min_length=1)] = (
+        (1.0, 0.0, 0.0),
+        (0.0, 1.0, 0.0),
+        (0.0, 0.0, -1.0),
+    )
+    displacement: Annotated[Length, Field(gt=0, le=0.1)] = 0.003
+    force: Annotated[Force, Field(gt=0)] = 0.2
+    steps: Annotated[int, Field(ge=2, le=1000)] = 5
+    repetitions: Annotated[int, Field(ge=1, le=1000)] = 5
+    settle: Annotated[Duration, Field(gt=0)] = 60.0
+    reach: Annotated[Length, Field(gt=0, le=0.1)] = 0.01
+
+    def pressures_at(self, pressure: float) -> Array:
+        """Pressures (n,) of all channels when that of the one is `pressure`."""
+        p = np.zeros(self.channels)
+        p[self.channel - 1] = pressure
+        return p
+
+
+def check_stiffness(rig: Rig, settings: StiffnessSettings) -> None:
+    """Refuse what this rig cannot do, before anything moves.
+
+    Raises
+    ------
+    InputError
+        It says what.
+    """
+    if rig.probe is None:
+        raise InputError("this rig has no probe; the stiffness experiment needs one")
+    if rig.tracker is None:
+        raise InputError("this rig has no tracker; the stiffness experiment needs one")
+    if settings.channel > rig.supply.n:
+        raise InputError(
+            f"there is no channel {settings.channel}; this rig has {rig.supply.n} channels"
+        )
+    check_pressures(rig, settings.pressures, [settings.channel - 1])
+
+
+def all_series(settings: StiffnessSettings) -> list[SeriesKey]:
+    """Every series in the order in which they are done."""
+    return [
+        SeriesKey(repetition, pressure, direction)
+        for repetition in range(1, settings.repetitions + 1)
+        for pressure in settings.pressures
+        for direction in settings.directions
+    ]
+
+
+def missing_series(folder: Path, settings: StiffnessSettings) -> list[SeriesKey]:
+    """Series that a folder lacks."""
+    done = {_rounded(series.key) for series in PointsFile(folder, settings.channels).read()}
+    return [key for key in all_series(settings) if _rounded(key) not in done]
+
+
+def run_stiffness(
+    rig: Rig,
+    folder: Path,
+    settings: StiffnessSettings,
+    model: Manipulator,
+    *,
+    rate: float,
+    progress: Progress = lambda done, total, text: None,
+    check: Callable[[], None] = lambda: None,
+    aside: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> list[str]:
+    """Do the series that a folder lacks.
+
+    Parameters
+    ----------
+    rig : Rig
+        Open, with a tracker and a probe.
+    folder : Path
+        Gets ``points.csv``, the steps of all series, and of each repetition everything that was
+        seen, as ``stiffness_1.csv`` (log v1) and ``stiffness_1.mcap``.
+    settings : StiffnessSettings
+    model : Manipulator
+        Says how large steps may be; nothing of it is in the data.
+    rate : float
+        Of the commands, in Hz.
+    progress : callable
+        Is told series done, series in all and what goes on.
+    check : callable
+        Called often; raises to stop.
+    aside : callable
+        Returns the context in which the probe is aligned, for which a person may be asked.
+
+    Returns
+    -------
+    list of str
+        What a user should know.
+
+    Raises
+    ------
+    InputError
+        This rig cannot do it; nothing has moved.
+    DeviceError
+        A device fails, or the probe does not find the tip; what was measured is kept.
+    """
+    check_stiffness(rig, settings)
+    todo = missing_series(folder, settings)
+    if not todo:
+        return []
+    run = _Run(folder, settings, model, Conductor(rig, rate, check), aside)
+    total = len(all_series(settings))
+    for number, key in enumerate(todo, start=total - len(todo)):
+        text = (
+            f"repetition {key.repetition} of {settings.repetitions}, "
+            f"{key.pressure * 1e-5:g} bar, {direction_name(key.direction)}"
+        )
+        progress(number, total, text)
+        run.do(key)
+    run.finish()
+    progress(total, total, "done")
+    return run.notes()
+
+
+def _still(rows: Sequence[Row]) -> bool:
+    """Whether the tip creeps so slowly that it hardly moves by itself during a series."""
+    return at_rest(rows, window=_REST_WINDOW)
+
+
+class _Run:
+    """The state between two series: which pressure is on, which recording is open."""
+
+    def __init__(
+        self,
+        folder: Path,
+        settings: StiffnessSettings,
+        model: Manipulator,
+        conductor: Conductor,
+        aside: Callable[[], AbstractContextManager[None]],
+    ) -> None:
+        self._folder, self._settings, self._model = folder, settings, model
+        self._aside = aside
+        self._conductor = conductor
+        self._probing = Probing(conductor)
+        self._points = PointsFile(folder, settings.channels)
+        self._raw: _Raw | None = None
+        self._at: tuple[int, float] | None = None
+        self._restless = self._unsettled = self._done = 0
+        conductor.start()
+
+    def do(self, key: SeriesKey) -> None:
+        """Pressurise, settle, align, push, note."""
+        try:
+            self._series(key)
+        except BaseException:
+            self.finish()
+            raise
+
+    def _series(self, key: SeriesKey) -> None:
+        settings, conductor = self._settings, self._conductor
+        p = settings.pressures_at(key.pressure)
+        if self._raw is None or self._raw.repetition != key.repetition:
+            self.finish()
+            self._raw = _Raw(self._folder, key.repetition, conductor, settings)
+        before, self._at = self._at, (key.repetition, key.pressure)
+        if before is not None and before != self._at:
+            with self._aside():
+                self._probing.probe.withdraw()  # the arm is about to move
+        if before is None or before[0] != key.repetition:
+            conductor.ramp(np.zeros(settings.channels))  # each repetition starts from nothing
+            self._rest(np.zeros(settings.channels))
+        self._rest(p)
+        with self._aside():
+            self._probing.probe.align(key.direction)
+        at_rest_then = self._rest(p)  # whoever aligned it may have taken long, or touched the arm
+        points = self._probing.run(p, self._planned(p, key))
+        self._restless += not at_rest_then
+        self._unsettled += sum(not point.settled for point in points)
+        self._done += 1
+        self._points.append(key, points)
+
+    def _rest(self, p: Array) -> bool:
+        self._conductor.ramp(p)
+        return self._conductor.settle(p, _still, self._settings.settle)
+
+    def _planned(self, p: Array, key: SeriesKey) -> Series:
+        """Steps so small that a stiff direction does not ask for too much force."""
+        settings = self._settings
+        expected = float(self._model.stiffness(p, key.direction))
+        return Series(
+            direction=np.array(key.direction),
+            displacement=min(settings.displacement, settings.force / max(expected, 1e-9)),
+            steps=settings.steps,
+            reach=settings.reach,
+            most_force=HARD_STOP * settings.force,
+        )
+
+    def notes(self) -> list[str]:
+        """What a user should know."""
+        found = []
+        if self._restless:
+            found.append(
+                f"the arm still crept after {self._settings.settle:g} s before {self._restless} of "
+                f"{self._done} series; a longer --settle may help"
+            )
+        if self._unsettled:
+            found.append(f"the force had not come to rest at {self._unsettled} points")
+        return found
+
+    def finish(self) -> None:
+        """Close the recording."""
+        if self._raw is not None:
+            self._raw.close()
+            self._raw = None
+
+
+class _Raw:
+    """Everything that is seen in a repetition; a run that is resumed continues the CSV file."""
+
+    def __init__(
+        self, folder: Path, repetition: int, conductor: Conductor, settings: StiffnessSettings
+    ) -> None:
+        self.repetition = repetition
+        self._conductor = conductor
+        turns = any(row.quaternion is not None for row in conductor.rows)
+        layout = LogLayout(
+            n=settings.channels, measured=True, tip_quaternion=turns, force=True, stage=True
+        )
+        name = f"stiffness_{repetition}"
+        self._csv = LogWriter(folder / f"{name}.csv", layout)
+        part, mcap = 1, folder / f"{name}.mcap"
+        while mcap.exists():
+            part += 1
+            mcap = folder / f"{name}_{part}.mcap"
+        about = {"experiment": "stiffness", "repetition": str(repetition), "rig": settings.rig}
+        self._mcap = McapLogWriter(mcap, layout, about)
+        last = self._csv.last_time
+        now = conductor.clock.now()
+        begin = now if last is None else now - last - _PAUSE
+
+        def keep(row: Row) -> None:
+            if row.time >= now:
+                self._csv.append(row.logged(begin))
+                self._mcap.append(row.logged(begin))
+
+        conductor.sink = keep
+
+    def close(self) -> None:
+        """Close both files."""
+        self._conductor.sink = None
+        try:
+            self._csv.close()
+        finally:
+            self._mcap.close()
+
+
+def _rounded(key: SeriesKey) -> tuple[int, float, tuple[float, ...]]:
+    """Return what tells series apart, as a file keeps it."""
+    direction = tuple(round(component, 6) + 0.0 for component in key.direction)
+    return key.repetition, round(key.pressure, 1), direction
+
+
+def direction_name(direction: tuple[float, float, float]) -> str:
+    """Return a direction as people name it: x, -z, (0.6, 0.8, 0)."""
+    for axis, name in enumerate("xyz"):
+        if abs(abs(direction[axis]) - 1) < 1e-9:
+            return name if direction[axis] > 0 else f"-{name}"
+    return f"({', '.join(f'{component + 0.0:.3g}' for component in direction)})"

@@ -1,0 +1,163 @@
+"""What a stiffness experiment has found, and how the model compares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stiffopt.experiments.conductor import Array
+from stiffopt.experiments.points import PointsFile, SeriesPoints
+from stiffopt.experiments.slope import Estimate, Line, combine, fit_line
+from stiffopt.experiments.stiffness import StiffnessSettings
+from stiffopt.logs import StiffnessTable
+from stiffopt.model.manipulator import Manipulator
+
+__all__ = ["StiffnessCell", "StiffnessResult", "evaluate_stiffness"]
+
+
+@dataclass(frozen=True)
+class StiffnessCell:
+    """Stiffness at one pressure in one direction.
+
+    Attributes
+    ----------
+    pressure : of the channel, in Pa.
+    direction : unit vector in the base frame.
+    estimate : from the displacement of the tip, in N/m; None if no repetition gave a slope.
+    by_stage : the same from the place of the stage: less by what contact and sensor give way.
+    slopes : of the repetitions, in N/m.
+    points : in contact, in all repetitions.
+    model : what the model says, in N/m.
+    """
+
+    pressure: float
+    direction: tuple[float, float, float]
+    estimate: Estimate | None
+    by_stage: Estimate | None
+    slopes: tuple[float, ...]
+    points: int
+    model: float
+
+
+@dataclass(frozen=True, eq=False)
+class StiffnessResult:
+    """All that was found.
+
+    Attributes
+    ----------
+    settings : of the experiment.
+    cells : one for each pressure and direction.
+    curve_pressures : of the channel (K,), in Pa, at which the model's curves are known.
+    curves : model's stiffness (K, d) along the d directions, in N/m.
+    """
+
+    settings: StiffnessSettings
+    cells: tuple[StiffnessCell, ...]
+    curve_pressures: Array
+    curves: Array
+
+    def along(self, direction: Sequence[float]) -> list[StiffnessCell]:
+        """Cells of one direction, in order of pressure."""
+        found = [cell for cell in self.cells if cell.direction == tuple(direction)]
+        return sorted(found, key=lambda cell: cell.pressure)
+
+    def table(self) -> StiffnessTable:
+        """Return the results as a table, for `write_stiffness_table`."""
+        cells = self.cells
+        estimates = [cell.estimate for cell in cells]
+        by_stage = [cell.by_stage for cell in cells]
+
+        def column(values: Sequence[float | None]) -> Array:
+            return np.array([np.nan if value is None else value for value in values], dtype=float)
+
+        return StiffnessTable(
+            pressures=np.stack([self.settings.pressures_at(cell.pressure) for cell in cells]),
+            directions=np.array([cell.direction for cell in cells]),
+            boundaries=("free",) * len(cells),
+            stiffness=column([None if e is None else e.value for e in estimates]),
+            sigma=column([None if e is None else e.sigma for e in estimates]),
+            others={
+                "ci95_n_per_m": column([None if e is None else e.half_width for e in estimates]),
+                "spread_n_per_m": column([None if e is None else e.spread for e in estimates]),
+                "repetitions": column([float(len(cell.slopes)) for cell in cells]),
+                "points": column([float(cell.points) for cell in cells]),
+                "by_stage_n_per_m": column([None if e is None else e.value for e in by_stage]),
+                "model_n_per_m": column([cell.model for cell in cells]),
+            },
+        )
+
+
+def evaluate_stiffness(
+    folder: Path, settings: StiffnessSettings, model: Manipulator, curve: int = 61
+) -> StiffnessResult:
+    """Fit the slopes of all series in a folder; compare with a model.
+
+    Parameters
+    ----------
+    folder : Path
+        Of an experiment, complete or not.
+    settings : StiffnessSettings
+    model : Manipulator
+    curve : int
+        Number of pressures of the model's curves.
+
+    Raises
+    ------
+    FileError
+        The points cannot be read.
+    """
+    series = PointsFile(folder, settings.channels).read()
+    top = max(settings.pressures)
+    pressures = np.linspace(min(settings.pressures), top, curve if top > 0 else 1)
+    directions = np.array(settings.directions)
+    expected = model.stiffness(
+        np.stack([settings.pressures_at(p) for p in settings.pressures]), directions
+    )
+    cells = tuple(
+        _cell(series, pressure, direction, float(expected[i, j]))
+        for i, pressure in enumerate(settings.pressures)
+        for j, direction in enumerate(settings.directions)
+    )
+    curves = model.stiffness(np.stack([settings.pressures_at(p) for p in pressures]), directions)
+    return StiffnessResult(settings, cells, pressures, curves)
+
+
+def _cell(
+    series: Sequence[SeriesPoints],
+    pressure: float,
+    direction: tuple[float, float, float],
+    model: float,
+) -> StiffnessCell:
+    mine = [
+        one
+        for one in series
+        if abs(one.key.pressure - pressure) < 1.0
+        and np.allclose(one.key.direction, direction, atol=1e-6)
+    ]
+    lines, by_stage, points = [], [], 0
+    for one in mine:
+        line = _line(one, one.displacement)
+        if line is not None:
+            lines.append(line)
+            points += line.points
+        other = _line(one, one.stage)
+        if other is not None:
+            by_stage.append(other)
+    return StiffnessCell(
+        pressure=pressure,
+        direction=direction,
+        estimate=combine(lines),
+        by_stage=combine(by_stage),
+        slopes=tuple(line.slope for line in lines),
+        points=points,
+        model=model,
+    )
+
+
+def _line(series: SeriesPoints, displacement: Array) -> Line | None:
+    """Force over displacement, of the points in contact, with a steady creep taken off."""
+    use = series.touching
+    return fit_line(displacement[use], series.force[use], series.time[use])

@@ -1,0 +1,28 @@
+"""Recordings: log v1 (CSV), the same as MCAP, and tables of measured stiffness."""
+
+from stiffopt.logs.layout import LogLayout
+from stiffopt.logs.log import Body, Log, LogRow
+from stiffopt.logs.mcap_log import McapLogWriter, read_mcap_log, require_mcap
+from stiffopt.logs.reading import read_log
+from stiffopt.logs.stiffness import (
+    StiffnessTable,
+    read_stiffness_table,
+    write_stiffness_table,
+)
+from stiffopt.logs.writing import LogWriter, write_log
+
+__all__ = [
+    "Body",
+    "Log",
+    "LogLayout",
+    "LogRow",
+    "LogWriter",
+    "McapLogWriter",
+    "StiffnessTable",
+    "read_log",
+    "read_mcap_log",
+    "read_stiffness_table",
+    "require_mcap",
+    "write_log",
+    "write_stiffness_table",
+]

@@ -1,0 +1,196 @@
+"""Tables of measured stiffness: what the stiffness experiment finds, and calibration fits."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from io import StringIO
+from math import isfinite, nan
+
+import numpy as np
+
+from stiffopt.errors import FileError, InputError, shown
+from stiffopt.logs.log import Array
+from stiffopt.logs.table import read_bytes
+
+__all__ = ["StiffnessTable", "read_stiffness_table", "write_stiffness_table"]
+
+BOUNDARIES = ("free", "guided", "clamped")
+_DIRECTION = ("direction_x", "direction_y", "direction_z")
+_VALUES = ("stiffness_n_per_m", "sigma_n_per_m")
+
+
+@dataclass(frozen=True, eq=False)
+class StiffnessTable:
+    """Stiffnesses of the tip along directions, as measured.
+
+    Attributes
+    ----------
+    pressures : ndarray
+        Commanded gauge pressures (N, n), in Pa.
+    directions : ndarray
+        Unit vectors (N, 3) in the base frame.
+    boundaries : tuple of str
+        ``free``, ``guided`` or ``clamped``, for each row.
+    stiffness : ndarray
+        (N,), in N/m; NaN where none could be measured.
+    sigma : ndarray
+        Standard uncertainty (N,) of `stiffness`, in N/m.
+    others : mapping of str to ndarray
+        Further columns (N,), by name.
+    """
+
+    pressures: Array
+    directions: Array
+    boundaries: tuple[str, ...]
+    stiffness: Array
+    sigma: Array
+    others: Mapping[str, Array] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        count = len(self.stiffness)
+        if self.pressures.ndim != 2 or not self.pressures.shape[1]:
+            raise InputError("a table of stiffness needs pressures (N, n)")
+        shapes = {
+            "pressures": (self.pressures.shape, (count, self.pressures.shape[1])),
+            "directions": (self.directions.shape, (count, 3)),
+            "boundaries": ((len(self.boundaries),), (count,)),
+            "sigma": (self.sigma.shape, (count,)),
+            **{name: (values.shape, (count,)) for name, values in self.others.items()},
+        }
+        for name, (shape, wanted) in shapes.items():
+            if shape != wanted:
+                raise InputError(f"{name} must have the shape {wanted}, not {shape}")
+
+    def __len__(self) -> int:
+        return len(self.stiffness)
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return int(self.pressures.shape[1])
+
+
+def write_stiffness_table(path: str | os.PathLike[str], table: StiffnessTable) -> None:
+    """Write a table as CSV, in the place of what is there.
+
+    Raises
+    ------
+    FileError
+        It cannot be written.
+    """
+    text = StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    pressures = [f"p{k + 1}_pa" for k in range(table.n)]
+    writer.writerow([*pressures, *_DIRECTION, "boundary", *_VALUES, *table.others])
+    for i in range(len(table)):
+        numbers = [*table.pressures[i], *table.directions[i]]
+        values = [table.stiffness[i], table.sigma[i], *(v[i] for v in table.others.values())]
+        writer.writerow(
+            [*map(_text, numbers), table.boundaries[i], *(_text(value) for value in values)]
+        )
+    part = f"{os.fspath(path)}.part"
+    try:
+        with open(part, "w", encoding="utf-8", newline="") as stream:
+            stream.write(text.getvalue())
+        os.replace(part, path)
+    except OSError as error:
+        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None
+
+
+def read_stiffness_table(path: str | os.PathLike[str]) -> StiffnessTable:
+    """Read a table of stiffness.
+
+    Parameters
+    ----------
+    path :
+        CSV with the columns ``p1_pa`` ..., ``direction_x``, ``direction_y``, ``direction_z``,
+        ``boundary``, ``stiffness_n_per_m``, ``sigma_n_per_m`` and any others that hold numbers.
+
+    Raises
+    ------
+    FileError
+        It cannot be read, a column is missing, a field is wrong. It names the line.
+    """
+    name = os.fspath(path)
+    try:
+        text = read_bytes(name).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise FileError(name, "is not UTF-8 text") from None
+    lines = list(csv.reader(StringIO(text, newline="")))
+    if not lines:
+        raise FileError(name, "is empty; expected a row of names", line=1)
+    columns = [column.strip() for column in lines[0]]
+    n = 0
+    while f"p{n + 1}_pa" in columns:
+        n += 1
+    pressures = [f"p{k + 1}_pa" for k in range(max(n, 1))]
+    needed = [*pressures, *_DIRECTION, "boundary", *_VALUES]
+    for column in needed:
+        if columns.count(column) != 1:
+            how = "there twice" if column in columns else "missing"
+            raise FileError(name, f"the column '{column}' is {how}", line=1)
+    rows = [
+        _checked_row(name, number, columns, fields)
+        for number, fields in enumerate(lines[1:], start=2)
+    ]
+    numbers = {
+        column: np.array([row[column] for row in rows], dtype=float)
+        for column in columns
+        if column != "boundary"
+    }
+
+    def stacked(names: list[str]) -> Array:
+        return np.stack([numbers[each] for each in names], axis=1)
+
+    return StiffnessTable(
+        pressures=stacked(pressures),
+        directions=stacked(list(_DIRECTION)),
+        boundaries=tuple(str(row["boundary"]) for row in rows),
+        stiffness=numbers[_VALUES[0]],
+        sigma=numbers[_VALUES[1]],
+        others={key: value for key, value in numbers.items() if key not in needed},
+    )
+
+
+def _checked_row(
+    path: str, line: int, columns: list[str], fields: list[str]
+) -> dict[str, float | str]:
+    if len(fields) != len(columns):
+        raise FileError(path, f"expected {len(columns)} fields, found {len(fields)}", line=line)
+    row: dict[str, float | str] = {}
+    for column, text in zip(columns, map(str.strip, fields), strict=True):
+        if column == "boundary":
+            if text not in BOUNDARIES:
+                raise FileError(
+                    path, f"{shown(text)} is not one of {', '.join(BOUNDARIES)}", line=line
+                )
+            row[column] = text
+            continue
+        may_be_missing = not (column.endswith("_pa") or column in _DIRECTION)
+        row[column] = _number(path, line, column, text, may_be_missing)
+    direction = [float(row[column]) for column in _DIRECTION]
+    norm = float(np.linalg.norm(direction))
+    if abs(norm - 1) > 1e-3:
+        raise FileError(path, f"the direction has length {norm:.4g}; expected 1", line=line)
+    if float(row["sigma_n_per_m"]) < 0:
+        raise FileError(path, "sigma_n_per_m is negative", line=line)
+    return row
+
+
+def _number(path: str, line: int, column: str, text: str, may_be_missing: bool) -> float:
+    if not text and may_be_missing:
+        return nan
+    try:
+        value = float(text)
+    except ValueError:
+        value = nan
+    if not isfinite(value):
+        raise FileError(path, f"{column}: {shown(text)} is not a finite number", line=line)
+    return value
+
+
+def _text(value: float) -> str:
+    return f"{value:.9g}" if isfinite(value) else ""

@@ -1,0 +1,166 @@
+"""Log v1, written row by row: whatever happens, at most the last row is lost."""
+
+from __future__ import annotations
+
+import os
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from stiffopt.errors import FileError, InputError
+from stiffopt.logs.layout import LogLayout
+from stiffopt.logs.log import Array, Log, LogRow
+from stiffopt.logs.table import cut_torn_end, read_bytes
+
+__all__ = ["LogWriter", "write_log"]
+
+
+class LogWriter:
+    """Appends rows to a recording (log v1). Each row is with the system when `append` returns.
+
+    A file that is there and has the same columns is continued; `last_time` then says where.
+
+    Parameters
+    ----------
+    path :
+        The file; its folder must exist.
+    layout :
+        Which columns it has.
+
+    Attributes
+    ----------
+    last_time : float or None
+        Time of the last row; None before the first.
+    was_torn : bool
+        Whether a last line without an end was found and cut off.
+
+    Raises
+    ------
+    FileError
+        It cannot be written, or is there and has other columns.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], layout: LogLayout) -> None:
+        self.path = os.fspath(path)
+        self.layout = layout
+        self.last_time: float | None = None
+        self.was_torn = False
+        self._formats = [_format(name) for name in layout.columns]
+        header = f"{','.join(layout.columns)}\n".encode()
+        if os.path.exists(self.path):
+            self._take_up(header)
+        try:
+            self._stream = open(self.path, "ab", buffering=0)  # noqa: SIM115 - kept open
+            if not self._stream.tell():
+                self._write(header)
+        except OSError as error:
+            raise self._cannot(error) from None
+
+    def _take_up(self, header: bytes) -> None:
+        """Find where an existing file ends."""
+        text = read_bytes(self.path)
+        if text and not text.startswith(header) and not header.startswith(text):
+            raise FileError(self.path, "is there and has other columns; give another name", line=1)
+        self.was_torn = cut_torn_end(self.path)
+        lines = text[: text.rfind(b"\n") + 1].splitlines()
+        if len(lines) > 1:
+            fields = lines[-1].split(b",")
+            if len(fields) != len(self._formats):
+                raise FileError(self.path, "the last row is not whole; remove it", line=len(lines))
+            try:
+                self.last_time = float(fields[0])
+            except ValueError:
+                raise FileError(self.path, "has no time", line=len(lines)) from None
+
+    def append(self, row: LogRow) -> None:
+        """Write a row.
+
+        Raises
+        ------
+        InputError
+            It does not fit the columns, or is not after the last one.
+        FileError
+            It cannot be written.
+        """
+        values = row.values(self.layout)
+        time = round(float(values[0]), 6)
+        if not np.isfinite(time) or (self.last_time is not None and time <= self.last_time):
+            raise InputError(f"a row at {time:g} s cannot follow one at {self.last_time} s")
+        self._write(self._line(values))
+        self.last_time = time
+
+    def _line(self, values: Array) -> bytes:
+        fields = [
+            "" if value != value else form % value
+            for form, value in zip(self._formats, values.tolist(), strict=True)
+        ]
+        return f"{','.join(fields)}\n".encode()
+
+    def _write(self, data: bytes) -> None:
+        try:
+            while data:
+                data = data[self._stream.write(data) :]
+        except OSError as error:
+            raise self._cannot(error) from None
+
+    def close(self) -> None:
+        """See the rows onto the disk and close; to close twice does nothing.
+
+        Raises
+        ------
+        FileError
+            The disk does not take them.
+        """
+        if self._stream.closed:
+            return
+        try:
+            os.fsync(self._stream.fileno())
+        except OSError as error:
+            raise self._cannot(error) from None
+        finally:
+            self._stream.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _cannot(self, error: OSError) -> FileError:
+        return FileError(self.path, f"cannot be written: {(error.strerror or '').lower()}")
+
+
+def write_log(path: str | os.PathLike[str], log: Log) -> None:
+    """Write a whole recording (log v1), in the place of what is there.
+
+    Raises
+    ------
+    FileError
+        It cannot be written.
+    """
+    part = f"{os.fspath(path)}.part"
+    try:
+        with LogWriter(part, log.layout) as writer:
+            for row in log.rows():
+                writer.append(row)
+        os.replace(part, path)
+    except OSError as error:
+        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None
+    finally:
+        if os.path.exists(part):
+            os.remove(part)
+
+
+def _format(column: str) -> str:
+    """Return how a column's numbers are written: finer than any sensor, in fixed steps."""
+    if column.endswith("_pa"):
+        return "%.1f"  # Pa
+    if column.endswith("_m"):
+        return "%.7f"  # 0.1 um
+    return "%.6f"  # us, uN, quaternions

@@ -1,0 +1,194 @@
+"""The NDI Aurora electromagnetic tracker, over its serial protocol (ndicapi)."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from stiffopt.errors import DeviceError, MissingExtraError
+from stiffopt.rig.drivers.streamed import StreamedSettings, StreamedTracker
+from stiffopt.rig.interface import Clock
+from stiffopt.units import Duration, Frequency
+
+__all__ = ["AuroraSettings", "AuroraTracker"]
+
+_READER = Path(__file__).with_name("ndi_reader.py")
+_END = 0.9  # s that the reader is given to end by itself
+_BETWEEN_TRIES = 0.5  # s before a lost device is looked for again
+_POLLS_PER_FRAME = 10  # a frame is seen at most a tenth of a period late
+
+
+class AuroraSettings(StreamedSettings):
+    """An NDI Aurora.
+
+    The device does not say when it captured a frame, and NDI states no latency: by default it is
+    taken for one frame at 40 Hz. A sensor of five degrees of freedom does not know its roll.
+
+    Attributes
+    ----------
+    port : serial port, such as ``/dev/ttyUSB0`` or ``COM3``; ``auto`` takes the one USB port that
+        says it is NDI's, and speaks to no other.
+    baud : speed of the line while tracking.
+    sensor : which of the sensors is at the tip, counted from 1 in the order of port handles.
+    rate : frames that the device makes in a second.
+    reply : ``binary`` is finer and faster; ``text`` (0.01 mm) is for old firmware, which ``auto``
+        knows.
+    outside_volume : believe poses outside of the volume that NDI characterised.
+    reconnect_after : a device that is silent for this long is connected anew, in s.
+    """
+
+    driver: Literal["aurora"]
+    port: Annotated[str, Field(min_length=1)] = "auto"
+    baud: Literal[9600, 19200, 38400, 57600, 115200] = 115200
+    sensor: Annotated[int, Field(ge=1, le=16)] = 1
+    rate: Annotated[Frequency, Field(gt=0, le=400)] = 40.0
+    reply: Literal["auto", "binary", "text"] = "auto"
+    outside_volume: bool = False
+    reconnect_after: Annotated[Duration, Field(gt=0, le=60)] = 5.0
+
+    def device(self, clock: Clock | None = None) -> AuroraTracker:
+        """Return the tracker, not yet open."""
+        return AuroraTracker(self, clock)
+
+
+class AuroraTracker(StreamedTracker):
+    """Starts `ndi_reader` as a process, listens to it in a thread, and starts it again if it ends.
+
+    A process, not a thread: the library waits up to 5 s for a silent device and cannot be
+    interrupted, and it does not check the length of what it is sent. A process can be killed, and
+    if it crashes the one that holds the pressures lives on.
+
+    A frame counts as captured `latency` before it was asked for: the reply takes time on the wire
+    that the frame does not.
+    """
+
+    def __init__(self, settings: AuroraSettings, clock: Clock | None = None) -> None:
+        super().__init__(settings.range, settings.registration, clock)
+        self.settings = settings
+        self._process: subprocess.Popen[str] | None = None
+        self._thread: threading.Thread | None = None
+        self._starting = threading.Lock()
+        self._settled = threading.Event()  # the first connection stands, or failed
+        self._refusal = ""  # why the first connection failed
+        self._lost = ""  # why the last one ended
+        self._frame = -1  # last of the device's
+        self._frames_before = 0  # in earlier sessions of the device
+
+    def _open(self) -> None:
+        for module, package in (("ndicapy", "ndicapi"), ("serial", "pyserial")):
+            if find_spec(module) is None:
+                raise MissingExtraError(package, "aurora")
+        self._arrived.clear()
+        self._stopping.clear()
+        self._settled.clear()
+        self._refusal = self._lost = ""
+        self._process = self._start_reader(9600)
+        self._thread = threading.Thread(target=self._listen, name="aurora", daemon=True)
+        self._thread.start()
+        if not self._settled.wait(self.settings.connect_timeout):
+            self._refusal = (
+                f"no NDI tracker answers at port {self.settings.port} within "
+                f"{self.settings.connect_timeout:g} s; check that it is switched on and its cable"
+            )
+        if self._refusal:
+            self._close()
+            raise DeviceError(f"aurora: {self._refusal}")
+
+    def _close(self) -> None:
+        with self._starting:
+            self._stopping.set()
+            process = self._process
+        if process is not None:
+            _end(process)
+        if self._thread is not None:
+            self._thread.join()
+        self._process = self._thread = None
+
+    def _start_reader(self, likely_baud: int) -> subprocess.Popen[str]:
+        chosen = self.settings
+        told = {
+            **chosen.model_dump(
+                include={"port", "baud", "sensor", "reply", "outside_volume", "reconnect_after"}
+            ),
+            "likely_baud": likely_baud,
+            "pause": 1 / (_POLLS_PER_FRAME * chosen.rate),
+        }
+        return subprocess.Popen(
+            [sys.executable, str(_READER), json.dumps(told)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,  # Ctrl-C is for the process that vents, not for this one
+        )
+
+    def _listen(self) -> None:
+        """Take what the reader says until the tracker is closed."""
+        while (process := self._process) is not None and process.stdout is not None:
+            with process.stdout as lines:
+                for line in lines:
+                    self._take(line)
+            _end(process)
+            if self._stopping.is_set():
+                return
+            if not self._settled.is_set():
+                self._refusal = self._lost or "the program that reads the tracker does not run"
+                self._settled.set()
+                return
+            self._count(f"aurora: {self._lost or 'the program that reads the tracker ended'}")
+            self._lost = ""
+            if self._stopping.wait(_BETWEEN_TRIES):
+                return
+            with self._starting:
+                if self._stopping.is_set():
+                    return
+                self._process = self._start_reader(self.settings.baud)
+
+    def _take(self, line: str) -> None:
+        try:
+            message: dict[str, Any] = json.loads(line)
+        except ValueError:  # the reader was killed while it wrote
+            return
+        if "frame" in message:
+            self._take_frame(message["at"], message["frame"], message["pose"])
+        elif "error" in message:
+            self._count(f"aurora: {message['error']}")
+        elif "ready" in message:
+            self._settled.set()
+        elif "lost" in message:
+            self._lost = message["lost"]
+
+    def _take_frame(self, asked: float, frame: int, pose: list[float] | None) -> None:
+        if frame == self._frame:  # it hangs, and was connected anew
+            return
+        if frame < self._frame:  # the device began to count anew
+            self._frames_before += self._frame + 1
+        self._frame = frame
+        number = self._frames_before + frame
+        elapsed = time.monotonic() - asked  # this clock is the same in both processes
+        captured = self.clock.now() - elapsed - self.settings.latency
+        if pose is None:
+            self._hand_over_nothing(captured, number)
+        else:
+            position = np.array(pose[4:7]) * 1e-3
+            self._hand_over(captured, number, position, pose[:4])
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """Ask a reader to end, then make it."""
+    if process.stdin is not None:
+        process.stdin.close()
+    try:
+        process.wait(_END)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

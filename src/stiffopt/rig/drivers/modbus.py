@@ -1,0 +1,354 @@
+"""A supply behind Modbus, over TCP or a serial line: output couplers, IO-Link masters, valves.
+
+pymodbus speaks the protocol. Where the pressures are is in `stiffopt.rig.drivers.modbus_registers`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
+
+from stiffopt.errors import DeviceError, InputError
+from stiffopt.rig.drivers.modbus_line import ModbusLine, RefusedError, SerialLine, Tcp
+from stiffopt.rig.drivers.modbus_registers import (
+    Channel,
+    DumpValve,
+    Point,
+    RegisterType,
+    Run,
+    Scale,
+    Table,
+    Watchdog,
+    WordOrder,
+    runs_of,
+    values_of,
+)
+from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply
+from stiffopt.schema import BadKeyError, Items, Schema
+from stiffopt.units import Duration
+
+__all__ = ["DumpValve", "ModbusSettings", "ModbusSupply", "SerialLine", "Tcp", "Watchdog"]
+
+Array = NDArray[np.float64]
+Registers = dict[int, tuple[int, ...]]
+
+_ILLEGAL_FUNCTION = 1
+
+
+class ModbusSettings(Schema):
+    """Connection and register map of a supply.
+
+    Attributes
+    ----------
+    tcp, serial : the connection, one of the two.
+    unit : number of the device on its line.
+    timeout : for each answer, in s.
+    channels : one for each channel of the robot, in its order.
+    scale, type, word_order : of all registers that have none of their own.
+    table : of the readings.
+    read_write : write and read in one request (function 23) if the device can.
+    verify : read back what was written.
+    watchdog, dump_valve : of the device, where it has them.
+    """
+
+    driver: Literal["modbus"]
+    tcp: Tcp | None = None
+    serial: SerialLine | None = None
+    unit: Annotated[int, Field(ge=0, le=255)] = 1
+    timeout: Annotated[Duration, Field(ge=0.005, le=5)] = 0.2
+    channels: Annotated[Items[Channel], Field(min_length=1)]
+    scale: Scale
+    type: RegisterType = "int16"
+    word_order: WordOrder = "big"
+    table: Table = "input"
+    read_write: bool = True
+    verify: bool = True
+    watchdog: Watchdog | None = None
+    dump_valve: DumpValve | None = None
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Self:
+        if (self.tcp is None) == (self.serial is None):
+            raise ValueError("expected one of the keys 'tcp' and 'serial'")
+        if self.serial is not None and not 1 <= self.unit <= 247:
+            raise BadKeyError("unit", f"expected 1 to 247 on a serial line, not {self.unit}")
+        for index, (channel, point) in enumerate(zip(self.channels, self.setpoints, strict=True)):
+            low, high = point.pressure_range()
+            if not low <= 0 <= high:
+                reason = "the register cannot say 0 bar, so not vent"
+                raise BadKeyError(f"channels.{index}.setpoint", reason)
+            if channel.min is not None and channel.max is not None and channel.min > channel.max:
+                raise BadKeyError(f"channels.{index}.max", "must be above min")
+        self._check_addresses()
+        return self
+
+    def _check_addresses(self) -> None:
+        """Refuse registers beyond the last one, and what would overwrite a set-point."""
+        taken = dict.fromkeys(self.watchdog.addresses if self.watchdog else (), "the watchdog")
+        for index, point in enumerate(self.setpoints):
+            for address in point.addresses:
+                if address in taken:
+                    raise BadKeyError(
+                        f"channels.{index}.setpoint",
+                        f"register {address} is that of {taken[address]}",
+                    )
+                taken[address] = f"channel {index + 1}"
+        for index, point in (*enumerate(self.setpoints + self.read_backs), *self.readings.items()):
+            if point.addresses[-1] > 0xFFFF:
+                reason = f"its registers go beyond 65535, the last one: {point.address} is too high"
+                raise BadKeyError(f"channels.{index % self.n}", reason)
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return len(self.channels)
+
+    @property
+    def setpoints(self) -> tuple[Point, ...]:
+        """Where each channel is commanded."""
+        return tuple(self._point(c.setpoint, "holding") for c in self.channels)
+
+    @property
+    def read_backs(self) -> tuple[Point, ...]:
+        """Where each channel's command can be read back."""
+        pairs = zip(self.channels, self.setpoints, strict=True)
+        return tuple(
+            point if c.setpoint.read_back is None else point.at(c.setpoint.read_back)
+            for c, point in pairs
+        )
+
+    @property
+    def readings(self) -> dict[int, Point]:
+        """Where the channels that are measured, counted from 0, are read."""
+        return {
+            index: self._point(c.reading, c.reading.table or self.table)
+            for index, c in enumerate(self.channels)
+            if c.reading is not None
+        }
+
+    @property
+    def connection(self) -> Tcp | SerialLine:
+        """How the device is reached."""
+        connection = self.tcp or self.serial
+        if connection is None:
+            raise InputError("expected one of the keys 'tcp' and 'serial'")
+        return connection
+
+    def limits(self, limits: PressureLimits) -> PressureLimits:
+        """Return limits as tight as those of the channels and the range of their registers."""
+        if limits.n != self.n:
+            raise InputError(f"there are {self.n} channels, but limits for {limits.n}")
+        low, high = limits.low.copy(), limits.high.copy()
+        for index, (channel, point) in enumerate(zip(self.channels, self.setpoints, strict=True)):
+            lowest, highest = point.pressure_range()
+            low[index] = max(low[index], lowest, *([] if channel.min is None else [channel.min]))
+            high[index] = min(high[index], highest, *([] if channel.max is None else [channel.max]))
+            if low[index] > high[index]:
+                raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
+        return PressureLimits(low, high)
+
+    def device(self, limits: PressureLimits, clock: Clock | None = None) -> ModbusSupply:
+        """Return the supply, not yet open."""
+        return ModbusSupply(self, self.limits(limits), clock)
+
+    def _point(self, register: Any, table: str) -> Point:
+        kind, scale = register.type or self.type, register.scale or self.scale
+        return Point(register.address, table, kind, self.word_order, scale)
+
+
+class ModbusSupply(PressureSupply):
+    """Regulators behind Modbus.
+
+    A request that fails is an error at once and ends the connection; the next one connects anew,
+    once. Nothing is sent twice but zeros, when the supply vents.
+    """
+
+    _line: ModbusLine
+
+    def __init__(
+        self, settings: ModbusSettings, limits: PressureLimits, clock: Clock | None = None
+    ) -> None:
+        super().__init__(limits, clock)
+        self.settings = settings
+        self._watched = 0  # the connection on which the watchdog was started
+        self._beat = 0
+        self._setpoints = settings.setpoints
+        self._read_backs = settings.read_backs
+        self._readings = settings.readings
+        self._written = runs_of(enumerate(self._setpoints))
+        self._verified = runs_of(enumerate(self._read_backs)) if settings.verify else ()
+        self._measured = runs_of(self._readings.items())
+        self._joint = self._joint_run() if settings.read_write else None
+
+    def _joint_run(self) -> Run | None:
+        """Return what function 23 reads, if it can write and read all in one request."""
+        readings = list(self._readings.items())
+        verified = [item for run in self._verified for item in run.points]
+        if len(self._written) > 1 or any(run.table != "holding" for run in self._measured):
+            return None
+        for points in (readings + verified, readings):
+            runs = runs_of(points)
+            if len(runs) == 1:
+                return runs[0]
+        return None
+
+    def _open(self) -> None:
+        settings = self.settings
+        self._watched = 0
+        self._line = ModbusLine(settings.connection, settings.unit, settings.timeout)
+        try:
+            self._line.connect()
+            self._watch()
+        except BaseException:
+            with suppress(DeviceError):  # what a watchdog has to say must not keep it from venting
+                self._write_once(self._encoded(np.zeros(self.n)), whatever_happens=True)
+            self._line.disconnect()
+            raise
+
+    def _close(self) -> None:
+        self._line.disconnect()
+
+    def _watch(self) -> None:
+        """Start the device's watchdog, once on every connection: the device may be a fresh one."""
+        watchdog = self.settings.watchdog
+        self._line.connect()
+        if watchdog is None or self._watched == self._line.connections:
+            return
+        for item in watchdog.before:
+            self._line.write(item.address, item.value)
+        held = self._line.read("the time of the watchdog", "holding", watchdog.address, 1)
+        if held != [watchdog.counts]:
+            self._line.write(watchdog.address, watchdog.counts)
+        for item in watchdog.after:
+            self._line.write(item.address, item.value)
+        self._watched = self._line.connections
+
+    def _trigger(self) -> None:
+        watchdog = self.settings.watchdog
+        if watchdog is not None and watchdog.trigger is not None:
+            self._beat = self._beat % 0xFFFF + 1
+            self._line.write(watchdog.trigger, self._beat)
+
+    # set-points ----------------------------------------------------------------------------------
+
+    def _encoded(self, pressures: Array) -> Registers:
+        """Return the registers of each channel: within its limits, whatever the pressures are."""
+        last = self.limits.clamp(pressures)
+        highest = np.maximum(self.limits.high, 0.0)  # 0 may be commanded below the lowest limit
+        points = enumerate(self._setpoints)
+        return {i: point.encode(float(last[i]), float(highest[i])) for i, point in points}
+
+    def _write(self, pressures: Array) -> None:
+        registers = self._encoded(pressures)
+        if np.any(self.limits.clamp(pressures)):
+            self._watch()
+            self._write_once(registers)
+        else:
+            _insist(lambda: self._write_once(registers, whatever_happens=True))
+
+    def _write_once(self, registers: Registers, *, whatever_happens: bool = False) -> None:
+        errors: list[DeviceError] = []
+        for run in self._written:
+            try:
+                values = values_of(run, registers)
+                self._line.ask(f"write {run}", "write_registers", run.start, values)
+            except DeviceError as error:
+                errors.append(error)
+                if not (whatever_happens and isinstance(error, RefusedError)):
+                    break
+        if errors:
+            raise errors[0]
+        self._trigger()
+        for run in self._verified:
+            self._read_back(run, registers)
+
+    def _read_back(self, run: Run, registers: Registers) -> None:
+        self._verify(run, self._line.read(str(run), run.table, run.start, run.count), registers)
+
+    def _verify(self, run: Run, values: Sequence[int], registers: Registers) -> None:
+        for channel, point in run.points:
+            held, written = tuple(run.cut(values, point)), tuple(registers[channel])
+            if point == self._read_backs[channel] and held != written:
+                raise DeviceError(
+                    f"{self.settings.connection}: register {point.address} of channel "
+                    f"{channel + 1} holds {point.decode(held) * 1e-5:.6g} bar after "
+                    f"{point.decode(written) * 1e-5:.6g} bar was written; does someone else write "
+                    "to it, or does the device read it back at another address?"
+                )
+
+    # readings ------------------------------------------------------------------------------------
+
+    def _read(self) -> ArrayLike:
+        pressures = np.full(self.n, np.nan)
+        for run in self._measured:
+            values = self._line.read(str(run), run.table, run.start, run.count)
+            self._decode(run, values, pressures)
+        return pressures
+
+    def _decode(self, run: Run, values: Sequence[int], pressures: Array) -> None:
+        for channel, point in run.points:
+            if self._readings.get(channel) == point:
+                pressures[channel] = point.decode(run.cut(values, point))
+
+    def _exchange(self, pressures: Array) -> ArrayLike | None:
+        joint = self._joint
+        if joint is None:
+            return None
+        self._watch()
+        registers, (written,) = self._encoded(pressures), self._written
+        what = f"write {written} and read {joint}"
+        addresses = {"read_address": joint.start, "write_address": written.start}
+        try:
+            values = self._line.ask_registers(
+                what,
+                joint.count,
+                "readwrite_registers",
+                **addresses,
+                read_count=joint.count,
+                values=values_of(written, registers),
+            )
+        except RefusedError as error:
+            if error.code != _ILLEGAL_FUNCTION:
+                raise
+            self._joint = None  # it has done nothing; from now on it gets two requests
+            return None
+        self._trigger()
+        measured = np.full(self.n, np.nan)
+        self._decode(joint, values, measured)
+        for run in self._verified:
+            if set(run.points) <= set(joint.points):
+                self._verify(joint, values, registers)
+            else:
+                self._read_back(run, registers)
+        return measured
+
+    # dump valve ----------------------------------------------------------------------------------
+
+    @property
+    def has_dump_valve(self) -> bool:
+        """Whether the rig file names one."""
+        return self.settings.dump_valve is not None
+
+    def _dump(self, *, open_valve: bool) -> None:
+        valve = self.settings.dump_valve
+        if valve is None:
+            return
+        what = f"{'open' if open_valve else 'close'} the dump valve (coil {valve.coil})"
+        state = valve.coil_for(open_valve=open_valve)
+        if open_valve:
+            _insist(lambda: self._line.ask(what, "write_coil", valve.coil, state))
+        else:
+            self._line.ask(what, "write_coil", valve.coil, state)
+
+
+def _insist(act: Callable[[], object]) -> None:
+    """Do what makes the arm safe; where it fails, once more, on a new connection."""
+    try:
+        act()
+    except DeviceError:
+        act()

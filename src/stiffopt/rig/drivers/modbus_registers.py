@@ -1,0 +1,346 @@
+"""The register map of a Modbus supply: where things are, and how pressures are counts there."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+import numpy as np
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+
+from stiffopt.errors import InputError
+from stiffopt.schema import BadKeyError, Items, Schema, items_of
+from stiffopt.units import Duration, Number, Pressure, finite_number, parse_quantity, read_from_file
+
+__all__ = [
+    "Address",
+    "Channel",
+    "DumpValve",
+    "Point",
+    "Reading",
+    "RegisterType",
+    "RegisterValue",
+    "Run",
+    "Scale",
+    "SetPoint",
+    "Table",
+    "Watchdog",
+    "WordOrder",
+    "runs_of",
+    "values_of",
+]
+
+ItemT = TypeVar("ItemT")
+Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
+Address = Annotated[int, Field(ge=0, le=0xFFFF)]
+RegisterType = Literal["int16", "uint16", "int32", "uint32", "float32"]
+WordOrder = Literal["big", "little"]
+Table = Literal["input", "holding"]
+
+_FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
+_RANGES = {
+    "int16": (-0x8000, 0x7FFF),
+    "uint16": (0, 0xFFFF),
+    "int32": (-0x80000000, 0x7FFFFFFF),
+    "uint32": (0, 0xFFFFFFFF),
+    "float32": (-1e12, 1e12),
+}
+_LONGEST = 120  # registers; what every request, also to read and write at once, may carry
+
+
+class Scale(Schema):
+    """The straight line between counts and pressure, through two points.
+
+    In a file, one pressure such as ``1 mbar`` stands for that pressure per count.
+
+    Attributes
+    ----------
+    counts : the two counts.
+    pressure : the pressures there, in Pa.
+    """
+
+    counts: Pair[Number]
+    pressure: Pair[Pressure]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _per_count(cls, value: Any, info: ValidationInfo) -> Any:
+        if isinstance(value, dict | Scale):
+            return value
+        if isinstance(value, str) or read_from_file(info):
+            per_count = parse_quantity(value, "Pa", "pressure per count")
+            return {"counts": [0, 1], "pressure": ["0 Pa", f"{per_count!r} Pa"]}
+        return {"counts": [0, 1], "pressure": [0.0, finite_number(value)]}
+
+    @model_validator(mode="after")
+    def _is_a_line(self) -> Self:
+        for name, ends in (("counts", self.counts), ("pressure", self.pressure)):
+            if ends[0] == ends[1]:
+                raise BadKeyError(name, "the two points must differ")
+        return self
+
+    @property
+    def rises(self) -> bool:
+        """Whether more counts are more pressure."""
+        return (self.counts[1] > self.counts[0]) == (self.pressure[1] > self.pressure[0])
+
+    def to_pressure(self, count: float) -> float:
+        """Pressure in Pa at a count."""
+        (c0, c1), (p0, p1) = self.counts, self.pressure
+        return p0 + (count - c0) * (p1 - p0) / (c1 - c0)
+
+    def to_count(self, pressure: float) -> float:
+        """Count at a pressure in Pa, not rounded."""
+        (c0, c1), (p0, p1) = self.counts, self.pressure
+        return c0 + (pressure - p0) * (c1 - c0) / (p1 - p0)
+
+
+class Register(Schema):
+    """A register; in a file, a bare address stands for it.
+
+    Attributes
+    ----------
+    address : as in the protocol, counted from 0.
+    type, scale : where they differ from those of the supply.
+    """
+
+    address: Address
+    type: RegisterType | None = None
+    scale: Scale | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _bare_address(cls, value: Any) -> Any:
+        bare = isinstance(value, int) and not isinstance(value, bool)
+        return {"address": value} if bare else value
+
+
+class SetPoint(Register):
+    """A holding register that sets a pressure.
+
+    Attributes
+    ----------
+    read_back : address at which the device tells what was written, if it is another one.
+    """
+
+    read_back: Address | None = None
+
+
+class Reading(Register):
+    """A register that tells a measured pressure.
+
+    Attributes
+    ----------
+    table : where it differs from that of the supply.
+    """
+
+    table: Table | None = None
+
+
+class Channel(Schema):
+    """One regulator.
+
+    Attributes
+    ----------
+    setpoint : register that sets its pressure.
+    reading : register that tells the measured pressure; None: it is not measured.
+    min, max : limits that hold where they are tighter than those of the rig, in Pa.
+    """
+
+    setpoint: SetPoint
+    reading: Reading | None = None
+    min: Pressure | None = None
+    max: Pressure | None = None
+
+
+class RegisterValue(Schema):
+    """What to write into a holding register."""
+
+    address: Address
+    value: Annotated[int, Field(ge=0, le=0xFFFF)]
+
+
+class Watchdog(Schema):
+    """The device's own watchdog, which turns its outputs off when no command comes.
+
+    It is set up whenever a connection is made: first ``before``, then the time, unless the
+    register holds it already, then ``after``.
+
+    Attributes
+    ----------
+    timeout : after which it acts, in s.
+    address : of the holding register that takes the time.
+    resolution : time per count of that register, in s.
+    before, after : other registers to be written, in this order.
+    trigger : holding register that must change to show that someone is there; it is written
+        after every command. None: commands alone are enough.
+    """
+
+    timeout: Annotated[Duration, Field(gt=0, le=60)] = 0.5
+    address: Address
+    resolution: Annotated[Duration, Field(gt=0, le=10)] = 0.001
+    before: Items[RegisterValue] = ()
+    after: Items[RegisterValue] = ()
+    trigger: Address | None = None
+
+    @property
+    def addresses(self) -> tuple[int, ...]:
+        """All registers that are written for it."""
+        others = tuple(item.address for item in (*self.before, *self.after))
+        return (self.address, *others, *(() if self.trigger is None else (self.trigger,)))
+
+    @property
+    def counts(self) -> int:
+        """The timeout as the register takes it, never longer than asked for."""
+        return int(self.timeout / self.resolution + 1e-9)
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if not 1 <= self.counts <= 0xFFFF:
+            raise BadKeyError("timeout", "expected 1 to 65535 times the resolution")
+        return self
+
+
+class DumpValve(Schema):
+    """A valve on a digital output that empties all chambers.
+
+    Attributes
+    ----------
+    coil : its address.
+    energised : state of the valve while the coil is on; ``closed``: without power it opens.
+    """
+
+    coil: Address
+    energised: Literal["closed", "open"] = "closed"
+
+    def coil_for(self, *, open_valve: bool) -> bool:
+        """State of the coil for a state of the valve."""
+        return open_valve == (self.energised == "open")
+
+
+@dataclass(frozen=True)
+class Point:
+    """A pressure in one or two registers, with everything that is known of it.
+
+    Attributes
+    ----------
+    address, table : of its first register.
+    type, word_order, scale : how the pressure is written.
+    """
+
+    address: int
+    table: str
+    type: RegisterType
+    word_order: WordOrder
+    scale: Scale
+
+    @property
+    def width(self) -> int:
+        """Number of registers."""
+        return struct.calcsize(_FORMATS[self.type]) // 2
+
+    @property
+    def addresses(self) -> range:
+        """Its registers."""
+        return range(self.address, self.address + self.width)
+
+    def at(self, address: int) -> Point:
+        """Return the same at another address."""
+        return Point(address, self.table, self.type, self.word_order, self.scale)
+
+    def pressure_range(self) -> tuple[float, float]:
+        """Lowest and highest pressure that can be written, in Pa."""
+        ends = sorted(self.scale.to_pressure(count) for count in _RANGES[self.type])
+        return ends[0], ends[1]
+
+    def encode(self, pressure: float, highest: float = math.inf) -> tuple[int, ...]:
+        """Return the registers for what is nearest to a finite pressure, but not above a limit."""
+        if not math.isfinite(pressure):
+            raise InputError(f"{pressure} is not a finite pressure")
+        count = self._rounded(self.scale.to_count(pressure))
+        if self.scale.to_pressure(count) > highest:
+            count = self._next(count, -1 if self.scale.rises else 1)
+        return self.registers(count)
+
+    def registers(self, count: float) -> tuple[int, ...]:
+        """Return the registers for a count that the type can hold."""
+        value = count if self.type == "float32" else int(count)
+        words = struct.unpack(f">{self.width}H", struct.pack(_FORMATS[self.type], value))
+        return words[::-1] if self.word_order == "little" else words
+
+    def decode(self, registers: Sequence[int]) -> float:
+        """Return the pressure in Pa that registers stand for; it may be NaN."""
+        words = registers[::-1] if self.word_order == "little" else registers
+        (count,) = struct.unpack(_FORMATS[self.type], struct.pack(f">{self.width}H", *words))
+        return self.scale.to_pressure(count)
+
+    def _rounded(self, count: float) -> float:
+        low, high = _RANGES[self.type]
+        count = min(max(count, low), high)
+        return float(np.float32(count)) if self.type == "float32" else round(count)
+
+    def _next(self, count: float, step: int) -> float:
+        if self.type == "float32":
+            return float(np.nextafter(np.float32(count), np.float32(step * np.inf)))
+        return self._rounded(count + step)
+
+
+@dataclass(frozen=True)
+class Run:
+    """Registers without a gap, which one request reads or writes.
+
+    Attributes
+    ----------
+    table, start, count : which.
+    points : the pressures in them, by channel, counted from 0.
+    """
+
+    table: str
+    start: int
+    count: int
+    points: tuple[tuple[int, Point], ...]
+
+    def __str__(self) -> str:
+        channels = sorted({channel + 1 for channel, _ in self.points})
+        s = "s" if len(channels) > 1 else ""
+        return f"channel{s} {', '.join(map(str, channels))} ({self.where})"
+
+    @property
+    def where(self) -> str:
+        """The registers in words."""
+        last = self.start + self.count - 1
+        what = f"{self.start} to {last}" if self.count > 1 else f"{self.start}"
+        return f"{self.table} register{'s' if self.count > 1 else ''} {what}"
+
+    def cut(self, registers: Sequence[int], point: Point) -> Sequence[int]:
+        """Return the registers of a point out of those of the run."""
+        offset = point.address - self.start
+        return registers[offset : offset + point.width]
+
+
+def runs_of(points: Iterable[tuple[int, Point]]) -> tuple[Run, ...]:
+    """Return the fewest runs that cover points; they never cover a register that has none."""
+    found: list[Run] = []
+    for item in sorted(points, key=lambda item: (item[1].table, item[1].address)):
+        point = item[1]
+        end = point.address + point.width
+        if found and found[-1].table == point.table:
+            last = found[-1]
+            count = max(last.count, end - last.start)
+            if point.address <= last.start + last.count and count <= _LONGEST:
+                found[-1] = Run(last.table, last.start, count, (*last.points, item))
+                continue
+        found.append(Run(point.table, point.address, point.width, (item,)))
+    return tuple(found)
+
+
+def values_of(run: Run, registers: Mapping[int, Sequence[int]]) -> list[int]:
+    """Return the values of all registers of a run from those of its channels."""
+    values = [0] * run.count
+    for channel, point in run.points:
+        offset = point.address - run.start
+        values[offset : offset + point.width] = registers[channel]
+    return values

@@ -1,0 +1,304 @@
+"""Regulators on the analogue outputs of NI-DAQ devices, with a dump valve on a digital line."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from stiffopt.errors import DeviceError, InputError
+from stiffopt.rig.drivers.daqmx import (
+    Address,
+    AnalogueInput,
+    AnalogueOutput,
+    Daqmx,
+    InputChannel,
+    InputName,
+    OutputName,
+    Pair,
+    Terminals,
+)
+from stiffopt.rig.drivers.nidaq_valve import DumpValve, Valve
+from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply
+from stiffopt.schema import BadKeyError, Items, Schema
+from stiffopt.units import Duration, Pressure, Voltage
+
+__all__ = ["Input", "NidaqSettings", "NidaqSupply", "Output", "RegulatorChannel"]
+
+Array = NDArray[np.float64]
+
+
+class _Line(Schema):
+    """A voltage that stands for a pressure: a straight line through two points.
+
+    Attributes
+    ----------
+    volts, pressures : of the two points, in V and Pa.
+    """
+
+    volts: Pair[Voltage] = (0.0, 10.0)
+    pressures: Pair[Pressure]
+
+    @model_validator(mode="after")
+    def _two_points(self) -> Self:
+        for name, (first, second) in (("volts", self.volts), ("pressures", self.pressures)):
+            if first == second:
+                raise BadKeyError(name, "expected two different values")
+        return self
+
+    def volts_for(self, pressure: float) -> float:
+        """Return the voltage in V that stands for a pressure in Pa."""
+        return float(_through(pressure, self.pressures, self.volts))
+
+    def pressure_at(self, volts: float) -> float:
+        """Return the pressure in Pa for which a voltage in V stands."""
+        return float(_through(volts, self.volts, self.pressures))
+
+
+def _through(x: float, xs: tuple[float, float], ys: tuple[float, float]) -> float:
+    return ys[0] + (x - xs[0]) * (ys[1] - ys[0]) / (xs[1] - xs[0])
+
+
+class Output(_Line):
+    """The set-point of a regulator. No voltage beyond the two points is ever written.
+
+    Attributes
+    ----------
+    channel : physical channel, such as ``Dev1/ao0``.
+    read_back : internal channel on which the device measures this output, such as
+        ``Dev1/_ao0_vs_aognd``; None: it is not checked.
+    """
+
+    channel: OutputName
+    read_back: InputName | None = None
+
+    @model_validator(mode="after")
+    def _can_vent(self) -> Self:
+        if not min(self.pressures) <= 0 <= max(self.pressures):
+            raise BadKeyError("pressures", "must span 0 bar: the regulator could not vent")
+        return self
+
+
+class Input(_Line):
+    """What a regulator or a sensor measures.
+
+    Attributes
+    ----------
+    channel : physical channel, such as ``Dev1/ai0``.
+    terminals : how it is wired.
+    range : of the converter, in V.
+    """
+
+    channel: InputName
+    terminals: Terminals = "default"
+    range: Pair[Voltage] = (-10.0, 10.0)
+
+    @model_validator(mode="after")
+    def _low_below_high(self) -> Self:
+        if not self.range[0] < self.range[1]:
+            raise BadKeyError("range", "the first voltage must be below the second")
+        return self
+
+
+class RegulatorChannel(Schema):
+    """One channel of the arm.
+
+    Attributes
+    ----------
+    output : its set-point.
+    input : its measured pressure; None: it is not measured.
+    min, max : lowest and highest pressure, where less is allowed than elsewhere, in Pa.
+    """
+
+    output: Output
+    input: Input | None = None
+    min: Pressure | None = None
+    max: Pressure | None = None
+
+
+class NidaqSettings(Schema):
+    """Regulators on NI-DAQ devices.
+
+    Attributes
+    ----------
+    grpc : host and port of NI's gRPC device server; None: the driver on this machine.
+    timeout : of every exchange with the device, in s.
+    channels : one for each channel of the arm.
+    read_back_tolerance : by which an output that is read back may differ, in V.
+    share_inputs : the probe reads inputs of the same device: hold it only while reading.
+    dump_valve : None: there is none.
+    watchdog : the device opens the dump valve by itself when nothing was written for so long, in
+        s; None: it does not.
+    """
+
+    driver: Literal["nidaq"]
+    grpc: Address | None = None
+    timeout: Annotated[Duration, Field(gt=0, le=10)] = 1.0
+    channels: Annotated[Items[RegulatorChannel], Field(min_length=1)]
+    read_back_tolerance: Annotated[Voltage, Field(gt=0)] = 0.05
+    share_inputs: bool = False
+    dump_valve: DumpValve | None = None
+    watchdog: Annotated[Duration, Field(ge=0.01, le=5)] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.watchdog is not None and self.dump_valve is None:
+            raise BadKeyError("watchdog", "needs a 'dump_valve': the device's watchdog opens it")
+        names: dict[str, str] = {}
+        for index, channel in enumerate(self.channels):
+            for kind in ("output", "input"):
+                name = getattr(getattr(channel, kind), "channel", None)
+                place = f"channels.{index}.{kind}"
+                if name in names:
+                    raise BadKeyError(place, f"{name} is already that of {names[name]}")
+                if name is not None:
+                    names[name] = f"channel {index + 1}"
+        return self
+
+    def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
+        """Return the supply.
+
+        Raises
+        ------
+        InputError
+            Another number of channels than the arm has, or limits that leave nothing.
+        """
+        return NidaqSupply(self, limits, clock)
+
+    def tightened(self, limits: PressureLimits) -> PressureLimits:
+        """Return what is within limits, those of the channels and the reach of the regulators."""
+        if len(self.channels) != limits.n:
+            raise InputError(
+                f"the supply has {len(self.channels)} channels, the robot {limits.n}; "
+                "list one under 'channels' for each channel of the robot"
+            )
+        low, high = limits.low.copy(), limits.high.copy()
+        for index, channel in enumerate(self.channels):
+            lowest, highest = sorted(channel.output.pressures)
+            low[index] = max(low[index], lowest, *([] if channel.min is None else [channel.min]))
+            high[index] = min(high[index], highest, *([] if channel.max is None else [channel.max]))
+            if low[index] > high[index]:
+                raise InputError(
+                    f"channel {index + 1}: no pressure is within the limits of the robot, those "
+                    "of the channel and what the regulator reaches"
+                )
+        return PressureLimits(low, high)
+
+
+class NidaqSupply(PressureSupply):
+    """Regulators on NI-DAQ devices: one task for all outputs, one for all inputs."""
+
+    def __init__(
+        self, settings: NidaqSettings, limits: PressureLimits, clock: Clock | None = None
+    ) -> None:
+        super().__init__(settings.tightened(limits), clock)
+        self._settings = settings
+        outputs = [channel.output for channel in settings.channels]
+        self._lowest = np.array([min(output.volts) for output in outputs])
+        self._highest = np.array([max(output.volts) for output in outputs])
+        self._read_backs = [i for i, output in enumerate(outputs) if output.read_back is not None]
+        self._vented = np.array([output.volts_for(0.0) for output in outputs])
+
+    @property
+    def has_dump_valve(self) -> bool:
+        """Whether there is one."""
+        return self._settings.dump_valve is not None
+
+    def _open(self) -> None:
+        settings = self._settings
+        with ExitStack() as stack:
+            daq = Daqmx(settings.grpc, settings.timeout, "nidaq")
+            stack.callback(daq.close)
+            self._outputs = AnalogueOutput(
+                daq,
+                [
+                    (channel.output.channel, low, high)
+                    for channel, low, high in zip(
+                        settings.channels, self._lowest, self._highest, strict=True
+                    )
+                ],
+            )
+            stack.callback(self._outputs.close)
+            self._inputs: AnalogueInput | None = None
+            if channels := self._input_channels():
+                self._inputs = AnalogueInput(daq, channels, shared=settings.share_inputs)
+                stack.callback(self._inputs.close)
+            self._valve: Valve | None = None
+            if settings.dump_valve is not None:
+                self._valve = Valve(daq, settings.dump_valve, settings.watchdog)
+                stack.callback(self._valve.close, self.clock)
+            self._opened = stack.pop_all()
+
+    def _close(self) -> None:
+        self._opened.close()
+
+    def _input_channels(self) -> list[InputChannel]:
+        """Return the measured pressures first, then the outputs that are read back."""
+        inputs = [channel.input for channel in self._settings.channels]
+        found = [InputChannel(i.channel, i.terminals, *i.range) for i in inputs if i is not None]
+        for channel, low, high in zip(
+            self._settings.channels, self._lowest, self._highest, strict=True
+        ):
+            if channel.output.read_back is not None:
+                found.append(InputChannel(channel.output.read_back, "default", low, high))
+        return found
+
+    def _write(self, pressures: Array) -> None:
+        volts = self._send(pressures)
+        if self._read_backs and self._inputs is not None:
+            self._check(volts, self._inputs.read())
+
+    def _read(self) -> Array:
+        return self._pressures(None if self._inputs is None else self._inputs.read())
+
+    def _exchange(self, pressures: Array) -> Array | None:
+        if self._inputs is None:
+            return None
+        volts = self._send(pressures)
+        found = self._inputs.read()
+        self._check(volts, found)
+        return self._pressures(found)
+
+    def _send(self, pressures: Array) -> Array:
+        """Write set-points, and return the volts that were written."""
+        outputs = [channel.output for channel in self._settings.channels]
+        volts = np.array([o.volts_for(p) for o, p in zip(outputs, pressures, strict=True)])
+        volts = np.where(np.isfinite(volts), volts, self._vented)
+        volts = np.array(np.clip(volts, self._lowest, self._highest))
+        self._outputs.write(volts)
+        if self._valve is not None and not self._valve.feed() and np.any(pressures):
+            raise DeviceError(
+                "the device's watchdog has opened the dump valve, as nothing was written for "
+                f"{self._settings.watchdog:g} s; vent, then arm the supply again"
+            )
+        return volts
+
+    def _check(self, wanted: Array, inputs: Array) -> None:
+        """Refuse outputs that are not where they should be; they come last of the inputs."""
+        found = inputs[len(inputs) - len(self._read_backs) :]
+        for index, volts in zip(self._read_backs, found, strict=True):
+            if not abs(volts - wanted[index]) <= self._settings.read_back_tolerance:
+                name = self._settings.channels[index].output.channel
+                raise DeviceError(
+                    f"channel {index + 1}: {name} is at {volts:.3f} V instead of "
+                    f"{wanted[index]:.3f} V; check its wiring for a short circuit"
+                )
+
+    def _pressures(self, inputs: Array | None) -> Array:
+        """Return measured pressures (n,), which come first of the inputs."""
+        pressures = np.full(self.n, np.nan)
+        volts = iter([] if inputs is None else inputs)
+        for index, channel in enumerate(self._settings.channels):
+            if channel.input is not None:
+                pressures[index] = channel.input.pressure_at(float(next(volts)))
+        return pressures
+
+    def _dump(self, *, open_valve: bool) -> None:
+        if self._valve is not None:
+            if open_valve:
+                self._valve.open()
+            else:
+                self._valve.shut()

@@ -1,0 +1,230 @@
+"""Trackers behind an OpenIGTLink server: PLUS, 3D Slicer and others (pyigtl)."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+import time
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stiffopt import lie
+from stiffopt.errors import DeviceError, MissingExtraError
+from stiffopt.rig.drivers.streamed import StreamedSettings, StreamedTracker
+from stiffopt.rig.interface import Clock
+from stiffopt.units import Duration
+
+__all__ = ["OpenIGTLinkSettings", "OpenIGTLinkTracker", "SenderClock", "pyigtl_messages"]
+
+_HEADER = 58  # bytes before the body of a message
+_LONGEST = 64 * 2**20  # bytes of a body; a longer one means that the stream is not understood
+_BETWEEN_TRIES = 0.5  # s before a lost server is called again
+_CALL = 0.5  # s in which a lost server must take the call
+_PATIENCE = 0.2  # s in which a read returns, so that closing is prompt
+_SKEW = 0.01  # by which the columns of a rotation may fail to be orthonormal
+_DRIFT = 1e-3  # by which the sender's clock may be fast or slow; NTP slews by half of it
+
+
+class OpenIGTLinkSettings(StreamedSettings):
+    """A server that sends the pose of the sensor as TRANSFORM messages, in mm.
+
+    Attributes
+    ----------
+    host, port : of the server.
+    name : device name of the messages, such as ``TipToTracker``: sensor to tracker.
+    reconnect_after : a server that sends nothing at all for this long, as when no tool is seen, is
+        called anew, in s.
+    """
+
+    driver: Literal["openigtlink"]
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=1, le=65535)] = 18944
+    name: Annotated[str, Field(min_length=1, max_length=20)] = "TipToTracker"
+    reconnect_after: Annotated[Duration, Field(gt=0, le=600)] = 10.0
+
+    def device(self, clock: Clock | None = None) -> OpenIGTLinkTracker:
+        """Return the tracker, not yet open."""
+        return OpenIGTLinkTracker(self, clock)
+
+
+class SenderClock:
+    """Maps times of the sender's clock to ours, knowing only when messages arrived.
+
+    A message's stamp plus the least difference seen between arrival and stamp is when it would
+    have arrived at the fastest: what is held up on the way does not become younger by it. The
+    least difference grows slowly with time, as clocks drift; a clock that goes back was set.
+    """
+
+    def __init__(self) -> None:
+        self._newest = -np.inf
+        self._fastest = (0.0, np.inf)  # stamp and difference
+
+    def fastest_arrival(self, stamp: float, arrival: float) -> float:
+        """Return when a message with this stamp would have arrived at the fastest."""
+        if not stamp > 0:  # senders without a clock write 0
+            return arrival
+        difference = arrival - stamp
+        fastest_stamp, least = self._fastest
+        least += _DRIFT * (stamp - fastest_stamp)
+        if stamp < self._newest or difference <= least:
+            self._fastest = (stamp, difference)
+            least = difference
+        self._newest = stamp
+        return min(stamp + least, arrival)  # rounding may put it later
+
+
+class OpenIGTLinkTracker(StreamedTracker):
+    """Reads the server's stream in a thread; pyigtl understands the messages.
+
+    pyigtl's own client is not used: when the server closes the connection it occupies a core
+    without noticing, it loses its place in the stream when a header comes in two parts, and it
+    delivers no more than about 97 messages a second, without the time of their arrival.
+
+    PLUS sends nothing for a tool that it does not see: only the age tells.
+
+    Attributes
+    ----------
+    heard : names of the devices whose messages came; helpful when `OpenIGTLinkSettings.name` is
+        wrong.
+    """
+
+    def __init__(self, settings: OpenIGTLinkSettings, clock: Clock | None = None) -> None:
+        super().__init__(settings.range, settings.registration, clock)
+        self.settings = settings
+        self.heard: set[str] = set()
+        self._thread: threading.Thread | None = None
+        self._messages: Any = None
+        self._sender = SenderClock()
+        self._address: tuple[Any, ...] = ()
+        self._stamp = -1.0
+        self._frame = 0
+
+    @property
+    def _where(self) -> str:
+        return f"{self.settings.host}:{self.settings.port}"
+
+    def _open(self) -> None:
+        self._messages = pyigtl_messages()
+        self._arrived.clear()
+        self._stopping.clear()
+        self._sender = SenderClock()
+        try:
+            chosen = self.settings
+            found = socket.getaddrinfo(chosen.host, chosen.port, type=socket.SOCK_STREAM)
+            self._address = found[0][4][:2]  # once: a name server may keep one waiting
+            connection = self._connect(chosen.connect_timeout)
+        except OSError as error:
+            raise DeviceError(
+                f"openigtlink: no server answers at {self._where} ({error}); start the "
+                "OpenIGTLink server of PLUS or Slicer, and check host and port"
+            ) from None
+        self._thread = threading.Thread(
+            target=self._run, args=(connection,), name="openigtlink", daemon=True
+        )
+        self._thread.start()
+
+    def _close(self) -> None:
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+
+    def _connect(self, patience: float) -> socket.socket:
+        connection = socket.create_connection(self._address, patience)
+        connection.settimeout(_PATIENCE)
+        return connection
+
+    def _run(self, connection: socket.socket | None) -> None:
+        """Follow the server until the tracker is closed, across connections."""
+        while not self._stopping.is_set():
+            try:
+                if connection is None:
+                    connection = self._connect(_CALL)
+                with connection:
+                    self._follow(connection)
+            except (OSError, ValueError) as error:
+                self._count(f"openigtlink: the server at {self._where} is lost: {error}")
+            connection = None
+            self._stopping.wait(_BETWEEN_TRIES)
+
+    def _follow(self, connection: socket.socket) -> None:
+        while not self._stopping.is_set():
+            header = self._receive(connection, _HEADER)
+            if not header:
+                return
+            arrival = self.clock.now()
+            fields = self._messages.MessageBase.parse_header(header)
+            if fields["body_size"] > _LONGEST:
+                raise ValueError("what it sends is not OpenIGTLink")
+            body = self._receive(connection, fields["body_size"])
+            if len(body) == fields["body_size"]:
+                self._take({**fields, "crc": int.from_bytes(header[-8:])}, body, arrival)
+
+    def _receive(self, connection: socket.socket, size: int) -> bytes:
+        """Return so many bytes, or fewer when the tracker is being closed."""
+        received = bytearray()
+        began = time.monotonic()
+        while len(received) < size and not self._stopping.is_set():
+            try:
+                chunk = connection.recv(size - len(received))
+            except TimeoutError:
+                if time.monotonic() - began > self.settings.reconnect_after:
+                    raise TimeoutError("it sends nothing") from None
+                continue
+            if not chunk:
+                raise ConnectionError("it closed the connection")
+            received += chunk
+        return bytes(received) if len(received) == size else b""
+
+    def _take(self, fields: dict[str, Any], body: bytes, arrival: float) -> None:
+        name, kind = fields["device_name"], fields["message_type"]
+        self.heard.add(name)
+        if name != self.settings.name or kind != "TRANSFORM":
+            if self._frame == 0:
+                self.last_error = (
+                    f"openigtlink: no TRANSFORM named {self.settings.name} came yet from "
+                    f"{self._where}; it sends {', '.join(sorted(self.heard))}"
+                )
+            return
+        message = self._unpacked(fields, body)
+        if message is None:
+            self._count(f"openigtlink: a message named {name} is damaged")
+            return
+        if message.timestamp == self._stamp:
+            return  # the same sample, sent again
+        self._stamp = message.timestamp or -1.0
+        self._frame += 1
+        fastest = self._sender.fastest_arrival(message.timestamp, arrival)
+        self._take_matrix(fastest - self.settings.latency, np.array(message.matrix, dtype=float))
+
+    def _unpacked(self, fields: dict[str, Any], body: bytes) -> Any:
+        if fields["crc"] and fields["crc"] != self._messages.CRC64(body):  # 0: none was computed
+            return None
+        message = self._messages.TransformMessage()
+        try:
+            message.unpack(fields, body)
+        except (struct.error, ValueError, IndexError):
+            return None
+        return message
+
+    def _take_matrix(self, captured: float, sensor: NDArray[np.float64]) -> None:
+        rotation = sensor[:3, :3]
+        skew = np.abs(rotation.T @ rotation - np.eye(3)).max()
+        if not (np.isfinite(sensor).all() and skew <= _SKEW and np.linalg.det(rotation) > 0):
+            self._hand_over_nothing(captured, self._frame)
+            return
+        quaternion = np.asarray(lie.quaternion_from_rotation(rotation))
+        self._hand_over(captured, self._frame, sensor[:3, 3] * 1e-3, quaternion)
+
+
+def pyigtl_messages() -> Any:
+    """Return the part of pyigtl that packs and unpacks messages."""
+    try:
+        from pyigtl import messages
+    except ImportError:
+        raise MissingExtraError("pyigtl", "openigtlink") from None
+    return messages

@@ -1,0 +1,1 @@
+"""The virtual lab: the simulated arm behind real protocol peers."""

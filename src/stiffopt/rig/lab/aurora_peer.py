@@ -1,0 +1,282 @@
+"""An NDI Aurora on a pseudo-terminal: the tracker of the virtual lab.
+
+It follows NDI's description of the protocol (Aurora Application Program Interface Guide), not the
+library that reads it. How commands and replies are written is in `stiffopt.rig.lab.ndi_wire`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import struct
+import threading
+from collections.abc import Callable
+
+import numpy as np
+
+from stiffopt.errors import DeviceError
+from stiffopt.rig.drivers.aurora import AuroraSettings
+from stiffopt.rig.lab.bench import Bench, Peer, TrackerFrame
+from stiffopt.rig.lab.ndi_wire import (
+    RefusedError,
+    crc16,
+    framed,
+    hexadecimal,
+    parse,
+    pose_as_text,
+)
+
+__all__ = ["AuroraPeer"]
+
+FIRST_HANDLE = 0x0A  # that an Aurora gives to a wired tool
+SLOW = 0.2  # s, by which a slow device answers late
+SPEEDS = {"0": 9600, "2": 19200, "3": 38400, "4": 57600, "5": 115200}
+TOOL_IN_PORT, INITIALISED, ENABLED = 0x01, 0x10, 0x20
+VERSION = (
+    "Northern Digital Inc.\nAurora Control Firmware\nNDI S/N: virtual\n"
+    "Characterization Date: 01/01/01\nFreeze Tag: {tag}\nFreeze Date: 01/01/01\n"
+    "(C) Northern Digital Inc.\n"
+)
+
+
+class AuroraPeer(Peer[AuroraSettings]):
+    """The tracker's control unit with one sensor or more, the bench's at the driver's port.
+
+    Attributes
+    ----------
+    firmware : what it says is its version.
+    garble : spoils the CRC of replies, for rehearsals of a bad line.
+    """
+
+    def __init__(
+        self, settings: AuroraSettings, bench: Bench, firmware: str = "AURORA Rev 013"
+    ) -> None:
+        super().__init__(settings, bench)
+        self.firmware = firmware
+        self.garble = False
+        self._handles = [FIRST_HANDLE + i for i in range(settings.sensor)]
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._speed = 9600
+        self._forget()
+
+    def start(self) -> AuroraSettings:
+        """Make a pseudo-terminal and answer on it."""
+        try:
+            import termios
+            import tty
+        except ImportError:
+            raise DeviceError(
+                "the virtual lab's Aurora needs pseudo-terminals, which Windows does not have"
+            ) from None
+        self._attributes = termios.tcgetattr
+        self._baud = {getattr(termios, f"B{speed}"): speed for speed in SPEEDS.values()}
+        self._stopping.clear()
+        self._speed = 9600
+        self._forget()
+        self._master, self._slave = os.openpty()  # the slave is held, or the line would hang up
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self._woken, self._wake = os.pipe()
+        self._thread = threading.Thread(target=self._serve, name="aurora-peer", daemon=True)
+        self._thread.start()
+        return self.settings.model_copy(update={"port": os.ttyname(self._slave)})
+
+    def close(self) -> None:
+        """Stop answering; the pseudo-terminal is gone."""
+        if self._thread is None:
+            return
+        self._stopping.set()
+        os.write(self._wake, b"x")
+        self._thread.join()
+        self._thread = None
+        for fd in (self._master, self._slave, self._woken, self._wake):
+            os.close(fd)
+
+    def _forget(self) -> None:
+        self._initialised = False
+        self._tracking = False
+        self._ready: set[int] = set()
+        self._enabled: set[int] = set()
+
+    # The line -----------------------------------------------------------------------------------
+
+    def _serve(self) -> None:
+        received = b""
+        while not self._stopping.is_set():
+            readable, _, _ = select.select([self._master, self._woken], [], [])
+            if self._master not in readable:
+                continue
+            received += os.read(self._master, 4096)
+            *commands, received = received.split(b"\r")
+            for command in commands:
+                self._answer(command)
+            received = received[-1024:]
+
+    def _answer(self, command: bytes) -> None:
+        fault = self.bench.fault("tracker")
+        if fault == "off" or not self._hears():
+            return
+        if fault == "slow" and self._stopping.wait(SLOW):
+            return
+        speed = self._speed
+        reply = self._reply(command)
+        if self.garble:
+            reply = reply[:-2] + bytes([reply[-2] ^ 0x01]) + reply[-1:]
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._master, reply)
+        if command.startswith(b"COMM") and reply.startswith(b"OKAY"):
+            speed = SPEEDS[command.partition(b":")[2][:1].decode()]
+        self._speed = speed
+
+    def _hears(self) -> bool:
+        """Say whether both ends of the line have one speed; else the device gets mere noise."""
+        return self._baud.get(self._attributes(self._slave)[5]) == self._speed
+
+    def _reply(self, command: bytes) -> bytes:
+        try:
+            name, parameters = parse(command)
+            if name == "BX":
+                return self._binary_frame(parameters)
+            text = self._obey(name, parameters)
+        except RefusedError as refused:
+            text = f"ERROR{refused.args[0]:02X}"
+        return f"{text}{crc16(text.encode()):04X}\r".encode()
+
+    # The commands -------------------------------------------------------------------------------
+
+    def _obey(self, name: str, parameters: str) -> str:
+        commands: dict[str, Callable[[str], str]] = {
+            "INIT": self._init,
+            "RESET": self._reset,
+            "COMM": self._comm,
+            "BEEP": lambda _: "1",
+            "VER": lambda _: VERSION.format(tag=self.firmware),
+            "PHSR": self._list_handles,
+            "PHINF": self._describe_handle,
+            "PHF": lambda text: self._drop(text, self._ready, self._enabled),
+            "PDIS": lambda text: self._drop(text, self._enabled),
+            "PINIT": self._initialise_handle,
+            "PENA": self._enable_handle,
+            "TSTART": self._start_tracking,
+            "TSTOP": self._stop_tracking,
+            "TX": self._text_frame,
+        }
+        if name not in commands:
+            raise RefusedError(RefusedError.INVALID)
+        if not self._initialised and name not in ("INIT", "RESET", "COMM", "VER", "BEEP"):
+            raise RefusedError(RefusedError.SYSTEM_NOT_INITIALISED)
+        return commands[name](parameters)
+
+    def _init(self, _: str) -> str:
+        self._forget()
+        self._initialised = True
+        return "OKAY"
+
+    def _reset(self, _: str) -> str:
+        self._forget()
+        return "RESET"
+
+    def _comm(self, parameters: str) -> str:
+        if len(parameters) != 5 or parameters[0] not in SPEEDS or parameters[1:] != "0000":
+            raise RefusedError(RefusedError.BAD_PARAMETERS)
+        return "OKAY"
+
+    def _list_handles(self, parameters: str) -> str:
+        self._must_not_track()
+        known = {
+            0: self._handles,
+            1: [],
+            2: [handle for handle in self._handles if handle not in self._ready],
+            3: [handle for handle in self._ready if handle not in self._enabled],
+            4: list(self._enabled),
+        }
+        listed = known.get(hexadecimal(parameters or "0"))
+        if listed is None:
+            raise RefusedError(RefusedError.BAD_PARAMETERS)
+        rows = (f"{handle:02X}{self._status(handle):03X}" for handle in sorted(listed))
+        return f"{len(listed):02X}{''.join(rows)}"
+
+    def _describe_handle(self, parameters: str) -> str:
+        handle = self._handle(parameters)
+        kind, maker, revision, serial = "02000000", f"{'NDI':12}", "001", f"{handle:08X}"
+        return f"{kind}{maker}{revision}{serial}{self._status(handle):02X}"
+
+    def _drop(self, parameters: str, *sets: set[int]) -> str:
+        self._must_not_track()
+        handle = self._handle(parameters)
+        for each in sets:
+            each.discard(handle)
+        return "OKAY"
+
+    def _initialise_handle(self, parameters: str) -> str:
+        self._must_not_track()
+        self._ready.add(self._handle(parameters))
+        return "OKAY"
+
+    def _enable_handle(self, parameters: str) -> str:
+        self._must_not_track()
+        handle = self._handle(parameters)
+        if parameters[2:] not in ("S", "D", "B"):
+            raise RefusedError(0x09)
+        if handle not in self._ready:
+            raise RefusedError(RefusedError.NOT_INITIALISED)
+        self._enabled.add(handle)
+        return "OKAY"
+
+    def _start_tracking(self, _: str) -> str:
+        self._tracking = True
+        return "OKAY"
+
+    def _stop_tracking(self, _: str) -> str:
+        if not self._tracking:
+            raise RefusedError(RefusedError.WRONG_MODE)
+        self._tracking = False
+        return "OKAY"
+
+    def _must_not_track(self) -> None:
+        if self._tracking:
+            raise RefusedError(RefusedError.WRONG_MODE)
+
+    def _handle(self, parameters: str) -> int:
+        handle = hexadecimal(parameters[:2])
+        if handle not in self._handles:
+            raise RefusedError(RefusedError.BAD_HANDLE)
+        return handle
+
+    def _status(self, handle: int) -> int:
+        flags = (INITIALISED, handle in self._ready), (ENABLED, handle in self._enabled)
+        return TOOL_IN_PORT + sum(flag for flag, is_set in flags if is_set)
+
+    # The frames ---------------------------------------------------------------------------------
+
+    def _poses(self, parameters: str) -> list[tuple[int, TrackerFrame | None]]:
+        """Return what each enabled sensor sees; all see the same."""
+        if not self._tracking:
+            raise RefusedError(RefusedError.WRONG_MODE)
+        if not hexadecimal(parameters or "0001") & 0x0001:
+            raise RefusedError(RefusedError.BAD_PARAMETERS)
+        frame = self.bench.frame()
+        return [(handle, frame) for handle in sorted(self._enabled)]
+
+    def _text_frame(self, parameters: str) -> str:
+        rows = []
+        for handle, frame in self._poses(parameters):
+            number = 0 if frame is None else frame.number & 0xFFFFFFFF
+            pose = "MISSING" if frame is None else pose_as_text(frame)
+            rows.append(f"{handle:02X}{pose}{self._status(handle):08X}{number:08X}\n")
+        return f"{len(rows):02X}{''.join(rows)}0000"
+
+    def _binary_frame(self, parameters: str) -> bytes:
+        poses = self._poses(parameters)
+        body = struct.pack("<B", len(poses))
+        for handle, frame in poses:
+            number = 0 if frame is None else frame.number & 0xFFFFFFFF
+            if frame is None or not np.isfinite(frame.position).all():
+                body += struct.pack("<BB", handle, 0x02)
+            else:
+                numbers = (*frame.quaternion, *(frame.position * 1e3), 0.1)
+                body += struct.pack("<BB8f", handle, 0x01, *numbers)
+            body += struct.pack("<II", self._status(handle), number)
+        return framed(body + struct.pack("<H", 0))

@@ -1,0 +1,270 @@
+"""A Modbus device for the virtual lab: pymodbus's server, with the register map of the rig file."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future
+from contextlib import suppress
+from threading import Thread
+from typing import Any
+
+import numpy as np
+
+from stiffopt.errors import DeviceError
+from stiffopt.rig.drivers.modbus import ModbusSettings, SerialLine, Tcp
+from stiffopt.rig.drivers.modbus_line import library
+from stiffopt.rig.drivers.modbus_registers import Point
+from stiffopt.rig.lab.bench import Bench, Peer
+
+__all__ = ["ModbusPeer"]
+
+LATE = 0.1  # s, by which a slow device's answers come late
+_TICK = 0.01  # s, between looks at the watchdog
+_COILS, _INPUTS = (1, 5, 15), 4  # function codes
+_START = 5.0  # s, within which the server must listen
+
+
+class ModbusPeer(Peer[ModbusSettings]):
+    """A coupler with regulators on its outputs.
+
+    What is written to set-points goes to the bench, readings come from it. An address that the
+    rig file does not name is refused, as by a real device. The watchdog starts with the first
+    write after its time was set; when it runs out, all outputs fall: set-points and coil.
+    """
+
+    def __init__(self, settings: ModbusSettings, bench: Bench) -> None:
+        super().__init__(settings, bench)
+        self._memory = dict.fromkeys(self._holding(), 0)  # holding registers
+        self._last_write: float | None = None
+        self._thread: Thread | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._stop: asyncio.Event | None = None
+
+    def start(self) -> ModbusSettings:
+        """Listen on loopback or a pseudo-terminal; return the settings that lead here."""
+        library("pymodbus.server")
+        if self._thread is not None:
+            raise DeviceError(f"{self.settings.connection} of the virtual lab runs already")
+        self._fall()
+        started: Future[Tcp | SerialLine] = Future()
+        self._thread = Thread(target=self._run, args=(started,), name="modbus-peer", daemon=True)
+        self._thread.start()
+        try:
+            connection = started.result(_START)
+        except BaseException:
+            self.close()
+            raise
+        kind = "tcp" if isinstance(connection, Tcp) else "serial"
+        return self.settings.model_copy(update={kind: connection})
+
+    def close(self) -> None:
+        """Stop; to close twice does nothing."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        if self._loop is not None and self._stop is not None:
+            with suppress(RuntimeError):  # the loop has ended by itself
+                self._loop.call_soon_threadsafe(self._stop.set)
+        thread.join(_START)
+
+    # server --------------------------------------------------------------------------------------
+
+    def _run(self, started: Future[Tcp | SerialLine]) -> None:
+        try:
+            asyncio.run(self._serve(started))
+        except BaseException as error:
+            if started.done():
+                raise
+            started.set_exception(error)
+
+    async def _serve(self, started: Future[Tcp | SerialLine]) -> None:
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        terminals = _Terminals() if self.settings.serial is not None else None
+        try:
+            server, connection = await self._listen(terminals)
+            watchdog = asyncio.create_task(self._watch())
+            started.set_result(connection)
+            await self._stop.wait()
+            watchdog.cancel()
+            await server.shutdown()
+            await asyncio.sleep(0)  # transports close in the next round
+        finally:
+            if terminals is not None:
+                terminals.close()
+
+    async def _listen(self, terminals: _Terminals | None) -> tuple[Any, Tcp | SerialLine]:
+        servers = library("pymodbus.server")
+        options = {"trace_packet": self._trace}
+        if terminals is not None:
+            asked = self.settings.serial or SerialLine(port="")
+            line = asked.model_copy(update={"parity": "none"})  # such terminals know no parity
+            server = servers.ModbusSerialServer(
+                self._device(), port=terminals.inner, **line.options(), **options
+            )
+            await _begin(server, f"the pseudo-terminal {terminals.inner} cannot be opened")
+            return server, line.model_copy(update={"port": terminals.outer})
+        host, port = _address(self.settings.tcp or Tcp(host="localhost", port=0))
+        server = servers.ModbusTcpServer(self._device(), address=(host, port), **options)
+        await _begin(server, f"port {port} of {host} is in use; give another one or 0 for any")
+        return server, Tcp(host=host, port=server.transport.sockets[0].getsockname()[1])
+
+    def _device(self) -> Any:
+        simulator = library("pymodbus.simulator")
+
+        def block(addresses: set[int]) -> list[Any]:
+            kind = simulator.DataType.REGISTERS
+            return [simulator.SimData(a, datatype=kind) for a in sorted(addresses or {0xFFFF})]
+
+        valve = self.settings.dump_valve
+        coil = simulator.SimData(
+            0xFFFF if valve is None else valve.coil,
+            values=[False],
+            datatype=simulator.DataType.BITS,
+        )
+        inputs = {
+            a for p in self.settings.readings.values() if p.table == "input" for a in p.addresses
+        }
+        blocks = ([coil], [coil], block(set(self._memory)), block(inputs))
+        return simulator.SimDevice(self.settings.unit, simdata=blocks, action=self._act)
+
+    def _holding(self) -> set[int]:
+        settings = self.settings
+        points = [p for p in settings.readings.values() if p.table == "holding"]
+        points += [*settings.setpoints, *settings.read_backs]
+        addresses = {address for point in points for address in point.addresses}
+        return addresses.union(settings.watchdog.addresses if settings.watchdog else ())
+
+    def _trace(self, sending: bool, packet: bytes) -> bytes:
+        """Keep silent while the device is off."""
+        return b"" if sending and self.bench.fault("supply") == "off" else packet
+
+    # requests ------------------------------------------------------------------------------------
+
+    async def _act(
+        self,
+        function: int,
+        start: int,
+        address: int,
+        count: int,
+        registers: list[int],
+        values: Sequence[int] | Sequence[bool] | None,
+    ) -> Any:
+        """Carry out a request; pymodbus answers with what is left in ``registers``."""
+        fault = self.bench.fault("supply")
+        if fault == "off":
+            return library("pymodbus.constants").ExcCodes.DEVICE_FAILURE  # `_trace` keeps it back
+        if fault == "slow":
+            await asyncio.sleep(LATE)
+        if function in _COILS:
+            if values is not None and self.settings.dump_valve is not None:
+                self._switch(bool(values[0]))
+        elif values is not None:
+            self._store(address, values)
+        else:
+            shown = self._shown("input" if function == _INPUTS else "holding")
+            for place in range(address, address + count):
+                registers[place - start] = shown.get(place, 0)
+        return None
+
+    def _store(self, address: int, values: Sequence[int]) -> None:
+        written = range(address, address + len(values))
+        self._memory.update(zip(written, values, strict=True))
+        if self.settings.watchdog is not None and self.settings.watchdog.address not in written:
+            self._last_write = time.monotonic()
+        for channel, point in enumerate(self.settings.setpoints):
+            if set(point.addresses) & set(written):
+                pressure = point.decode([self._memory[a] for a in point.addresses])
+                self.bench.command(channel, pressure)
+
+    def _shown(self, table: str) -> dict[int, int]:
+        """Return what a table reads as; a reading hides a set-point at its address."""
+        shown = dict(self._memory) if table == "holding" else {}
+        if table == "holding":
+            pairs = zip(self.settings.read_backs, self.settings.setpoints, strict=True)
+            for back, point in pairs:
+                shown |= {
+                    b: self._memory[a] for a, b in zip(point.addresses, back.addresses, strict=True)
+                }
+        measured = self.bench.measured()
+        for channel, point in self.settings.readings.items():
+            if point.table == table:
+                shown |= dict(zip(point.addresses, _counts(point, measured[channel]), strict=True))
+        return shown
+
+    def _switch(self, state: bool) -> None:
+        valve = self.settings.dump_valve
+        if valve is not None:
+            self.bench.dump(open_valve=state == valve.coil_for(open_valve=True))
+
+    # watchdog ------------------------------------------------------------------------------------
+
+    async def _watch(self) -> None:
+        watchdog = self.settings.watchdog
+        while watchdog is not None:
+            await asyncio.sleep(_TICK)
+            timeout = self._memory[watchdog.address] * watchdog.resolution
+            last = self._last_write
+            if last is not None and timeout > 0 and time.monotonic() - last > timeout:
+                self._fall()
+
+    def _fall(self) -> None:
+        """Let all outputs fall, as when the device has just been switched on."""
+        self._last_write = None
+        for channel, point in enumerate(self.settings.setpoints):
+            self._memory.update(zip(point.addresses, point.encode(0.0), strict=True))
+            self.bench.command(channel, 0.0)
+        self._switch(False)
+
+
+class _Terminals:
+    """Two pseudo-terminals, joined: a serial line with both its ends on this machine.
+
+    Both ends are kept open here, else the line would break whenever someone hangs up.
+    """
+
+    def __init__(self) -> None:
+        import tty
+
+        self._ends = [os.openpty(), os.openpty()]
+        self.inner, self.outer = (os.ttyname(slave) for _, slave in self._ends)
+        masters = [master for master, _ in self._ends]
+        for (_, slave), source, target in zip(self._ends, masters, masters[::-1], strict=True):
+            tty.setraw(slave)
+            os.set_blocking(source, False)
+            asyncio.get_running_loop().add_reader(source, self._pass_on, source, target)
+
+    def _pass_on(self, source: int, target: int) -> None:
+        with suppress(BlockingIOError):  # a full line loses what is sent, as a real one does
+            os.write(target, os.read(source, 4096))
+
+    def close(self) -> None:
+        for ends in self._ends:
+            asyncio.get_running_loop().remove_reader(ends[0])
+            for end in ends:
+                os.close(end)
+
+
+async def _begin(server: Any, failure: str) -> None:
+    try:
+        await server.serve_forever(background=True)
+    except RuntimeError:  # pymodbus has logged why and does not say it
+        raise DeviceError(failure) from None
+
+
+def _address(asked: Tcp) -> tuple[str, int]:
+    """Return where to listen: where asked, if that is on loopback, else on any free port there."""
+    local = asked.host == "localhost" or asked.host.startswith("127.")
+    return ("127.0.0.1", asked.port if local else 0)
+
+
+def _counts(point: Point, pressure: float) -> tuple[int, ...]:
+    """Return the registers of a reading; integers know no NaN and then read as full."""
+    if np.isfinite(pressure):
+        return point.encode(float(pressure))
+    low, high = point.pressure_range()
+    if point.type == "float32":
+        return point.registers(float(pressure))
+    return point.encode(high if point.scale.rises else low)

@@ -1,0 +1,71 @@
+"""Where a tracker and its sensor are with respect to the arm; applied here and nowhere else."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.directions import Quaternion
+from stiffopt.schema import Schema, Vector
+from stiffopt.units import Length
+
+__all__ = ["Placement", "Registration"]
+
+Array = NDArray[np.float64]
+
+
+class Placement(Schema):
+    """A frame in another.
+
+    Attributes
+    ----------
+    position : of its origin, in m.
+    orientation : its axes, as a unit quaternion, w first.
+    """
+
+    position: Vector[Length] = (0.0, 0.0, 0.0)
+    orientation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
+    def transform(self) -> Array:
+        """Transform (4, 4) of coordinates in this frame to those in the other."""
+        rotation = lie.rotation_from_quaternion(np.array(self.orientation))
+        return np.asarray(lie.transform(rotation, np.array(self.position)))
+
+
+class Registration(Schema):
+    """How a tracker's readings become the pose of the tip in the base frame.
+
+    Attributes
+    ----------
+    tracker_in_base : the tracker's frame in the arm's base frame.
+    tip_in_sensor : the tip frame in the frame of the tracked sensor.
+    """
+
+    tracker_in_base: Placement = Placement()
+    tip_in_sensor: Placement = Placement()
+
+    def tip_in_base(self, position: Array, quaternion: Array | None) -> tuple[Array, Array | None]:
+        """Return position (3,) and quaternion (4,) or None of the tip in the base frame.
+
+        Parameters
+        ----------
+        position, quaternion :
+            Of the sensor in the tracker's frame, in m and w first; without a quaternion the
+            sensor's place is taken for that of the tip.
+        """
+        T = self.tracker_in_base.transform()
+        if quaternion is None:
+            return T[:3, :3] @ position + T[:3, 3], None
+        sensor = np.eye(4)
+        sensor[:3, :3], sensor[:3, 3] = lie.rotation_from_quaternion(quaternion), position
+        tip = T @ sensor @ self.tip_in_sensor.transform()
+        return tip[:3, 3], lie.quaternion_from_rotation(tip[:3, :3])
+
+    def sensor_in_tracker(self, tip: Array) -> Array:
+        """Return what a perfect tracker reads (4, 4) where the tip (4, 4) is in the base frame."""
+        return (
+            np.linalg.inv(self.tracker_in_base.transform())
+            @ tip
+            @ np.linalg.inv(self.tip_in_sensor.transform())
+        )

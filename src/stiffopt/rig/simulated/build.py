@@ -1,0 +1,268 @@
+"""From the robot file and the plant's block to the arrays that the compiled loops work on."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.polynomial import legendre
+from numpy.typing import NDArray
+
+from stiffopt.errors import InputError
+from stiffopt.model.description import RobotDescription, Segment
+from stiffopt.rig.simulated.material import LINEAR, YEOH, Material
+from stiffopt.rig.simulated.rod import Rod
+from stiffopt.rig.simulated.settings import Mismatch, PlantSettings
+
+__all__ = ["make_material", "make_rod", "node_at"]
+
+Array = NDArray[np.float64]
+
+_ON_RING = 6  # fibres on each of two rings
+_SAME = 1e-6  # of a segment's length; a load so near to a node acts on the node
+_DENSITY = 1070.0  # kg/m^3; of silicone, for robots that have no gravity and name no density
+
+
+def make_rod(
+    robot: RobotDescription, settings: PlantSettings, mismatch: Mismatch, station: float | None
+) -> Rod:
+    """Discretise the arm.
+
+    Parameters
+    ----------
+    robot :
+        What the robot file says.
+    settings :
+        Of the plant.
+    mismatch :
+        The one that is in force, with what was drawn.
+    station :
+        Arc length at rest that shall be a node, in m; None for the tip.
+    """
+    grid = settings.discretisation
+    bending, shear = grid.bending_degree + 1, grid.shear_degree + 1
+    count = np.array([shear, shear, shear, bending, bending, shear])
+    basis_size = max(bending, shear)
+    points, weights = legendre.leggauss(grid.bending_degree + 2)
+    lengths = _lengths(robot, mismatch)
+    cuts = [_cuts(grid.sub_intervals) for _ in robot.segments]
+    if station is not None:
+        segment, place = station_of(robot, mismatch, station)
+        if np.abs(cuts[segment] - place).min() > _SAME:
+            cuts[segment] = np.sort(np.append(cuts[segment], place))
+    most = max(len(c) - 1 for c in cuts)
+    interval = np.zeros((len(cuts), most))
+    interval_basis = np.zeros((len(cuts), most, 2, basis_size))
+    for s, c in enumerate(cuts):
+        h = np.diff(c)
+        interval[s, : len(h)] = h * lengths[s]
+        middle = 0.5 * (c[1:] + c[:-1])
+        for m in range(len(h)):
+            gauss = middle[m] + h[m] * np.array([-1, 1]) / (2 * math.sqrt(3))
+            interval_basis[s, m] = _legendre(gauss, basis_size)
+    intervals = np.array([len(c) - 1 for c in cuts])
+    first_node = np.concatenate(([0], np.cumsum(intervals + 1)[:-1]))
+    base = mismatch.base.transform()
+    gravity = robot.gravity if settings.gravity is None else settings.gravity
+    return Rod(
+        first=np.concatenate(([0], np.cumsum(count)[:-1])),
+        count=count,
+        per_segment=int(count.sum()),
+        length=lengths,
+        connector=np.array([segment.connector for segment in robot.segments]),
+        first_node=first_node,
+        intervals=intervals,
+        interval=interval,
+        interval_basis=interval_basis,
+        weight=weights / 2,
+        basis=_legendre((points + 1) / 2, basis_size),
+        base_rotation=np.ascontiguousarray(base[:3, :3]),
+        base_position=np.ascontiguousarray(base[:3, 3]),
+        mass=_masses(robot, settings, lengths, cuts, grid.sub_intervals),
+        gravity=np.array(gravity, dtype=float),
+    )
+
+
+def station_of(robot: RobotDescription, mismatch: Mismatch, at: float) -> tuple[int, float]:
+    """Segment (from 0) and place within it (0 to 1) at an arc length at rest, in m.
+
+    Raises
+    ------
+    InputError
+        There is no such place on the arm.
+    """
+    begin = 0.0
+    for s, length in enumerate(_lengths(robot, mismatch)):
+        if begin <= at <= begin + length:
+            return s, (at - begin) / length
+        begin += length + robot.segments[s].connector
+        if at < begin:
+            return s, 1.0  # on a connector
+    if at <= begin * (1 + 1e-9):
+        return robot.n_segments - 1, 1.0
+    raise InputError(f"the load acts at {at * 1e3:g} mm; the arm is {begin * 1e3:g} mm long")
+
+
+def _lengths(robot: RobotDescription, mismatch: Mismatch) -> Array:
+    factors = mismatch.length or (1.0,) * robot.n_segments
+    return np.array([s.length * f for s, f in zip(robot.segments, factors, strict=True)])
+
+
+def _legendre(places: Array, size: int) -> Array:
+    """Values (m, size) of Legendre polynomials at places (m,) between 0 and 1."""
+    return np.asarray(legendre.legvander(2 * np.asarray(places) - 1, size - 1), dtype=float)
+
+
+def _cuts(intervals: int) -> Array:
+    """Ends of the intervals, between 0 and 1: Lobatto's points, which integrate inertia best."""
+    inner = np.sort(legendre.legroots(legendre.legder([0] * intervals + [1])))
+    return np.concatenate(([0.0], (inner + 1) / 2, [1.0]))
+
+
+def _lobatto_weights(intervals: int) -> Array:
+    x = 2 * _cuts(intervals) - 1
+    values = legendre.legval(x, [0] * intervals + [1])
+    return 1 / (intervals * (intervals + 1) * values**2)
+
+
+def _masses(
+    robot: RobotDescription,
+    settings: PlantSettings,
+    lengths: Array,
+    cuts: list[Array],
+    intervals: int,
+) -> Array:
+    """Mass of each node over (position, x axis, y axis) (N, 3, 3)."""
+    masses = []
+    for s, segment in enumerate(robot.segments):
+        density = segment.material.density or _DENSITY
+        per_length = density * _section_moments(segment)
+        at = dict(zip(_cuts(intervals), _lobatto_weights(intervals), strict=True))
+        masses += [at.get(place, 0.0) * lengths[s] * per_length for place in cuts[s]]
+    tip = np.zeros((3, 3))
+    tip[0, 0] = robot.tip_mass + settings.payload
+    return np.array([*masses, tip])
+
+
+def _section_moments(segment: Segment) -> Array:
+    """``int (1, x, y) (1, x, y)' dA`` (3, 3) of the silicone at rest, about the axis."""
+    x, y, dA = _quadrature(segment)
+    places = np.stack([np.ones_like(x), x, y])
+    moments = (places * dA) @ places.T
+    moments[np.abs(moments) < 1e-14 * moments[0, 0]] = 0.0
+    return np.asarray(moments)
+
+
+def make_material(
+    robot: RobotDescription, settings: PlantSettings, mismatch: Mismatch, viscosity: float
+) -> Material:
+    """Return the sections of the arm; `viscosity` is that of the dashpot over E, in s."""
+    silicone = settings.silicone
+    n = robot.n_segments
+    factors = mismatch.modulus or (1.0,) * n
+    modulus, slope, shear, torsion = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    centroid = np.empty((n, 2))
+    fibres, area = np.empty((n, 2 * _ON_RING, 2)), np.empty((n, 2 * _ON_RING))
+    for s, segment in enumerate(robot.segments):
+        lamb = segment.compensation
+        modulus[s] = segment.material.youngs_modulus * factors[s]
+        slope[s] = (lamb.modulus_per_pressure if lamb else 0.0) * factors[s]
+        scale_area, scale_inertia = (lamb.area, lamb.inertia) if lamb else (1.0, 1.0)
+        fibres[s], area[s] = _fibres(segment, scale_area, scale_inertia)
+        centroid[s] = area[s] @ fibres[s] / area[s].sum()
+        in_shear = 1 / (2 * (1 + segment.material.poisson_ratio))  # G / E
+        shear[s] = in_shear * area[s].sum()
+        torsion[s] = in_shear * (area[s] @ ((fibres[s] - centroid[s]) ** 2).sum(axis=1))
+    force, first = _channels(robot, mismatch)
+    return Material(
+        law=LINEAR if silicone.law == "linear" else YEOH,
+        stiffening=silicone.stiffening if silicone.law == "yeoh" else 0.0,
+        viscosity=viscosity,
+        creep_share=np.array([c.share for c in silicone.creep], dtype=float),
+        creep_time=np.array([c.time for c in silicone.creep], dtype=float),
+        slip_share=np.array([h.share for h in silicone.hysteresis], dtype=float),
+        slip_strain=np.array([h.strain for h in silicone.hysteresis], dtype=float),
+        modulus=modulus,
+        modulus_slope=slope,
+        shear=shear,
+        torsion=torsion,
+        centroid=centroid,
+        fibre_x=np.ascontiguousarray(fibres[:, :, 0]),
+        fibre_y=np.ascontiguousarray(fibres[:, :, 1]),
+        fibre_area=area,
+        first_channel=np.cumsum([0, *(segment.n_channels for segment in robot.segments)]),
+        channel_force=force,
+        channel_x=first[:, 0].copy(),
+        channel_y=first[:, 1].copy(),
+    )
+
+
+def _fibres(segment: Segment, scale_area: float, scale_inertia: float) -> tuple[Array, Array]:
+    """Fibres (f, 2) and their areas (f,) in place of a section.
+
+    Two rings, mapped as the section's second moments want it, with the radii and areas of the
+    Gauss rule for the squared distance: moments of area up to the sixth are right if the section
+    is symmetric. The compensation scales area and second moments.
+    """
+    x, y, dA = _quadrature(segment)
+    area = dA.sum()
+    places = np.stack([x, y], axis=1)
+    centroid = dA @ places / area
+    places = places - centroid
+    values, axes = np.linalg.eigh((places.T * dA) @ places / area)
+    root = axes @ np.diag(np.sqrt(values)) @ axes.T
+    squared = ((places @ np.linalg.inv(root)) ** 2).sum(axis=1)
+    m1, m2, m3 = (dA @ squared**k / area for k in (1, 2, 3))
+    # orthogonal polynomial t^2 - b t + c of the measure; its roots are the squared radii
+    b, c = np.linalg.solve([[m1, -1.0], [m2, -m1]], [m2, m3])
+    radii = np.sort(np.roots([1.0, -b, c]).real)
+    outer_share = (m1 - radii[0]) / (radii[1] - radii[0])
+    rings, areas = [], []
+    for ring, (radius, share) in enumerate(zip(radii, (1 - outer_share, outer_share), strict=True)):
+        angles = 2 * np.pi * (np.arange(_ON_RING) + 0.5 * ring) / _ON_RING
+        rings.append(math.sqrt(radius) * np.stack([np.cos(angles), np.sin(angles)], axis=1))
+        areas.append(np.full(_ON_RING, share * area * scale_area / _ON_RING))
+    spread = math.sqrt(scale_inertia / scale_area)
+    return centroid + spread * np.concatenate(rings) @ root.T, np.concatenate(areas)
+
+
+def _quadrature(segment: Segment) -> tuple[Array, Array, Array]:
+    """Points and weights (m,) on a section that are exact up to degree seven: discs less discs."""
+    chambers = segment.chambers
+    discs = [(0.0, 0.0, segment.outer_radius, 1.0), (0.0, 0.0, segment.inner_radius, -1.0)]
+    for angle in chambers.angles:
+        x, y = chambers.offset * math.cos(angle), chambers.offset * math.sin(angle)
+        discs.append((x, y, chambers.radius, -1.0))
+    nodes, weights = legendre.leggauss(4)
+    turns = 2 * np.pi * np.arange(8) / 8
+    xs, ys, areas = [], [], []
+    for x, y, radius, sign in discs:
+        r = radius * np.sqrt((nodes + 1) / 2)
+        xs.append((x + np.outer(r, np.cos(turns))).ravel())
+        ys.append((y + np.outer(r, np.sin(turns))).ravel())
+        share = np.repeat(weights / 2, len(turns)) / len(turns)
+        areas.append(sign * math.pi * radius**2 * share)
+    return np.concatenate(xs), np.concatenate(ys), np.concatenate(areas)
+
+
+def _channels(robot: RobotDescription, mismatch: Mismatch) -> tuple[Array, Array]:
+    """Area (n,) and first moments of area (n, 2) of the channels' chambers."""
+    force, first = [], []
+    turns = iter(mismatch.angle or (0.0,) * robot.n_pressures)
+    for segment in robot.segments:
+        chambers = segment.chambers
+        hole = math.pi * chambers.radius**2
+        for channel in segment.channels:
+            angles = np.array([chambers.angles[number - 1] for number in channel]) + next(turns)
+            centres = chambers.offset * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+            force.append(hole * len(channel))
+            first.append(hole * centres.sum(axis=0))
+    return np.array(force), np.array(first)
+
+
+def node_at(robot: RobotDescription, mismatch: Mismatch, rod: Rod, at: float) -> int:
+    """Node of a rod that was made with a station there."""
+    segment, place = station_of(robot, mismatch, at)
+    m = int(rod.intervals[segment])
+    cuts = np.concatenate(([0.0], np.cumsum(rod.interval[segment, :m]))) / rod.length[segment]
+    return int(rod.first_node[segment]) + int(np.abs(cuts - place).argmin())

@@ -1,0 +1,144 @@
+"""The simulated devices: a world seen through the interface of the rig."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import CommandError, DeviceError
+from stiffopt.rig.interface import (
+    Clock,
+    ForceProbe,
+    ForceSample,
+    PoseTracker,
+    PressureLimits,
+    PressureSupply,
+    RawPose,
+)
+from stiffopt.rig.registration import Registration
+from stiffopt.rig.simulated.world import World
+
+__all__ = ["SimulatedProbe", "SimulatedSupply", "SimulatedTracker"]
+
+Array = NDArray[np.float64]
+
+_TICK = 0.005  # s, at which a moving stage is looked after
+
+
+class SimulatedSupply(PressureSupply):
+    """Regulators of a simulated arm."""
+
+    def __init__(self, world: World, limits: PressureLimits, clock: Clock) -> None:
+        super().__init__(limits, clock)
+        self._world = world
+
+    def _open(self) -> None:
+        self._answer()
+
+    def _close(self) -> None:
+        pass
+
+    def _answer(self) -> None:
+        self._world.catch_up()
+        if self._world.faults["supply"] == "off":
+            raise DeviceError("the simulated supply does not answer (its fault is 'off')")
+
+    @property
+    def has_dump_valve(self) -> bool:
+        """Whether the rig file gives it one."""
+        return self._world.supply.dump_valve
+
+    def _write(self, pressures: Array) -> None:
+        self._answer()
+        self._world.command(pressures)
+
+    def _read(self) -> ArrayLike:
+        self._answer()
+        return self._world.measured()
+
+    def _dump(self, *, open_valve: bool) -> None:
+        if self.has_dump_valve:  # the valve is wired past the supply, which may be off
+            self._world.catch_up()
+            self._world.dump(open_valve=open_valve)
+
+
+class SimulatedTracker(PoseTracker):
+    """A tracker that sees a simulated arm."""
+
+    def __init__(self, world: World, registration: Registration, clock: Clock) -> None:
+        super().__init__(registration, clock)
+        self._world = world
+
+    def _open(self) -> None:
+        self._world.catch_up()
+        self._world.frames()  # what was captured before nobody asked for
+
+    def _close(self) -> None:
+        pass
+
+    def _poll(self) -> None:
+        self._world.catch_up()
+        for frame in self._world.frames():
+            self._deliver(
+                RawPose(
+                    frame.captured, frame.number, frame.position, frame.quaternion, frame.delivered
+                )
+            )
+
+
+class SimulatedProbe(ForceProbe):
+    """A plate on a stage that pushes a simulated arm's tip."""
+
+    def __init__(self, world: World, clock: Clock) -> None:
+        super().__init__(clock)
+        self._world = world
+
+    def _open(self) -> None:
+        self._answer()
+
+    def _close(self) -> None:
+        self._world.stop_stage()
+        self._world.align_stage(None)
+
+    def _answer(self) -> None:
+        self._world.catch_up()
+        if self._world.faults["probe"] == "off":
+            raise DeviceError("the simulated probe does not answer (its fault is 'off')")
+
+    def align(self, direction: Iterable[float]) -> None:
+        """Put the plate just clear of the tip, facing along a unit vector (3,) in the base."""
+        self._must_be_open()
+        self._answer()
+        axis = np.array(tuple(direction), dtype=float)
+        if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
+            raise CommandError("expected a direction [x, y, z] to align the probe with")
+        self._world.align_stage(axis)
+
+    def withdraw(self) -> None:
+        """Take the plate away."""
+        self._must_be_open()
+        self._answer()
+        self._world.align_stage(None)
+
+    def move_to(self, position: float, speed: float) -> None:
+        """Move the plate and return when it is there; see `ForceProbe.move_to`."""
+        self._must_be_open()
+        self._answer()
+        if not (np.isfinite(position) and np.isfinite(speed) and speed > 0):
+            raise CommandError("expected a finite position and a speed above 0")
+        self._world.move_stage(position, speed)
+        while self._world.stage_moving:
+            self.clock.sleep(_TICK)
+            self._answer()
+
+    def stop(self) -> None:
+        """Stop the plate."""
+        self._world.stop_stage()
+
+    def sample(self) -> ForceSample:
+        """Read force and position."""
+        self._must_be_open()
+        self._answer()
+        return ForceSample(self.clock.now(), self._world.force(), self._world.stage_position)

@@ -1,0 +1,566 @@
+"""The motion of the rod: one step in time, many steps, and what is conserved.
+
+With inertia, a variational integrator: the discrete Lagrangian of a step from q0 to q1 is
+
+    L = 1/(2h) (X1 - X0)' m (X1 - X0) - h V(elastic; (q0 + q1)/2) - h/2 (U(q0) + U(q1))
+
+where X are the positions and section axes of the nodes and U the potential of gravity. Momenta
+p0 = -dL/dq0 and p1 = dL/dq1, with the forces that have no potential split in the same way. It has
+no numerical damping; elasticity is implicit, gravity, loads and contact are explicit. Without
+inertia, backward Euler: stresses, viscosity included, are in equilibrium with all loads at the
+end of the step.
+
+Newton's method uses a tangent by finite differences that is kept over many steps.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stiffopt.rig.simulated.jit import jit
+from stiffopt.rig.simulated.material import (
+    Material,
+    Memory,
+    Scheme,
+    internal_forces,
+    remember,
+)
+from stiffopt.rig.simulated.rod import Rod, jacobians, poses
+
+Array = Any
+
+_CLOSE = 1e-9  # strain by which the last iteration may still change
+_SLOWEST = 0.3  # share of the correction before; if one is larger, the tangent is made anew
+_ITERATIONS = 40
+_SHORTEST = 1 / 64  # share of a step; one that does not work is divided down to this
+_NUDGE = 1e-7  # strain, for the finite differences
+_STRIDE = 0.3  # strain; no iteration goes further
+_SOFT = 1e-6  # m, over which contact sets in: more than a nudge moves the tip
+_REACH = 0.015  # m; turns curvatures into strains
+
+
+class Loads(NamedTuple):
+    """What pushes on the arm.
+
+    Attributes
+    ----------
+    node : on which the wrench acts.
+    force, moment : (3,), N and N m.
+    follows : whether they turn with the node's section.
+    plate : unit normal of the probe's plate (3,), from the probe towards the tip.
+    plate_at : where the plate is along its normal, m.
+    plate_speed : at which it moves, m/s.
+    plate_stiffness : N/m; 0 where there is no plate.
+    """
+
+    node: int
+    force: Array
+    moment: Array
+    follows: bool
+    plate: Array
+    plate_at: float
+    plate_speed: float
+    plate_stiffness: float
+
+
+class State(NamedTuple):
+    """What of an arm changes in time. n coefficients, N nodes.
+
+    Attributes
+    ----------
+    q, momentum : (n,).
+    rate : of q during the last step (n,), 1/s; the next step's guess follows it.
+    rotations, positions : of the nodes (N, 3, 3), (N, 3), always those of q.
+    inverse : of the tangent (n, n).
+    tangent_of : step and kind of equations that the tangent belongs to (2,); 0 where there is none.
+    totals : energy dissipated, work of the pressures, and of loads and contact, so far (3,), J.
+    memory : of the fibres.
+    """
+
+    q: Array
+    momentum: Array
+    rate: Array
+    rotations: Array
+    positions: Array
+    inverse: Array
+    tangent_of: Array
+    totals: Array
+    memory: Memory
+
+
+@jit
+def loads_after(loads: Loads, duration: float) -> Loads:
+    """Loads after some time: the plate moves."""
+    return Loads(
+        loads.node,
+        loads.force,
+        loads.moment,
+        loads.follows,
+        loads.plate,
+        loads.plate_at + duration * loads.plate_speed,
+        loads.plate_speed,
+        loads.plate_stiffness,
+    )
+
+
+@jit
+def depth_of(loads: Loads, tip: Array) -> float:
+    """How far the tip is behind the plate's face, m; negative where it is clear of it."""
+    along: float = loads.plate[0] * tip[0] + loads.plate[1] * tip[1] + loads.plate[2] * tip[2]
+    return loads.plate_at - along
+
+
+@jit
+def external_forces(rod: Rod, loads: Loads, R: Array, r: Array, J: Array, out: Array) -> None:
+    """Generalised forces (n,) of gravity and wrench."""
+    n = len(out)
+    last = len(r) - 1
+    out[:] = 0.0
+    wrench, down = np.empty(6), np.empty(3)
+    for node in range(1, last + 1):
+        turn = R[node]
+        mass, mx, my = rod.mass[node, 0, 0], rod.mass[node, 0, 1], rod.mass[node, 0, 2]
+        for i in range(3):
+            down[i] = 0.0
+            for j in range(3):
+                down[i] += turn[j, i] * rod.gravity[j]
+            wrench[i] = mass * down[i]
+        wrench[3] = my * down[2]
+        wrench[4] = -mx * down[2]
+        wrench[5] = mx * down[1] - my * down[0]
+        if node == loads.node:
+            for i in range(3):
+                for j in range(3):
+                    along = (1.0 if i == j else 0.0) if loads.follows else turn[j, i]
+                    wrench[i] += along * loads.force[j]
+                    wrench[3 + i] += along * loads.moment[j]
+        for k in range(n):
+            total = 0.0
+            for i in range(6):
+                total += J[node, k, i] * wrench[i]
+            out[k] += total
+
+
+@jit
+def contact_force(loads: Loads, depth: float) -> float:
+    """Force of the plate on the tip at some depth, N: ``k max(depth, 0)``, rounded at 0."""
+    if loads.plate_stiffness == 0:
+        return 0.0
+    rounded: float = 0.5 * loads.plate_stiffness * (depth + math.hypot(depth, _SOFT))
+    return rounded
+
+
+@jit
+def contact_energy(loads: Loads, depth: float) -> float:
+    """Integral of `contact_force`, J, but for a constant."""
+    around = math.hypot(depth, _SOFT)
+    energy: float = depth * (depth + around) + _SOFT**2 * math.asinh(depth / _SOFT)
+    return 0.25 * loads.plate_stiffness * energy
+
+
+@jit
+def add_contact(loads: Loads, depth: float, R: Array, J: Array, out: Array) -> None:
+    """Add the plate's generalised forces (n,) on the tip, with axes R (3, 3) and Jacobian J."""
+    push = contact_force(loads, depth)
+    if push == 0:
+        return
+    for i in range(3):
+        along = push * (
+            R[0, i] * loads.plate[0] + R[1, i] * loads.plate[1] + R[2, i] * loads.plate[2]
+        )
+        for k in range(len(out)):
+            out[k] += J[k, i] * along
+
+
+@jit
+def _inertia(
+    rod: Rod, J: Array, R: Array, R0: Array, r0: Array, R1: Array, r1: Array, out: Array
+) -> None:
+    """``J' m (X1 - X0)`` (n,), with Jacobians J and axes R of one of the two ends."""
+    out[:] = 0.0
+    d = np.empty((3, 3))  # of position, x axis, y axis
+    f = np.empty((3, 3))
+    wrench = np.empty(6)
+    for node in range(1, len(r0)):
+        for i in range(3):
+            d[0, i] = r1[node, i] - r0[node, i]
+            d[1, i] = R1[node, i, 0] - R0[node, i, 0]
+            d[2, i] = R1[node, i, 1] - R0[node, i, 1]
+        for a in range(3):
+            for i in range(3):
+                total = 0.0
+                for b in range(3):
+                    total += rod.mass[node, a, b] * (
+                        d[b, 0] * R[node, 0, i] + d[b, 1] * R[node, 1, i] + d[b, 2] * R[node, 2, i]
+                    )
+                f[a, i] = total
+        for i in range(3):
+            wrench[i] = f[0, i]
+        wrench[3] = f[2, 2]  # x cross f1 + y cross f2
+        wrench[4] = -f[1, 2]
+        wrench[5] = f[1, 1] - f[2, 0]
+        for k in range(len(out)):
+            total = 0.0
+            for i in range(6):
+                total += J[node, k, i] * wrench[i]
+            out[k] += total
+
+
+@jit
+def _invert(A: Array, out: Array) -> bool:
+    """Inverse of a matrix by elimination with pivoting; destroys A. False if it has none."""
+    n = len(A)
+    out[:] = 0.0
+    for i in range(n):
+        out[i, i] = 1.0
+    for c in range(n):
+        pivot = c
+        for i in range(c + 1, n):
+            if abs(A[i, c]) > abs(A[pivot, c]):
+                pivot = i
+        if not abs(A[pivot, c]) > 0:
+            return False
+        if pivot != c:
+            for j in range(n):
+                A[c, j], A[pivot, j] = A[pivot, j], A[c, j]
+                out[c, j], out[pivot, j] = out[pivot, j], out[c, j]
+        scale = 1 / A[c, c]
+        for j in range(n):
+            A[c, j] *= scale
+            out[c, j] *= scale
+        for i in range(n):
+            factor = A[i, c]
+            if i != c and factor != 0:
+                for j in range(n):
+                    A[i, j] -= factor * A[c, j]
+                    out[i, j] -= factor * out[c, j]
+    return True
+
+
+class Work(NamedTuple):
+    """Room for a step: Jacobians, poses and forces. Made once per call."""
+
+    jacobian: Array
+    rotations: Array
+    positions: Array
+    inner: Array
+    outer: Array
+    trial: Array
+    residual: Array
+    nudged: Array
+    tangent: Array
+    guess: Array
+    touch: Array
+
+
+@jit
+def _residual(
+    rod: Rod,
+    material: Material,
+    scheme: Scheme,
+    loads: Loads,
+    inertia: bool,
+    state: State,
+    pressures: Array,
+    work: Work,
+    q: Array,
+    out: Array,
+) -> None:
+    """Imbalance (n,) of a step that ends at q, in N m or the like."""
+    h = scheme.step
+    last = len(state.positions) - 1
+    poses(rod, q, work.rotations, work.positions)
+    internal_forces(rod, material, scheme, state.memory, pressures, state.q, q, work.inner)
+    depth = depth_of(loads, work.positions[last])
+    if inertia:  # work.jacobian and work.outer are those of the beginning
+        _inertia(
+            rod,
+            work.jacobian,
+            state.rotations,
+            state.rotations,
+            state.positions,
+            work.rotations,
+            work.positions,
+            out,
+        )
+        work.touch[:] = 0.0
+        mean = 0.5 * (depth + depth_of(loads, state.positions[last]) - h * loads.plate_speed)
+        add_contact(loads, mean, state.rotations[last], work.jacobian[last], work.touch)
+        for k in range(len(q)):
+            out[k] = (out[k] / h - state.momentum[k]) * 2 / h + work.inner[k] - work.outer[k]
+            out[k] -= work.touch[k]
+    else:
+        jacobians(rod, q, work.jacobian)
+        external_forces(rod, loads, work.rotations, work.positions, work.jacobian, work.outer)
+        add_contact(loads, depth, work.rotations[last], work.jacobian[last], work.outer)
+        for k in range(len(q)):
+            out[k] = work.inner[k] - work.outer[k]
+
+
+@jit
+def _in_strain(rod: Rod, k: int) -> float:
+    """How much strain a unit of a coefficient is."""
+    return _REACH if k % rod.per_segment >= rod.first[3] else 1.0
+
+
+@jit
+def _correction(rod: Rod, state: State, work: Work) -> float:
+    """Put Newton's correction (n,) into work.trial; return the largest in it, as a strain."""
+    largest = 0.0
+    for i in range(len(work.trial)):
+        total = 0.0
+        for k in range(len(work.trial)):
+            total -= state.inverse[i, k] * work.residual[k]
+        work.trial[i] = total
+        largest = max(largest, abs(total) * _in_strain(rod, i))
+        if np.isnan(total):
+            return np.nan
+    return largest
+
+
+@jit
+def _make_tangent(
+    rod: Rod,
+    material: Material,
+    scheme: Scheme,
+    loads: Loads,
+    inertia: bool,
+    state: State,
+    pressures: Array,
+    work: Work,
+    q: Array,
+) -> bool:
+    """Put the inverse of the tangent (n, n) at q into the state; return whether there is one."""
+    n = len(q)
+    args = (rod, material, scheme, loads, inertia, state, pressures, work)
+    for k in range(n):
+        nudge = _NUDGE / _in_strain(rod, k)
+        kept = q[k]
+        q[k] = kept + nudge
+        _residual(*args, q, work.nudged)
+        q[k] = kept
+        for i in range(n):
+            work.tangent[i, k] = (work.nudged[i] - work.residual[i]) / nudge
+    return _invert(work.tangent, state.inverse)
+
+
+@jit
+def _solve(
+    rod: Rod,
+    material: Material,
+    scheme: Scheme,
+    loads: Loads,
+    inertia: bool,
+    state: State,
+    pressures: Array,
+    work: Work,
+    q: Array,
+) -> bool:
+    """Bring q (n,), at first a guess, to the end of a step; return whether that worked."""
+    n = len(q)
+    kind = (2.0 if inertia else 1.0) + (4.0 if scheme.history else 0.0)
+    args = (rod, material, scheme, loads, inertia, state, pressures, work)
+    before = np.inf
+    for _ in range(_ITERATIONS):
+        _residual(*args, q, work.residual)
+        known = state.tangent_of[0] == scheme.step and state.tangent_of[1] == kind
+        largest = _correction(rod, state, work) if known else np.inf
+        if (
+            not known or not largest <= _SLOWEST * before
+        ):  # an old tangent no longer serves; NaN comes here too
+            if not _make_tangent(*args, q):
+                return False
+            state.tangent_of[0] = scheme.step
+            state.tangent_of[1] = kind
+            largest = _correction(rod, state, work)
+            if not np.isfinite(largest):
+                state.tangent_of[0] = 0.0
+                return False
+        scale = min(1.0, _STRIDE / largest) if largest > 0 else 1.0
+        for i in range(n):
+            q[i] += scale * work.trial[i]
+        if largest < _CLOSE:
+            return True
+        before = largest
+    state.tangent_of[0] = 0.0
+    return False
+
+
+@jit
+def make_work(n: int, nodes: int) -> Work:
+    """Room for a step."""
+    return Work(
+        np.empty((nodes, n, 6)),
+        np.empty((nodes, 3, 3)),
+        np.empty((nodes, 3)),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n),
+        np.empty((n, n)),
+        np.empty(n),
+        np.empty(n),
+    )
+
+
+@jit
+def step(
+    rod: Rod,
+    material: Material,
+    scheme: Scheme,
+    loads: Loads,
+    inertia: bool,
+    state: State,
+    pressures: Array,
+    work: Work,
+) -> bool:
+    """Take one step at constant pressures (n,); return whether that worked.
+
+    With inertia, the Jacobians and the loads of the beginning are in `work`, and those of the end
+    are left there.
+    """
+    n = len(state.q)
+    h = scheme.step
+    q = work.guess
+    end = loads_after(loads, h)
+    args = (rod, material, scheme, end, inertia, state, pressures, work)
+    for k in range(n):
+        q[k] = state.q[k] + h * state.rate[k]
+    if not _solve(*args, q):
+        return False
+    poses(rod, q, work.rotations, work.positions)
+    last = len(state.positions) - 1
+    mean = 0.5 * (depth_of(end, work.positions[last]) + depth_of(loads, state.positions[last]))
+    if not inertia:
+        mean = depth_of(end, work.positions[last])
+    done = contact_force(loads, mean) * loads.plate_speed * h
+    for i in range(3):
+        force = loads.force[i]
+        if loads.follows:
+            force = 0.0
+            for j in range(3):
+                turn = state.rotations[loads.node, i, j] + work.rotations[loads.node, i, j]
+                force += 0.5 * turn * loads.force[j]
+        done += force * (work.positions[loads.node, i] - state.positions[loads.node, i])
+    if inertia:
+        internal_forces(rod, material, scheme, state.memory, pressures, state.q, q, work.inner)
+        jacobians(rod, q, work.jacobian)
+        _inertia(
+            rod,
+            work.jacobian,
+            work.rotations,
+            state.rotations,
+            state.positions,
+            work.rotations,
+            work.positions,
+            work.residual,
+        )
+        external_forces(rod, end, work.rotations, work.positions, work.jacobian, work.outer)
+        work.touch[:] = 0.0
+        add_contact(end, mean, work.rotations[last], work.jacobian[last], work.touch)
+        for k in range(n):
+            force = work.inner[k] - work.outer[k] - work.touch[k]
+            state.momentum[k] = work.residual[k] / h - 0.5 * h * force
+    lost, pushed = remember(rod, material, scheme, state.memory, pressures, state.q, q)
+    state.totals[0] += lost
+    state.totals[1] += pushed
+    state.totals[2] += done
+    for k in range(n):
+        state.rate[k] = (q[k] - state.q[k]) / h
+    state.q[:] = q
+    state.rotations[:] = work.rotations
+    state.positions[:] = work.positions
+    return True
+
+
+@jit
+def mass_matrix(rod: Rod, R: Array, J: Array, out: Array) -> None:
+    """Mass matrix (n, n) of the coefficients."""
+    n = len(out)
+    out[:] = 0.0
+    A = np.empty((6, 6))
+    for node in range(1, len(R)):
+        m = rod.mass[node]
+        A[:] = 0.0
+        for i in range(3):
+            A[i, i] = m[0, 0]
+        A[2, 3], A[2, 4] = m[0, 2], -m[0, 1]  # v z is the mass's moment times w, and so on
+        A[0, 5], A[1, 5] = -m[0, 2], m[0, 1]
+        A[3, 3], A[4, 4] = m[2, 2], m[1, 1]
+        A[3, 4] = -m[1, 2]
+        A[5, 5] = m[1, 1] + m[2, 2]
+        for i in range(6):
+            for j in range(i):
+                A[i, j] = A[j, i]
+        for k in range(n):
+            for j in range(k + 1):
+                total = 0.0
+                for a in range(6):
+                    for b in range(6):
+                        total += J[node, k, a] * A[a, b] * J[node, j, b]
+                out[k, j] += total
+    for k in range(n):
+        for j in range(k):
+            out[j, k] = out[k, j]
+
+
+@jit
+def run(
+    rod: Rod,
+    material: Material,
+    scheme: Scheme,
+    loads: Loads,
+    inertia: bool,
+    state: State,
+    pressures: Array,
+) -> int:
+    """Take a step at each row of pressures (m, n), in parts where it is too long.
+
+    Returns how many steps worked.
+    """
+    work = make_work(len(state.q), len(state.positions))
+    if inertia:
+        jacobians(rod, state.q, work.jacobian)
+        external_forces(rod, loads, state.rotations, state.positions, work.jacobian, work.outer)
+    for i in range(len(pressures)):
+        h, left = scheme.step, scheme.step
+        while left > 1e-9 * scheme.step:
+            part = Scheme(min(h, left), scheme.share, scheme.history)
+            if step(rod, material, part, loads, inertia, state, pressures[i], work):
+                left -= part.step
+                loads = loads_after(loads, part.step)
+            elif h > _SHORTEST * scheme.step:
+                h *= 0.5
+            else:
+                return i
+    return len(pressures)
+
+
+@jit
+def stiffness(
+    rod: Rod,
+    material: Material,
+    scheme: Scheme,
+    loads: Loads,
+    state: State,
+    pressures: Array,
+    out: Array,
+) -> None:
+    """Derivative (n, n) of the imbalance without inertia by the end of a step from the state."""
+    n = len(state.q)
+    work = make_work(n, len(state.positions))
+    q = state.q.copy()
+    args = (rod, material, scheme, loads, False, state, pressures, work, q)
+    for k in range(n):
+        nudge = _NUDGE / _in_strain(rod, k)
+        q[k] = state.q[k] + nudge
+        _residual(*args, work.nudged)
+        q[k] = state.q[k] - nudge
+        _residual(*args, work.residual)
+        q[k] = state.q[k]
+        for i in range(n):
+            out[i, k] = (work.nudged[i] - work.residual[i]) / (2 * nudge)

@@ -1,0 +1,57 @@
+"""Compilation of the simulator's inner loops by numba, kept on disk by content.
+
+numba's own cache looks at the time stamp of one file and not at the functions that it calls in
+others; here the cache's folder is named after the text of all files with compiled functions, so
+that code which has changed is never mixed with code that has not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from stiffopt.errors import MissingExtraError
+
+__all__ = ["jit"]
+
+FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
+
+_FILES = ("rod.py", "material.py", "dynamics.py", "regulators.py")
+_REORDER = {"contract", "reassoc", "arcp", "nsz"}  # but NaN and infinity stay what they are
+
+
+def _folder() -> str:
+    here = Path(__file__).parent
+    text = b"".join((here / name).read_bytes() for name in _FILES)
+    root = os.environ.get("STIFFOPT_CACHE_DIR") or Path.home() / ".cache" / "stiffopt"
+    return str(Path(root) / "simulator" / hashlib.sha256(text).hexdigest()[:16])
+
+
+def jit(function: FunctionT) -> FunctionT:
+    """Compile a function when it is first called, without the interpreter's lock.
+
+    Raises
+    ------
+    MissingExtraError
+        numba is not installed.
+    """
+    try:
+        import numba
+    except ImportError:
+        raise MissingExtraError("numba", "sim") from None
+    config: Any = numba.config
+    compile_it: Any = numba.njit
+    options = {"nogil": True, "fastmath": _REORDER, "error_model": "numpy"}
+    before = config.CACHE_DIR  # of the whole process: other packages keep theirs
+    try:
+        config.CACHE_DIR = _folder()
+        Path(config.CACHE_DIR).mkdir(parents=True, exist_ok=True)
+        compiled = compile_it(cache=True, **options)(function)
+    except (OSError, RuntimeError):  # nowhere to keep it: compiled once per process
+        compiled = compile_it(**options)(function)
+    finally:
+        config.CACHE_DIR = before
+    return compiled  # type: ignore[no-any-return]

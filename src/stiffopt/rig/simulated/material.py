@@ -1,0 +1,310 @@
+"""The silicone: stresses of the fibres of a section, with what they remember.
+
+A section is made of fibres along the arm that strain by ``v_z + u_x y - u_y x``. Beside a fibre's
+hyperelastic stress there are, in parallel: a dashpot (Kelvin-Voigt), springs in series with a
+dashpot (Maxwell: creep), and springs in series with a slider (Jenkin: hysteresis). Shear and twist
+are linear and have the dashpot alone. Stresses and strains are nominal: per area and length at
+rest.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stiffopt.rig.simulated.jit import jit
+from stiffopt.rig.simulated.rod import Rod, strain_at
+
+Array = Any
+
+LINEAR, YEOH = 0, 1
+_SOFTEST = 0.05  # share of the modulus that no pressure takes away
+_THINNEST = 0.1  # stretch below which the hyperelastic law is continued by its tangent
+
+
+class Material(NamedTuple):
+    """What of the sections does not change in time. S segments, f fibres, n channels.
+
+    Attributes
+    ----------
+    law : `LINEAR` or `YEOH` (neo-Hookean with no stiffening).
+    stiffening : C2 / C1 of the Yeoh law.
+    viscosity : of the dashpot, over the modulus, s.
+    creep_share, creep_time : of the Maxwell branches (c,).
+    slip_share, slip_strain : of the Jenkin elements (j,).
+    modulus, modulus_slope : of the segments (S,): E at rest in Pa, and its change per norm of the
+        segment's pressures.
+    shear, torsion : G A / E and G J / E of the segments (S,).
+    centroid : of the sections (S, 2), m.
+    fibre_x, fibre_y, fibre_area : of the fibres (S, f), m and m^2.
+    first_channel : of the segments (S + 1,).
+    channel_force, channel_x, channel_y : of the channels (n,): area, and first moments of area.
+    """
+
+    law: int
+    stiffening: float
+    viscosity: float
+    creep_share: Array
+    creep_time: Array
+    slip_share: Array
+    slip_strain: Array
+    modulus: Array
+    modulus_slope: Array
+    shear: Array
+    torsion: Array
+    centroid: Array
+    fibre_x: Array
+    fibre_y: Array
+    fibre_area: Array
+    first_channel: Array
+    channel_force: Array
+    channel_x: Array
+    channel_y: Array
+
+
+class Memory(NamedTuple):
+    """What the fibres remember. S segments, g Gauss points, f fibres.
+
+    Attributes
+    ----------
+    strain : of the fibres (S, g, f).
+    creep : strain of the Maxwell branches' dashpots (S, g, f, c).
+    slip : strain of the Jenkin elements' springs (S, g, f, j).
+    """
+
+    strain: Array
+    creep: Array
+    slip: Array
+
+
+class Scheme(NamedTuple):
+    """How a step in time is taken.
+
+    Attributes
+    ----------
+    step : s.
+    share : of the end of the step in what elastic stresses are evaluated at: 1/2 is the midpoint
+        rule, which loses no energy; 1 is backward Euler, which has no wiggles.
+    history : whether creep and hysteresis are there; without them the stresses are those in the
+        long run.
+    """
+
+    step: float
+    share: float
+    history: bool
+
+
+@jit
+def stress(material: Material, strain: float) -> float:
+    """Hyperelastic stress over Young's modulus."""
+    if material.law == LINEAR:
+        return strain
+    stretch = max(1 + strain, _THINNEST)
+    inverse = 1 / stretch
+    surplus = stretch * stretch + 2 * inverse - 3
+    value = (stretch - inverse * inverse) * (1 + 2 * material.stiffening * surplus) / 3
+    if 1 + strain < _THINNEST:
+        value += (1 + strain - _THINNEST) * 2 * inverse**3
+    return value
+
+
+@jit
+def energy(material: Material, strain: float) -> float:
+    """Hyperelastic energy over Young's modulus."""
+    if material.law == LINEAR:
+        return 0.5 * strain * strain
+    stretch = max(1 + strain, _THINNEST)
+    surplus = stretch * stretch + 2 / stretch - 3
+    return surplus * (1 + material.stiffening * surplus) / 6
+
+
+@jit
+def pressed_modulus(material: Material, segment: int, pressures: Array) -> float:
+    """Young's modulus at these pressures (n,), over that at rest."""
+    total = 0.0
+    for channel in range(material.first_channel[segment], material.first_channel[segment + 1]):
+        total += pressures[channel] * pressures[channel]
+    modulus = material.modulus[segment] + material.modulus_slope[segment] * total**0.5
+    pressed: float = modulus / material.modulus[segment]
+    return max(pressed, _SOFTEST)
+
+
+@jit
+def creep_coefficients(material: Material, scheme: Scheme, out: Array) -> None:
+    """For each Maxwell branch (c, 2): its dashpot ends at ``out[0] creep + out[1] mean``.
+
+    That is the theta method, with the fibre's strain at theta between the ends as `mean`.
+    """
+    for k in range(len(material.creep_time)):
+        rate = scheme.step / material.creep_time[k]
+        divisor = 1 + scheme.share * rate
+        out[k, 0] = (1 - (1 - scheme.share) * rate) / divisor
+        out[k, 1] = rate / divisor
+        if not scheme.history:
+            out[k, 0], out[k, 1] = 0.0, 1.0
+
+
+@jit
+def slip_after(limit: float, spring: float, change: float) -> float:
+    """Strain of a Jenkin element's spring after the fibre's strain has changed."""
+    return min(max(spring + change, -limit), limit)
+
+
+@jit
+def internal_forces(
+    rod: Rod,
+    material: Material,
+    scheme: Scheme,
+    memory: Memory,
+    pressures: Array,
+    before: Array,
+    after: Array,
+    out: Array,
+) -> None:
+    """Generalised forces (n,) of the stresses less those of the pressures during a step."""
+    out[:] = 0.0
+    e0 = np.empty(6)
+    e1 = np.empty(6)
+    force = np.empty(6)
+    share = scheme.share
+    rest = 1 - share
+    history = scheme.history
+    viscous = material.viscosity / scheme.step
+    branches, sliders = len(material.creep_share), len(material.slip_share)
+    ends = np.empty((branches, 2))
+    creep_coefficients(material, scheme, ends)
+    stiff = 0.0  # stress of the Maxwell branches per mean strain
+    for k in range(branches):
+        stiff += material.creep_share[k] * (1 - share * ends[k, 1]) if history else 0.0
+        ends[k, 0] = material.creep_share[k] * (share * ends[k, 0] + rest)
+    for s in range(len(rod.length)):
+        pressed = pressed_modulus(material, s, pressures)
+        E = material.modulus[s]
+        cx, cy = material.centroid[s, 0], material.centroid[s, 1]
+        push, push_x, push_y = 0.0, 0.0, 0.0
+        for c in range(material.first_channel[s], material.first_channel[s + 1]):
+            push += pressures[c] * material.channel_force[c]
+            push_x += pressures[c] * material.channel_x[c]
+            push_y += pressures[c] * material.channel_y[c]
+        for g in range(len(rod.weight)):
+            strain_at(rod, s, rod.basis[g], before, e0)
+            strain_at(rod, s, rod.basis[g], after, e1)
+            for i in range(6):  # of what is linear: shear at the centroid, and twist
+                force[i] = pressed * (share * e1[i] + rest * e0[i])
+                force[i] += viscous * (e1[i] - e0[i])
+            shear = material.shear[s] * E
+            nx = shear * (force[0] - force[5] * cy)
+            ny = shear * (force[1] + force[5] * cx)
+            mz = material.torsion[s] * E * force[5] - nx * cy + ny * cx
+            nz, mx, my = 0.0, 0.0, 0.0
+            for f in range(material.fibre_x.shape[1]):
+                x, y = material.fibre_x[s, f], material.fibre_y[s, f]
+                end = e1[2] + e1[3] * y - e1[4] * x
+                begin = memory.strain[s, g, f]
+                mean = share * end + rest * begin
+                n = pressed * stress(material, mean) + viscous * (end - begin)
+                if history:
+                    n += stiff * mean
+                    for k in range(branches):
+                        n -= ends[k, 0] * memory.creep[s, g, f, k]
+                    for k in range(sliders):
+                        old = memory.slip[s, g, f, k]
+                        new = slip_after(material.slip_strain[k], old, end - begin)
+                        n += material.slip_share[k] * (share * new + rest * old)
+                n *= material.fibre_area[s, f]
+                nz += n
+                mx += n * y
+                my -= n * x
+            force[0], force[1], force[2] = nx, ny, E * nz - push
+            force[3], force[4], force[5] = E * mx - push_y, E * my + push_x, mz
+            weight = rod.weight[g] * rod.length[s]
+            for c in range(6):
+                first = s * rod.per_segment + rod.first[c]
+                for k in range(rod.count[c]):
+                    out[first + k] += weight * rod.basis[g, k] * force[c]
+
+
+@jit
+def remember(
+    rod: Rod,
+    material: Material,
+    scheme: Scheme,
+    memory: Memory,
+    pressures: Array,
+    before: Array,
+    after: Array,
+) -> tuple[float, float]:
+    """Take a step into the memory; return the energy dissipated in it and the pressures' work."""
+    e0 = np.empty(6)
+    e1 = np.empty(6)
+    share = scheme.share
+    ends = np.empty((len(material.creep_share), 2))
+    creep_coefficients(material, scheme, ends)
+    lost, work = 0.0, 0.0
+    for s in range(len(rod.length)):
+        E = material.modulus[s]
+        cx, cy = material.centroid[s, 0], material.centroid[s, 1]
+        for g in range(len(rod.weight)):
+            weight = rod.weight[g] * rod.length[s]
+            strain_at(rod, s, rod.basis[g], before, e0)
+            strain_at(rod, s, rod.basis[g], after, e1)
+            for i in range(6):
+                e0[i] = e1[i] - e0[i]
+            for c in range(material.first_channel[s], material.first_channel[s + 1]):
+                swept = e0[2] * material.channel_force[c]
+                swept += e0[3] * material.channel_y[c] - e0[4] * material.channel_x[c]
+                work += weight * pressures[c] * swept
+            gx, gy = e0[0] - e0[5] * cy, e0[1] + e0[5] * cx
+            sheared = material.shear[s] * (gx * gx + gy * gy) + material.torsion[s] * e0[5] ** 2
+            lost += weight * E * material.viscosity / scheme.step * sheared
+            for f in range(material.fibre_x.shape[1]):
+                x, y = material.fibre_x[s, f], material.fibre_y[s, f]
+                end = e1[2] + e1[3] * y - e1[4] * x
+                begin = memory.strain[s, g, f]
+                change = end - begin
+                per_area = material.viscosity * change * change / scheme.step
+                memory.strain[s, g, f] = end
+                for k in range(len(material.creep_share)):
+                    old = memory.creep[s, g, f, k]
+                    inside = share * end + (1 - share) * begin
+                    new = ends[k, 0] * old + ends[k, 1] * inside
+                    mean = share * (end - new) + (1 - share) * (begin - old)
+                    per_area += material.creep_share[k] * mean * (new - old)
+                    memory.creep[s, g, f, k] = new
+                for k in range(len(material.slip_share)):
+                    old = memory.slip[s, g, f, k]
+                    new = slip_after(material.slip_strain[k], old, change)
+                    new = new if scheme.history else 0.0
+                    mean = share * new + (1 - share) * old
+                    per_area += material.slip_share[k] * mean * (change - (new - old))
+                    memory.slip[s, g, f, k] = new
+                lost += weight * E * material.fibre_area[s, f] * per_area
+    return lost, work
+
+
+@jit
+def stored(rod: Rod, material: Material, memory: Memory, pressures: Array, q: Array) -> float:
+    """Elastic energy of the segments, of creep and hysteresis too, in J."""
+    e = np.empty(6)
+    total = 0.0
+    for s in range(len(rod.length)):
+        pressed = pressed_modulus(material, s, pressures)
+        cx, cy = material.centroid[s, 0], material.centroid[s, 1]
+        for g in range(len(rod.weight)):
+            strain_at(rod, s, rod.basis[g], q, e)
+            gx, gy = e[0] - e[5] * cy, e[1] + e[5] * cx
+            per_length = material.shear[s] * (gx * gx + gy * gy) + material.torsion[s] * e[5] ** 2
+            per_length *= 0.5 * pressed
+            for f in range(material.fibre_x.shape[1]):
+                strain = e[2] + e[3] * material.fibre_y[s, f] - e[4] * material.fibre_x[s, f]
+                per_area = pressed * energy(material, strain)
+                for k in range(len(material.creep_share)):
+                    spring = memory.strain[s, g, f] - memory.creep[s, g, f, k]
+                    per_area += 0.5 * material.creep_share[k] * spring * spring
+                for k in range(len(material.slip_share)):
+                    spring = memory.slip[s, g, f, k]
+                    per_area += 0.5 * material.slip_share[k] * spring * spring
+                per_length += material.fibre_area[s, f] * per_area
+            total += rod.weight[g] * rod.length[s] * material.modulus[s] * per_length
+    return total

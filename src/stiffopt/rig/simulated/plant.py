@@ -1,0 +1,368 @@
+"""The simulated arm: a rod whose mechanics are not the optimiser's model.
+
+The differences are meant: the rod is per reference length and has distributed weight, inertia,
+shear and stretch; its silicone is hyperelastic, creeps and has hysteresis. Pressure acts normal to
+the section: the force p A on each section at the chamber's centre, constant in the section's axes,
+which is conjugate to the volume that a chamber of constant bore sweeps. (Along the chamber instead
+of normal to the section would change the compliance of a bent arm by about 3 %.)
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import EquilibriumError, InputError, PressureError, StiffoptError
+from stiffopt.model.description import RobotDescription
+from stiffopt.rig.simulated import dynamics, material, rod
+from stiffopt.rig.simulated.build import make_material, make_rod, node_at
+from stiffopt.rig.simulated.dynamics import Loads, State
+from stiffopt.rig.simulated.material import Memory, Scheme
+from stiffopt.rig.simulated.mismatch import draw
+from stiffopt.rig.simulated.settings import Load, PlantSettings
+
+__all__ = ["Energies", "Plant", "SimulationError"]
+
+Array = NDArray[np.float64]
+
+_LONG = 1e9  # s; a step after which viscosity has nothing more to say
+_FIRST_STEP = 0.02  # s
+_TRIES = 400
+_STILL = 1e-3  # s; step for stiffness to motions so fast that nothing creeps or slips
+
+
+class SimulationError(StiffoptError):
+    """The simulated arm cannot be followed: a load or a pressure is far beyond what it bears."""
+
+
+@dataclass(frozen=True)
+class Energies:
+    """Where the energy is, in J.
+
+    Attributes
+    ----------
+    kinetic : of the motion.
+    elastic : in the silicone, the springs of creep and hysteresis included.
+    gravity : potential, zero where the arm's mass is at the base.
+    contact : in the contact with the probe.
+    dissipated : by viscosity, creep and hysteresis so far.
+    work : of the pressures so far.
+    load_work : of the load's force and of the moving probe so far (moments are not counted).
+    """
+
+    kinetic: float
+    elastic: float
+    gravity: float
+    contact: float
+    dissipated: float
+    work: float
+    load_work: float
+
+
+class Plant:
+    """An arm in time.
+
+    Parameters
+    ----------
+    robot :
+        What the robot file says.
+    settings :
+        How this arm differs, and how it is simulated.
+
+    Raises
+    ------
+    InputError
+        The settings do not fit the robot.
+    MissingExtraError
+        numba is not installed.
+    """
+
+    def __init__(self, robot: RobotDescription, settings: PlantSettings | None = None) -> None:
+        self.robot = robot
+        self.settings = settings or PlantSettings()
+        self.mismatch = draw(robot, self.settings)
+        self._gain = np.array(self.mismatch.gain or (1.0,) * robot.n_pressures)
+        self._offset = np.array(self.mismatch.offset or (0.0,) * robot.n_pressures)
+        self._steps = 0
+        self._load: Load | None = None
+        self._plate: tuple[Array, float, float, float] | None = None
+        self._material = make_material(robot, self.settings, self.mismatch, 0.0)
+        self._mesh(None)
+        self._state = self._at_rest()
+        self.set_load(self.settings.load)
+        self._tame()
+
+    def _tame(self) -> None:
+        """Set the viscosity so that it damps the first bending mode as asked, and settle."""
+        self.settle(np.zeros(self.robot.n_pressures))
+        wanted = self.settings.silicone.damping
+        if wanted > 0:
+            first = 2 * math.pi * float(self.modes(1)[0][0])
+            self._material = self._material._replace(viscosity=2 * wanted / first)
+            self.settle(np.zeros(self.robot.n_pressures))
+
+    def _mesh(self, station: float | None) -> None:
+        self._rod = make_rod(self.robot, self.settings, self.mismatch, station)
+
+    def _at_rest(self) -> State:
+        parts, n = self._material, self._rod.per_segment * self.robot.n_segments
+        nodes = len(self._rod.mass)
+        shape = (self.robot.n_segments, len(self._rod.weight), parts.fibre_x.shape[1])
+        state = State(
+            q=np.zeros(n),
+            momentum=np.zeros(n),
+            rate=np.zeros(n),
+            rotations=np.empty((nodes, 3, 3)),
+            positions=np.empty((nodes, 3)),
+            inverse=np.zeros((n, n)),
+            tangent_of=np.zeros(2),
+            totals=np.zeros(3),
+            memory=Memory(
+                strain=np.zeros(shape),
+                creep=np.zeros((*shape, len(parts.creep_share))),
+                slip=np.zeros((*shape, len(parts.slip_share))),
+            ),
+        )
+        rod.poses(self._rod, state.q, state.rotations, state.positions)
+        return state
+
+    @property
+    def step(self) -> float:
+        """Step in time, in s."""
+        return self.settings.discretisation.step
+
+    @property
+    def time(self) -> float:
+        """Time since the plant was made, in s."""
+        return self._steps * self.step
+
+    def tip_pose(self) -> Array:
+        """Pose of the tip (4, 4) in the nominal base frame."""
+        tip: Array = self.poses()[-1]
+        return tip
+
+    def poses(self) -> Array:
+        """Poses (m, 4, 4) of the nodes from the base to the tip, in the nominal base frame."""
+        T = np.tile(np.eye(4), (len(self._state.positions), 1, 1))
+        T[:, :3, :3] = self._state.rotations
+        T[:, :3, 3] = self._state.positions
+        return T
+
+    def set_load(self, load: Load | None) -> None:
+        """Let a wrench act from now on, or none.
+
+        Raises
+        ------
+        InputError
+            There is no such place on the arm.
+        """
+        station = None if load is None else load.at
+        if station != (None if self._load is None else self._load.at):
+            self._mesh(station)
+            nodes = len(self._rod.mass)
+            self._state = self._state._replace(
+                rotations=np.empty((nodes, 3, 3)), positions=np.empty((nodes, 3))
+            )
+            rod.poses(self._rod, self._state.q, self._state.rotations, self._state.positions)
+        self._load = load
+        self._state.tangent_of[:] = 0.0
+
+    def set_plate(
+        self,
+        normal: ArrayLike | None,
+        at: float = 0.0,
+        stiffness: float = 0.0,
+        speed: float = 0.0,
+    ) -> None:
+        """Put the flat plate of a probe somewhere, or take it away.
+
+        Parameters
+        ----------
+        normal :
+            Unit vector (3,) in the base frame from the probe towards the tip, or None.
+        at :
+            Where the plate is along it, in m: it touches a tip that is less far along.
+        stiffness :
+            Of the contact, in N/m.
+        speed :
+            At which it moves while time passes next, in m/s.
+        """
+        self._plate = None if normal is None else (np.array(normal, float), at, speed, stiffness)
+
+    def contact_force(self) -> float:
+        """Force with which the plate pushes the tip, in N."""
+        loads = self._loads()
+        return float(
+            dynamics.contact_force(loads, dynamics.depth_of(loads, self._state.positions[-1]))
+        )
+
+    def advance(self, duration: float, pressures: ArrayLike) -> None:
+        """Let time pass at constant pressures in the chambers.
+
+        Parameters
+        ----------
+        duration :
+            In s; rounded to whole steps.
+        pressures :
+            Gauge pressures (n,), in Pa.
+
+        Raises
+        ------
+        SimulationError
+            The arm cannot be followed.
+        """
+        steps = round(duration / self.step)
+        self.follow(np.tile(self._checked(pressures), (steps, 1)))
+
+    def follow(self, pressures: Array) -> None:
+        """Take one step at each row of chamber pressures (m, n), in Pa.
+
+        Raises
+        ------
+        SimulationError
+            The arm cannot be followed; it is where it was when that happened.
+        """
+        full = self.settings.dynamics == "full"
+        scheme = Scheme(self.step, 0.5 if full else 1.0, True)
+        done = dynamics.run(
+            self._rod,
+            self._material,
+            scheme,
+            self._loads(),
+            full,
+            self._state,
+            self._acting(pressures),
+        )
+        self._steps += int(done)
+        if done < len(pressures):
+            raise SimulationError(
+                f"the simulated arm cannot be followed beyond {self.time:.3f} s: a load, a "
+                "contact or a pressure is far beyond what it bears"
+            )
+
+    def settle(self, pressures: ArrayLike, load: Load | None = None) -> None:
+        """Bring the arm to rest in equilibrium, with all creep done and no hysteresis left.
+
+        Parameters
+        ----------
+        pressures :
+            In the chambers (n,), in Pa.
+        load :
+            Acts from now on in place of the present one, if given.
+
+        Raises
+        ------
+        EquilibriumError
+            There is no equilibrium that a slow arm would come to.
+        """
+        if load is not None:
+            self.set_load(load)
+        acting = self._acting(self._checked(pressures)[None, :])
+        # Viscosity slows an arm without inertia down: steps of growing length follow it to rest.
+        slow = self._material._replace(viscosity=max(self._material.viscosity, 0.02))
+        self._state.rate[:] = 0.0
+        step = _FIRST_STEP
+        for _ in range(_TRIES):
+            scheme = Scheme(step, 1.0, False)
+            args = (self._rod, slow, scheme, self._loads(), False, self._state)
+            self._state.tangent_of[:] = 0.0
+            if dynamics.run(*args, acting):
+                if step >= _LONG:
+                    break
+                step *= 3
+            else:
+                step /= 5
+            self._state.rate[:] = 0.0
+        else:
+            raise EquilibriumError("the simulated arm finds no equilibrium")
+        self._state.momentum[:] = 0.0
+        self._state.tangent_of[:] = 0.0
+        self._state.totals[:] = 0.0
+
+    def energies(self) -> Energies:
+        """Where the energy is now."""
+        state, mass = self._state, self._mass()
+        speed = np.linalg.solve(mass, state.momentum)
+        weight = np.zeros(3)
+        for m, R, r in zip(self._rod.mass, state.rotations, state.positions, strict=True):
+            weight += m[0, 0] * r + R[:, :2] @ m[0, 1:]
+        loads = self._loads()
+        depth = dynamics.depth_of(loads, state.positions[-1])
+        return Energies(
+            kinetic=0.5 * float(state.momentum @ speed),
+            elastic=float(
+                material.stored(self._rod, self._material, state.memory, self._last_acting, state.q)
+            ),
+            gravity=-float(self._rod.gravity @ weight),
+            contact=float(dynamics.contact_energy(loads, depth)),
+            dissipated=float(state.totals[0]),
+            work=float(state.totals[1]),
+            load_work=float(state.totals[2]),
+        )
+
+    def modes(self, count: int = 6) -> tuple[Array, Array]:
+        """Natural frequencies of small vibrations about the present state.
+
+        Returns
+        -------
+        Frequencies (k,) in Hz, the lowest first, of the undamped arm (springs of creep and
+        hysteresis count as stiff), and shares of critical damping (k,) by viscosity.
+        """
+        still = self._material._replace(viscosity=0.0)
+        viscous = self._material._replace(viscosity=self._material.viscosity + 1e-12)
+        scheme = Scheme(_STILL, 1.0, True)
+        K = self._tangent(still, scheme)
+        C = (self._tangent(viscous, scheme) - K) * _STILL
+        half = np.linalg.inv(np.linalg.cholesky(self._mass()))
+        squares, shapes = np.linalg.eigh(half @ (0.5 * (K + K.T)) @ half.T)
+        if squares[0] <= 0:
+            raise EquilibriumError("the simulated arm does not rest in a stable equilibrium")
+        omega = np.sqrt(squares[:count])
+        damped = np.einsum("ik,ij,jk->k", shapes, half @ C @ half.T, shapes)[:count]
+        return omega / (2 * math.pi), damped / (2 * omega)
+
+    def _tangent(self, parts: material.Material, scheme: Scheme) -> Array:
+        n = len(self._state.q)
+        out = np.empty((n, n))
+        dynamics.stiffness(
+            self._rod, parts, scheme, self._loads(), self._state, self._last_acting, out
+        )
+        return out
+
+    def _mass(self) -> Array:
+        n = len(self._state.q)
+        J, M = np.empty((len(self._rod.mass), n, 6)), np.empty((n, n))
+        rod.jacobians(self._rod, self._state.q, J)
+        dynamics.mass_matrix(self._rod, self._state.rotations, J, M)
+        return M
+
+    def _loads(self) -> Loads:
+        load, plate = self._load, self._plate
+        last = len(self._rod.mass) - 1
+        normal, at, speed, stiffness = (np.zeros(3), 0.0, 0.0, 0.0) if plate is None else plate
+        if load is None:
+            node, force, moment, follows = last, np.zeros(3), np.zeros(3), False
+        else:
+            node = (
+                last if load.at is None else node_at(self.robot, self.mismatch, self._rod, load.at)
+            )
+            force, moment = np.array(load.force), np.array(load.moment)
+            follows = load.frame == "tip"
+        return Loads(node, force, moment, follows, normal, at, speed, stiffness)
+
+    def _checked(self, pressures: ArrayLike) -> Array:
+        p = np.array(pressures, dtype=float)
+        if p.shape != (self.robot.n_pressures,):
+            raise InputError(f"expected {self.robot.n_pressures} pressures, not {p.shape}")
+        if not np.isfinite(p).all():
+            raise PressureError("the pressures are not finite")
+        return p
+
+    def _acting(self, pressures: Array) -> Array:
+        acting = np.ascontiguousarray(pressures * self._gain + self._offset)
+        if len(acting):
+            self._last_acting = acting[-1]
+        return acting

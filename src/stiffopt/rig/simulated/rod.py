@@ -1,0 +1,249 @@
+"""The rod: from polynomial strains to poses along the arm and their derivatives.
+
+A geometrically exact Cosserat rod, per reference length. The strain of a segment (linear part
+first: shear, stretch; then curvature, twist) is a sum of Legendre polynomials with coefficients q;
+the pose obeys ``T' = T (e + strain)^``. Between two nodes it is integrated by the Magnus expansion
+of order four (two Gauss points):
+
+    T(b) = T(a) exp(X),   X = h/2 (x1 + x2) + sqrt(3)/12 h^2 [x1, x2].
+
+Everything here is compiled and works on arrays that the caller owns.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stiffopt.rig.simulated.jit import jit
+
+Array = Any  # an array of floats; numba infers the rest
+
+
+class Rod(NamedTuple):
+    """What of an arm does not change in time. S segments, n coefficients, N nodes.
+
+    The first node of a segment is its proximal end; the very last node is the tip, after the last
+    connector.
+
+    Attributes
+    ----------
+    first, count : where the coefficients of a strain component begin within a segment (6,), and
+        how many they are (6,).
+    per_segment : coefficients of a segment.
+    length, connector : of the segments (S,), m.
+    first_node : of the segments (S,).
+    intervals : between the nodes of a segment (S,).
+    interval : their lengths (S, m), m.
+    interval_basis : polynomials at the Gauss points of the intervals (S, m, 2, k).
+    weight, basis : Gauss points for the stresses (g,), and the polynomials there (g, k).
+    base_rotation, base_position : of the arm (3, 3), (3,).
+    mass : of each node, over (position, x axis, y axis) (N, 3, 3), kg, kg m, kg m^2.
+    gravity : (3,), m/s^2.
+    """
+
+    first: Array
+    count: Array
+    per_segment: int
+    length: Array
+    connector: Array
+    first_node: Array
+    intervals: Array
+    interval: Array
+    interval_basis: Array
+    weight: Array
+    basis: Array
+    base_rotation: Array
+    base_position: Array
+    mass: Array
+    gravity: Array
+
+
+_COMMUTATOR = math.sqrt(3) / 12
+_SMALL = 0.04  # squared angle below which series are used
+
+
+@jit
+def strain_at(rod: Rod, segment: int, basis: Array, q: Array, out: Array) -> None:
+    """Strain (6,) at a point with these values of the polynomials; the rod at rest has zero."""
+    offset = segment * rod.per_segment
+    for c in range(6):
+        total = 0.0
+        first = offset + rod.first[c]
+        for k in range(rod.count[c]):
+            total += basis[k] * q[first + k]
+        out[c] = total
+
+
+@jit
+def _bracket(a: Array, b: Array, out: Array) -> None:
+    """Lie bracket [a, b] of two twists: linear a_w x b_v - b_w x a_v, angular a_w x b_w."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] = a[3 + j] * b[k] - a[3 + k] * b[j] - b[3 + j] * a[k] + b[3 + k] * a[j]
+        out[3 + i] = a[3 + j] * b[3 + k] - a[3 + k] * b[3 + j]
+
+
+@jit
+def _exponential_terms(x: float) -> tuple[float, float, float]:
+    """``sin t / t``, ``(1 - cos t) / t^2`` and ``(t - sin t) / t^3`` for x = t^2."""
+    if x < _SMALL:
+        a = 1 - x / 6 * (1 - x / 20 * (1 - x / 42 * (1 - x / 72)))
+        b = 0.5 * (1 - x / 12 * (1 - x / 30 * (1 - x / 56 * (1 - x / 90))))
+        c = (1 - x / 20 * (1 - x / 42 * (1 - x / 72 * (1 - x / 110)))) / 6
+        return a, b, c
+    t = math.sqrt(x)
+    sine = math.sin(t) / t
+    return sine, (1 - math.cos(t)) / x, (1 - sine) / x
+
+
+@jit
+def _exponential(X: Array, R: Array, p: Array) -> None:
+    """Rotation (3, 3) and translation (3,) of exp(X)."""
+    w0, w1, w2 = X[3], X[4], X[5]
+    x = w0 * w0 + w1 * w1 + w2 * w2
+    a, b, c = _exponential_terms(x)
+    R[0, 0] = 1 - b * (w1 * w1 + w2 * w2)
+    R[1, 1] = 1 - b * (w0 * w0 + w2 * w2)
+    R[2, 2] = 1 - b * (w0 * w0 + w1 * w1)
+    R[0, 1] = b * w0 * w1 - a * w2
+    R[1, 0] = b * w0 * w1 + a * w2
+    R[0, 2] = b * w0 * w2 + a * w1
+    R[2, 0] = b * w0 * w2 - a * w1
+    R[1, 2] = b * w1 * w2 - a * w0
+    R[2, 1] = b * w1 * w2 + a * w0
+    dot = w0 * X[0] + w1 * X[1] + w2 * X[2]
+    p[0] = a * X[0] + b * (w1 * X[2] - w2 * X[1]) + c * dot * w0
+    p[1] = a * X[1] + b * (w2 * X[0] - w0 * X[2]) + c * dot * w1
+    p[2] = a * X[2] + b * (w0 * X[1] - w1 * X[0]) + c * dot * w2
+
+
+@jit
+def _interval_twist(rod: Rod, s: int, m: int, q: Array, x1: Array, x2: Array, X: Array) -> None:
+    """Twist X (6,) over interval m of segment s, and the strains x1, x2 (with e) it is made of."""
+    h = rod.interval[s, m]
+    strain_at(rod, s, rod.interval_basis[s, m, 0], q, x1)
+    strain_at(rod, s, rod.interval_basis[s, m, 1], q, x2)
+    x1[2] += 1.0
+    x2[2] += 1.0
+    _bracket(x1, x2, X)
+    for i in range(6):
+        X[i] = 0.5 * h * (x1[i] + x2[i]) + _COMMUTATOR * h * h * X[i]
+
+
+@jit
+def _compose(R: Array, r: Array, dR: Array, dr: Array, R_out: Array, r_out: Array) -> None:
+    for i in range(3):
+        r_out[i] = r[i] + R[i, 0] * dr[0] + R[i, 1] * dr[1] + R[i, 2] * dr[2]
+        for j in range(3):
+            R_out[i, j] = R[i, 0] * dR[0, j] + R[i, 1] * dR[1, j] + R[i, 2] * dR[2, j]
+
+
+@jit
+def poses(rod: Rod, q: Array, R: Array, r: Array) -> None:
+    """Rotations (N, 3, 3) and positions (N, 3) of the nodes."""
+    x1, x2, X = np.empty(6), np.empty(6), np.empty(6)
+    dR, dr = np.empty((3, 3)), np.empty(3)
+    R[0] = rod.base_rotation
+    r[0] = rod.base_position
+    node = 0
+    for s in range(len(rod.length)):
+        for m in range(rod.intervals[s]):
+            _interval_twist(rod, s, m, q, x1, x2, X)
+            _exponential(X, dR, dr)
+            _compose(R[node], r[node], dR, dr, R[node + 1], r[node + 1])
+            node += 1
+        for i in range(3):  # the connector is rigid
+            r[node + 1, i] = r[node, i] + R[node, i, 2] * rod.connector[s]
+            for j in range(3):
+                R[node + 1, i, j] = R[node, i, j]
+        node += 1
+
+
+@jit
+def _exponential_derivative(X: Array, dX: Array, out: Array, work: Array) -> None:
+    """``exp(X)^-1 d exp(X)`` (6,) for a change dX (6,).
+
+    The series ``sum (-ad X)^n / (n + 1)! dX`` is summed by the minimal polynomial of ad X,
+    ``ad (ad^2 + t^2)^2 = 0``, which leaves four terms.
+    """
+    x = X[3] * X[3] + X[4] * X[4] + X[5] * X[5]
+    if x < _SMALL:
+        c1 = -0.5 + x * x / 720 * (1 - x / 28)
+        c2 = 1 / 6 - x * x / 5040 * (1 - x / 36)
+        c3 = -1 / 24 + x / 360 - x * x / 13440
+        c4 = 1 / 120 - x / 2520 + x * x / 120960
+    else:
+        t = math.sqrt(x)
+        sine, cosine = math.sin(t), math.cos(t)
+        c1 = (t * sine + 4 * cosine - 4) / (2 * x)
+        c2 = (4 * t - 5 * sine + t * cosine) / (2 * x * t)
+        c3 = (t * sine + 2 * cosine - 2) / (2 * x * x)
+        c4 = (2 * t - 3 * sine + t * cosine) / (2 * x * x * t)
+    for i in range(6):
+        out[i] = dX[i]
+        work[0, i] = dX[i]
+    for c in (c1, c2, c3, c4):
+        _bracket(X, work[0], work[1])
+        for i in range(6):
+            out[i] += c * work[1, i]
+            work[0, i] = work[1, i]
+
+
+@jit
+def jacobians(rod: Rod, q: Array, J: Array) -> None:
+    """Body Jacobians of the nodes, transposed (N, n, 6): their twist in their own axes per q."""
+    x1, x2, X = np.empty(6), np.empty(6), np.empty(6)
+    d1, d2, dX, work = np.empty(6), np.empty(6), np.empty(6), np.empty((2, 6))
+    dR, dr = np.empty((3, 3)), np.empty(3)
+    J[0] = 0.0
+    node = 0
+    for s in range(len(rod.length)):
+        begin = s * rod.per_segment
+        end = begin + rod.per_segment
+        for m in range(rod.intervals[s]):
+            h = rod.interval[s, m]
+            _interval_twist(rod, s, m, q, x1, x2, X)
+            _exponential(X, dR, dr)
+            here, there = J[node], J[node + 1]
+            for column in range(end):
+                _carry(here[column], dR, dr, there[column])
+            for column in range(end, J.shape[1]):
+                there[column] = 0.0
+            for c in range(6):
+                for k in range(rod.count[c]):
+                    b1, b2 = rod.interval_basis[s, m, 0, k], rod.interval_basis[s, m, 1, k]
+                    d1[:] = 0.0
+                    d2[:] = 0.0
+                    d1[c], d2[c] = b1, b2
+                    _bracket(d1, x2, dX)
+                    _bracket(x1, d2, work[0])
+                    for i in range(6):
+                        dX[i] = _COMMUTATOR * h * h * (dX[i] + work[0, i])
+                    dX[c] += 0.5 * h * (b1 + b2)
+                    _exponential_derivative(X, dX, d1, work)
+                    target = there[begin + rod.first[c] + k]
+                    for i in range(6):
+                        target[i] += d1[i]
+            node += 1
+        length = rod.connector[s]
+        for column in range(J.shape[1]):
+            here, there = J[node, column], J[node + 1, column]
+            for i in range(6):
+                there[i] = here[i]
+            there[0] += length * here[4]
+            there[1] -= length * here[3]
+        node += 1
+
+
+@jit
+def _carry(twist: Array, dR: Array, dr: Array, out: Array) -> None:
+    """Express a body's twist in the axes and at the origin of a frame (dR, dr) fixed to it."""
+    v0 = twist[0] + twist[4] * dr[2] - twist[5] * dr[1]
+    v1 = twist[1] + twist[5] * dr[0] - twist[3] * dr[2]
+    v2 = twist[2] + twist[3] * dr[1] - twist[4] * dr[0]
+    for i in range(3):
+        out[i] = dR[0, i] * v0 + dR[1, i] * v1 + dR[2, i] * v2
+        out[3 + i] = dR[0, i] * twist[3] + dR[1, i] * twist[4] + dR[2, i] * twist[5]

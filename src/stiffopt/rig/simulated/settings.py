@@ -1,0 +1,269 @@
+"""The simulated arm and its devices, as the rig file describes them.
+
+What the plant's block says is the difference between the arm and its robot file, and what the
+robot file has no words for: how the silicone stretches, creeps and loses energy. All default
+values are those of a perfect copy but for the material's, which are typical of soft silicones.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from stiffopt.rig.registration import Placement, Registration
+from stiffopt.schema import Items, Schema, Vector
+from stiffopt.units import (
+    Acceleration,
+    Angle,
+    Duration,
+    Force,
+    Frequency,
+    Length,
+    Mass,
+    Moment,
+    Pressure,
+    PressureRate,
+    Ratio,
+    Speed,
+    TranslationalStiffness,
+)
+
+__all__ = [
+    "Creep",
+    "Discretisation",
+    "Hysteresis",
+    "Mismatch",
+    "PlantSettings",
+    "Silicone",
+    "SimulatedProbeSettings",
+    "SimulatedSupplySettings",
+    "SimulatedTrackerSettings",
+    "Spread",
+]
+
+Positive = Field(gt=0)
+NotNegative = Field(ge=0)
+Share = Annotated[Ratio, Field(ge=0, le=1)]
+
+
+class Creep(Schema):
+    """One Maxwell branch of the silicone, beside its equilibrium modulus.
+
+    Attributes
+    ----------
+    share : stiffness of the branch, as a share of the equilibrium modulus.
+    time : relaxation time, in s.
+    """
+
+    share: Share
+    time: Annotated[Duration, Positive]
+
+
+class Hysteresis(Schema):
+    """One elastic, ideally plastic element (Jenkin) of the silicone: Maxwell slip.
+
+    Attributes
+    ----------
+    share : stiffness of the element, as a share of the equilibrium modulus.
+    strain : strain of a fibre at which the element slips.
+    """
+
+    share: Share
+    strain: Annotated[Ratio, Positive]
+
+
+class Silicone(Schema):
+    """How the material differs from a linear elastic one.
+
+    Attributes
+    ----------
+    law : uniaxial law of a fibre at rest, incompressible: ``linear``, ``neo-hookean`` (softens
+        as it stretches) or ``yeoh``.
+    stiffening : C2 / C1 of the Yeoh law; above 0 it stiffens as it stretches further.
+    damping : share of critical damping that the material's viscosity (Kelvin-Voigt) gives to a
+        vibration at the frequency of the arm's first bending mode.
+    creep : relaxation.
+    hysteresis : between loading and unloading.
+    """
+
+    law: Literal["linear", "neo-hookean", "yeoh"] = "yeoh"
+    stiffening: Annotated[Ratio, Field(ge=0, le=2)] = 0.1
+    damping: Annotated[Ratio, Field(ge=0, le=1)] = 0.1
+    creep: Items[Creep] = (Creep(share=0.05, time=2.0), Creep(share=0.05, time=20.0))
+    hysteresis: Items[Hysteresis] = (
+        Hysteresis(share=0.06, strain=0.01),
+        Hysteresis(share=0.06, strain=0.04),
+    )
+
+
+class Mismatch(Schema):
+    """How this arm differs from its robot file.
+
+    Lists have one value per channel or per segment, the proximal segment first.
+
+    Attributes
+    ----------
+    gain : of each channel: pressure that acts per pressure in the chamber.
+    offset : of each channel: pressure that acts in addition, in Pa.
+    angle : of each channel: rotation of its chambers about the axis, in rad.
+    modulus : of each segment: factor on Young's modulus.
+    length : of each segment: factor on the rest length.
+    base : the true base frame in the nominal one.
+    registration : what the registered tracker says is the base frame, in the true one.
+    """
+
+    gain: Items[Annotated[Ratio, Positive]] = ()
+    offset: Items[Pressure] = ()
+    angle: Items[Angle] = ()
+    modulus: Items[Annotated[Ratio, Positive]] = ()
+    length: Items[Annotated[Ratio, Positive]] = ()
+    base: Placement = Placement()
+    registration: Placement = Placement()
+
+
+class Spread(Schema):
+    """Standard deviations from which a mismatch is drawn, on top of the one that is given."""
+
+    gain: Share = 0.05
+    offset: Annotated[Pressure, NotNegative] = 500.0
+    angle: Annotated[Angle, NotNegative] = 0.035
+    modulus: Share = 0.1
+    length: Share = 0.01
+    base_position: Annotated[Length, NotNegative] = 0.001
+    base_tilt: Annotated[Angle, NotNegative] = 0.0175
+    registration_position: Annotated[Length, NotNegative] = 0.0005
+    registration_angle: Annotated[Angle, NotNegative] = 0.005
+
+
+class Load(Schema):
+    """A wrench on the arm.
+
+    Attributes
+    ----------
+    force, moment : in N and N m.
+    frame : ``base``: keeps its direction; ``tip``: follows the section it acts on.
+    at : arc length of that section at rest, in m; the tip by default.
+    """
+
+    force: Vector[Force] = (0.0, 0.0, 0.0)
+    moment: Vector[Moment] = (0.0, 0.0, 0.0)
+    frame: Literal["base", "tip"] = "base"
+    at: Length | None = None
+
+
+class Discretisation(Schema):
+    """Of the rod, per segment.
+
+    Attributes
+    ----------
+    bending_degree : of the Legendre polynomials of curvature.
+    shear_degree : of those of stretch, shear and twist.
+    sub_intervals : over which the strains are integrated to poses.
+    step : in time, in s.
+    """
+
+    bending_degree: Annotated[int, Field(ge=0, le=8)] = 3
+    shear_degree: Annotated[int, Field(ge=0, le=8)] = 2
+    sub_intervals: Annotated[int, Field(ge=2, le=16)] = 5
+    step: Annotated[Duration, Field(gt=0, le=0.02)] = 0.001
+
+
+class PlantSettings(Schema):
+    """The simulated arm.
+
+    Attributes
+    ----------
+    dynamics : ``full``: the arm has inertia; ``quasi-static``: it has none.
+    silicone, mismatch, discretisation : see there.
+    spread : draw a mismatch from the seed with these standard deviations; None draws none.
+    seed : of the mismatch and of all noise.
+    payload : mass at the tip that the robot file does not know of, in kg.
+    gravity : acceleration in the base frame, in m/s^2, where it is not that of the robot file.
+    load : acts all the time; None for none.
+    faults : whether faults may be injected while the rig runs.
+    """
+
+    dynamics: Literal["quasi-static", "full"] = "full"
+    silicone: Silicone = Silicone()
+    mismatch: Mismatch = Mismatch()
+    spread: Spread | None = None
+    seed: Annotated[int, NotNegative] = 0
+    payload: Annotated[Mass, NotNegative] = 0.0
+    gravity: Vector[Acceleration] | None = None
+    load: Load | None = None
+    faults: bool = False
+    discretisation: Discretisation = Discretisation()
+
+
+class SimulatedSupplySettings(Schema):
+    """Regulators, one per channel.
+
+    Attributes
+    ----------
+    dead_time : until a set-point has any effect, in s.
+    lag : time constant, in s.
+    slew : greatest rate of change, in Pa/s.
+    resolution : step of the set-points and of the readings, in Pa.
+    noise : standard deviation of the readings, in Pa.
+    ripple : standard deviation of the pressure itself, in Pa.
+    saturation : the highest pressure that the supply has, in Pa; None: the limits.
+    leak : time constant with which a chamber empties through a leak, in s; None: no leak.
+    watchdog : vents after this time without a command, in s; None: never.
+    dump_valve : whether there is a valve that empties all chambers, see `PressureSupply.arm`.
+    """
+
+    driver: Literal["simulated"] = "simulated"
+    dead_time: Annotated[Duration, Field(ge=0, le=1)] = 0.01
+    lag: Annotated[Duration, NotNegative] = 0.06
+    slew: Annotated[PressureRate, Positive] = 5e5
+    resolution: Annotated[Pressure, NotNegative] = 50.0
+    noise: Annotated[Pressure, NotNegative] = 150.0
+    ripple: Annotated[Pressure, NotNegative] = 100.0
+    saturation: Annotated[Pressure, Positive] | None = None
+    leak: Annotated[Duration, Positive] | None = None
+    watchdog: Annotated[Duration, Positive] | None = None
+    dump_valve: bool = False
+
+
+class SimulatedTrackerSettings(Schema):
+    """An electromagnetic tracker.
+
+    Attributes
+    ----------
+    rate : frames a second.
+    latency : from capture to arrival, in s.
+    noise, angular_noise : standard deviations in each axis, in m and rad.
+    dropouts : share of the frames in which the tool is not seen.
+    missing : share of the frames that never arrive.
+    flips : share of the frames with the other sign of the quaternion.
+    registration : where tracker and sensor are.
+    """
+
+    driver: Literal["simulated"] = "simulated"
+    rate: Annotated[Frequency, Positive] = 40.0
+    latency: Annotated[Duration, NotNegative] = 0.025
+    noise: Annotated[Length, NotNegative] = 3e-5
+    angular_noise: Annotated[Angle, NotNegative] = 1e-3
+    dropouts: Share = 0.0
+    missing: Share = 0.0
+    flips: Share = 0.0
+    registration: Registration = Registration()
+
+
+class SimulatedProbeSettings(Schema):
+    """A flat plate on a linear stage that pushes the tip, and its force sensor.
+
+    Attributes
+    ----------
+    stiffness : of the contact, in N/m.
+    speed : greatest speed of the stage, in m/s.
+    clearance : between plate and tip when the probe is aligned, in m.
+    noise : standard deviation of the force, in N.
+    """
+
+    driver: Literal["simulated"] = "simulated"
+    stiffness: Annotated[TranslationalStiffness, Positive] = 2000.0
+    speed: Annotated[Speed, Positive] = 0.02
+    clearance: Annotated[Length, NotNegative] = 0.001
+    noise: Annotated[Force, NotNegative] = 0.0005

@@ -1,0 +1,693 @@
+"""The paper's experiments, on a rig that is where it is told and as stiff as it is told."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import stiffopt
+from fake_rig import CLEARANCE, FakeSupply, FakeWorld, fake_rig, straight
+from stiffopt.cli import experiment_run
+from stiffopt.cli.main import main
+from stiffopt.cli.quantities import directions, pressures
+from stiffopt.errors import DeviceError, FileError, InputError
+from stiffopt.experiments import (
+    KinematicsSettings,
+    PressureSequence,
+    StiffnessSettings,
+    evaluate_kinematics,
+    evaluate_stiffness,
+    run_kinematics,
+    run_stiffness,
+)
+from stiffopt.experiments.kinematics_result import read_recordings
+from stiffopt.experiments.points import PointsFile
+from stiffopt.experiments.slope import Line, combine, fit_line, student_t
+from stiffopt.logs import read_log, read_mcap_log, read_stiffness_table
+from stiffopt.rig.interface import PressureLimits, Rig
+
+GOLDEN = {  # bar: stiffness along x, y, z in N/m; reference/paper-notes.md
+    0.0: (14.03, 14.03, 730.42),
+    0.4: (12.67, 12.13, 222.38),
+    1.0: (13.91, 9.33, 31.89),
+    1.5: (28.23, 7.24, 11.63),
+}
+
+
+def world_of(rig: Rig) -> FakeWorld:
+    assert isinstance(rig.clock, FakeWorld)
+    return rig.clock
+
+
+def golden(p: np.ndarray, direction: np.ndarray) -> float:
+    """Stiffness at the nearest pressure of the table: it is constant while the arm rests."""
+    bar = min(GOLDEN, key=lambda level: abs(level * 1e5 - p[0]))
+    return float(GOLDEN[bar][int(np.argmax(np.abs(direction)))])
+
+
+def short(**given: object) -> KinematicsSettings:
+    values = {"channels": 3, "pressures": (0.5e5,), "period": 1.0, "repetitions": 2, **given}
+    return KinematicsSettings(**values)
+
+
+def quick(**given: object) -> StiffnessSettings:
+    values = {"channels": 3, "pressures": (0.4e5,), "repetitions": 1, "steps": 4, **given}
+    return StiffnessSettings(**values)
+
+
+def model() -> stiffopt.Manipulator:
+    return stiffopt.load_robot("stiff-flop-1")
+
+
+# -- the sequence of pressures --------------------------------------------------------------------
+
+
+def test_the_papers_sequence_is_nine_teeth_in_forty_seconds() -> None:
+    settings = KinematicsSettings(channels=3)
+    sequence = PressureSequence.sawtooth(np.zeros(3), settings.pressures, settings.period, 1e9)
+    assert sequence.duration == pytest.approx(40)
+    peaks = sequence.at((np.arange(9) + 0.5) * 40 / 9)
+    expected = np.zeros((9, 3))
+    for channel in range(3):
+        expected[3 * channel : 3 * channel + 3, channel] = (0.4e5, 0.8e5, 1e5)
+    np.testing.assert_allclose(peaks, expected, atol=1e-6)
+    np.testing.assert_allclose(sequence.at(np.arange(10) * 40 / 9), 0, atol=1e-6)
+    np.testing.assert_allclose(sequence.at(40 / 36), [0.2e5, 0, 0])  # half way up the first
+    assert sequence.at(99.0).tolist() == [0, 0, 0]
+
+
+def test_a_tooth_is_stretched_where_the_rig_is_slow() -> None:
+    sequence = PressureSequence.sawtooth([0.0, 0.0], [1e5], 2.0, [1e9, 0.2e5])
+    assert sequence.times.tolist() == [0, 1, 2, 7, 12]
+
+
+# -- kinematics -----------------------------------------------------------------------------------
+
+
+def test_a_recording_holds_what_was_so_at_each_frame(tmp_path: Path) -> None:
+    rig = fake_rig(slew=3e5)
+    with rig:
+        assert run_kinematics(rig, tmp_path, short(), rate=100.0) == []
+    for repetition in (1, 2):
+        log = read_log(tmp_path / f"kinematics_{repetition}.csv")
+        other = read_mcap_log(tmp_path / f"kinematics_{repetition}.mcap")
+        np.testing.assert_allclose(other.tip_position, log.tip_position, atol=1e-7)
+        assert log.time[0] < 0.03
+        assert log.time[-1] > 3.1
+        np.testing.assert_allclose(np.diff(log.time), 0.025, atol=2e-6)
+        assert log.tip_quaternion is not None
+        assert log.measured is not None
+        # the tip is where the true pressure of that moment puts it, so the measured pressure that
+        # stands beside it must be that of the same moment: 10 ms at 1 bar/s are 1000 Pa
+        truth = (log.tip_position - [0, 0, 0.09]) / 2e-7
+        np.testing.assert_allclose(log.measured, truth, atol=700)
+        ramp = np.interp(log.time, np.arange(7) * 0.5, [0, 0.5e5, 0, 0, 0, 0, 0])
+        np.testing.assert_allclose(log.commanded[:, 0], ramp, atol=1100)
+        np.testing.assert_allclose(log.commanded.max(axis=0), 0.5e5, rtol=0.02)
+    assert not list(tmp_path.glob("*.part.*"))
+
+
+def assert_gentle(rig: Rig, slew: float, high: float) -> None:
+    """All that was ever written: in range, no faster than the slew but for the vents, 0 at last."""
+    times = np.array([time for time, _ in world_of(rig).writes])
+    values = np.array([value for _, value in world_of(rig).writes])
+    assert values.min() >= 0
+    assert values.max() <= high
+    assert not values[-1].any()
+    rise = np.diff(values, axis=0).max(axis=1)
+    assert (rise <= slew * np.diff(times) + 1e-6).all()
+    ramps = np.diff(values, axis=0)[:-1]
+    assert (-ramps <= slew * np.diff(times)[:-1, np.newaxis] + 1e-6).all()
+
+
+def test_commands_keep_slew_and_limits(tmp_path: Path) -> None:
+    rig = fake_rig(slew=0.3e5, high=0.5e5)
+    with rig:
+        run_kinematics(rig, tmp_path, short(repetitions=1), rate=50.0)
+    assert_gentle(rig, 0.3e5, 0.5e5)
+    assert read_log(tmp_path / "kinematics_1.csv").time[-1] > 10  # 6 ramps of 0.5 bar at 0.3 bar/s
+
+
+def test_channels_that_cannot_be_low_are_brought_up_and_down(tmp_path: Path) -> None:
+    rig = fake_rig(slew=1e5)
+    rig.supply.limits = PressureLimits(np.full(3, 0.1e5), np.full(3, 1e5))
+    with rig:
+        run_kinematics(rig, tmp_path, short(repetitions=1), rate=50.0)
+    log = read_log(tmp_path / "kinematics_1.csv")
+    assert log.commanded.min() == 0.1e5
+    assert not world_of(rig).commanded.any()
+
+
+def test_the_error_is_that_of_the_model_and_not_of_the_regulators(tmp_path: Path) -> None:
+    arm, shift = model(), np.array([0.0, 0.002, 0.0])
+    rig = fake_rig(lambda p: arm.tip_pose(p)[:3, 3] + shift, slew=3e5)
+    settings = short(pressures=(1e5,), period=4.0, repetitions=2)
+    with rig:
+        run_kinematics(rig, tmp_path, settings, rate=100.0)
+    result = evaluate_kinematics(read_recordings(tmp_path, settings), arm)
+    assert result.repetitions == 2
+    assert result.mean == pytest.approx(0.002, rel=0.03)
+    assert result.worst < 0.0026  # 5 ms of 0.5 bar/s; with commanded pressures it would be 0.004
+    np.testing.assert_allclose(np.nanmean(result.component_error, axis=0), -shift, atol=1e-4)
+    assert result.repeatability < 3e-4
+    assert result.error.shape == result.time.shape
+
+
+def test_the_band_holds_all_repetitions_and_gaps_stay_gaps(tmp_path: Path) -> None:
+    head = "time_s,p1_pa,p2_pa,p3_pa,tip_x_m,tip_y_m,tip_z_m\n"
+    for number, x in ((1, 0.001), (2, 0.003)):
+        rows = "".join(
+            f"{0.1 * k:.1f},0,0,0,{x if not 30 < k < 50 or number == 1 else ''},0,0.09\n"
+            for k in range(100)
+        )
+        (tmp_path / f"kinematics_{number}.csv").write_text(head + rows)
+    result = evaluate_kinematics(read_recordings(tmp_path, short()), model())
+    early, gap = np.searchsorted(result.time, [1.0, 4.0])
+    assert (result.low[early, 0], result.high[early, 0]) == pytest.approx((0.001, 0.003))
+    assert (result.low[gap, 0], result.high[gap, 0]) == pytest.approx((0.001, 0.001))
+    assert len(result.errors) == 181
+    assert result.worst == pytest.approx(0.003)
+
+
+def test_nothing_moves_beyond_the_limits(tmp_path: Path) -> None:
+    rig = fake_rig(high=0.6e5)
+    with rig, pytest.raises(InputError, match=r"channel 1 cannot have 0.7 bar.* 0 to 0.6 bar"):
+        run_kinematics(rig, tmp_path, short(pressures=(0.7e5,)), rate=100.0)
+    assert not any(value.any() for _, value in world_of(rig).writes)
+
+
+def test_a_tracker_that_goes_blind_ends_the_experiment(tmp_path: Path) -> None:
+    rig = fake_rig()
+    world_of(rig).at.append((5.0, lambda: setattr(world_of(rig), "seen", False)))
+    with rig, pytest.raises(DeviceError, match="has not seen the tip for 2 s"):
+        run_kinematics(rig, tmp_path, short(period=4.0), rate=100.0)
+    assert world_of(rig).t < 100 + 5 + 2.2
+    assert not world_of(rig).commanded.any()
+    assert len(read_log(tmp_path / "kinematics_1.part.csv")) > 50
+
+
+def test_a_tracker_that_sees_nothing_at_all(tmp_path: Path) -> None:
+    rig = fake_rig()
+    world_of(rig).seen = False
+    with rig, pytest.raises(DeviceError, match="has not seen the tip for 5 s"):
+        run_kinematics(rig, tmp_path, short(), rate=100.0)
+    assert not any(value.any() for _, value in world_of(rig).writes)
+
+
+def stop_at(moment: float, rig: Rig) -> Callable[[], None]:
+    def check() -> None:
+        if world_of(rig).t - 100 > moment:
+            raise KeyboardInterrupt
+
+    return check
+
+
+def test_what_was_complete_is_not_repeated(tmp_path: Path) -> None:
+    rig = fake_rig(slew=3e5)
+    settings = short(repetitions=3)
+    with rig, pytest.raises(KeyboardInterrupt):
+        run_kinematics(rig, tmp_path, settings, rate=100.0, check=stop_at(7.0, rig))
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["kinematics_1.csv", "kinematics_1.mcap"] + [
+        f"kinematics_2.part.{ending}" for ending in ("csv", "mcap")
+    ]
+    assert len(read_log(tmp_path / "kinematics_2.part.csv")) > 20
+    first = (tmp_path / "kinematics_1.csv").stat().st_mtime_ns
+    rig = fake_rig(slew=3e5)
+    with rig:
+        run_kinematics(rig, tmp_path, settings, rate=100.0)
+    assert (tmp_path / "kinematics_1.csv").stat().st_mtime_ns == first
+    assert {path.name for path in tmp_path.glob("*.csv")} == {
+        f"kinematics_{k}.csv" for k in (1, 2, 3)
+    }
+
+
+# -- stiffness ------------------------------------------------------------------------------------
+
+
+def test_the_slope_is_the_stiffness_of_the_arm(tmp_path: Path) -> None:
+    """Known stiffness, from the golden table, comes back; and it is that of the model."""
+    rig = fake_rig(stiffness=golden)
+    settings = quick(pressures=(0.0, 1.5e5))
+    with rig:
+        notes = run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    assert notes == []
+    result = evaluate_stiffness(tmp_path, settings, model())
+    assert len(result.cells) == 6
+    for cell in result.cells:
+        truth = golden(np.array([cell.pressure]), np.array(cell.direction))
+        assert cell.estimate is not None
+        assert cell.by_stage is not None
+        assert cell.estimate.value == pytest.approx(truth, rel=1e-4)
+        assert cell.model == pytest.approx(truth, rel=2e-3)
+        series = 1 / (1 / truth + 1 / 5000)  # the stage also compresses the contact
+        assert cell.by_stage.value == pytest.approx(series, rel=1e-3)
+        assert cell.points == 9
+    # each pressure, each direction, once, with the arm at rest at that pressure
+    done = [(p[0], tuple(axis)) for axis, p in world_of(rig).alignments]
+    wanted = [(p, d) for p in settings.pressures for d in settings.directions]
+    assert [d for _, d in done] == [d for _, d in wanted]
+    np.testing.assert_allclose([p for p, _ in done], [p for p, _ in wanted], atol=20)
+    assert_gentle(rig, 0.5e5, 1.5e5)
+
+
+def test_noise_is_covered_by_the_interval(tmp_path: Path) -> None:
+    rig = fake_rig(stiffness=lambda p, d: 12.4, noise=3e-5, force_noise=5e-4, seed=3)
+    settings = quick(repetitions=3, directions=((1.0, 0.0, 0.0),))
+    with rig:
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    (cell,) = evaluate_stiffness(tmp_path, settings, model()).cells
+    assert cell.estimate is not None
+    assert len(cell.slopes) == 3
+    assert abs(cell.estimate.value - 12.4) < cell.estimate.half_width < 1.5
+
+
+def test_creep_is_not_taken_for_stiffness(tmp_path: Path) -> None:
+    """There and back, a steady drift of the arm can be told from what the probe does."""
+    world: list[FakeWorld] = []
+
+    def creeping(p: np.ndarray) -> np.ndarray:
+        return straight(p) + np.array([1e-5 * (world[0].t - 100), 0, 0])  # 10 um/s
+
+    rig = fake_rig(creeping, lambda p, d: 12.67)
+    world.append(world_of(rig))
+    settings = quick(directions=((1.0, 0.0, 0.0),), settle=5.0)
+    with rig:
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    (cell,) = evaluate_stiffness(tmp_path, settings, model()).cells
+    assert cell.estimate is not None
+    assert cell.estimate.value == pytest.approx(12.67, rel=2e-3)
+    (series,) = PointsFile(tmp_path, 3).read()
+    blind = fit_line(series.displacement[:5], series.force[:5])  # there, and not back
+    assert blind is not None
+    assert abs(blind.slope - 12.67) > 0.2
+
+
+def test_only_points_in_contact_count(tmp_path: Path) -> None:
+    rig = fake_rig(stiffness=golden)
+    settings = quick(directions=((1.0, 0.0, 0.0),))
+    with rig:
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    path = tmp_path / "points.csv"
+    lines = path.read_text().splitlines()
+    fields = [line.split(",") for line in lines]
+    force, touching = lines[0].split(",").index("force_n"), lines[0].split(",").index("touching")
+    for row in fields[1:4]:  # three points that felt something else, and no contact
+        row[force], row[touching] = "5", "0"
+    path.write_text("\n".join(map(",".join, fields)) + "\n")
+    (cell,) = evaluate_stiffness(tmp_path, settings, model()).cells
+    assert cell.estimate is not None
+    assert cell.points == 6
+    assert cell.estimate.value == pytest.approx(12.67, rel=1e-4)
+
+
+def test_a_stiff_direction_is_displaced_less(tmp_path: Path) -> None:
+    rig = fake_rig(stiffness=golden)
+    settings = quick(pressures=(0.0,), directions=((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)))
+    with rig:
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    soft, stiff = PointsFile(tmp_path, 3).read()
+    assert soft.displacement.max() == pytest.approx(0.003, rel=0.1)
+    assert 0.15 < stiff.force.max() < 0.26
+
+
+def test_an_arm_that_is_stiffer_than_thought_is_not_crushed(tmp_path: Path) -> None:
+    rig = fake_rig(stiffness=lambda p, d: 2000.0)
+    felt: list[float] = []
+    world = world_of(rig)
+    tick = world.sleep_until
+    world.sleep_until = lambda moment: (tick(moment), felt.append(world.force()))[0]  # type: ignore[method-assign, func-returns-value]
+    settings = quick(directions=((1.0, 0.0, 0.0),))
+    with rig:
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    assert 0.9 < max(felt) < 1.5  # five times 0.2 N, and what one small move adds
+    assert world.stage == 0
+
+
+def test_raw_recordings_hold_force_and_stage(tmp_path: Path) -> None:
+    rig = fake_rig(stiffness=golden)
+    settings = quick(directions=((1.0, 0.0, 0.0),), repetitions=2)
+    with rig:
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    for repetition in (1, 2):
+        log = read_log(tmp_path / f"stiffness_{repetition}.csv")
+        assert log.force is not None
+        assert log.stage is not None
+        probing = np.isfinite(log.force)
+        assert 0.3 < probing.mean() < 0.95
+        assert log.stage[probing].max() == pytest.approx(0.003 + CLEARANCE, rel=0.2)
+        assert read_mcap_log(tmp_path / f"stiffness_{repetition}.mcap").force is not None
+
+
+def test_series_that_are_whole_are_not_repeated(tmp_path: Path) -> None:
+    settings = quick(repetitions=2, directions=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    rig = fake_rig(stiffness=golden)
+    with rig, pytest.raises(KeyboardInterrupt):
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0, check=stop_at(60, rig))
+    before = PointsFile(tmp_path, 3).read()
+    assert 0 < len(before) < 4
+    path = tmp_path / "points.csv"
+    torn = path.read_bytes() + path.read_bytes().splitlines()[1] + b"\n1,2,3"
+    path.write_bytes(torn)  # as if killed while a series was written
+    assert len(PointsFile(tmp_path, 3).read()) == len(before)
+    rig = fake_rig(stiffness=golden)
+    with rig:
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    after = PointsFile(tmp_path, 3).read()
+    assert len(after) == 4
+    assert len(world_of(rig).alignments) == 4 - len(before)
+    keys = {(series.key.repetition, series.key.direction) for series in after}
+    assert len(keys) == 4
+    assert (np.diff(read_log(tmp_path / "stiffness_1.csv").time) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "settings", "words"),
+    [
+        ({"probe": False}, {}, "this rig has no probe"),
+        ({"tracker": False}, {}, "this rig has no tracker"),
+        ({"high": 0.3e5}, {}, "channel 1 cannot have 0.4 bar"),
+        ({}, {"channel": 4}, "there is no channel 4"),
+    ],
+)
+def test_what_a_rig_cannot_do_is_said_before_anything_moves(
+    tmp_path: Path, changes: dict, settings: dict, words: str
+) -> None:
+    rig = fake_rig(**changes)
+    with rig, pytest.raises(InputError, match=words):
+        run_stiffness(rig, tmp_path, quick(**settings), model(), rate=50.0)
+    assert not any(value.any() for _, value in world_of(rig).writes)
+    assert not world_of(rig).alignments
+
+
+def test_a_probe_that_meets_nothing(tmp_path: Path) -> None:
+    rig = fake_rig(stiffness=lambda p, d: 1e-3)
+    with rig, pytest.raises(DeviceError, match="met nothing within 10 mm"):
+        run_stiffness(rig, tmp_path, quick(), model(), rate=50.0)
+    assert not world_of(rig).commanded.any()
+    assert PointsFile(tmp_path, 3).read() == []
+
+
+# -- slopes ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 10, 11, 54, 301])
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
+def test_students_quantile(confidence: float, freedom: int) -> None:
+    expected = stats.t.ppf((1 + confidence) / 2, freedom)
+    assert student_t(confidence, freedom) == pytest.approx(expected, rel=1e-10)
+
+
+def test_a_line_by_least_squares() -> None:
+    random = np.random.default_rng(0)
+    x = np.linspace(0, 0.003, 9)
+    y = 14 * x + 0.01 + 1e-3 * random.normal(size=9)
+    found, expected = fit_line(x, y), stats.linregress(x, y)
+    assert found is not None
+    assert found.slope == pytest.approx(expected.slope)
+    assert found.freedom == 7
+    assert found.sigma == pytest.approx(expected.stderr)
+    assert fit_line(x[:2], y[:2]) is None
+    assert fit_line([1, 1, 1], [1, 2, 3]) is None
+    assert fit_line([1, np.nan, 2], [1, 2, 3]) is None
+
+
+def test_a_trend_is_taken_off_where_it_can_be_told() -> None:
+    random = np.random.default_rng(0)
+    x, t = np.array([0, 1, 2, 3, 2, 1, 0.0]), np.arange(7.0)
+    y = 14 * x - 0.3 * t + 0.1 * random.normal(size=7)
+    columns = np.stack([np.ones(7), x, t], axis=1)
+    expected, (rest,), _, _ = np.linalg.lstsq(columns, y)
+    sigma = math.sqrt(rest / 4 * np.linalg.inv(columns.T @ columns)[1, 1])
+    found = fit_line(x, y, t)
+    assert found is not None
+    assert (found.slope, found.sigma) == pytest.approx((expected[1], sigma))
+    assert (found.freedom, found.points) == (4, 7)
+    alike = fit_line(t, y, t + 1e-3 * random.normal(size=7))
+    assert alike == fit_line(t, y)
+
+
+def test_repetitions_that_differ_are_believed_over_residuals_that_do_not() -> None:
+    lines = [Line(slope, 0.01, 7, 9) for slope in (13.0, 14.0, 15.0)]
+    found = combine(lines)
+    assert found is not None
+    assert found.value == pytest.approx(14)
+    assert found.spread == pytest.approx(1)
+    assert found.sigma == pytest.approx(1 / math.sqrt(3))
+    assert found.half_width == pytest.approx(4.3027 / math.sqrt(3), rel=1e-4)
+
+
+def test_repetitions_that_agree_by_luck_do_not_hide_the_residuals() -> None:
+    found = combine([Line(14.0, 0.5, 7, 9)] * 2)
+    assert found is not None
+    assert found.sigma == pytest.approx(0.5 / math.sqrt(2))
+    assert found.half_width == pytest.approx(2.1448 * 0.5 / math.sqrt(2), rel=1e-4)
+    assert combine([]) is None
+
+
+@pytest.mark.parametrize("between", [0.0, 0.5])
+def test_the_interval_holds_the_truth_as_often_as_it_says(between: float) -> None:
+    random = np.random.default_rng(7)
+    x, held, trials = np.linspace(0, 3, 7), 0, 800
+    for _ in range(trials):
+        lines = []
+        for _ in range(5):
+            slope = 14 + between * random.normal()
+            line = fit_line(x, slope * x + random.normal(size=7) * 0.5)
+            assert line is not None
+            lines.append(line)
+        found = combine(lines)
+        assert found is not None
+        held += abs(found.value - 14) <= found.half_width
+    assert 0.93 <= held / trials <= 0.995
+
+
+# -- the command ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Rig], Rig]:
+    """Let the command find this rig behind any file."""
+    monkeypatch.chdir(tmp_path)
+
+    def put(rig: Rig) -> Rig:
+        monkeypatch.setattr(experiment_run, "_rig", lambda path: (rig, "a rig", 50.0, "runs"))
+        return rig
+
+    return put
+
+
+KINEMATICS = ["experiment", "kinematics", "rig.yaml", "--pressures", "0.5 bar", "--period", "1 s",
+              "--repetitions", "2"]  # fmt: skip
+STIFFNESS = ["experiment", "stiffness", "rig.yaml", "--pressures", "0:1:1 bar", "--directions",
+             "x,-z", "--repetitions", "1", "--steps", "3"]  # fmt: skip
+
+
+def test_kinematics_from_the_rig_to_the_figure(
+    use: Callable[[Rig], Rig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = use(fake_rig(slew=3e5))
+    assert main(KINEMATICS) == 0
+    (folder,) = (tmp_path / "runs").iterdir()
+    assert folder.name.startswith("kinematics_a-rig_20")
+    assert {path.name for path in folder.iterdir()} == {
+        "experiment.yaml", "figure.png", "report.md", "kinematics_1.csv", "kinematics_1.mcap",
+        "kinematics_2.csv", "kinematics_2.mcap",
+    }  # fmt: skip
+    assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
+    said = capsys.readouterr()
+    assert "95th percentile" in said.out
+    assert "% of length" in (folder / "report.md").read_text()
+    assert not said.err
+    assert not world_of(rig).commanded.any()
+    # complete: nothing moves, the report is made again
+    rig = use(fake_rig())
+    assert main(["experiment", "kinematics", "rig.yaml", "--resume", str(folder)]) == 0
+    assert "nothing was left to do" in capsys.readouterr().err
+    assert not world_of(rig).writes
+
+
+def test_stiffness_from_the_rig_to_the_table(
+    use: Callable[[Rig], Rig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    use(fake_rig(stiffness=golden))
+    assert main([*STIFFNESS, "--out", "k"]) == 0
+    table = read_stiffness_table(tmp_path / "k" / "stiffness.csv")
+    assert table.pressures[:, 0].tolist() == [0, 0, 1e5, 1e5]
+    assert table.directions[:2].tolist() == [[1, 0, 0], [0, 0, -1]]
+    np.testing.assert_allclose(table.stiffness, [14.03, 730.42, 13.91, 31.89], rtol=1e-3)
+    np.testing.assert_allclose(table.others["model_n_per_m"], table.stiffness, rtol=2e-3)
+    assert (tmp_path / "k" / "figure.png").read_bytes().startswith(b"\x89PNG")
+    assert "95 % confidence" in capsys.readouterr().out
+
+
+def test_quiet_is_quiet(use: Callable[[Rig], Rig], capsys: pytest.CaptureFixture[str]) -> None:
+    use(fake_rig(slew=3e5))
+    assert main([*KINEMATICS, "--quiet", "--no-plot", "--out", "a"]) == 0
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", "")
+    assert not Path("a/figure.png").exists()
+
+
+def test_ctrl_c_vents_and_keeps_and_can_be_resumed(
+    use: Callable[[Rig], Rig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = use(fake_rig(slew=3e5))
+    world, supply = world_of(rig), rig.supply
+    assert isinstance(supply, FakeSupply)
+    pressed: list[float] = []
+
+    def press() -> None:
+        pressed.append(world.commanded.max())
+        signal.raise_signal(signal.SIGINT)
+
+    def impatient() -> None:
+        if pressed:  # a second time, while the arm is vented
+            signal.raise_signal(signal.SIGINT)
+
+    world.at.append((6.3, press))
+    supply.on_write = impatient
+    assert main([*KINEMATICS, "--out", "run"]) == 130
+    assert pressed[0] > 0
+    assert not world.commanded.any()
+    assert not supply.is_open
+    assert world.t - 100 < 6.4
+    said = capsys.readouterr().err
+    assert "rig.yaml --resume run" in said
+    assert "interrupted" in said
+    assert (tmp_path / "run" / "kinematics_1.csv").exists()
+    assert len(read_log(tmp_path / "run" / "kinematics_2.part.csv")) > 10
+    use(fake_rig(slew=3e5))
+    assert main(["experiment", "kinematics", "rig.yaml", "--resume", "run"]) == 0
+    assert (tmp_path / "run" / "kinematics_2.csv").exists()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_fault_of_the_rig(
+    use: Callable[[Rig], Rig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = use(fake_rig())
+    world_of(rig).at.append((4.0, lambda: setattr(world_of(rig), "seen", False)))
+    assert main([*KINEMATICS, "--out", "run"]) == 5
+    said = capsys.readouterr().err
+    assert "has not seen the tip for 2 s; the arm is vented" in said
+    assert "--resume run" in said
+    assert not world_of(rig).commanded.any()
+
+
+def test_a_supply_that_dies_is_said_to_be_dangerous(
+    use: Callable[[Rig], Rig], capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = use(fake_rig())
+    world_of(rig).at.append((3.0, lambda: setattr(rig.supply, "dead", True)))
+    assert main([*KINEMATICS, "--out", "run"]) == 5
+    assert "MAY STILL BE UNDER PRESSURE" in capsys.readouterr().err
+
+
+def test_no_device_leaves_no_folder(
+    use: Callable[[Rig], Rig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = use(fake_rig())
+    rig.supply.dead = True  # type: ignore[attr-defined]
+    assert main([*KINEMATICS, "--out", "run"]) == 5
+    assert "does not answer" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([*KINEMATICS, "--pressures", "2 bar"], "cannot have 2 bar"),
+        ([*KINEMATICS, "--pressures", "0.4,0.8"], "is no list of pressures"),
+        ([*KINEMATICS, "--pressures", "1 mm"], "--pressures: '1 mm'"),
+        ([*KINEMATICS, "--pressures", "0 bar"], "must be greater than 0"),
+        ([*KINEMATICS, "--period", "5"], "--period: '5' has no unit"),
+        ([*KINEMATICS, "--model", "stiff-flop-2"], "has 6 channels, the rig has 3"),
+        ([*KINEMATICS, "--resume", "none"], "--pressures cannot be changed"),
+        (["experiment", "kinematics", "rig.yaml", "--resume", "none"], "holds no experiment"),
+        ([*KINEMATICS, "--out", "full"], "is not empty"),
+        ([*STIFFNESS, "--directions", "x,w"], "'w' is no direction"),
+        ([*STIFFNESS, "--directions", "x,x"], "a direction is there twice"),
+        ([*STIFFNESS, "--channel", "7"], "there is no channel 7"),
+        ([*STIFFNESS, "--displacement", "3 s"], "--displacement: '3 s'"),
+    ],
+)
+def test_bad_input_moves_nothing(
+    use: Callable[[Rig], Rig],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    words: str,
+) -> None:
+    rig = use(fake_rig())
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").touch()
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert words in said
+    assert "Traceback" not in said
+    assert not world_of(rig).writes
+    assert not (tmp_path / "runs").exists()
+
+
+def test_an_experiment_of_another_kind_or_robot_is_not_resumed(
+    use: Callable[[Rig], Rig], capsys: pytest.CaptureFixture[str]
+) -> None:
+    use(fake_rig(slew=3e5))
+    assert main([*KINEMATICS, "--out", "run", "--no-plot", "-q"]) == 0
+    assert main([*KINEMATICS, "--out", "run"]) == 2
+    assert "continue it with --resume run" in capsys.readouterr().err
+    assert main(["experiment", "stiffness", "rig.yaml", "--resume", "run"]) == 2
+    assert "experiment.yaml" in capsys.readouterr().err
+    use(fake_rig(robot="stiff-flop-2"))
+    assert main(["experiment", "kinematics", "rig.yaml", "--resume", "run"]) == 2
+    assert "begun with the robot stiff-flop-1, not stiff-flop-2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("module", "extra"), [("matplotlib", "plot"), ("mcap", "log")])
+def test_what_is_not_installed_is_said_before_anything_moves(
+    use: Callable[[Rig], Rig],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    module: str,
+    extra: str,
+) -> None:
+    rig = use(fake_rig())
+    import sys
+
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main(KINEMATICS) == 2
+    assert f"pip install 'stiffopt[{extra}]'" in capsys.readouterr().err
+    assert not world_of(rig).writes
+    assert not Path("runs").exists()
+
+
+def test_lists_and_ranges_of_pressures() -> None:
+    assert pressures("-p", "0.4,0.8,1.0 bar") == (0.4e5, 0.8e5, 1e5)
+    assert pressures("-p", "0:1.5:0.25 bar") == tuple(0.25e5 * k for k in range(7))
+    assert pressures("-p", "0:0.3:0.1 bar") == pytest.approx((0, 1e4, 2e4, 3e4))
+    assert pressures("-p", " 50 kPa ") == (5e4,)
+    for text in ("", "bar", "1,,2 bar", "0:1 bar", "1:0:0.1 bar", "0:1:0 bar", "1,1 bar",
+                 "0:1:0.0001 bar", "nan bar", "1;2 bar"):  # fmt: skip
+        with pytest.raises(InputError, match=r"^-p: "):
+            pressures("-p", text)
+    assert directions("-d", "x, -z") == ((1, 0, 0), (0, 0, -1))
+
+
+def test_the_settings_are_read_back(tmp_path: Path) -> None:
+    from stiffopt.experiments.folder import create_folder, open_folder
+
+    for number, settings in enumerate(
+        (KinematicsSettings(channels=3), quick(directions=((0.0, 0.6, -0.8),)))
+    ):
+        folder = tmp_path / str(number)
+        create_folder(folder, settings)
+        assert open_folder(folder, type(settings)) == settings
+    with pytest.raises(FileError, match="holds an experiment"):
+        create_folder(tmp_path / "0", KinematicsSettings(channels=3))

@@ -1,0 +1,258 @@
+"""The virtual lab: real drivers over real protocols against a simulated arm."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stiffopt.cli.main import main
+from stiffopt.errors import DeviceError, InputError
+from stiffopt.files import read_file, save_file
+from stiffopt.model.robot_files import load_description
+from stiffopt.rig.config import RigDescription, load_rig_description, make_rig, open_rig
+from stiffopt.rig.interface import Rig
+from stiffopt.rig.lab.virtual import VirtualLab
+from stiffopt.rig.simulated.settings import PlantSettings, Silicone
+
+RIGS = Path(__file__).parent.parent / "rig"
+ROBOT = load_description("stiff-flop-1")
+
+
+def wait_for(condition: Callable[[], Any], timeout: float = 5.0) -> Any:
+    end = time.monotonic() + timeout
+    while not (value := condition()):
+        assert time.monotonic() < end, "that did not happen in time"
+        time.sleep(0.01)
+    return value
+
+
+def anywhere(description: RigDescription) -> RigDescription:
+    """Let the Modbus peer listen on a free port."""
+    supply = description.supply
+    if supply.driver != "modbus":
+        return description
+    tcp = supply.tcp.model_copy(update={"port": free_port()})
+    return description.model_copy(update={"supply": supply.model_copy(update={"tcp": tcp})})
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def moves(rig: Rig, lab: VirtualLab) -> None:
+    """Drive an arm and see it move through all devices."""
+    tracker = rig.tracker
+    assert tracker is not None
+    with rig:
+        rest = wait_for(lambda: tracker.latest)
+        np.testing.assert_allclose(rest.position, [0, 0, 0.09], atol=0.004)
+        rig.supply.arm()
+
+        def pressed() -> Any:  # again and again: the device's watchdog vents otherwise
+            rig.command([1e5, 0, 0])
+            return rig.observe().pressure.pressures[0] > 0.9e5
+
+        def bent_sample() -> Any:
+            sample = tracker.latest
+            return pressed() and sample and sample.position[0] < -0.02 and sample
+
+        wait_for(pressed)
+        bent = wait_for(bent_sample)
+        truth = lab.world.plant.tip_pose()[:3, 3]
+        assert np.linalg.norm(bent.position - truth) < 0.02  # it still swings
+    wait_for(lambda: (lab.world.pressures < 1e3).all())  # vented by closing
+
+
+@pytest.mark.parametrize("supply", ["modbus", "nidaq"])
+@pytest.mark.parametrize("tracker", ["aurora", "openigtlink"])
+def test_a_simulated_rig_is_driven_over_real_protocols(supply: str, tracker: str) -> None:
+    description = load_rig_description(RIGS / "sim.yaml").model_copy(update={"probe": None})
+    with VirtualLab(description, ROBOT, supply, tracker) as lab:
+        lab.description = anywhere(lab.description)
+        addressed = lab.start()
+        moves(make_rig(addressed, ROBOT), lab)
+
+
+@pytest.mark.parametrize("name", ["modbus-aurora", "nidaq-aurora", "openigtlink"])
+def test_the_files_of_real_rigs_can_be_rehearsed(name: str) -> None:
+    description = load_rig_description(RIGS / f"{name}.yaml")
+    with VirtualLab(anywhere(description), ROBOT) as lab:
+        addressed = lab.start()
+        assert addressed.plant is None
+        moves(make_rig(addressed.model_copy(update={"probe": None}), ROBOT), lab)
+
+
+@pytest.fixture(scope="module")
+def virtual_lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[VirtualLab, Path]]:
+    description = anywhere(load_rig_description(RIGS / "virtual-lab.yaml"))
+    path = tmp_path_factory.mktemp("lab") / "lab.yaml"
+    with VirtualLab(description, ROBOT) as lab:
+        save_file(path, "rig", lab.start())
+        yield lab, path
+
+
+def test_the_printed_file_drives_the_arm(virtual_lab: tuple[VirtualLab, Path]) -> None:
+    lab, path = virtual_lab
+    moves(open_rig(path), lab)
+
+
+def test_the_probe_measures_stiffness_over_its_protocols() -> None:
+    """Tracker, stage, sensor and NI-DAQ together find the golden stiffness of the straight arm."""
+    description = load_rig_description(RIGS / "virtual-lab.yaml")
+    plant = PlantSettings(silicone=Silicone(law="linear", damping=0.3, creep=(), hysteresis=()))
+    description = anywhere(description.model_copy(update={"plant": plant}))
+    with VirtualLab(description, ROBOT) as lab:
+        rig = make_rig(lab.start(), ROBOT)
+        probe, tracker = rig.probe, rig.tracker
+        assert probe is not None
+        assert tracker is not None
+        probe._prompt = lambda request: lab.bench.mount([1, 0, 0])  # type: ignore[attr-defined]
+        with rig:
+            probe.align([1, 0, 0])
+            places, forces = [], []
+            for position in (0.003, 0.004, 0.005, 0.006):
+                probe.move_to(position, 0.01)
+                time.sleep(0.6)
+                tracker.read()
+                time.sleep(0.4)
+                seen = [s for s in tracker.read() if s.visible]
+                places.append(np.mean([sample.position[0] for sample in seen]))
+                forces.append(np.mean([probe.sample().force for _ in range(10)]))
+                assert probe.sample().position == pytest.approx(position, abs=1e-6)
+            assert np.polyfit(places, forces, 1)[0] == pytest.approx(14.03, rel=0.05)  # N/m
+
+
+def test_faults_reach_the_drivers(virtual_lab: tuple[VirtualLab, Path]) -> None:
+    lab, path = virtual_lab
+    rig = open_rig(path)
+    tracker = rig.tracker
+    assert tracker is not None
+    with rig:
+        wait_for(lambda: tracker.age() < 0.2)
+        lab.world.inject("tracker", "missing")
+        wait_for(lambda: tracker.age() > 0.3)
+        assert not tracker.latest.visible
+        lab.world.inject("tracker", "ok")
+        wait_for(lambda: tracker.age() < 0.2)
+        lab.world.inject("tracker", "stuck")
+        wait_for(lambda: tracker.age() > 0.3)
+        lab.world.inject("tracker", "ok")
+        lab.world.inject("supply", "wrong", 1)
+        wait_for(lambda: rig.supply.read().pressures[1] > 1e4)
+        lab.world.inject("supply", "ok")
+        lab.world.inject("supply", "off")
+        wait_for(lambda: not answers(rig))
+        lab.world.inject("supply", "ok")
+        wait_for(lambda: answers(rig))
+
+
+def answers(rig: Rig) -> bool:
+    try:
+        rig.supply.read()
+    except DeviceError:
+        return False
+    return True
+
+
+def test_a_lost_controller_is_vented_by_the_device(virtual_lab: tuple[VirtualLab, Path]) -> None:
+    """The coupler's watchdog acts when commands stop, whatever the program does."""
+    lab, path = virtual_lab
+    with open_rig(path) as rig:
+        rig.supply.arm()
+        for _ in range(20):
+            rig.command([1e5, 1e5, 0])
+            time.sleep(0.05)
+        assert lab.world.pressures[0] > 0.9e5
+        wait_for(lambda: lab.world.pressures.max() < 1e3, 3.0)
+
+
+# The command -------------------------------------------------------------------------------------
+
+
+def start(*arguments: str) -> subprocess.Popen[str]:
+    command = [
+        sys.executable,
+        "-c",
+        "import sys; from stiffopt.cli.main import main; sys.exit(main())",
+    ]
+    return subprocess.Popen(
+        [*command, "lab", *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+
+
+def test_the_command_writes_a_file_takes_commands_and_ends(tmp_path: Path) -> None:
+    rig_file, out = tmp_path / "rig.yaml", tmp_path / "lab.yaml"
+    save_file(rig_file, "rig", anywhere(load_rig_description(RIGS / "virtual-lab.yaml")))
+    process = start(str(rig_file), "--out", str(out))
+    try:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        assert "the lab runs" in process.stderr.readline()
+        with open_rig(out) as rig:
+            assert rig.supply.read().pressures.max() < 5e3
+            process.stdin.write("fault supply wrong 2\nfault door open\nmount 0 1 0\nstatus\n")
+            process.stdin.flush()
+            wait_for(lambda: rig.supply.read().pressures[1] > 1e4)
+        said = [process.stderr.readline() for _ in range(4)]
+        assert "there is no fault 'open' of 'door'" in said[1]
+        assert "rail is along 0 1 0" in said[2]
+        assert "faults: supply wrong" in said[3]
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10) == 0
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_the_rig_file_is_printed(tmp_path: Path) -> None:
+    process = start(str(RIGS / "sim.yaml"), "--supply", "nidaq", "--tracker", "openigtlink")
+    try:
+        assert process.stderr is not None
+        assert "the lab runs" in process.stderr.readline()
+        out, _ = process.communicate("quit\n", 15)
+        assert process.returncode == 0
+    finally:
+        process.kill()
+        process.wait()
+    printed = tmp_path / "printed.yaml"
+    printed.write_text(out)
+    description = read_file(printed, "rig", RigDescription)
+    assert (description.supply.driver, description.tracker.driver) == ("nidaq", "openigtlink")
+
+
+def test_a_port_in_use_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig_file = tmp_path / "rig.yaml"
+    description = anywhere(load_rig_description(RIGS / "virtual-lab.yaml"))
+    save_file(rig_file, "rig", description)
+    with socket.create_server(("127.0.0.1", description.supply.tcp.port)):
+        assert main(["lab", str(rig_file)]) == 2
+    error = capsys.readouterr().err
+    assert str(description.supply.tcp.port) in error
+    assert "Traceback" not in error
+
+
+def test_unknown_drivers_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["lab", str(RIGS / "sim.yaml"), "--supply", "steam"]) == 2
+    assert "modbus or nidaq" in capsys.readouterr().err
+
+
+def test_faults_must_be_enabled() -> None:
+    description = load_rig_description(RIGS / "sim.yaml")
+    with VirtualLab(description, ROBOT) as lab, pytest.raises(InputError, match="faults: true"):
+        lab.world.inject("tracker", "off")

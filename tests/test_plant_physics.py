@@ -1,0 +1,626 @@
+"""The simulated arm against exact results and references that share no code with it."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from independent import ARMS, FLOP, Arm, Tube, planar_tip, rod_tip, silicone
+from independent import Load as Reference
+from references import (
+    Column,
+    Jenkin,
+    beam,
+    creep,
+    elastica_tip,
+    fibre_bending,
+    free_tip,
+    loaded_tip,
+    loop_area,
+    stretch_under,
+    tip_compliance,
+)
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.robot_files import load_description
+from stiffopt.rig.registration import Placement
+from stiffopt.rig.simulated.plant import Plant
+from stiffopt.rig.simulated.settings import (
+    Creep,
+    Discretisation,
+    Hysteresis,
+    Load,
+    Mismatch,
+    PlantSettings,
+    Silicone,
+)
+
+LINEAR = Silicone(law="linear", damping=0.0, creep=(), hysteresis=())
+PLAIN = replace(FLOP, factors=None)  # without lambda
+CONSTANT = replace(FLOP, factors=(0.0, 1.2, 1.05))  # a modulus that pressure does not change
+STIFF = replace(FLOP, factors=(0.0, 1e5, 1.0))  # neither shears nor stretches
+ONE, TWO = Arm((FLOP,)), Arm((FLOP, FLOP))
+DOWN = (0.0, 0.0, 9.81)
+BAR = 1e5
+
+
+def make(arm: Arm, silicone: Silicone = LINEAR, **settings: Any) -> Plant:
+    settings.setdefault("dynamics", "quasi-static")
+    return Plant(RobotDescription(**arm.mapping()), PlantSettings(silicone=silicone, **settings))
+
+
+def settled(arm: Arm, p: Any = None, load: Load | None = None, **settings: Any) -> Any:
+    plant = make(arm, **settings)
+    plant.settle(np.zeros(arm.n) if p is None else p, load)
+    return plant.tip_pose()
+
+
+def material(**changes: Any) -> Silicone:
+    return LINEAR.model_copy(update=changes)
+
+
+# -- statics --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tubes", [1, 2])
+@pytest.mark.parametrize("share", [1.0, 5.0, 13.0])
+def test_elastica(share, tubes):
+    arm = Arm((STIFF,) * tubes)
+    force = share * beam(STIFF).bending / arm.length**2
+    T = settled(arm, load=Load(force=(force, 0, 0)))
+    x, z, angle = elastica_tip(share)
+    assert T[:3, 3] == pytest.approx([x * arm.length, 0, z * arm.length], abs=1e-4)
+    assert np.arctan2(T[0, 2], T[2, 2]) == pytest.approx(angle, abs=5e-3)
+
+
+@pytest.mark.parametrize(("tubes", "share"), [(1, 1.0), (1, 5.0), (2, 5.0), (2, 13.0)])
+def test_elastica_that_shears_and_stretches(share, tubes):
+    arm = Arm((FLOP,) * tubes)
+    force = share * beam(FLOP).bending / arm.length**2
+    T = settled(arm, load=Load(force=(0, force, 0)))
+    expected = loaded_tip(arm, np.zeros(arm.n), [Reference((0, force, 0))], steps=8)
+    assert T[:3, 3] == pytest.approx(expected[:3, 3], abs=1e-4)
+
+
+def test_a_stubby_elastica_on_a_finer_mesh():
+    """One segment under 6 N across: it shears by a third of what it bends."""
+    force = 13 * beam(FLOP).bending / ONE.length**2
+    mesh = Discretisation(bending_degree=5, shear_degree=3, sub_intervals=8)
+    T = settled(ONE, load=Load(force=(0, force, 0)), discretisation=mesh)
+    x, z, _ = planar_tip(ONE, np.zeros(3), (force, 0))
+    assert T[:3, 3] == pytest.approx([0, x, z], abs=1e-4)
+
+
+@pytest.mark.parametrize("frame", ["base", "tip"])
+@pytest.mark.parametrize("arm", [ONE, TWO], ids=["one segment", "two"])
+def test_pure_moment_bends_to_a_full_circle(arm, frame):
+    moment = 2 * np.pi * beam(FLOP).bending / arm.length
+    T = settled(arm, load=Load(moment=(0, moment, 0), frame=frame))
+    assert pytest.approx(np.eye(4), abs=1e-6) == T
+
+
+@pytest.mark.parametrize("arm", [ONE, TWO], ids=["one segment", "two"])
+def test_pressure_alone_bends_to_arcs(arm):
+    p = BAR * np.array([0.9, 0.2, 0.1, 0.0, 0.6, 0.3])[: arm.n]
+    assert settled(arm, p) == pytest.approx(free_tip(arm, p), abs=1e-6)
+
+
+PRESSED = {
+    "one segment, straight": (ONE, [0.0, 0.0, 0.0]),
+    "one segment, bent": (ONE, [1.0, 0.2, 0.0]),
+    "two segments, bent apart": (TWO, [0.9, 0.2, 0.0, 0.1, 0.8, 0.3]),
+    "two segments, stretched": (TWO, [0.7, 0.7, 0.7, 0.5, 0.5, 0.5]),
+}
+
+
+@pytest.mark.parametrize("name", PRESSED)
+def test_small_load_compliance(name):
+    arm, bar = PRESSED[name]
+    p = BAR * np.array(bar)
+    plant, sizes = make(arm), [1e-3] * 3 + [2e-5] * 3
+    plant.settle(p)
+    T, columns = plant.tip_pose(), []
+    for wrench in np.diag(sizes):
+        ends = []
+        for sign in (1, -1):
+            f, m = sign * wrench[:3], sign * wrench[3:]
+            plant.settle(p, Load(force=tuple(f), moment=tuple(m), frame="tip"))
+            ends.append(plant.tip_pose())
+        change = np.linalg.inv(T) @ (ends[0] - ends[1]) / (2 * wrench.max())
+        columns.append([*change[:3, 3], change[2, 1], change[0, 2], change[1, 0]])
+    expected = tip_compliance(arm, p)
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((np.array(columns).T - expected) / size).max() < 1e-3
+
+
+LOADED = {
+    "dead force": [Reference((0.06, -0.1, 0.05), (1e-3, 0, 5e-4))],
+    "follower": [Reference((0.05, 0.1, 0), (0, 2e-3, 1e-3), follower=True)],
+    "dead, along the arm": [Reference((0.1, -0.15, 0), (0, 1e-3, 0), at=0.05)],
+    "follower, along the arm": [Reference((0.1, 0.2, 0.1), at=0.12, follower=True)],
+    "beyond buckling": [Reference((0.03, 0.02, -0.35))],
+}
+
+
+@pytest.mark.parametrize("name", LOADED)
+def test_load_against_the_rod_shot_from_its_tip(name):
+    (load,) = LOADED[name]
+    p = np.zeros(6) if name == "beyond buckling" else BAR * np.array([0.5, 0.2, 0, 0.3, 0.8, 0.0])
+    frame = "tip" if load.follower else "base"
+    acting = Load(force=load.force, moment=load.moment, frame=frame, at=load.at)
+    expected = loaded_tip(TWO, p, [load], steps=8)
+    assert settled(TWO, p, acting) == pytest.approx(expected, abs=1e-3)  # rotations
+    assert settled(TWO, p, acting)[:3, 3] == pytest.approx(expected[:3, 3], abs=1e-4)
+
+
+MOUNTINGS = {
+    "hanging": (0.0, 0.0, 9.81),
+    "horizontal": (9.81, 0.0, 0.0),
+    "horizontal, about another axis": (0.0, -9.81, 0.0),
+    "tilted": (5.0, 3.0, 7.0),
+    "upright, on the moon": (0.1, 0.0, -1.62),
+}
+
+
+@pytest.mark.parametrize("name", MOUNTINGS)
+def test_gravity_in_every_mounting(name):
+    arm = TWO.under(MOUNTINGS[name], 0.02)
+    p = BAR * np.array([0.4, 0.0, 0.1, 0.0, 0.5, 0.2])
+    expected = loaded_tip(arm, p)[:3, 3]
+    assert settled(arm, p)[:3, 3] == pytest.approx(expected, abs=1e-4)
+    bare = TWO.under((0, 0, 0.1))  # the plant's settings overrule the robot file
+    T = settled(bare, p, gravity=MOUNTINGS[name], payload=0.02)
+    assert T[:3, 3] == pytest.approx(expected, abs=1e-4)
+
+
+def test_sections_off_the_axis_and_connectors():
+    """Three different segments, centroids beside the axis, against the rod from its base."""
+    arm = ARMS["3 segments, mixed"].under((2.0, 1.0, 9.0), 0.01)
+    load = Reference((0.05, -0.08, 0.02), (1e-3, 0, 5e-4))
+    T = settled(arm, load=Load(force=load.force, moment=load.moment))
+    expected = rod_tip(arm, np.zeros(arm.n), [load], steps=6)
+    assert T[:3, 3] == pytest.approx(expected[:3, 3], abs=1e-4)
+    assert T[:3, :3] == pytest.approx(expected[:3, :3], abs=1e-3)
+
+
+def test_a_mismatch_is_what_it_says():
+    """Modulus, length, gain, offset, angle and base of the arm that there really is."""
+    tube = replace(PLAIN, youngs_modulus=1.1 * PLAIN.youngs_modulus, length=1.02 * PLAIN.length)
+    tilt = np.array([np.cos(0.05), np.sin(0.05), 0, 0])  # by 0.1 rad about x
+    T_base = np.eye(4)
+    T_base[1:3, 1:3] = [[np.cos(0.1), -np.sin(0.1)], [np.sin(0.1), np.cos(0.1)]]
+    T_base[:3, 3] = 0.001, 0.002, 0.003
+    true = Arm((replace(tube, angles=tuple(angle + 10 for angle in tube.angles)),))
+    true = true.under(T_base[:3, :3].T @ (3.0, 0.0, 9.0), 0.01)
+    p = BAR * np.array([0.5, 0.1, 0.0])
+    expected = T_base @ loaded_tip(true, 0.9 * p + 2000.0)
+    mismatch = Mismatch(
+        gain=(0.9,) * 3,
+        offset=(2000.0,) * 3,
+        angle=(np.radians(10.0),) * 3,
+        modulus=(1.1,),
+        length=(1.02,),
+        base=Placement(position=(0.001, 0.002, 0.003), orientation=tuple(tilt)),
+    )
+    T = settled(Arm((PLAIN,)).under((3, 0, 9), 0.01), p, mismatch=mismatch)
+    assert T[:3, 3] == pytest.approx(expected[:3, 3], abs=2e-5)
+    assert T[:3, :3] == pytest.approx(expected[:3, :3], abs=1e-3)
+
+
+@pytest.mark.long
+def test_random_arms_under_random_loads():
+    rng = np.random.default_rng(11)
+    for _ in range(15):
+        tubes = int(rng.integers(1, 4))
+        arm = Arm((replace(FLOP, connector=float(rng.choice([0.0, 0.01]))),) * tubes)
+        arm = arm.under(np.array([0, 0, 9.0]) + rng.normal(0, 2.0, 3), rng.uniform(0, 0.02))
+        p = rng.uniform(0, 0.5 * BAR, arm.n)
+        load = Reference(
+            rng.normal(0, 0.04, 3), rng.normal(0, 2e-3, 3), follower=bool(rng.integers(2))
+        )
+        frame = "tip" if load.follower else "base"
+        acting = Load(force=tuple(load.force), moment=tuple(load.moment), frame=frame)
+        expected = loaded_tip(arm, p, [load], steps=8)[:3, 3]
+        assert settled(arm, p, acting)[:3, 3] == pytest.approx(expected, abs=1e-4)
+
+
+def test_turning_the_world_turns_the_arm():
+    """By 120 degrees: gravity, and each channel's pressure into the next channel."""
+    c, s = np.cos(2 * np.pi / 3), np.sin(2 * np.pi / 3)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    p = BAR * np.array([[0.4, 0.0, 0.1], [0.0, 0.5, 0.2]])
+    here = settled(TWO.under((6, 0, 7), 0.02), p.ravel())
+    there = settled(TWO.under(turn @ (6, 0, 7), 0.02), np.roll(p, 1, axis=1).ravel())
+    assert there[:3, 3] == pytest.approx(turn @ here[:3, 3], abs=1e-7)
+
+
+@pytest.mark.parametrize("law", ["neo-hookean", "yeoh"])
+@pytest.mark.parametrize("stress", [-2e4, 1e4, 4e4])
+def test_hyperelastic_stretch(law, stress):
+    arm, area = Arm((PLAIN,)), silicone(PLAIN).area
+    stretch = stretch_under(law, PLAIN.youngs_modulus, 0.2, stress)
+    rubber = material(law=law, stiffening=0.2)
+    T = settled(arm, load=Load(force=(0, 0, stress * area)), silicone=rubber)
+    assert T[2, 3] == pytest.approx(arm.length * stretch, rel=1e-6)
+    if stress > 0:  # the same by pressure
+        bores = 6 * np.pi * PLAIN.chamber_radius**2
+        T = settled(arm, [stress * area / bores] * 3, silicone=rubber)
+        assert T[2, 3] == pytest.approx(arm.length * stretch, rel=1e-6)
+
+
+@pytest.mark.parametrize("law", ["linear", "neo-hookean", "yeoh"])
+def test_hyperelastic_bending(law):
+    """A moment that bends a segment by about 80 degrees: within 1 % of length.
+
+    The reference integrates over all fibres of the section; the plant has a few.
+    """
+    arm, moment = Arm((PLAIN,)), 0.06
+    strain, curvature = fibre_bending(PLAIN, law, 0.1, (0.0, moment))
+    rubber = material(law=law, stiffening=0.1)
+    T = settled(arm, load=Load(moment=(0, moment, 0)), silicone=rubber)
+    angle, radius = curvature * arm.length, (1 + strain) / curvature
+    expected = [radius * (1 - np.cos(angle)), 0, radius * np.sin(angle)]
+    assert angle > 1.3
+    assert np.linalg.norm(T[:3, 3] - expected) < (1e-6 if law == "linear" else 9e-4)
+
+
+# -- vibration ------------------------------------------------------------------------------
+
+
+FINE = Discretisation(bending_degree=5, shear_degree=3, sub_intervals=8)
+
+
+@pytest.mark.parametrize("mass", [0.0, 0.02])
+@pytest.mark.parametrize("tubes", [1, 2])
+def test_natural_frequencies(tubes, mass):
+    """Bending in each plane, stretching and twisting, within 1 %; more modes on a finer mesh."""
+    arm = Arm((FLOP,) * tubes).under((0, 0, 0), mass)
+    column = Column(beam(FLOP), arm.length, mass)
+    for mesh, bendings, others, tolerance in (
+        (Discretisation(), tubes, 1, 0.01),
+        (FINE, 2, 2, 0.003),
+    ):
+        expected = [
+            *np.repeat(column.bending_frequencies(bendings), 2),
+            *column.axial_frequencies(others),
+            *column.torsion_frequencies(others),
+        ]
+        found = make(arm, dynamics="full", discretisation=mesh).modes(20)[0] * 2 * np.pi
+        assert found[:2] == pytest.approx(expected[:2], rel=tolerance)
+        for omega in expected:  # each mode is taken once
+            nearest = int(np.abs(found - omega).argmin())
+            assert found[nearest] == pytest.approx(omega, rel=tolerance)
+            found = np.delete(found, nearest)
+
+
+def balance(plant: Plant) -> float:
+    """Energy that is somewhere, less what came in."""
+    e = plant.energies()
+    return e.kinetic + e.elastic + e.gravity + e.dissipated - e.work
+
+
+def released(
+    plant: Plant, force: tuple[float, float, float], duration: float, axis: int, sample: float
+) -> tuple[Any, Any]:
+    """Times and the tip's motion along an axis after a pull is let go, every so many s."""
+    zero = np.zeros(plant.robot.n_pressures)
+    rest = plant.tip_pose()[axis, 3]
+    plant.settle(zero, Load(force=force))
+    plant.set_load(None)
+    x = [plant.tip_pose()[axis, 3]]
+    for _ in range(round(duration / sample)):
+        plant.advance(sample, zero)
+        x.append(plant.tip_pose()[axis, 3])
+    return sample * np.arange(len(x)), np.array(x) - rest
+
+
+def crossings(t: Any, x: Any) -> Any:
+    """Where x goes up through zero, linearly interpolated."""
+    k = np.flatnonzero((x[:-1] < 0) & (x[1:] >= 0))
+    return t[k] - x[k] * (t[k + 1] - t[k]) / (x[k + 1] - x[k])
+
+
+def peaks(x: Any) -> Any:
+    """Heights of the maxima of x, by parabolas."""
+    k = np.flatnonzero((x[1:-1] > x[:-2]) & (x[1:-1] >= x[2:]) & (x[1:-1] > 0)) + 1
+    slope, bend = (x[k + 1] - x[k - 1]) / 2, x[k + 1] - 2 * x[k] + x[k - 1]
+    return x[k] - slope**2 / (2 * bend)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.05])
+def test_swinging_in_time(damping):
+    plant = make(TWO, material(damping=damping), dynamics="full")
+    t, x = released(plant, (0.01, 0, 0), 4.0, axis=0, sample=5e-3)
+    ups = crossings(t, x)[1:]
+    frequency = (len(ups) - 1) / (ups[-1] - ups[0])
+    expected = Column(beam(FLOP), TWO.length).bending_frequencies(1)[0] / (2 * np.pi)
+    assert frequency == pytest.approx(expected * np.sqrt(1 - damping**2), rel=0.01)
+
+
+def test_stretching_in_time():
+    plant = make(ONE.under((0, 0, 0), 0.02), dynamics="full")
+    t, z = released(plant, (0, 0, 0.05), 1.0, axis=2, sample=1e-3)
+    ups = crossings(t, z)
+    frequency = (len(ups) - 1) / (ups[-1] - ups[0])
+    expected = Column(beam(FLOP), ONE.length, 0.02).axial_frequencies(1)[0] / (2 * np.pi)
+    assert frequency == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize("damping", [0.02, 0.1])
+@pytest.mark.parametrize("step", [1e-3, 5e-4])
+def test_free_decay(damping, step):
+    """The logarithmic decrement is what was asked for, whatever the step."""
+    plant = make(
+        TWO, material(damping=damping), dynamics="full", discretisation=Discretisation(step=step)
+    )
+    assert plant.modes(2)[1] == pytest.approx([damping] * 2, rel=1e-3)
+    tops = peaks(released(plant, (0.01, 0, 0), 2.5, axis=0, sample=5e-3)[1])[1:]
+    decrement = np.log(tops[0] / tops[-1]) / (len(tops) - 1)
+    assert decrement / np.hypot(2 * np.pi, decrement) == pytest.approx(damping, rel=0.03)
+
+
+@pytest.mark.parametrize("step", [2e-3, 1e-3])
+@pytest.mark.parametrize("size", [0.01, 1.0])
+def test_nothing_damps_but_the_material(size, step):
+    """Swings of 4 s without damping, large ones and small: no energy is lost, at any step."""
+    plant = make(TWO, dynamics="full", discretisation=Discretisation(step=step))
+    at_rest = balance(plant)
+    plant.settle(np.zeros(6), Load(force=(0.1 * size, 0.05 * size, 0)))
+    plant.set_load(None)
+    energies = []
+    for _ in range(40):
+        plant.advance(0.1, np.zeros(6))
+        energies.append(balance(plant) - at_rest)
+    assert np.ptp(energies) < 1e-4 * np.mean(energies)
+    assert plant.energies().dissipated < 1e-9 * np.mean(energies)
+
+
+def disbalance(silicone: Silicone, step: float, arm: Arm) -> tuple[float, float]:
+    """Greatest error of the energy balance under two steps of pressure, and the work done."""
+    plant = make(arm, silicone, dynamics="full", discretisation=Discretisation(step=step))
+    start, worst = balance(plant), 0.0
+    for bar in ([0.6, 0, 0, 0, 0.4, 0], [0.1, 0.3, 0, 0, 0, 0]):
+        for _ in range(20):
+            plant.advance(0.04, BAR * np.array(bar))
+            worst = max(worst, abs(balance(plant) - start))
+    return worst, plant.energies().dissipated
+
+
+BALANCED = Arm((CONSTANT, CONSTANT)).under(DOWN, 0.02)
+
+
+@pytest.mark.parametrize("law", ["linear", "yeoh"])
+def test_energy_balance_improves_with_the_square_of_the_step(law):
+    rubber = material(law=law, damping=0.1, creep=(Creep(share=0.1, time=0.5),))
+    errors = [disbalance(rubber, step, BALANCED) for step in (4e-3, 2e-3, 1e-3)]
+    for (coarse, _), (fine, lost) in itertools.pairwise(errors):
+        assert fine < coarse / 3
+        assert fine < 0.01 * lost
+
+
+def test_energy_balance_with_all_that_silicone_does():
+    error, lost = disbalance(Silicone(), 1e-3, BALANCED)
+    assert error < 0.01 * lost
+
+
+def test_weight_and_pressure_have_the_energies_of_textbooks():
+    """Hanging straight: m g L / 2 and M g L; stretched by pressure: F^2 L / (2 E A)."""
+    stiff = Arm((replace(STIFF),)).under(DOWN, 0.03)
+    mass = beam(STIFF).mass * stiff.length
+    expected = -9.81 * stiff.length * (mass / 2 + 0.03)
+    assert make(stiff).energies().gravity == pytest.approx(expected, rel=1e-4)
+    arm = Arm((CONSTANT,))
+    plant = make(arm)
+    before = plant.energies()
+    plant.advance(0.01, BAR * np.ones(3))
+    force = 6 * np.pi * FLOP.chamber_radius**2 * BAR
+    stored = force**2 * arm.length / (2 * beam(CONSTANT).axial)
+    after = plant.energies()
+    assert after.elastic - before.elastic == pytest.approx(stored, rel=1e-6)
+    assert after.work - before.work == pytest.approx(2 * stored, rel=1e-6)  # a sudden step
+
+
+def test_a_closed_path_of_pressures_costs_nothing():
+    """Without anything that dissipates, quasi-static: pressure is conjugate to swept volume."""
+    plant = make(Arm((CONSTANT, CONSTANT)).under((6, 0, 7), 0.02))
+    corners = BAR * np.array([[0] * 6, [0.8, 0, 0, 0, 0.3, 0], [0.8, 0.5, 0, 0.6, 0, 0], [0] * 6])
+    plant.settle(corners[0])
+    start, ups = plant.energies().work, []
+    for a, b in itertools.pairwise(corners):
+        for s in (np.arange(100) + 0.5) / 100:  # the middle of each step: the trapezium rule
+            plant.advance(plant.step, a + s * (b - a))
+        ups.append(plant.energies().work - start)
+    assert abs(ups[-1]) < 0.02 * max(ups)
+
+
+# -- hanging --------------------------------------------------------------------------------
+
+
+def test_the_built_in_hanging_arm_rings_as_measured():
+    robot = load_description("stiff-flop-2-hanging")
+    omega, ratio = Column(beam(FLOP), 0.18, 0.02, 9.81).damped(0.1)
+    linear = Plant(robot, PlantSettings(silicone=material(damping=0.1)))
+    frequencies, damping = linear.modes(2)
+    assert frequencies == pytest.approx([omega / (2 * np.pi)] * 2, rel=0.01)
+    assert damping == pytest.approx([ratio] * 2, rel=0.02)
+    assert 1.5 < frequencies[0] < 1.7
+    assert damping[0] == pytest.approx(0.04, abs=0.01)
+    tops = peaks(released(linear, (0.02, 0, 0), 4.0, axis=0, sample=5e-3)[1])[1:]
+    decrement = np.log(tops[0] / tops[-1]) / (len(tops) - 1)
+    assert decrement / (2 * np.pi) == pytest.approx(ratio, rel=0.05)
+
+
+# -- history --------------------------------------------------------------------------------
+
+SLIP = (Hysteresis(share=0.1, strain=0.01), Hysteresis(share=0.2, strain=0.03))
+
+
+def cycle(plant: Plant, top: Any, duration: float, cycles: int, samples: int = 40) -> Any:
+    """Tip poses (cycles, 2 samples, 4, 4) while pressures go up to `top` and down to 0."""
+    up = (np.arange(samples) + 1) / samples
+    ramp = np.concatenate([up, 1 - up])
+    tips = []
+    for _ in range(cycles):
+        for share in ramp:
+            plant.advance(duration / len(ramp), share * np.asarray(top))
+            tips.append(plant.tip_pose())
+    return np.array(tips).reshape(cycles, len(ramp), 4, 4), ramp
+
+
+def test_bending_loops_close_enclose_area_and_know_no_rate():
+    top = BAR * np.array([1.0, 0, 0, 0, 0.6, 0])
+    tips = {}
+    for duration in (0.8, 8.0):
+        plant = make(TWO.under(DOWN, 0.02), material(law="yeoh", hysteresis=SLIP))
+        tips[duration], ramp = cycle(plant, top, duration, 3)
+    x = tips[0.8][..., 0, 3]
+    assert np.ptp(x) > 0.02
+    assert tips[8.0] == pytest.approx(tips[0.8], abs=1e-6)
+    for later in (1, 2):
+        assert x[later, -1] == pytest.approx(x[0, -1], abs=1e-5)
+    assert x[2] == pytest.approx(x[1], abs=1e-5)
+    side = np.sign(x[1, 39])
+    area = loop_area(side * x[1], ramp)
+    assert 0.005 < area / np.ptp(x) < 0.5  # share of the box around the loop
+
+
+def test_stretching_loops_are_jenkins():
+    """Uniform stretch: each sample is that of a fibre under the same stress, to rounding."""
+    arm, tall = Arm((PLAIN,)), 1.5 * BAR
+    plant = make(arm, material(hysteresis=SLIP))
+    stress = tall * 6 * np.pi * PLAIN.chamber_radius**2 / silicone(PLAIN).area
+    fibre = Jenkin(
+        PLAIN.youngs_modulus,
+        np.array([part.share for part in SLIP]),
+        np.array([part.strain for part in SLIP]),
+    )
+    tips, ramp = cycle(plant, [tall] * 3, 0.16, 3)
+    strains = tips[..., 2, 3].ravel() / arm.length - 1
+    expected = [fibre.strain(share * stress) for share in np.tile(ramp, 3)]
+    assert max(expected) > 0.1
+    assert strains == pytest.approx(expected, abs=1e-6)
+    lost = arm.length * silicone(PLAIN).area * loop_area(expected[-80:], stress * ramp)
+    before = plant.energies().dissipated
+    cycle(plant, [tall] * 3, 0.16, 1)
+    assert plant.energies().dissipated - before == pytest.approx(lost, rel=0.1)
+
+
+@pytest.mark.parametrize("bar", [[1.0, 1.0, 1.0], [1.0, 0.0, 0.0]], ids=["stretch", "bend"])
+def test_creep_is_maxwells(bar):
+    shares, times = (0.2, 0.1), (2.0, 20.0)
+    branches = tuple(Creep(share=s, time=t) for s, t in zip(shares, times, strict=True))
+    arm = Arm((CONSTANT,))
+    plant = make(arm, material(creep=branches), discretisation=Discretisation(step=0.01))
+    p = BAR * np.array(bar)
+
+    def strain() -> float:
+        T = plant.tip_pose()
+        return T[2, 3] / arm.length - 1 if bar[1] else float(np.arctan2(T[0, 2], T[2, 2]))
+
+    plant.settle(p)
+    final = strain()
+    plant.settle(np.zeros(3))
+    marks, seen = np.array([0.01, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0, 100.0]), []
+    for wait in np.diff(marks, prepend=0.0):
+        plant.advance(wait, p)
+        seen.append(strain() / final)
+    assert seen == pytest.approx(creep(shares, times, marks), abs=2e-3)
+
+
+def drift(duration: float, step: float, dynamics: str) -> float:
+    """How far the resting tip moves."""
+    p = BAR * np.array([0.5, 0.1, 0.0, 0.0, 0.6, 0.2])
+    discretisation = Discretisation(step=step)
+    arm = TWO.under(DOWN, 0.02)
+    plant = make(arm, Silicone(), dynamics=dynamics, discretisation=discretisation)
+    plant.settle(p)
+    before = plant.tip_pose()
+    plant.advance(duration, p)
+    assert plant.time == pytest.approx(duration)
+    return float(np.abs(plant.tip_pose() - before).max())
+
+
+def test_a_resting_arm_stays():
+    assert drift(120.0, 0.02, "quasi-static") < 1e-6
+    assert drift(10.0, 1e-3, "full") < 1e-6
+
+
+@pytest.mark.long
+def test_a_resting_arm_stays_for_an_hour():
+    assert drift(3600.0, 0.02, "quasi-static") < 1e-6
+    assert drift(600.0, 1e-3, "full") < 1e-6
+
+
+# -- discretisation -------------------------------------------------------------------------
+
+MESHES = [(1, 0, 2), (3, 1, 4), (5, 3, 8)]
+
+
+def test_refining_the_rod_converges():
+    """Error of the elastica, F L^2 / (E I) = 4, with shear and stretch."""
+    force = 4 * beam(FLOP).bending / ONE.length**2
+    x, z, _ = planar_tip(ONE, np.zeros(3), (force, 0))
+    errors = []
+    for bending, shear, pieces in MESHES:
+        mesh = Discretisation(bending_degree=bending, shear_degree=shear, sub_intervals=pieces)
+        T = settled(ONE, load=Load(force=(force, 0, 0)), discretisation=mesh)
+        errors.append(np.hypot(T[0, 3] - x, T[2, 3] - z))
+    assert all(fine < coarse / 10 for coarse, fine in itertools.pairwise(errors))
+    assert errors[1] < 1e-4
+    assert errors[2] < 2e-6
+
+
+def test_refining_a_twisted_arm_under_weight_converges():
+    arm = TWO.under((6, 3, 4), 0.02)
+    p = BAR * np.array([0.5, 0.1, 0.0, 0.0, 0.6, 0.2])
+    expected = loaded_tip(arm, p, steps=8)[:3, 3]
+    errors = []
+    for bending, shear, pieces in MESHES:
+        mesh = Discretisation(bending_degree=bending, shear_degree=shear, sub_intervals=pieces)
+        errors.append(np.linalg.norm(settled(arm, p, discretisation=mesh)[:3, 3] - expected))
+    assert all(fine < coarse / 10 for coarse, fine in itertools.pairwise(errors))
+    assert errors[1] < 5e-5
+    assert errors[2] < 2e-6
+
+
+@pytest.mark.parametrize("arm", [TWO, TWO.under(DOWN, 0.02)], ids=["weightless", "hanging"])
+def test_refining_the_step_converges_with_its_square(arm):
+    """A swing of 2 s, compared every 32 ms."""
+
+    def swing(step: float) -> Any:
+        grid = Discretisation(step=step)
+        plant = make(arm, material(damping=0.1), dynamics="full", discretisation=grid)
+        tips = []
+        for _ in range(64):
+            plant.advance(0.032, BAR * np.array([0.3, 0, 0, 0, 0.2, 0]))
+            tips.append(plant.tip_pose()[:3, 3])
+        return np.array(tips)
+
+    exact = swing(5e-4)
+    errors = [np.abs(swing(step) - exact).max() for step in (8e-3, 4e-3, 2e-3)]
+    assert all(fine < coarse / 3 for coarse, fine in itertools.pairwise(errors))
+    assert errors[-1] < 1e-4
+
+
+def test_dynamics_come_to_rest_where_quasi_statics_are():
+    arm = TWO.under((4, 0, 8), 0.02)
+    p = BAR * np.array([0.6, 0, 0, 0, 0.3, 0])
+    rubber = material(law="yeoh", damping=0.5)
+    full = make(arm, rubber, dynamics="full")
+    full.advance(8.0, p)
+    assert full.tip_pose() == pytest.approx(settled(arm, p, silicone=rubber), abs=1e-5)
+
+
+def test_a_heavy_tube_is_as_heavy_as_its_rest_section():
+    """Compensation factors change stiffness, not weight."""
+
+    def sag(tube: Tube) -> Any:
+        arm = Arm((tube,)).under((9.81, 0, 0))
+        return settled(arm)[:3, 3], loaded_tip(arm, np.zeros(3))[:3, 3]
+
+    for tube in (PLAIN, replace(FLOP, factors=(0.0, 2.0, 1.5))):
+        found, expected = sag(tube)
+        assert found == pytest.approx(expected, abs=2e-5)

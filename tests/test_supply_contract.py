@@ -1,0 +1,104 @@
+"""The contract of pressure supplies, over all of them.
+
+A case is a context manager that yields a `Case`; its function is listed in `CASES`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+import numpy as np
+import pytest
+
+from fake_bench import FakeBench
+
+pytest.register_assert_rewrite("supply_contract")
+
+from stiffopt.rig.interface import PressureLimits  # noqa: E402
+from supply_contract import Case, SupplyContract  # noqa: E402
+
+LIMITS = PressureLimits(np.zeros(3), np.array([1.5e5, 1.2e5, 0.9e5]))
+
+
+@contextmanager
+def modbus(table: str = "input", valve: bool = False) -> Iterator[Case]:
+    from stiffopt.rig.drivers.modbus import ModbusSettings
+    from stiffopt.rig.lab.modbus_peer import ModbusPeer
+
+    settings = ModbusSettings(
+        driver="modbus",
+        tcp={"host": "127.0.0.1", "port": 0},
+        timeout=2.0,
+        scale={"counts": [0, 32767], "pressure": ["0 bar", "10 bar"]},
+        channels=[{"setpoint": 2048 + i, "reading": i} for i in range(3)],
+        table=table,
+        dump_valve={"coil": 5} if valve else None,
+    )
+    bench = FakeBench()
+    peer = ModbusPeer(settings, bench)
+    try:
+        supply = peer.start().device(LIMITS)
+        yield Case(
+            supply,
+            wire=lambda: bench.pressures,
+            tolerance=1e6 / 32767,
+            disturb=lambda: bench.command(1, 5e4),
+            valve_open=(lambda: bench.valve_open) if valve else None,
+        )
+    finally:
+        peer.close()
+
+
+@contextmanager
+def nidaq() -> Iterator[Case]:
+    from stiffopt.rig.drivers.nidaq import NidaqSettings
+    from stiffopt.rig.lab.nidaq_peer import NidaqPeer
+
+    settings = NidaqSettings(
+        driver="nidaq",
+        timeout=5.0,
+        channels=[
+            {
+                "output": {
+                    "channel": f"Dev2/ao{i}",
+                    "pressures": ["0 bar", "3 bar"],
+                    "read_back": f"Dev2/_ao{i}_vs_aognd",
+                },
+                "input": {"channel": f"Dev1/ai{i}", "pressures": ["0 bar", "4 bar"]},
+            }
+            for i in range(3)
+        ],
+        dump_valve={"line": "Dev1/port0/line0"},
+        watchdog=5.0,
+    )
+    bench = FakeBench()
+    peer = NidaqPeer(settings, bench)
+    try:
+        supply = peer.start().device(LIMITS)
+        yield Case(
+            supply,
+            wire=lambda: np.round(bench.pressures, 6),  # volts are not pressures to the last bit
+            disturb=lambda: bench.command(1, 5e4),
+            valve_open=lambda: bench.valve_open,
+        )
+    finally:
+        peer.close()
+
+
+CASES: dict[str, Callable[[], AbstractContextManager[Case]]] = {
+    "modbus": modbus,
+    "modbus-at-once": lambda: modbus(table="holding", valve=True),
+    "nidaq": nidaq,
+}
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> Iterator[Case]:
+    with CASES[request.param]() as made:
+        made.name = request.param
+        yield made
+
+
+class TestSupply(SupplyContract):
+    pass

@@ -1,0 +1,329 @@
+"""The simulated devices: regulators, tracker, probe, faults, and time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stiffopt.errors import CommandError, DeviceError, InputError
+from stiffopt.model.robot_files import load_description
+from stiffopt.rig.config import RigDescription, limits_of
+from stiffopt.rig.simulated.rig import SimulatedRig, simulated_rig
+from stiffopt.rig.simulated.world import FAULTS
+
+ROBOT = load_description("stiff-flop-1")
+SILENT = {"noise": 0.0, "ripple": 0.0, "resolution": 0.0}
+STILL = {"noise": 0.0, "angular_noise": 0.0}
+
+
+def make(
+    supply: dict[str, Any] | None = None,
+    tracker: dict[str, Any] | None = None,
+    probe: dict[str, Any] | None = None,
+    plant: dict[str, Any] | None = None,
+    robot: Any = ROBOT,
+) -> SimulatedRig:
+    description = RigDescription(
+        robot="stiff-flop-1",
+        supply={"driver": "simulated", **SILENT, **(supply or {})},
+        tracker={"driver": "simulated", **STILL, **(tracker or {})},
+        probe={"driver": "simulated", "noise": 0.0, **(probe or {})},
+        plant={"dynamics": "quasi-static", "faults": True, **(plant or {})},
+    )
+    return simulated_rig(description, robot, limits_of(description, robot))
+
+
+def readings(rig: SimulatedRig, duration: float, every: float = 0.001) -> np.ndarray:
+    values = []
+    for _ in range(round(duration / every)):
+        rig.clock.sleep(every)
+        values.append(rig.supply.read().pressures)
+    return np.array(values)
+
+
+# Regulators --------------------------------------------------------------------------------------
+
+
+def test_a_set_point_arrives_after_dead_time_and_lag() -> None:
+    with make({"dead_time": 0.02, "lag": 0.05, "slew": 1e9}) as rig:
+        rig.command([1e5, 0.0, 5e4])
+        p = readings(rig, 0.5)
+        t = 0.001 * np.arange(1, 501)
+        expected = np.where(t > 0.02, 1 - np.exp(-(t - 0.02) / 0.05), 0.0)
+        np.testing.assert_allclose(p[:, 0] / 1e5, expected, atol=1e-9)
+        np.testing.assert_allclose(p[:, 2] / 5e4, expected, atol=1e-9)
+        assert not p[:, 1].any()
+
+
+def test_slew_and_saturation() -> None:
+    with make({"dead_time": 0.0, "lag": 0.0, "slew": 2e5, "saturation": 8e4}) as rig:
+        rig.command([1.2e5, 0, 0])
+        p = readings(rig, 0.6)[:, 0]
+        assert np.diff(p).max() == pytest.approx(200.0)
+        assert p.max() == pytest.approx(8e4)
+        rig.vent()
+        assert np.diff(readings(rig, 0.1)[:, 0]).min() == pytest.approx(-200.0)
+
+
+def test_a_leak_lowers_the_pressure_that_a_regulator_holds() -> None:
+    with make({"lag": 0.06, "leak": 0.6, "slew": 1e9}) as rig:
+        rig.command([1e5, 0, 0])
+        rig.clock.sleep(3)
+        # (wanted - p) / lag = p / leak
+        assert rig.supply.read().pressures[0] == pytest.approx(1e5 / 1.1, rel=0.01)
+
+
+def test_readings_are_rounded_and_noisy() -> None:
+    with make({"noise": 150.0, "resolution": 50.0, "lag": 0.0}) as rig:
+        rig.command([1e5, 1e5, 1e5])
+        rig.clock.sleep(1)
+        p = np.array([rig.supply.read().pressures for _ in range(2000)])
+        assert (p % 50 == 0).all()
+        assert p.std(axis=0) == pytest.approx(150, rel=0.1)
+        assert p.mean(axis=0) == pytest.approx(1e5, abs=20)
+
+
+def test_the_watchdog_vents_when_commands_stop() -> None:
+    with make({"watchdog": 0.2, "lag": 0.01, "slew": 1e9, "dead_time": 0.0}) as rig:
+        for _ in range(10):
+            rig.command([1e5, 0, 0])
+            rig.clock.sleep(0.1)
+        assert rig.supply.read().pressures[0] == pytest.approx(1e5, rel=1e-3)
+        rig.clock.sleep(0.15)
+        assert rig.supply.read().pressures[0] < 1e5 * np.exp(-4)
+        rig.clock.sleep(0.2)
+        assert rig.supply.read().pressures[0] < 1e-3
+
+
+def test_a_dump_valve_empties_what_a_stuck_regulator_holds() -> None:
+    with make({"dump_valve": True}) as rig:
+        with pytest.raises(CommandError, match="arm the supply"):
+            rig.command([1e5, 0, 0])
+        rig.supply.arm()
+        rig.command([1e5, 0, 0])
+        rig.clock.sleep(1)
+        rig.world.inject("supply", "high", 0)
+        rig.clock.sleep(1)
+        rig.command([0, 0, 0])
+        rig.clock.sleep(1)
+        assert rig.supply.read().pressures[0] == pytest.approx(1.5e5, rel=0.01)
+        rig.vent()
+        rig.clock.sleep(0.3)
+        assert rig.world.pressures[0] < 1
+
+
+# Tracker -----------------------------------------------------------------------------------------
+
+
+def test_frames_come_at_their_rate_and_late() -> None:
+    with make(tracker={"rate": 40.0, "latency": 0.03}) as rig:
+        seen: list[Any] = []
+        for _ in range(100):
+            rig.clock.sleep(0.01)
+            seen += rig.tracker.read()  # type: ignore[union-attr]
+        assert [s.frame for s in seen] == list(range(1, len(seen) + 1))
+        assert len(seen) == 38  # 40 were captured, of which two are on their way
+        assert np.diff([s.time for s in seen]) == pytest.approx(0.025)
+        assert all(s.received - s.time == pytest.approx(0.03) for s in seen)
+
+
+def test_a_sample_is_where_the_tip_was_when_it_was_captured() -> None:
+    turned = {"position": (0.1, -0.2, 0.3), "orientation": (0.5, -0.5, 0.5, 0.5)}
+    sensor = {"position": (0.0, 0.002, -0.005), "orientation": (0.6, 0.0, 0.8, 0.0)}
+    registration = {"tracker_in_base": turned, "tip_in_sensor": sensor}
+    with make(tracker={"registration": registration, "latency": 0.04}) as rig:
+        true = {}
+        rig.command([1e5, 0.5e5, 0])
+        for step in range(1, 400):
+            rig.clock.sleep(0.001)
+            true[step] = rig.world.plant.tip_pose()
+        for sample in rig.tracker.read():  # type: ignore[union-attr]
+            T = true[round(sample.time * 1000)]
+            np.testing.assert_allclose(sample.position, T[:3, 3], atol=1e-12)
+            w, v = sample.quaternion[0], sample.quaternion[1:]
+            assert w >= 0
+            assert np.cos(2 * np.arccos(w)) == pytest.approx((np.trace(T[:3, :3]) - 1) / 2)
+            np.testing.assert_allclose(T[:3, :3] @ v, v, atol=1e-9)  # the axis stays
+
+
+def test_noise_dropouts_missing_frames_and_flips_have_their_shares() -> None:
+    settings = {"noise": 5e-5, "dropouts": 0.1, "missing": 0.2, "rate": 200.0}
+    with make(tracker=settings) as rig:
+        rig.clock.sleep(20)
+        samples = rig.tracker.read()  # type: ignore[union-attr]
+        assert len(samples) == pytest.approx(0.8 * 4000, rel=0.05)
+        seen = [s.position for s in samples if s.visible]
+        assert len(seen) == pytest.approx(0.9 * len(samples), rel=0.05)
+        assert np.std(seen, axis=0) == pytest.approx(5e-5, rel=0.1)
+
+
+def test_a_wrong_registration_moves_what_is_seen_but_not_the_arm() -> None:
+    off = {"registration": {"position": (0.001, 0.0, 0.0)}}
+    with make(plant={"mismatch": off}) as rig:
+        rig.clock.sleep(0.1)
+        sample = rig.tracker.latest  # type: ignore[union-attr]
+        assert sample is not None
+        np.testing.assert_allclose(sample.position, [-0.001, 0, 0.09], atol=1e-9)
+
+
+# Probe -------------------------------------------------------------------------------------------
+
+
+def test_the_plate_feels_the_arm_in_series_with_the_contact() -> None:
+    linear = {"silicone": {"law": "linear", "creep": (), "hysteresis": ()}}
+    with make(probe={"stiffness": 50.0, "clearance": 0.0005}, plant=linear) as rig:
+        probe = rig.probe
+        assert probe is not None
+        probe.align([1, 0, 0])
+        assert probe.sample().force == pytest.approx(0, abs=1e-6)
+        forces = []
+        for position in (0.0004, 0.0010, 0.0015):
+            probe.move_to(position, 0.01)
+            rig.clock.sleep(5)
+            forces.append(probe.sample().force)
+        E, length, inertia, area = 1e5, 0.09, 1.05 * 3.445e-8, 1.2 * 547.8e-6
+        arm = 1 / (length**3 / (3 * E * inertia) + length / (E / 3 * area))  # bending and shear
+        series = 1 / (1 / arm + 1 / 50.0)
+        assert forces[0] == pytest.approx(0, abs=1e-4)
+        assert forces[1:] == pytest.approx([series * 0.0005, series * 0.0010], rel=5e-3)
+        moved = rig.world.plant.tip_pose()[0, 3]
+        assert moved == pytest.approx(forces[-1] / arm, rel=5e-3)
+
+
+def test_a_stage_moves_at_its_speed_and_stops() -> None:
+    with make(probe={"speed": 0.02}) as rig:
+        probe = rig.probe
+        assert probe is not None
+        probe.align([0, 1, 0])
+        begin = rig.clock.now()
+        probe.move_to(0.004, 0.5)  # faster than it can
+        assert rig.clock.now() - begin == pytest.approx(0.2, abs=0.011)
+        assert probe.sample().position == 0.004
+        with pytest.raises(CommandError, match="finite"):
+            probe.move_to(float("nan"), 0.01)
+        with pytest.raises(CommandError, match="direction"):
+            probe.align([0, 0, 0])
+
+
+# Faults ------------------------------------------------------------------------------------------
+
+
+def test_faults_need_leave() -> None:
+    with make(plant={"faults": False}) as rig, pytest.raises(InputError, match="faults: true"):
+        rig.world.inject("tracker", "off")
+
+
+@pytest.mark.parametrize(
+    ("device", "fault", "channel"),
+    [
+        ("tracker", "on fire", None),
+        ("door", "off", None),
+        ("supply", "off", 7),
+        ("probe", "off", 0),
+    ],
+)
+def test_unknown_faults_are_refused(device: str, fault: str, channel: int | None) -> None:
+    with make() as rig, pytest.raises(InputError, match="there is no"):
+        rig.world.inject(device, fault, channel)
+
+
+def test_each_fault_does_what_it_says_and_goes_away() -> None:
+    assert set(FAULTS) == {"supply", "tracker", "probe"}
+    with make({"lag": 0.01, "slew": 1e9}) as rig:
+        world, tracker = rig.world, rig.tracker
+        assert tracker is not None
+
+        def settled(pressures: Any) -> np.ndarray:
+            rig.command(pressures)
+            rig.clock.sleep(1)
+            return rig.supply.read().pressures
+
+        settled([5e4, 5e4, 5e4])
+        world.inject("supply", "off")
+        with pytest.raises(DeviceError, match="does not answer"):
+            rig.supply.read()
+        world.inject("supply", "ok")
+        world.inject("supply", "stuck", 1)
+        assert settled([1e5, 1e5, 1e5]) == pytest.approx([1e5, 5e4, 1e5])
+        world.inject("supply", "ok", 1)
+        assert settled([1e5, 1e5, 1e5]) == pytest.approx([1e5] * 3)
+        world.inject("supply", "wrong", 2)
+        assert abs(settled([1e5] * 3) - 1e5) == pytest.approx([0, 0, 1e4], abs=1)
+        world.inject("supply", "ok", 2)
+        world.inject("supply", "leak", 0)
+        assert settled([1e5] * 3)[0] < 0.99e5
+        world.inject("supply", "garbage")
+        values = np.array([settled([1e5] * 3) for _ in range(4)])
+        assert (np.isnan(values) | (values > 1e9)).all()
+        world.inject("supply", "slow")
+        before = world.pressures.copy()
+        rig.vent()
+        rig.clock.sleep(0.1)
+        assert (world.pressures > 0.7 * before).all()
+        world.inject("supply", "ok")
+
+        def samples(fault: str) -> Any:
+            world.inject("tracker", fault)
+            rig.clock.sleep(0.3)
+            tracker.read()
+            rig.clock.sleep(1.0)
+            return tracker.read()
+
+        assert len(samples("ok")) == 40
+        assert samples("off") == ()
+        assert not any(s.visible for s in samples("missing"))
+        assert not any(s.visible for s in samples("garbage"))
+        assert len({s.frame for s in samples("stuck")}) == 1
+        good = samples("ok")[-1]
+        assert np.linalg.norm(samples("wrong")[-1].position - good.position) > 0.01
+        assert all(s.quaternion[0] >= 0 for s in samples("flip"))
+        assert all(s.received - s.time > 0.5 for s in samples("slow"))
+
+
+# Time --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dynamics", ["full", "quasi-static"])
+def test_the_world_is_the_same_in_large_and_small_steps(dynamics: str) -> None:
+    noisy = {"noise": 100.0, "ripple": 100.0, "resolution": 10.0}
+    ends = []
+    for every in (0.5, 0.05, 0.003):
+        with make(noisy, {"noise": 1e-4}, plant={"dynamics": dynamics, "seed": 5}) as rig:
+            probe = rig.probe
+            assert probe is not None
+            rig.command([4e4, 1e5, 0])
+            rig.clock.sleep_until(0.3)
+            probe.align([1, 0, 0])
+            rig.world.move_stage(0.004, 0.01)
+            while rig.clock.now() < 1.0:
+                rig.clock.sleep_until(min(1.0, rig.clock.now() + every))
+            ends.append((rig.world.plant.tip_pose(), rig.tracker.latest, rig.world.force()))  # type: ignore[union-attr]
+    for tip, sample, force in ends[1:]:
+        np.testing.assert_allclose(tip, ends[0][0], atol=1e-9)
+        np.testing.assert_allclose(sample.position, ends[0][1].position, atol=1e-9)
+        assert force == pytest.approx(ends[0][2], abs=1e-5)
+
+
+def test_seeds_decide() -> None:
+    def tip(seed: int) -> np.ndarray:
+        with make({"ripple": 500.0}, plant={"seed": seed, "spread": {}}) as rig:
+            rig.command([1e5, 0, 0])
+            rig.clock.sleep(0.5)
+            return np.asarray(rig.world.plant.tip_pose()[:3, 3])
+
+    assert (tip(3) == tip(3)).all()
+    assert np.linalg.norm(tip(3) - tip(4)) > 1e-4
+
+
+def test_real_time_passes_by_itself() -> None:
+    description = RigDescription(robot="stiff-flop-1", supply={"driver": "simulated"})
+    rig = simulated_rig(description, ROBOT, limits_of(description, ROBOT), real_time=True)
+    with rig:
+        rig.command([5e4, 0, 0])
+        begin = rig.clock.now()
+        rig.clock.sleep(0.3)
+        assert rig.clock.now() - begin >= 0.3
+        assert rig.supply.read().pressures[0] > 2e4
+        assert rig.world.time <= rig.clock.now() + 0.01
