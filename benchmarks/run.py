@@ -21,7 +21,17 @@ import environment
 import plots
 import report
 from results import Section
-from sections import full_task, growth, kinds, kinematics, pose, processes, statics, throughput
+from sections import (
+    full_task,
+    growth,
+    kinds,
+    kinematics,
+    pose,
+    processes,
+    simulator,
+    statics,
+    throughput,
+)
 from settings import Settings, quick
 
 HERE = Path(__file__).resolve().parent
@@ -47,6 +57,7 @@ def plan(sizes: Settings, done: dict[str, Section]) -> dict[str, Callable[[], Se
         "evaluations": lambda: kinematics.section(sizes),
         "pose": lambda: pose.section(sizes),
         "statics": lambda: statics.section(sizes),
+        "simulator": lambda: simulator.section(sizes),
         "segments": growth_with_segments,
         "starts": lambda: growth.with_starts(sizes),
     }

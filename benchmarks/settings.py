@@ -62,5 +62,6 @@ SHARE_BEST = {1: 0.99, 2: 0.99, 3: 0.98}
 KIND_FACTOR, LOADED_FACTOR = 3.0, 10.0
 COMPILE_SECONDS = 3.0  # three segments
 COMMAND_SECONDS = 0.8
+TIMES_REAL_TIME = 10.0  # of the simulated arm, two segments, full dynamics
 BATCH_SOLVES = 1500.0  # per second, two segments
 BATCH_POSES, BATCH_STIFFNESSES = 1.5e6, 0.5e6  # per second, two segments

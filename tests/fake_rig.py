@@ -56,6 +56,8 @@ class FakeWorld(Clock):
         self.plate = 0.0
         self.alignments: list[tuple[Array, Array]] = []
         self.seen = True
+        self.swept = 0
+        """How often the pressure changed while the probe was in the arm's way."""
         self.at: list[tuple[float, Callable[[], None]]] = []
         """What happens when: moments, in s from the start, and what to call then."""
 
@@ -106,6 +108,8 @@ class FakeSupply(PressureSupply):
         self.on_write()
         if self.dead:
             raise DeviceError("the supply does not answer")
+        if self.world.axis is not None and not np.array_equal(pressures, self.world.commanded):
+            self.world.swept += 1
         self.world.commanded = pressures.copy()
         self.world.writes.append((self.world.t, pressures.copy()))
 

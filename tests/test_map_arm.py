@@ -133,7 +133,7 @@ def test_the_command_prints_draws_and_writes(
     assert "13.91" in said.out  # along x at 1 bar
     assert not said.err
     assert plot.read_bytes().startswith(b"\x89PNG")
-    rows = list(csv.DictReader(table.open(encoding="utf-8")))
+    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
     assert len(rows) == 2 * 2 * 5
     tip = next(r for r in rows if r["channels"] == "1" and r["pressure_pa"] == "100000"
                and r["at_m"] == "0.09")  # fmt: skip

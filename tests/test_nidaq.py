@@ -18,7 +18,8 @@ from pydantic import ValidationError
 
 from fake_bench import FakeBench
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
-from stiffopt.rig.drivers import daqmx
+from stiffopt.rig.drivers.daqmx import Daqmx
+from stiffopt.rig.drivers.daqmx_tasks import AnalogueInput, InputChannel, Watchdog
 from stiffopt.rig.drivers.nidaq import NidaqSettings, NidaqSupply
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.lab.daq_server import DaqHardware, DaqServer
@@ -301,8 +302,8 @@ def test_the_watchdog_acts_when_the_connection_is_lost(started: Any, bench: Fake
 
 def test_a_watchdog_that_has_expired_before_is_cleared(started: Any, bench: FakeBench) -> None:
     supply = started(dump_valve=VALVE, watchdog=5.0)
-    lost = daqmx.Daqmx(supply._settings.grpc, 1.0, "nidaq")  # a program that died on the job
-    watchdog = daqmx.Watchdog(lost, VALVE["line"], 0.02, high=False)
+    lost = Daqmx(supply._settings.grpc, 1.0, "nidaq")  # a program that died on the job
+    watchdog = Watchdog(lost, VALVE["line"], 0.02, high=False)
     watchdog.start()
     assert wait_for(lambda: bench.valve_open)
     watchdog.close()
@@ -417,12 +418,12 @@ def test_a_device_that_is_taken(started: Any) -> None:
 
 
 def test_inputs_are_shared_where_the_rig_file_says_so(started: Any, bench: FakeBench) -> None:
-    other = [daqmx.InputChannel("Dev1/ai1", "rse", -10.0, 10.0)]
+    other = [InputChannel("Dev1/ai1", "rse", -10.0, 10.0)]
     for shared in (True, False):
         with started(share_inputs=shared, timeout=0.2) as supply:
             supply.command([1e5, 0.6e5])
-            daq = daqmx.Daqmx(supply._settings.grpc, 0.2, "nidaq")
-            sensor = daqmx.AnalogueInput(daq, other, shared=True)
+            daq = Daqmx(supply._settings.grpc, 0.2, "nidaq")
+            sensor = AnalogueInput(daq, other, shared=True)
             if shared:
                 for _ in range(5):
                     assert sensor.read()[0] == pytest.approx(2.3)  # 0.5 V + 9 V * 0.6 / 3

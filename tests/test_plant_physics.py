@@ -253,18 +253,18 @@ def test_hyperelastic_stretch(law, stress):
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean", "yeoh"])
 def test_hyperelastic_bending(law):
-    """A moment that bends a segment by about 80 degrees: within 1 % of length.
+    """A moment that bends a segment by about a right angle.
 
     The reference integrates over all fibres of the section; the plant has a few.
     """
     arm, moment = Arm((PLAIN,)), 0.06
-    strain, curvature = fibre_bending(PLAIN, law, 0.1, (0.0, moment))
-    rubber = material(law=law, stiffening=0.1)
+    strain, curvature = fibre_bending(PLAIN, law, 0.3, (0.0, moment))
+    rubber = material(law=law, stiffening=0.3)
     T = settled(arm, load=Load(moment=(0, moment, 0)), silicone=rubber)
     angle, radius = curvature * arm.length, (1 + strain) / curvature
     expected = [radius * (1 - np.cos(angle)), 0, radius * np.sin(angle)]
-    assert angle > 1.3
-    assert np.linalg.norm(T[:3, 3] - expected) < (1e-6 if law == "linear" else 9e-4)
+    assert angle > 1.4
+    assert np.linalg.norm(T[:3, 3] - expected) < (1e-6 if law == "linear" else 1e-4)
 
 
 # -- vibration ------------------------------------------------------------------------------
@@ -307,6 +307,7 @@ def released(
 ) -> tuple[Any, Any]:
     """Times and the tip's motion along an axis after a pull is let go, every so many s."""
     zero = np.zeros(plant.robot.n_pressures)
+    plant.settle(zero, Load())
     rest = plant.tip_pose()[axis, 3]
     plant.settle(zero, Load(force=force))
     plant.set_load(None)
@@ -359,7 +360,7 @@ def test_free_decay(damping, step):
     assert plant.modes(2)[1] == pytest.approx([damping] * 2, rel=1e-3)
     tops = peaks(released(plant, (0.01, 0, 0), 2.5, axis=0, sample=5e-3)[1])[1:]
     decrement = np.log(tops[0] / tops[-1]) / (len(tops) - 1)
-    assert decrement / np.hypot(2 * np.pi, decrement) == pytest.approx(damping, rel=0.03)
+    assert decrement / np.hypot(2 * np.pi, decrement) == pytest.approx(damping, rel=0.01)
 
 
 @pytest.mark.parametrize("step", [2e-3, 1e-3])
@@ -398,12 +399,12 @@ def test_energy_balance_improves_with_the_square_of_the_step(law):
     errors = [disbalance(rubber, step, BALANCED) for step in (4e-3, 2e-3, 1e-3)]
     for (coarse, _), (fine, lost) in itertools.pairwise(errors):
         assert fine < coarse / 3
-        assert fine < 0.01 * lost
+        assert fine < 1e-3 * lost
 
 
 def test_energy_balance_with_all_that_silicone_does():
     error, lost = disbalance(Silicone(), 1e-3, BALANCED)
-    assert error < 0.01 * lost
+    assert error < 1e-3 * lost
 
 
 def test_weight_and_pressure_have_the_energies_of_textbooks():
@@ -450,7 +451,7 @@ def test_the_built_in_hanging_arm_rings_as_measured():
     assert damping[0] == pytest.approx(0.04, abs=0.01)
     tops = peaks(released(linear, (0.02, 0, 0), 4.0, axis=0, sample=5e-3)[1])[1:]
     decrement = np.log(tops[0] / tops[-1]) / (len(tops) - 1)
-    assert decrement / (2 * np.pi) == pytest.approx(ratio, rel=0.05)
+    assert decrement / np.hypot(2 * np.pi, decrement) == pytest.approx(ratio, rel=0.01)
 
 
 # -- history --------------------------------------------------------------------------------

@@ -86,10 +86,32 @@ def nidaq() -> Iterator[Case]:
         peer.close()
 
 
+@contextmanager
+def simulated(valve: bool = False) -> Iterator[Case]:
+    from stiffopt.model.robot_files import load_description
+    from stiffopt.rig.config import RigDescription
+    from stiffopt.rig.simulated.rig import simulated_rig
+
+    description = RigDescription(
+        robot="stiff-flop-1",
+        supply={"driver": "simulated", "resolution": 0.0, "dump_valve": valve},
+        plant={"dynamics": "quasi-static"},
+    )
+    rig = simulated_rig(description, load_description("stiff-flop-1"), LIMITS)
+    yield Case(
+        rig.supply,
+        wire=lambda: rig.world.set_point,
+        disturb=lambda: rig.world.command_channel(1, 5e4),
+        valve_open=(lambda: rig.world.valve_open) if valve else None,
+    )
+
+
 CASES: dict[str, Callable[[], AbstractContextManager[Case]]] = {
     "modbus": modbus,
     "modbus-at-once": lambda: modbus(table="holding", valve=True),
     "nidaq": nidaq,
+    "simulated": simulated,
+    "simulated-with-valve": lambda: simulated(valve=True),
 }
 
 

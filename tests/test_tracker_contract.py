@@ -8,14 +8,19 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from fake_bench import FakeBench
+from stiffopt.model.robot_files import load_description
+from stiffopt.rig.config import RigDescription, limits_of
 from stiffopt.rig.drivers.aurora import AuroraSettings
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.interface import PoseTracker
 from stiffopt.rig.lab.aurora_peer import AuroraPeer
 from stiffopt.rig.lab.openigtlink_peer import OpenIGTLinkPeer
 from stiffopt.rig.registration import Registration
+from stiffopt.rig.simulated.rig import simulated_rig
+from stiffopt.rig.simulated.world import World
 from tracker_contract import CHECKS, PLACE, TURN, Control, Factory
 
 
@@ -74,7 +79,51 @@ def openigtlink(registration: Registration) -> Iterator[tuple[PoseTracker, Contr
         peer.close()
 
 
-@pytest.mark.parametrize("factory", [aurora, openigtlink])
+class WorldControl:
+    """What the sensor in a simulated world does."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.show((0.01, -0.02, -0.15), (1.0, 0.0, 0.0, 0.0))
+
+    def show(self, position: ArrayLike, quaternion: ArrayLike) -> None:
+        w, x, y, z = np.asarray(quaternion, dtype=float)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), position
+        self.world._as_tracked = lambda noise: T  # type: ignore[method-assign]
+        self.world.inject("tracker", "flip" if w < 0 else "ok")
+
+    def drop(self) -> None:
+        self.world.inject("tracker", "missing")
+
+    def spoil(self) -> None:
+        self.world.inject("tracker", "garbage")
+
+    def freeze(self) -> None:
+        self.world.inject("tracker", "stuck")
+
+    def silence(self) -> None:
+        self.world.inject("tracker", "off")
+
+    def resume(self) -> None:
+        self.world.inject("tracker", "ok")
+
+
+@contextmanager
+def simulated(registration: Registration) -> Iterator[tuple[PoseTracker, Control]]:
+    description = RigDescription(
+        robot="stiff-flop-1",
+        supply={"driver": "simulated"},
+        tracker={"driver": "simulated", "registration": registration},
+        plant={"faults": True, "dynamics": "quasi-static"},
+    )
+    robot = load_description("stiff-flop-1")
+    rig = simulated_rig(description, robot, limits_of(description, robot))
+    assert rig.tracker is not None
+    yield rig.tracker, WorldControl(rig.world)
+
+
+@pytest.mark.parametrize("factory", [aurora, openigtlink, simulated])
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__.removeprefix("check_"))
 def test_contract(check: Callable[[Factory], None], factory: Factory) -> None:
     check(factory)

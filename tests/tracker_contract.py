@@ -73,7 +73,7 @@ def drain(tracker: PoseTracker) -> None:
     tracker.read()
 
 
-def nothing_seen(tracker: PoseTracker, duration: float = 0.3) -> None:
+def nothing_seen(tracker: PoseTracker, duration: float = 0.2) -> None:
     """Check that the tracker knows for a while that it sees nothing, and never blocks."""
     drain(tracker)
     age = tracker.age()
@@ -200,7 +200,7 @@ def check_silence_shows_only_as_age(factory: Factory) -> None:
     with factory(Registration()) as (tracker, control), tracker:
         collect(tracker, 2)
         control.silence()
-        nothing_seen(tracker, 0.8)
+        nothing_seen(tracker, 0.5)
         assert tracker.read() == ()
         control.resume()
         assert collect(tracker, 1, patience=10)[0].visible
@@ -238,7 +238,7 @@ def check_life_cycle(factory: Factory) -> None:
             with pytest.raises(DeviceError, match="not open"):
                 tracker.read()
             assert threading.active_count() == threads
-            tracker.clock.sleep(0.6)
+            tracker.clock.sleep(0.55)
 
 
 CHECKS = [check for name, check in dict(globals()).items() if name.startswith("check_")]

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from stiffopt.errors import (
+        CommandError,
+        DeviceError,
         EquilibriumError,
         FileError,
         InputError,
@@ -32,12 +34,16 @@ if TYPE_CHECKING:
     from stiffopt.optimise.solver import PressureSolver, solve_batch, solve_pressure
     from stiffopt.optimise.target import Target, Tolerance
     from stiffopt.optimise.task import Load, Task, load_task
+    from stiffopt.rig.config import open_rig
+    from stiffopt.rig.interface import Observation, PoseSample, PressureCommand, Rig
     from stiffopt.workspace import WorkspaceMap, map_workspace, open_workspace_map
 
 __version__ = "0.1.0"
 
 __all__ = [
     "AtLeast",
+    "CommandError",
+    "DeviceError",
     "EquilibriumError",
     "FileError",
     "InputError",
@@ -46,9 +52,13 @@ __all__ = [
     "MatchMatrix",
     "MatchValue",
     "MissingExtraError",
+    "Observation",
+    "PoseSample",
+    "PressureCommand",
     "PressureError",
     "PressureSolution",
     "PressureSolver",
+    "Rig",
     "RobotDescription",
     "SlowWarning",
     "StiffnessGoal",
@@ -65,6 +75,7 @@ __all__ = [
     "load_robot",
     "load_task",
     "map_workspace",
+    "open_rig",
     "open_workspace_map",
     "pareto_front",
     "solve_batch",
@@ -75,8 +86,8 @@ __all__ = [
 # second, for which neither `--help` nor a wrong option should wait.
 _NAMES = {
     "stiffopt.errors": (
-        *("EquilibriumError", "FileError", "InputError", "MissingExtraError"),
-        *("PressureError", "SlowWarning", "StiffoptError"),
+        *("CommandError", "DeviceError", "EquilibriumError", "FileError"),
+        *("InputError", "MissingExtraError", "PressureError", "SlowWarning", "StiffoptError"),
     ),
     "stiffopt.model.description": ("RobotDescription",),
     "stiffopt.model.manipulator": ("Manipulator", "load_robot"),
@@ -90,6 +101,8 @@ _NAMES = {
     "stiffopt.optimise.solver": ("PressureSolver", "solve_batch", "solve_pressure"),
     "stiffopt.optimise.target": ("Target", "Tolerance"),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
+    "stiffopt.rig.config": ("open_rig",),
+    "stiffopt.rig.interface": ("Observation", "PoseSample", "PressureCommand", "Rig"),
     "stiffopt.workspace": ("WorkspaceMap", "map_workspace", "open_workspace_map"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}

@@ -46,7 +46,7 @@ def kinematics_facts(
                 f"each of {settings.channels} channels to {peaks} bar, {result.time[-1]:.0f} s",
             ),
             ("recordings", f"{result.repetitions}, {len(result.errors):,} samples compared"),
-            ("repetitions", f"differ by {result.repeatability * _MM:.2f} mm in the mean"),
+            *_spread(result),
         ),
         heading=("tip error", "mm", "% of length"),
         rows=(
@@ -56,6 +56,12 @@ def kinematics_facts(
         ),
         remark="distance of the model's tip from the measured one, at the measured pressures",
     )
+
+
+def _spread(result: KinematicsResult) -> tuple[tuple[str, str], ...]:
+    if result.repetitions < 2:
+        return ()
+    return (("repetitions", f"differ by {result.repeatability * _MM:.2f} mm in the mean"),)
 
 
 def stiffness_facts(result: StiffnessResult, model: Manipulator) -> Facts:

@@ -11,6 +11,7 @@ from stiffopt.cli import experiment_report, quantities
 from stiffopt.cli.console import report_error, report_note, show, warnings_as_notes
 from stiffopt.cli.exits import BAD_INPUT, FAULT, INTERRUPTED, SOLVED
 from stiffopt.cli.experiment_display import Display
+from stiffopt.cli.interrupts import Interruptible
 from stiffopt.cli.stopping import Stopping
 from stiffopt.errors import DeviceError, FileError, InputError, StiffoptError
 from stiffopt.experiments import (
@@ -69,7 +70,8 @@ class _Plan:
 def run(experiment: str, options: Options) -> int:
     """Do an experiment, or go on with it; report and draw; return the exit code."""
     try:
-        plan = _planned(experiment, options)
+        with Interruptible():
+            plan = _planned(experiment, options)
     except KeyboardInterrupt:
         return INTERRUPTED
     except StiffoptError as error:
@@ -78,7 +80,8 @@ def run(experiment: str, options: Options) -> int:
     try:
         with warnings_as_notes(quiet=options.quiet):
             _do(plan, options)
-            _tell(plan, options)
+            with Interruptible():
+                _tell(plan, options)
     except KeyboardInterrupt:
         _say_where(experiment, plan, options)
         return INTERRUPTED

@@ -38,6 +38,7 @@ class ArmMap:
     stiffness : (G, P, S, d), in N/m.
     positions : of the points in the base frame (G, P, S, 3), in m.
     backbones : shapes of the arm (G, P, B, 3), from its base, in m.
+    hangs : whether z points down.
     """
 
     robot: str
@@ -51,6 +52,7 @@ class ArmMap:
     stiffness: Array
     positions: Array
     backbones: Array
+    hangs: bool
 
     @property
     def middle(self) -> int:
@@ -166,6 +168,7 @@ def map_arm(
         stiffness=np.stack(found, axis=1).reshape(*shape, len(at), len(table)),
         positions=np.stack(positions, axis=1).reshape(*shape, len(at), 3),
         backbones=robot.backbone(batch, 41)[..., :3, 3].reshape(*shape, 41, 3),
+        hangs=robot.description.gravity[2] > 0,
     )
 
 

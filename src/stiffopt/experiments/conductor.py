@@ -26,6 +26,8 @@ _FIRST = 5.0  # s that a tracker may take to see the tip for the first time
 _LONGEST_STEP = 0.1  # s; a loop that was held up does not catch up with a jump
 _LOOK = 0.1  # s between two looks at whether something has settled
 _KEPT = 4096  # rows and moments
+_RECENT = 200  # moments among which that of a frame is looked for
+_NEAR = 0.1  # s between a frame and readings that belong to it
 _STEEPEST = 1e12  # Pa/s, in place of no limit
 
 
@@ -170,7 +172,7 @@ class Conductor:
         """Put a frame together with what held when it was captured."""
         if self.rows and sample.time <= self.rows[-1].time:
             return  # a frame that came twice
-        held, nearest = self._moment(sample.time)
+        held, nearest = self._moments_at(sample.time)
         row = Row(
             time=sample.time,
             position=sample.position,
@@ -184,19 +186,22 @@ class Conductor:
         if self.sink is not None:
             self.sink(row)
 
-    def _moment(self, time: float) -> tuple[_Moment, _Moment]:
-        """Return the moments whose command held at a time, and whose readings are nearest."""
-        recent = [self._moments[-k] for k in range(min(len(self._moments), 200), 0, -1)]
-        after = bisect_right([moment.time for moment in recent], time)
-        held = recent[max(after - 1, 0)]
-        return held, min(recent[max(after - 1, 0) : after + 1], key=lambda m: abs(m.time - time))
+    def _moments_at(self, time: float) -> tuple[_Moment, _Moment]:
+        """Return the moment whose command held at a time, and that with the nearest readings."""
+        recent = [self._moments[-k] for k in range(min(len(self._moments), _RECENT), 0, -1)]
+        after = bisect_right(recent, time, key=lambda moment: moment.time)
+        around = recent[max(after - 1, 0) : after + 1]
+        nearest = min(around, key=lambda moment: abs(moment.time - time))
+        if abs(nearest.time - time) > _NEAR:
+            nearest = _Moment(time, nearest.commanded, np.full(self.n, np.nan), np.nan, np.nan)
+        return around[0], nearest
 
     # -- longer manoeuvres ------------------------------------------------------------------
 
     def ramp(self, target: ArrayLike, slew: float = GENTLE) -> None:
         """Bring the pressures (n,) somewhere; from what is measured, should they have fallen."""
         target = self.rig.supply.limits.clamp(np.asarray(target, dtype=float))
-        measured = self._moments[-1].measured if self._moments else self._setpoint
+        measured = self.rig.supply.read().pressures
         fallen = np.isfinite(measured) & (measured < self._setpoint - 0.1e5)
         self._setpoint = np.where(fallen, np.maximum(measured, 0.0), self._setpoint)
         while not np.array_equal(self._setpoint, target):

@@ -18,7 +18,7 @@ __all__ = ["KinematicsResult", "evaluate_kinematics"]
 
 _GRID = 0.05  # s
 _GAP = 0.3  # s; nothing is drawn across a gap that is longer
-_MOST_LOADED = 400  # rows of a recording that are evaluated where each is an equilibrium
+_EVERY = 2  # points of the grid at which a loaded arm is evaluated
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,8 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
     """Compare recordings of the same pressures with a model.
 
     The model is given the measured pressures, where they were measured: what is judged is the
-    arm's model and not the regulators.
+    arm's model and not the regulators. An arm under gravity is given their mean over the
+    repetitions.
 
     Raises
     ------
@@ -96,7 +97,9 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
         )
     end = min(float(log.time[-1]) for log in logs)
     grid = np.arange(0.0, end + _GRID / 2, _GRID)
-    each = [_compared(log, model, grid) for log in logs]
+    pressures = np.mean([_on_grid(grid, log.time, log.pressures, np.inf) for log in logs], axis=0)
+    tip = _tip_of_all(model, grid, pressures) if model.is_loaded else None
+    each = [_compared(log, model, grid, tip) for log in logs]
     tips = np.stack([one.tip for one in each])
     models = np.stack([one.model for one in each])
     with np.errstate(invalid="ignore"):
@@ -104,7 +107,7 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
     return KinematicsResult(
         repetitions=len(logs),
         time=grid,
-        pressures=np.mean([one.pressures for one in each], axis=0),
+        pressures=pressures,
         low=np.fmin.reduce(tips),
         high=np.fmax.reduce(tips),
         model=models.mean(axis=0),
@@ -121,22 +124,27 @@ class _Compared:
 
     tip: Array
     model: Array
-    pressures: Array
     errors: Array
 
 
-def _compared(log: Log, model: Manipulator, grid: Array) -> _Compared:
+def _compared(log: Log, model: Manipulator, grid: Array, of_all: Array | None) -> _Compared:
     seen = np.isfinite(log.tip_position).all(axis=1)
-    time, tip, p = log.time[seen], log.tip_position[seen], log.pressures[seen]
-    stride = max(1, -(-len(time) // _MOST_LOADED)) if model.is_loaded else 1
-    at = model.tip_pose(p[::stride])[:, :3, 3]
-    errors = np.linalg.norm(at - tip[::stride], axis=1)
+    time, tip = log.time[seen], log.tip_position[seen]
+    if of_all is None:
+        expected = model.tip_pose(log.pressures[seen])[:, :3, 3]
+    else:
+        expected = _on_grid(time, grid, of_all, np.inf)
     return _Compared(
         tip=_on_grid(grid, time, tip, _GAP),
-        model=_on_grid(grid, time[::stride], at, np.inf),
-        pressures=_on_grid(grid, log.time, log.pressures, np.inf),
-        errors=errors,
+        model=_on_grid(grid, time, expected, np.inf),
+        errors=np.linalg.norm(expected - tip, axis=1),
     )
+
+
+def _tip_of_all(model: Manipulator, grid: Array, pressures: Array) -> Array:
+    """The model's tip (K, 3) for all repetitions: each pose of a loaded arm takes milliseconds."""
+    at = np.unique(np.append(np.arange(0, len(grid), _EVERY), len(grid) - 1))
+    return _on_grid(grid, grid[at], model.tip_pose(pressures[at])[:, :3, 3], np.inf)
 
 
 def _on_grid(grid: Array, time: Array, values: Array, gap: float) -> Array:

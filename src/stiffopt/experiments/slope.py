@@ -14,31 +14,36 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Estimate", "Line", "combine", "fit_line", "student_t"]
+__all__ = ["Estimate", "Line", "combine", "fit_line", "fit_lines", "student_t"]
+
+Array = NDArray[np.float64]
 
 FEWEST = 3
 """Points without which a line is not fitted: two have no residual."""
+_DOUBT = 3.0  # standard errors by which a curvature must differ from none
 _ALIKE = 0.9  # correlation of a trend with x from which on it is left out
 
 
 @dataclass(frozen=True)
 class Line:
-    """A straight line by least squares.
+    """A line by least squares.
 
     Attributes
     ----------
-    slope : of the line.
+    slope : of the line, at x = 0.
     sigma : standard error of the slope, from the residuals.
     freedom : degrees of freedom of the residuals.
     points : number of points.
+    bend : curvature at x = 0 over its standard error; 0 if none was fitted.
     """
 
     slope: float
     sigma: float
     freedom: int
     points: int
+    bend: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -61,31 +66,66 @@ class Estimate:
     count: int
 
 
-def fit_line(x: ArrayLike, y: ArrayLike, trend: ArrayLike | None = None) -> Line | None:
+def fit_line(
+    x: ArrayLike, y: ArrayLike, trend: ArrayLike | None = None, *, curved: bool = False
+) -> Line | None:
     """Fit y by a line in x, all (N,); None for too few points or all at one x.
 
-    With a trend, such as time, y may also be linear in that: the slope is then that at a constant
-    trend. One that can hardly be told from x is left out.
+    Parameters
+    ----------
+    x, y :
+        What is not finite is left out.
+    trend :
+        Such as time, in which y may also be linear: the slope is then that at a constant trend.
+        One that can hardly be told from x is left out.
+    curved :
+        Fit a parabola, whose slope at x = 0 is the result.
     """
     u, v = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     w = np.zeros_like(u) if trend is None else np.asarray(trend, dtype=float)
     known = np.isfinite(u) & np.isfinite(v) & np.isfinite(w)
     u, v, w = u[known], v[known], w[known]
-    if len(u) < FEWEST:
+    size = float(np.ptp(u)) if len(u) >= FEWEST else 0.0
+    if size <= 0:
         return None
-    du, dv, dw = u - u.mean(), v - v.mean(), w - w.mean()
-    freedom = len(u) - 2
-    size = math.sqrt(float(dw @ dw) * float(du @ du))
-    if freedom > 1 and size > 0 and abs(float(du @ dw)) < _ALIKE * size:
-        du = du - dw * (float(du @ dw) / float(dw @ dw))
-        dv = dv - dw * (float(dv @ dw) / float(dw @ dw))
-        freedom -= 1
-    width = float(du @ du)
-    if width <= 0:
-        return None
-    slope = float(du @ dv) / width
-    rest = dv - slope * du
-    return Line(slope, math.sqrt(float(rest @ rest) / freedom / width), freedom, len(u))
+    columns = [np.ones_like(u), u / size]
+    if curved and len(u) > len(columns) + 2:
+        columns.append((u / size) ** 2)
+    if len(u) > len(columns) + 1 and _can_be_told(u, w):
+        columns.append((w - w.mean()) / np.ptp(w))
+    design = np.stack(columns, axis=1)
+    found, _, rank, _ = np.linalg.lstsq(design, v)
+    if rank < len(columns):
+        return None if len(columns) == 2 else fit_line(u, v)
+    rest = v - design @ found
+    freedom = len(u) - len(columns)
+    spread = np.linalg.inv(design.T @ design) * (float(rest @ rest) / freedom)
+    bend = 0.0
+    if curved and len(columns) > 2 and spread[2, 2] > 0:
+        bend = float(found[2]) / math.sqrt(spread[2, 2])
+    return Line(float(found[1]) / size, math.sqrt(spread[1, 1]) / size, freedom, len(u), bend)
+
+
+def _can_be_told(x: Array, trend: Array) -> bool:
+    """Whether a trend differs from x by so much that both can be fitted."""
+    dx, dt = x - x.mean(), trend - trend.mean()
+    size = math.sqrt(float(dx @ dx) * float(dt @ dt))
+    return size > 0 and abs(float(dx @ dt)) < _ALIKE * size
+
+
+def fit_lines(
+    series: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike]],
+) -> list[Line]:
+    """Fit the slopes at x = 0 of repetitions, each (x, y, trend).
+
+    They are straight lines, unless all repetitions together show beyond doubt that they bend:
+    then all are parabolas.
+    """
+    bent = [fit_line(x, y, trend, curved=True) for x, y, trend in series]
+    bends = [line.bend for line in bent if line is not None]
+    curved = bool(bends) and abs(math.fsum(bends)) > _DOUBT * math.sqrt(len(bends))
+    lines = bent if curved else [fit_line(x, y, trend) for x, y, trend in series]
+    return [line for line in lines if line is not None]
 
 
 def combine(lines: Sequence[Line], confidence: float = 0.95) -> Estimate | None:

@@ -180,7 +180,7 @@ def run_stiffness(
         )
         progress(number, total, text)
         run.do(key)
-    run.finish()
+    run.wind_down()
     progress(total, total, "done")
     return run.notes()
 
@@ -227,8 +227,7 @@ class _Run:
             self._raw = _Raw(self._folder, key.repetition, conductor, settings)
         before, self._at = self._at, (key.repetition, key.pressure)
         if before is not None and before != self._at:
-            with self._aside():
-                self._probing.probe.withdraw()  # the arm is about to move
+            self._withdraw()  # the arm is about to move
         if before is None or before[0] != key.repetition:
             conductor.ramp(np.zeros(settings.channels))  # each repetition starts from nothing
             self._rest(np.zeros(settings.channels))
@@ -241,6 +240,18 @@ class _Run:
         self._unsettled += sum(not point.settled for point in points)
         self._done += 1
         self._points.append(key, points)
+
+    def _withdraw(self) -> None:
+        with self._aside():
+            self._probing.probe.withdraw()
+
+    def wind_down(self) -> None:
+        """Take the probe away, let the pressure down, close the recording."""
+        try:
+            self._withdraw()
+            self._conductor.ramp(np.zeros(self._settings.channels))
+        finally:
+            self.finish()
 
     def _rest(self, p: Array) -> bool:
         self._conductor.ramp(p)

@@ -10,7 +10,7 @@ import numpy as np
 
 from stiffopt.experiments.conductor import Array
 from stiffopt.experiments.points import PointsFile, SeriesPoints
-from stiffopt.experiments.slope import Estimate, Line, combine, fit_line
+from stiffopt.experiments.slope import Estimate, Line, combine, fit_lines
 from stiffopt.experiments.stiffness import StiffnessSettings
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.manipulator import Manipulator
@@ -111,7 +111,7 @@ def evaluate_stiffness(
     """
     series = PointsFile(folder, settings.channels).read()
     top = max(settings.pressures)
-    pressures = np.linspace(min(settings.pressures), top, curve if top > 0 else 1)
+    pressures = np.linspace(min(0.0, *settings.pressures), top, curve if top > 0 else 1)
     directions = np.array(settings.directions)
     expected = model.stiffness(
         np.stack([settings.pressures_at(p) for p in settings.pressures]), directions
@@ -137,27 +137,23 @@ def _cell(
         if abs(one.key.pressure - pressure) < 1.0
         and np.allclose(one.key.direction, direction, atol=1e-6)
     ]
-    lines, by_stage, points = [], [], 0
-    for one in mine:
-        line = _line(one, one.displacement)
-        if line is not None:
-            lines.append(line)
-            points += line.points
-        other = _line(one, one.stage)
-        if other is not None:
-            by_stage.append(other)
+    lines = _lines(mine, [one.displacement for one in mine])
     return StiffnessCell(
         pressure=pressure,
         direction=direction,
         estimate=combine(lines),
-        by_stage=combine(by_stage),
+        by_stage=combine(_lines(mine, [one.stage for one in mine])),
         slopes=tuple(line.slope for line in lines),
-        points=points,
+        points=sum(line.points for line in lines),
         model=model,
     )
 
 
-def _line(series: SeriesPoints, displacement: Array) -> Line | None:
+def _lines(series: Sequence[SeriesPoints], displacements: Sequence[Array]) -> list[Line]:
     """Force over displacement, of the points in contact, with a steady creep taken off."""
-    use = series.touching
-    return fit_line(displacement[use], series.force[use], series.time[use])
+    return fit_lines(
+        [
+            (displacement[one.touching], one.force[one.touching], one.time[one.touching])
+            for one, displacement in zip(series, displacements, strict=True)
+        ]
+    )

@@ -72,7 +72,7 @@ def _draw_shapes(axes: Any, found: ArmMap, row: int, colours: list[Any]) -> None
     axes.set_xlabel(f"{sign}{across} (mm)", fontsize=9)
     axes.set_ylabel("z (mm)", fontsize=9)
     axes.set_aspect("equal", adjustable="datalim")
-    if shapes[..., 2].mean() < 0:
+    if found.hangs:
         axes.invert_yaxis()
     _plain(axes)
 

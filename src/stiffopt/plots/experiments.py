@@ -153,7 +153,8 @@ def _draw_stiffness(axes: Any, result: StiffnessResult, number: int) -> None:
             [cell.pressure * BAR for cell in cells],
             [each.value * N_PER_CM for each in estimates],
             yerr=[each.half_width * N_PER_CM for each in estimates],
-            color=MEASURED, marker="s", markersize=4.5, capsize=3, linewidth=1.2, label="measured",
+            color=MEASURED, marker="s", markersize=4.5, capsize=3, linestyle="none",
+            label="measured",
         )  # fmt: skip
     axes.set_title(f"along {direction_name(direction)}", loc="left", fontsize=11, weight="bold")
     axes.set_xlabel("pressure (bar)")

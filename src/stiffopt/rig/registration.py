@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,15 @@ from stiffopt.units import Length
 __all__ = ["Placement", "Registration"]
 
 Array = NDArray[np.float64]
+
+
+@lru_cache(maxsize=64)
+def _transform(position: tuple[float, ...], orientation: tuple[float, ...]) -> Array:
+    """Transform (4, 4), not to be written to: there is one for all who ask."""
+    rotation = lie.rotation_from_quaternion(np.array(orientation))
+    transform = np.asarray(lie.transform(rotation, np.array(position)))
+    transform.flags.writeable = False
+    return transform
 
 
 class Placement(Schema):
@@ -29,8 +40,7 @@ class Placement(Schema):
 
     def transform(self) -> Array:
         """Transform (4, 4) of coordinates in this frame to those in the other."""
-        rotation = lie.rotation_from_quaternion(np.array(self.orientation))
-        return np.asarray(lie.transform(rotation, np.array(self.position)))
+        return _transform(self.position, self.orientation)
 
 
 class Registration(Schema):

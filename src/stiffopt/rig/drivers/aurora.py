@@ -87,21 +87,24 @@ class AuroraTracker(StreamedTracker):
         for module, package in (("ndicapy", "ndicapi"), ("serial", "pyserial")):
             if find_spec(module) is None:
                 raise MissingExtraError(package, "aurora")
-        self._arrived.clear()
         self._stopping.clear()
         self._settled.clear()
         self._refusal = self._lost = ""
         self._process = self._start_reader(9600)
         self._thread = threading.Thread(target=self._listen, name="aurora", daemon=True)
         self._thread.start()
-        if not self._settled.wait(self.settings.connect_timeout):
-            self._refusal = (
-                f"no NDI tracker answers at port {self.settings.port} within "
-                f"{self.settings.connect_timeout:g} s; check that it is switched on and its cable"
-            )
-        if self._refusal:
+        try:
+            if not self._settled.wait(self.settings.connect_timeout):
+                self._refusal = (
+                    f"no NDI tracker answers at port {self.settings.port} within "
+                    f"{self.settings.connect_timeout:g} s; check that it is switched on and its "
+                    "cable"
+                )
+            if self._refusal:
+                raise DeviceError(f"aurora: {self._refusal}")
+        except BaseException:  # also when somebody does not want to wait any longer
             self._close()
-            raise DeviceError(f"aurora: {self._refusal}")
+            raise
 
     def _close(self) -> None:
         with self._starting:

@@ -10,17 +10,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from stiffopt.errors import DeviceError, InputError
-from stiffopt.rig.drivers.daqmx import (
-    Address,
-    AnalogueInput,
-    AnalogueOutput,
-    Daqmx,
-    InputChannel,
-    InputName,
-    OutputName,
-    Pair,
-    Terminals,
-)
+from stiffopt.rig.drivers.daqmx import Address, Daqmx, InputName, OutputName, Pair, Terminals
+from stiffopt.rig.drivers.daqmx_tasks import AnalogueInput, AnalogueOutput, InputChannel
 from stiffopt.rig.drivers.nidaq_valve import DumpValve, Valve
 from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply
 from stiffopt.schema import BadKeyError, Items, Schema

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 from typing import Literal
 
-from stiffopt.rig.drivers.daqmx import (
-    Daqmx,
-    DigitalOutput,
-    LineName,
-    Watchdog,
-    WatchdogExpiredError,
-)
+from stiffopt.rig.drivers.daqmx import Daqmx, LineName, WatchdogExpiredError
+from stiffopt.rig.drivers.daqmx_tasks import DigitalOutput, Watchdog
 from stiffopt.rig.interface import Clock
 from stiffopt.schema import Schema
 

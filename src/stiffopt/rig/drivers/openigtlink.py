@@ -109,7 +109,6 @@ class OpenIGTLinkTracker(StreamedTracker):
 
     def _open(self) -> None:
         self._messages = pyigtl_messages()
-        self._arrived.clear()
         self._stopping.clear()
         self._sender = SenderClock()
         try:

@@ -13,15 +13,8 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from stiffopt.errors import CommandError, DeviceError
-from stiffopt.rig.drivers.daqmx import (
-    Address,
-    AnalogueInput,
-    Daqmx,
-    InputChannel,
-    InputName,
-    Pair,
-    Terminals,
-)
+from stiffopt.rig.drivers.daqmx import Address, Daqmx, InputName, Pair, Terminals
+from stiffopt.rig.drivers.daqmx_tasks import AnalogueInput, InputChannel
 from stiffopt.rig.drivers.zaber import Stage, StageSettings
 from stiffopt.rig.interface import Clock, ForceProbe, ForceSample
 from stiffopt.schema import BadKeyError, Schema

@@ -9,14 +9,13 @@ from __future__ import annotations
 import itertools
 import sys
 from collections.abc import Callable, Mapping
-from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
-from queue import SimpleQueue
-from threading import Event, RLock, Thread, Timer
+from threading import Event, RLock, Timer
 from typing import Any
 
 from stiffopt.errors import DeviceError
 from stiffopt.rig.drivers.daqmx import library
+from stiffopt.rig.lab.threads import LastingThreads
 
 __all__ = ["DaqHardware", "DaqServer"]
 
@@ -104,41 +103,6 @@ class _Watchdog:
         self.expired = True
 
 
-class _Threads(Executor):
-    """Threads that serve on while the interpreter exits, which is when supplies vent."""
-
-    def __init__(self) -> None:
-        self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._threads = [
-            Thread(target=self._work, name="daq-server", daemon=True) for _ in range(THREADS)
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def submit(self, call: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-
-        def job() -> None:
-            if future.set_running_or_notify_cancel():
-                try:
-                    future.set_result(call(*args, **kwargs))
-                except BaseException as error:
-                    future.set_exception(error)
-
-        self._jobs.put(job)
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        for _ in self._threads:
-            self._jobs.put(None)
-        for thread in self._threads:
-            thread.join()
-
-    def _work(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            job()
-
-
 class DaqServer:
     """Serves the hardware until it is closed.
 
@@ -160,13 +124,13 @@ class DaqServer:
         self._lock = RLock()
         self._closing = Event()
         self._server: Any = None
-        self._threads: _Threads | None = None
+        self._threads: LastingThreads | None = None
 
     def start(self) -> str:
         """Listen, and return the address."""
         grpc = library("grpc", "nidaqmx[grpc]", self._extra)
         self._messages = library("nidaqmx._stubs.nidaqmx_pb2", "nidaqmx[grpc]", self._extra)
-        threads = _Threads()
+        threads = LastingThreads(THREADS, "daq-server")
         # Without this option two servers may listen on one port, and each gets some of the calls.
         server = grpc.server(threads, options=[("grpc.so_reuseport", 0)])
         handlers = {name: self._handler(grpc, name, call) for name, call in self._calls().items()}

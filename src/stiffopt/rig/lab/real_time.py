@@ -25,13 +25,10 @@ class RealTimeBench(Bench):
     ----------
     world :
         Made for real time.
-    towards_tip :
-        1 if the stage's position grows towards the tip, else -1.
     """
 
-    def __init__(self, world: World, towards_tip: int = 1) -> None:
+    def __init__(self, world: World) -> None:
         self.world = world
-        self._towards_tip = towards_tip
         self._mounted_at = 0.0  # where the stage was, on its own scale, when it was mounted
         self._newest: Frame | None = None
         self._stop = threading.Event()
@@ -104,7 +101,7 @@ class RealTimeBench(Bench):
     @property
     def stage_position(self) -> float:
         """See `Bench`."""
-        return self._mounted_at + self._towards_tip * self.world.stage_position
+        return self._mounted_at + self.world.stage_position
 
     @property
     def stage_moving(self) -> bool:
@@ -115,7 +112,7 @@ class RealTimeBench(Bench):
         """See `Bench`."""
         with self.world.lock:
             self.world.catch_up()
-            self.world.move_stage(self._towards_tip * (position - self._mounted_at), speed)
+            self.world.move_stage(position - self._mounted_at, speed)
 
     def stage_stop(self) -> None:
         """See `Bench`."""

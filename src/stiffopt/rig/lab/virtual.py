@@ -9,7 +9,6 @@ from typing import Any, Self
 
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.config import LabSettings, RigDescription, limits_of
-from stiffopt.rig.drivers.probe import ProbeSettings
 from stiffopt.rig.lab.bench import Peer
 from stiffopt.rig.lab.defaults import with_real_devices
 from stiffopt.rig.lab.real_time import RealTimeBench
@@ -57,9 +56,7 @@ class VirtualLab:
         plant = self.description.plant or PlantSettings()
         limits = limits_of(self.description, robot)
         world = World(robot, limits, plant, lab.supply, seen, lab.probe, real_time=True)
-        probe = self.description.probe
-        towards_tip = probe.stage.towards_tip if isinstance(probe, ProbeSettings) else 1
-        self.bench = RealTimeBench(world, towards_tip)
+        self.bench = RealTimeBench(world)
         self._peers: list[Peer[Any]] = []
 
     @property

@@ -70,6 +70,7 @@ class SimulatedTracker(PoseTracker):
     def __init__(self, world: World, registration: Registration, clock: Clock) -> None:
         super().__init__(registration, clock)
         self._world = world
+        self._last_number = 0
 
     def _open(self) -> None:
         self._world.catch_up()
@@ -81,6 +82,9 @@ class SimulatedTracker(PoseTracker):
     def _poll(self) -> None:
         self._world.catch_up()
         for frame in self._world.frames():
+            if frame.number <= self._last_number:
+                continue  # a frozen frame is not a new one
+            self._last_number = frame.number
             self._deliver(
                 RawPose(
                     frame.captured, frame.number, frame.position, frame.quaternion, frame.delivered

@@ -32,7 +32,7 @@ from stiffopt.rig.simulated.rod import Rod, jacobians, poses
 
 Array = Any
 
-_CLOSE = 1e-9  # strain by which the last iteration may still change
+_CLOSE = 1e-9  # strain by which a step may still be wrong
 _SLOWEST = 0.3  # share of the correction before; if one is larger, the tangent is made anew
 _ITERATIONS = 40
 _SHORTEST = 1 / 64  # share of a step; one that does not work is divided down to this
@@ -72,7 +72,8 @@ class State(NamedTuple):
     Attributes
     ----------
     q, momentum : (n,).
-    rate : of q during the last step (n,), 1/s; the next step's guess follows it.
+    rate, last_rate : of q during the last step and the one before (n,), 1/s; the next step's
+        guess continues them.
     rotations, positions : of the nodes (N, 3, 3), (N, 3), always those of q.
     inverse : of the tangent (n, n).
     tangent_of : step and kind of equations that the tangent belongs to (2,); 0 where there is none.
@@ -83,6 +84,7 @@ class State(NamedTuple):
     q: Array
     momentum: Array
     rate: Array
+    last_rate: Array
     rotations: Array
     positions: Array
     inverse: Array
@@ -359,31 +361,34 @@ def _solve(
     work: Work,
     q: Array,
 ) -> bool:
-    """Bring q (n,), at first a guess, to the end of a step; return whether that worked."""
+    """Bring q (n,), at first a guess, to the end of a step; return whether that worked.
+
+    What `_residual` leaves in `work` is then that of q.
+    """
     n = len(q)
     kind = (2.0 if inertia else 1.0) + (4.0 if scheme.history else 0.0)
     args = (rod, material, scheme, loads, inertia, state, pressures, work)
     before = np.inf
-    for _ in range(_ITERATIONS):
+    for iteration in range(_ITERATIONS):
         _residual(*args, q, work.residual)
         known = state.tangent_of[0] == scheme.step and state.tangent_of[1] == kind
         largest = _correction(rod, state, work) if known else np.inf
-        if (
-            not known or not largest <= _SLOWEST * before
-        ):  # an old tangent no longer serves; NaN comes here too
+        # An old tangent may no longer serve; NaN comes here too.
+        if not known or not largest <= _SLOWEST * before:
             if not _make_tangent(*args, q):
                 return False
+            _residual(*args, q, work.residual)
             state.tangent_of[0] = scheme.step
             state.tangent_of[1] = kind
             largest = _correction(rod, state, work)
             if not np.isfinite(largest):
                 state.tangent_of[0] = 0.0
                 return False
-        scale = min(1.0, _STRIDE / largest) if largest > 0 else 1.0
+        if largest < _CLOSE and iteration > 0:  # a guess alone, however good, would drift
+            return True
+        scale = min(1.0, _STRIDE / max(largest, _CLOSE))
         for i in range(n):
             q[i] += scale * work.trial[i]
-        if largest < _CLOSE:
-            return True
         before = largest
     state.tangent_of[0] = 0.0
     return False
@@ -429,10 +434,9 @@ def step(
     end = loads_after(loads, h)
     args = (rod, material, scheme, end, inertia, state, pressures, work)
     for k in range(n):
-        q[k] = state.q[k] + h * state.rate[k]
+        q[k] = state.q[k] + h * (2 * state.rate[k] - state.last_rate[k])
     if not _solve(*args, q):
         return False
-    poses(rod, q, work.rotations, work.positions)
     last = len(state.positions) - 1
     mean = 0.5 * (depth_of(end, work.positions[last]) + depth_of(loads, state.positions[last]))
     if not inertia:
@@ -447,7 +451,6 @@ def step(
                 force += 0.5 * turn * loads.force[j]
         done += force * (work.positions[loads.node, i] - state.positions[loads.node, i])
     if inertia:
-        internal_forces(rod, material, scheme, state.memory, pressures, state.q, q, work.inner)
         jacobians(rod, q, work.jacobian)
         _inertia(
             rod,
@@ -470,6 +473,7 @@ def step(
     state.totals[1] += pushed
     state.totals[2] += done
     for k in range(n):
+        state.last_rate[k] = state.rate[k]
         state.rate[k] = (q[k] - state.q[k]) / h
     state.q[:] = q
     state.rotations[:] = work.rotations

@@ -69,8 +69,8 @@ class Memory(NamedTuple):
     Attributes
     ----------
     strain : of the fibres (S, g, f).
-    creep : strain of the Maxwell branches' dashpots (S, g, f, c).
-    slip : strain of the Jenkin elements' springs (S, g, f, j).
+    creep : strain of the Maxwell branches' dashpots (S, g, c, f).
+    slip : strain of the Jenkin elements' springs (S, g, j, f).
     """
 
     strain: Array
@@ -172,12 +172,14 @@ def internal_forces(
     history = scheme.history
     viscous = material.viscosity / scheme.step
     branches, sliders = len(material.creep_share), len(material.slip_share)
-    ends = np.empty((branches, 2))
-    creep_coefficients(material, scheme, ends)
+    fibres = material.fibre_x.shape[1]
+    ends, stresses, pull = np.empty(fibres), np.empty(fibres), np.empty(branches)
+    dashpot = np.empty((branches, 2))
+    creep_coefficients(material, scheme, dashpot)
     stiff = 0.0  # stress of the Maxwell branches per mean strain
     for k in range(branches):
-        stiff += material.creep_share[k] * (1 - share * ends[k, 1]) if history else 0.0
-        ends[k, 0] = material.creep_share[k] * (share * ends[k, 0] + rest)
+        stiff += material.creep_share[k] * (1 - share * dashpot[k, 1]) if history else 0.0
+        pull[k] = material.creep_share[k] * (share * dashpot[k, 0] + rest)
     for s in range(len(rod.length)):
         pressed = pressed_modulus(material, s, pressures)
         E = material.modulus[s]
@@ -197,25 +199,27 @@ def internal_forces(
             nx = shear * (force[0] - force[5] * cy)
             ny = shear * (force[1] + force[5] * cx)
             mz = material.torsion[s] * E * force[5] - nx * cy + ny * cx
+            strain, creep, slip = memory.strain[s, g], memory.creep[s, g], memory.slip[s, g]
+            for f in range(fibres):
+                ends[f] = e1[2] + e1[3] * material.fibre_y[s, f] - e1[4] * material.fibre_x[s, f]
+                mean = share * ends[f] + rest * strain[f]
+                stresses[f] = stiff * mean + viscous * (ends[f] - strain[f])
+                stresses[f] += pressed * stress(material, mean)
+            if history:
+                for k in range(branches):
+                    for f in range(fibres):
+                        stresses[f] -= pull[k] * creep[k, f]
+                for k in range(sliders):
+                    stiffness, limit = material.slip_share[k], material.slip_strain[k]
+                    for f in range(fibres):
+                        new = slip_after(limit, slip[k, f], ends[f] - strain[f])
+                        stresses[f] += stiffness * (share * new + rest * slip[k, f])
             nz, mx, my = 0.0, 0.0, 0.0
-            for f in range(material.fibre_x.shape[1]):
-                x, y = material.fibre_x[s, f], material.fibre_y[s, f]
-                end = e1[2] + e1[3] * y - e1[4] * x
-                begin = memory.strain[s, g, f]
-                mean = share * end + rest * begin
-                n = pressed * stress(material, mean) + viscous * (end - begin)
-                if history:
-                    n += stiff * mean
-                    for k in range(branches):
-                        n -= ends[k, 0] * memory.creep[s, g, f, k]
-                    for k in range(sliders):
-                        old = memory.slip[s, g, f, k]
-                        new = slip_after(material.slip_strain[k], old, end - begin)
-                        n += material.slip_share[k] * (share * new + rest * old)
-                n *= material.fibre_area[s, f]
+            for f in range(fibres):
+                n = material.fibre_area[s, f] * stresses[f]
                 nz += n
-                mx += n * y
-                my -= n * x
+                mx += n * material.fibre_y[s, f]
+                my -= n * material.fibre_x[s, f]
             force[0], force[1], force[2] = nx, ny, E * nz - push
             force[3], force[4], force[5] = E * mx - push_y, E * my + push_x, mz
             weight = rod.weight[g] * rod.length[s]
@@ -266,19 +270,19 @@ def remember(
                 per_area = material.viscosity * change * change / scheme.step
                 memory.strain[s, g, f] = end
                 for k in range(len(material.creep_share)):
-                    old = memory.creep[s, g, f, k]
+                    old = memory.creep[s, g, k, f]
                     inside = share * end + (1 - share) * begin
                     new = ends[k, 0] * old + ends[k, 1] * inside
                     mean = share * (end - new) + (1 - share) * (begin - old)
                     per_area += material.creep_share[k] * mean * (new - old)
-                    memory.creep[s, g, f, k] = new
+                    memory.creep[s, g, k, f] = new
                 for k in range(len(material.slip_share)):
-                    old = memory.slip[s, g, f, k]
+                    old = memory.slip[s, g, k, f]
                     new = slip_after(material.slip_strain[k], old, change)
                     new = new if scheme.history else 0.0
                     mean = share * new + (1 - share) * old
                     per_area += material.slip_share[k] * mean * (change - (new - old))
-                    memory.slip[s, g, f, k] = new
+                    memory.slip[s, g, k, f] = new
                 lost += weight * E * material.fibre_area[s, f] * per_area
     return lost, work
 
@@ -300,10 +304,10 @@ def stored(rod: Rod, material: Material, memory: Memory, pressures: Array, q: Ar
                 strain = e[2] + e[3] * material.fibre_y[s, f] - e[4] * material.fibre_x[s, f]
                 per_area = pressed * energy(material, strain)
                 for k in range(len(material.creep_share)):
-                    spring = memory.strain[s, g, f] - memory.creep[s, g, f, k]
+                    spring = memory.strain[s, g, f] - memory.creep[s, g, k, f]
                     per_area += 0.5 * material.creep_share[k] * spring * spring
                 for k in range(len(material.slip_share)):
-                    spring = memory.slip[s, g, f, k]
+                    spring = memory.slip[s, g, k, f]
                     per_area += 0.5 * material.slip_share[k] * spring * spring
                 per_length += material.fibre_area[s, f] * per_area
             total += rod.weight[g] * rod.length[s] * material.modulus[s] * per_length

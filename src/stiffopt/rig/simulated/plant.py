@@ -115,6 +115,7 @@ class Plant:
             q=np.zeros(n),
             momentum=np.zeros(n),
             rate=np.zeros(n),
+            last_rate=np.zeros(n),
             rotations=np.empty((nodes, 3, 3)),
             positions=np.empty((nodes, 3)),
             inverse=np.zeros((n, n)),
@@ -122,8 +123,8 @@ class Plant:
             totals=np.zeros(3),
             memory=Memory(
                 strain=np.zeros(shape),
-                creep=np.zeros((*shape, len(parts.creep_share))),
-                slip=np.zeros((*shape, len(parts.slip_share))),
+                creep=np.zeros((*shape[:2], len(parts.creep_share), shape[2])),
+                slip=np.zeros((*shape[:2], len(parts.slip_share), shape[2])),
             ),
         )
         rod.poses(self._rod, state.q, state.rotations, state.positions)
@@ -264,6 +265,7 @@ class Plant:
         # Viscosity slows an arm without inertia down: steps of growing length follow it to rest.
         slow = self._material._replace(viscosity=max(self._material.viscosity, 0.02))
         self._state.rate[:] = 0.0
+        self._state.last_rate[:] = 0.0
         step = _FIRST_STEP
         for _ in range(_TRIES):
             scheme = Scheme(step, 1.0, False)
@@ -276,6 +278,7 @@ class Plant:
             else:
                 step /= 5
             self._state.rate[:] = 0.0
+            self._state.last_rate[:] = 0.0
         else:
             raise EquilibriumError("the simulated arm finds no equilibrium")
         self._state.momentum[:] = 0.0

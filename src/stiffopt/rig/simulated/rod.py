@@ -80,10 +80,14 @@ def strain_at(rod: Rod, segment: int, basis: Array, q: Array, out: Array) -> Non
 @jit
 def _bracket(a: Array, b: Array, out: Array) -> None:
     """Lie bracket [a, b] of two twists: linear a_w x b_v - b_w x a_v, angular a_w x b_w."""
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        out[i] = a[3 + j] * b[k] - a[3 + k] * b[j] - b[3 + j] * a[k] + b[3 + k] * a[j]
-        out[3 + i] = a[3 + j] * b[3 + k] - a[3 + k] * b[3 + j]
+    a0, a1, a2, w0, w1, w2 = a[0], a[1], a[2], a[3], a[4], a[5]
+    b0, b1, b2, u0, u1, u2 = b[0], b[1], b[2], b[3], b[4], b[5]
+    out[0] = w1 * b2 - w2 * b1 - u1 * a2 + u2 * a1
+    out[1] = w2 * b0 - w0 * b2 - u2 * a0 + u0 * a2
+    out[2] = w0 * b1 - w1 * b0 - u0 * a1 + u1 * a0
+    out[3] = w1 * u2 - w2 * u1
+    out[4] = w2 * u0 - w0 * u2
+    out[5] = w0 * u1 - w1 * u0
 
 
 @jit
@@ -196,7 +200,8 @@ def _exponential_derivative(X: Array, dX: Array, out: Array, work: Array) -> Non
 def jacobians(rod: Rod, q: Array, J: Array) -> None:
     """Body Jacobians of the nodes, transposed (N, n, 6): their twist in their own axes per q."""
     x1, x2, X = np.empty(6), np.empty(6), np.empty(6)
-    d1, d2, dX, work = np.empty(6), np.empty(6), np.empty(6), np.empty((2, 6))
+    d1, dX, at1, at2 = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
+    work = np.empty((2, 6))
     dR, dr = np.empty((3, 3)), np.empty(3)
     J[0] = 0.0
     node = 0
@@ -212,21 +217,24 @@ def jacobians(rod: Rod, q: Array, J: Array) -> None:
                 _carry(here[column], dR, dr, there[column])
             for column in range(end, J.shape[1]):
                 there[column] = 0.0
-            for c in range(6):
+            for c in range(6):  # a strain e_c at either Gauss point, then the polynomials
+                d1[:] = 0.0
+                d1[c] = 1.0
+                _bracket(d1, x2, dX)
+                for i in range(6):
+                    dX[i] *= _COMMUTATOR * h * h
+                dX[c] += 0.5 * h
+                _exponential_derivative(X, dX, at1, work)
+                _bracket(x1, d1, dX)
+                for i in range(6):
+                    dX[i] *= _COMMUTATOR * h * h
+                dX[c] += 0.5 * h
+                _exponential_derivative(X, dX, at2, work)
                 for k in range(rod.count[c]):
                     b1, b2 = rod.interval_basis[s, m, 0, k], rod.interval_basis[s, m, 1, k]
-                    d1[:] = 0.0
-                    d2[:] = 0.0
-                    d1[c], d2[c] = b1, b2
-                    _bracket(d1, x2, dX)
-                    _bracket(x1, d2, work[0])
-                    for i in range(6):
-                        dX[i] = _COMMUTATOR * h * h * (dX[i] + work[0, i])
-                    dX[c] += 0.5 * h * (b1 + b2)
-                    _exponential_derivative(X, dX, d1, work)
                     target = there[begin + rod.first[c] + k]
                     for i in range(6):
-                        target[i] += d1[i]
+                        target[i] += b1 * at1[i] + b2 * at2[i]
             node += 1
         length = rod.connector[s]
         for column in range(J.shape[1]):

@@ -112,7 +112,8 @@ class World:
         )
         self._delayed = np.zeros((round(supply.dead_time / step), n))
         self._first = 0
-        self._set_point = np.zeros(n)
+        self.set_point = np.zeros(n)
+        """What the regulators were told (n,), in Pa."""
         self._commanded_at = 0.0
         self.pressures = np.zeros(n)
         """In the chambers (n,), in Pa."""
@@ -172,7 +173,7 @@ class World:
         if self._stage_speed:
             distance = abs(self._stage_target - self.stage_position)
             events.append(here + max(1, int(distance / self._stage_speed / step)))
-        if self.supply.watchdog is not None and self._set_point.any():
+        if self.supply.watchdog is not None and self.set_point.any():
             events.append(int(np.ceil((self._commanded_at + self.supply.watchdog) / step)))
         return max(here + 1, min(events))
 
@@ -188,7 +189,7 @@ class World:
             self._regulators,
             self._delayed,
             self._first,
-            self._set_point,
+            self.set_point,
             self.pressures,
             ripple,
             trace,
@@ -201,7 +202,7 @@ class World:
             self._capture()
         watchdog = self.supply.watchdog
         if watchdog is not None and self.time - self._commanded_at >= watchdog:
-            self._set_point[:] = 0.0
+            self.set_point[:] = 0.0
 
     # Supply --------------------------------------------------------------------------------------
 
@@ -213,12 +214,12 @@ class World:
             if self.supply.resolution > 0:
                 p = np.round(p / self.supply.resolution) * self.supply.resolution
             if self.faults["supply"] != "off":
-                self._set_point[:] = p
+                self.set_point[:] = p
 
     def command_channel(self, channel: int, pressure: float) -> None:
         """Give one regulator (from 0) its set-point, in Pa."""
         with self.lock:
-            p = self._set_point.copy()
+            p = self.set_point.copy()
             p[channel] = pressure
             self.command(p)
 
@@ -239,6 +240,11 @@ class World:
         """Open or close the valve that empties all chambers."""
         with self.lock:
             self._regulators = self._regulators._replace(dumped=open_valve)
+
+    @property
+    def valve_open(self) -> bool:
+        """Whether the dump valve is open."""
+        return bool(self._regulators.dumped)
 
     # Tracker -------------------------------------------------------------------------------------
 

@@ -1,0 +1,289 @@
+"""Supplies: what sets and reads the pressures, and what no supply may do."""
+
+from __future__ import annotations
+
+import atexit
+import sys
+from abc import abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import CommandError, DeviceError, InputError
+from stiffopt.rig.device import Clock, Device
+
+__all__ = ["PressureCommand", "PressureLimits", "PressureReading", "PressureSupply"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PressureLimits:
+    """What may be commanded, for each channel.
+
+    Attributes
+    ----------
+    low, high : ndarray
+        Gauge pressures (n,), in Pa; venting (0 Pa) is always allowed.
+    """
+
+    low: Array
+    high: Array
+
+    def __post_init__(self) -> None:
+        for name in ("low", "high"):
+            value = np.array(getattr(self, name), dtype=float)
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        if self.low.shape != self.high.shape or self.low.ndim != 1 or not len(self.low):
+            raise InputError("expected one low and one high limit for each channel")
+        if not np.all(np.isfinite(self.low) & np.isfinite(self.high) & (self.low <= self.high)):
+            raise InputError("limits of pressure must be finite, the low one below the high one")
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return len(self.low)
+
+    def check(self, pressures: ArrayLike) -> Array:
+        """Return pressures (n,) if they may be commanded.
+
+        Raises
+        ------
+        CommandError
+            Wrong number, not finite or out of range; it names the channel.
+        """
+        try:
+            p = np.array(pressures, dtype=float)
+        except (TypeError, ValueError):
+            raise CommandError("expected one pressure in Pa for each channel") from None
+        if p.shape != self.low.shape:
+            raise CommandError(f"expected {self.n} pressures, not an array of shape {p.shape}")
+        for index in np.flatnonzero(~np.isfinite(p)):
+            raise CommandError(f"channel {index + 1}: {p[index]} is not a finite pressure")
+        slack = 1e-6 * (self.high - self.low)
+        outside = (p < self.low - slack) | (p > self.high + slack)
+        for index in np.flatnonzero(outside & (p != 0)):
+            raise CommandError(
+                f"channel {index + 1}: {p[index] * 1e-5:.6g} bar is out of range; the limits are "
+                f"{self.low[index] * 1e-5:g} to {self.high[index] * 1e-5:g} bar"
+            )
+        return self.clamp(p)
+
+    def clamp(self, pressures: Array) -> Array:
+        """Return what is nearest within the limits; 0 stays, and what is not finite becomes 0."""
+        p = np.asarray(pressures, dtype=float)
+        p = np.where(np.isfinite(p), p, 0.0)
+        return np.where(p == 0, 0.0, np.clip(p, self.low, self.high))
+
+
+@dataclass(frozen=True)
+class PressureReading:
+    """What a supply measures.
+
+    Attributes
+    ----------
+    time : float
+        When it was read.
+    pressures : ndarray
+        Gauge pressures (n,), in Pa; NaN where the device measures none.
+    """
+
+    time: float
+    pressures: Array
+
+
+@dataclass(frozen=True)
+class PressureCommand:
+    """What a supply shall do, and until when: commands expire.
+
+    Attributes
+    ----------
+    pressures : ndarray
+        Gauge pressures (n,), in Pa.
+    time : float
+        When it was given.
+    valid_for : float
+        Seconds after which a command that was not repeated holds no longer.
+    """
+
+    pressures: Array
+    time: float
+    valid_for: float = 0.5
+
+    def expired(self, now: float) -> bool:
+        """Say whether the command is too old to be carried out."""
+        return not 0 <= now - self.time <= self.valid_for
+
+
+class PressureSupply(Device):
+    """Sets and reads the pressures of all channels.
+
+    Nothing reaches a device that is out of range or not finite: `command` refuses it, and what is
+    handed to the driver's `_write` has been clamped once more. A supply vents when it is opened,
+    when it is closed, also by an exception, and when the interpreter exits.
+    """
+
+    def __init__(self, limits: PressureLimits, clock: Clock | None = None) -> None:
+        super().__init__(clock)
+        self.limits = limits
+        self.commanded: Array = np.zeros(limits.n)
+        """What was last written (n,), in Pa."""
+        self._valve_open = False
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return self.limits.n
+
+    def open(self) -> None:
+        """Connect, and vent."""
+        if self._is_open:
+            return
+        super().open()
+        _open_supplies.add(self)
+        try:
+            self.vent()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Vent and disconnect.
+
+        Raises
+        ------
+        DeviceError
+            The device did not take the command to vent; it is disconnected all the same.
+        """
+        if not self._is_open:
+            return
+        try:
+            self.vent()
+        finally:
+            _open_supplies.discard(self)
+            super().close()
+
+    def command(self, pressures: ArrayLike | PressureCommand) -> None:
+        """Set the pressures (n,), in Pa.
+
+        Raises
+        ------
+        CommandError
+            Wrong number, not finite, out of range or expired: nothing was written.
+        DeviceError
+            The device did not take it.
+        """
+        self._write_clamped(self._checked(pressures))
+
+    def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
+        """Set the pressures and read the measured ones, in one exchange where the device can.
+
+        Raises
+        ------
+        CommandError
+            As for `command`: nothing was written.
+        DeviceError
+            The device did not take it or does not answer.
+        """
+        last = self.limits.clamp(self._checked(pressures))
+        values = self._exchange(last)
+        if values is None:
+            self._write_clamped(last)
+            return self.read()
+        self.commanded = last
+        return self._reading(values)
+
+    def read(self) -> PressureReading:
+        """Read the measured pressures.
+
+        Raises
+        ------
+        DeviceError
+            The device does not answer.
+        """
+        self._must_be_open()
+        return self._reading(self._read())
+
+    def _reading(self, pressures: ArrayLike) -> PressureReading:
+        values = np.array(pressures, dtype=float)
+        if values.shape != (self.n,):
+            raise DeviceError(f"the supply reads {values.size} pressures; expected {self.n}")
+        return PressureReading(self.clock.now(), values)
+
+    def vent(self) -> None:
+        """Set all channels to 0 Pa and, where there is a dump valve, open it.
+
+        Raises
+        ------
+        DeviceError
+            The device did not take it.
+        """
+        self._must_be_open()
+        try:
+            self._write_clamped(np.zeros(self.n))
+        finally:
+            self._valve_open = self.has_dump_valve
+            self._dump(open_valve=True)
+
+    @property
+    def has_dump_valve(self) -> bool:
+        """Whether `vent` also opens a valve that needs no regulator's cooperation."""
+        return False
+
+    def arm(self) -> None:
+        """Close the dump valve, which `vent` opens: until then commands are refused.
+
+        Without a valve this does nothing.
+        """
+        self._must_be_open()
+        self._dump(open_valve=False)
+        self._valve_open = False
+
+    def _checked(self, pressures: ArrayLike | PressureCommand) -> Array:
+        """Return the pressures (n,) of a command that may be carried out; refuse all others."""
+        self._must_be_open()
+        if isinstance(pressures, PressureCommand):
+            if pressures.expired(self.clock.now()):
+                raise CommandError("the command has expired; nothing was written")
+            pressures = pressures.pressures
+        checked = self.limits.check(pressures)
+        if self._valve_open and checked.any():
+            raise CommandError("the dump valve is open and nothing was written; arm the supply")
+        return checked
+
+    def _write_clamped(self, pressures: Array) -> None:
+        last = self.limits.clamp(pressures)
+        self._write(last)
+        self.commanded = last
+
+    @abstractmethod
+    def _write(self, pressures: Array) -> None:
+        """Write set-points (n,), in Pa, and check by reading them back where the device can."""
+
+    @abstractmethod
+    def _read(self) -> ArrayLike:
+        """Return measured pressures (n,), in Pa; NaN for channels that measure none."""
+
+    def _exchange(self, pressures: Array) -> ArrayLike | None:
+        """Write set-points and return measured pressures at once; None: the device cannot.
+
+        With None nothing was written, and `_write` and `_read` are called instead.
+        """
+        return None
+
+    def _dump(self, *, open_valve: bool) -> None:
+        """Open or close the dump valve, where there is one."""
+
+
+_open_supplies: set[PressureSupply] = set()  # held, so that none is forgotten while it is open
+
+
+@atexit.register
+def _vent_what_is_open() -> None:
+    for supply in list(_open_supplies):
+        try:
+            supply.close()
+        except Exception as error:  # the other supplies must be vented too
+            print(f"a supply could not be vented: {error}", file=sys.stderr)

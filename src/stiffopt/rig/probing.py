@@ -1,0 +1,59 @@
+"""Probes: what pushes on the tip and feels the force."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from stiffopt.rig.device import Device
+
+__all__ = ["ForceProbe", "ForceSample"]
+
+
+@dataclass(frozen=True)
+class ForceSample:
+    """What a probe feels.
+
+    Attributes
+    ----------
+    time : float
+        When it was read.
+    force : float
+        Force with which the probe pushes the tip along its axis, in N.
+    position : float
+        Place of the probe along its axis, in m.
+    """
+
+    time: float
+    force: float
+    position: float
+
+
+class ForceProbe(Device):
+    """Pushes on the tip along one axis and feels the force."""
+
+    @abstractmethod
+    def align(self, direction: Iterable[float]) -> None:
+        """Make a unit vector (3,) in the base frame the axis; on a real rig, ask that it be done.
+
+        The probe is then at position 0, just clear of the tip.
+        """
+
+    @abstractmethod
+    def move_to(self, position: float, speed: float) -> None:
+        """Move to a place along the axis, in m, at a speed in m/s, and return when there."""
+
+    def withdraw(self) -> None:
+        """Take the probe out of the arm's way; on a real rig, ask that it be done.
+
+        It has to be aligned before it is used again.
+        """
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop at once."""
+
+    @abstractmethod
+    def sample(self) -> ForceSample:
+        """Read force and position."""

@@ -1,0 +1,147 @@
+"""Trackers: where the tip is, and when that was seen."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.rig.device import Clock, Device
+from stiffopt.rig.registration import Registration
+
+__all__ = ["PoseSample", "PoseTracker", "RawPose"]
+
+Array = NDArray[np.float64]
+
+_QUEUED = 4096  # samples that a tracker keeps until they are read; the oldest go first
+_NORM_SLACK = 0.05  # by which the norm of a tracker's quaternion may differ from 1
+
+
+@dataclass(frozen=True)
+class PoseSample:
+    """The pose of the tip in the base frame, as tracked.
+
+    Attributes
+    ----------
+    time : float
+        When it was captured (not when it arrived).
+    received : float
+        When it arrived.
+    frame : int
+        The tracker's frame number.
+    position : ndarray
+        (3,), in m; NaN where the tool was not seen.
+    quaternion : ndarray or None
+        (4,), w first, w >= 0; None from trackers of position alone.
+    """
+
+    time: float
+    received: float
+    frame: int
+    position: Array
+    quaternion: Array | None
+
+    @property
+    def visible(self) -> bool:
+        """Whether the tool was seen."""
+        return bool(np.isfinite(self.position).all())
+
+
+@dataclass(frozen=True)
+class RawPose:
+    """What a tracker's driver hands over: the sensor in the tracker's frame.
+
+    Attributes
+    ----------
+    time : float
+        When it was captured, on the rig's clock.
+    frame : int
+        The device's frame number, or a count.
+    position : ndarray
+        (3,), in m; anything not finite means that the tool was not seen.
+    quaternion : ndarray or None
+        (4,), w first, of any sign.
+    received : float or None
+        When it arrived, if not just now.
+    """
+
+    time: float
+    frame: int
+    position: ArrayLike
+    quaternion: ArrayLike | None = None
+    received: float | None = None
+
+
+class PoseTracker(Device):
+    """Tells where the tip is.
+
+    A driver calls `_deliver` with what the device sends, from whatever thread; registration, signs
+    and sense are seen to here. `read` never waits for the device: a silent device delivers
+    nothing, and only the age of the latest sample tells.
+    """
+
+    def __init__(
+        self, registration: Registration | None = None, clock: Clock | None = None
+    ) -> None:
+        super().__init__(clock)
+        self.registration = registration or Registration()
+        self._arrived: deque[PoseSample] = deque(maxlen=_QUEUED)
+        self._latest: PoseSample | None = None
+        self._latest_visible: PoseSample | None = None
+
+    def open(self) -> None:
+        """Connect; samples of an earlier time are forgotten."""
+        if not self._is_open:
+            self._arrived.clear()
+            self._latest = self._latest_visible = None
+            super().open()
+
+    def read(self) -> tuple[PoseSample, ...]:
+        """Return the samples that have arrived since the last call, in order of arrival."""
+        self._must_be_open()
+        self._poll()
+        samples = []
+        while self._arrived:
+            samples.append(self._arrived.popleft())
+        return tuple(samples)
+
+    @property
+    def latest(self) -> PoseSample | None:
+        """The sample that arrived last."""
+        self._poll()
+        return self._latest
+
+    def age(self) -> float:
+        """Seconds since the latest capture that saw the tool; infinite before the first."""
+        self._poll()
+        latest = self._latest_visible
+        return self.clock.now() - latest.time if latest else float("inf")
+
+    def _poll(self) -> None:
+        """Deliver what has arrived, in drivers that have no thread to do so."""
+
+    def _deliver(self, raw: RawPose) -> None:
+        """Register a sample of the device and queue it."""
+        sample = self._registered(raw)
+        self._arrived.append(sample)
+        self._latest = sample
+        if sample.visible:
+            self._latest_visible = sample
+
+    def _registered(self, raw: RawPose) -> PoseSample:
+        received = self.clock.now() if raw.received is None else raw.received
+        position = np.array(raw.position, dtype=float).reshape(-1)
+        quaternion = None
+        seen = position.shape == (3,) and bool(np.isfinite(position).all())
+        if raw.quaternion is not None:
+            quaternion = np.array(raw.quaternion, dtype=float).reshape(-1)
+            norm = float(np.linalg.norm(quaternion)) if quaternion.shape == (4,) else np.nan
+            seen = seen and bool(abs(norm - 1) <= _NORM_SLACK)  # NaN is not seen either
+            quaternion = quaternion / norm if seen else None
+        if not seen:
+            nowhere = np.full(3, np.nan)
+            return PoseSample(raw.time, received, raw.frame, nowhere, None)
+        position, quaternion = self.registration.tip_in_base(position, quaternion)
+        return PoseSample(raw.time, received, raw.frame, position, quaternion)
