@@ -90,7 +90,8 @@ class WorldControl:
         w, x, y, z = np.asarray(quaternion, dtype=float)
         T = np.eye(4)
         T[:3, :3], T[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), position
-        self.world._as_tracked = lambda noise: T  # type: ignore[method-assign]
+        assert self.world.camera is not None
+        self.world.camera.sensor_in_tracker = lambda noise: T  # type: ignore[method-assign]
         self.world.inject("tracker", "flip" if w < 0 else "ok")
 
     def drop(self) -> None:

@@ -20,7 +20,7 @@ from stiffopt.errors import InputError
 from stiffopt.experiments.conductor import Array, Conductor, Row, at_rest, check_pressures
 from stiffopt.experiments.points import PointsFile, SeriesKey
 from stiffopt.experiments.probing import Probing, Series
-from stiffopt.logs import LogLayout, LogWriter, McapLogWriter
+from stiffopt.experiments.raw import RawRecording
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.interface import Rig
 from stiffopt.schema import Items, Schema
@@ -31,7 +31,6 @@ __all__ = ["StiffnessSettings", "direction_name", "run_stiffness"]
 HARD_STOP = 5.0
 """Times the force that is meant not to be exceeded, at which a series ends."""
 _REST_WINDOW = 4.0  # s
-_PAUSE = 1.0  # s between the times of two runs that share a file
 
 Progress = Callable[[float, float, str], None]
 
@@ -206,7 +205,7 @@ class _Run:
         self._conductor = conductor
         self._probing = Probing(conductor)
         self._points = PointsFile(folder, settings.channels)
-        self._raw: _Raw | None = None
+        self._raw: RawRecording | None = None
         self._at: tuple[int, float] | None = None
         self._restless = self._unsettled = self._done = 0
         conductor.start()
@@ -224,7 +223,7 @@ class _Run:
         p = settings.pressures_at(key.pressure)
         if self._raw is None or self._raw.repetition != key.repetition:
             self.finish()
-            self._raw = _Raw(self._folder, key.repetition, conductor, settings)
+            self._raw = RawRecording(self._folder, key.repetition, conductor, settings.rig)
         before, self._at = self._at, (key.repetition, key.pressure)
         if before is not None and before != self._at:
             self._withdraw()  # the arm is about to move
@@ -286,46 +285,6 @@ class _Run:
         if self._raw is not None:
             self._raw.close()
             self._raw = None
-
-
-class _Raw:
-    """Everything that is seen in a repetition; a run that is resumed continues the CSV file."""
-
-    def __init__(
-        self, folder: Path, repetition: int, conductor: Conductor, settings: StiffnessSettings
-    ) -> None:
-        self.repetition = repetition
-        self._conductor = conductor
-        turns = any(row.quaternion is not None for row in conductor.rows)
-        layout = LogLayout(
-            n=settings.channels, measured=True, tip_quaternion=turns, force=True, stage=True
-        )
-        name = f"stiffness_{repetition}"
-        self._csv = LogWriter(folder / f"{name}.csv", layout)
-        part, mcap = 1, folder / f"{name}.mcap"
-        while mcap.exists():
-            part += 1
-            mcap = folder / f"{name}_{part}.mcap"
-        about = {"experiment": "stiffness", "repetition": str(repetition), "rig": settings.rig}
-        self._mcap = McapLogWriter(mcap, layout, about)
-        last = self._csv.last_time
-        now = conductor.clock.now()
-        begin = now if last is None else now - last - _PAUSE
-
-        def keep(row: Row) -> None:
-            if row.time >= now:
-                self._csv.append(row.logged(begin))
-                self._mcap.append(row.logged(begin))
-
-        conductor.sink = keep
-
-    def close(self) -> None:
-        """Close both files."""
-        self._conductor.sink = None
-        try:
-            self._csv.close()
-        finally:
-            self._mcap.close()
 
 
 def _rounded(key: SeriesKey) -> tuple[int, float, tuple[float, ...]]:

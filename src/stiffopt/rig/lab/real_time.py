@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.rig.lab.bench import Bench, TrackerFrame
-from stiffopt.rig.simulated.world import Frame, World
+from stiffopt.rig.simulated.camera import Frame
+from stiffopt.rig.simulated.world import World
 
 __all__ = ["RealTimeBench"]
 
@@ -64,7 +65,7 @@ class RealTimeBench(Bench):
         with self.world.lock:
             self.world.catch_up()
             self._mounted_at = self.stage_position
-            self.world.align_stage(tuple(direction))
+            self.world.mount_stage(tuple(direction))
 
     @property
     def n(self) -> int:

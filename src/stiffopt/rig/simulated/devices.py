@@ -104,7 +104,7 @@ class SimulatedProbe(ForceProbe):
 
     def _close(self) -> None:
         self._world.stop_stage()
-        self._world.align_stage(None)
+        self._world.mount_stage(None)
 
     def _answer(self) -> None:
         self._world.catch_up()
@@ -118,13 +118,13 @@ class SimulatedProbe(ForceProbe):
         axis = np.array(tuple(direction), dtype=float)
         if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
             raise CommandError("expected a direction [x, y, z] to align the probe with")
-        self._world.align_stage(axis)
+        self._world.mount_stage(axis)
 
     def withdraw(self) -> None:
         """Take the plate away."""
         self._must_be_open()
         self._answer()
-        self._world.align_stage(None)
+        self._world.mount_stage(None)
 
     def move_to(self, position: float, speed: float) -> None:
         """Move the plate and return when it is there; see `ForceProbe.move_to`."""

@@ -6,7 +6,7 @@ With inertia, a variational integrator: the discrete Lagrangian of a step from q
 
 where X are the positions and section axes of the nodes and U the potential of gravity. Momenta
 p0 = -dL/dq0 and p1 = dL/dq1, with the forces that have no potential split in the same way. It has
-no numerical damping; elasticity is implicit, gravity, loads and contact are explicit. Without
+no numerical damping; elasticity and contact are implicit, gravity and loads are explicit. Without
 inertia, backward Euler: stresses, viscosity included, are in equilibrium with all loads at the
 end of the step.
 
@@ -15,12 +15,19 @@ Newton's method uses a tangent by finite differences that is kept over many step
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from stiffopt.rig.simulated.jit import jit
+from stiffopt.rig.simulated.loads import (
+    Loads,
+    add_contact,
+    contact_force,
+    depth_of,
+    external_forces,
+    loads_after,
+)
 from stiffopt.rig.simulated.material import (
     Material,
     Memory,
@@ -38,32 +45,7 @@ _ITERATIONS = 40
 _SHORTEST = 1 / 64  # share of a step; one that does not work is divided down to this
 _NUDGE = 1e-7  # strain, for the finite differences
 _STRIDE = 0.3  # strain; no iteration goes further
-_SOFT = 1e-6  # m, over which contact sets in: more than a nudge moves the tip
 _REACH = 0.015  # m; turns curvatures into strains
-
-
-class Loads(NamedTuple):
-    """What pushes on the arm.
-
-    Attributes
-    ----------
-    node : on which the wrench acts.
-    force, moment : (3,), N and N m.
-    follows : whether they turn with the node's section.
-    plate : unit normal of the probe's plate (3,), from the probe towards the tip.
-    plate_at : where the plate is along its normal, m.
-    plate_speed : at which it moves, m/s.
-    plate_stiffness : N/m; 0 where there is no plate.
-    """
-
-    node: int
-    force: Array
-    moment: Array
-    follows: bool
-    plate: Array
-    plate_at: float
-    plate_speed: float
-    plate_stiffness: float
 
 
 class State(NamedTuple):
@@ -91,90 +73,6 @@ class State(NamedTuple):
     tangent_of: Array
     totals: Array
     memory: Memory
-
-
-@jit
-def loads_after(loads: Loads, duration: float) -> Loads:
-    """Loads after some time: the plate moves."""
-    return Loads(
-        loads.node,
-        loads.force,
-        loads.moment,
-        loads.follows,
-        loads.plate,
-        loads.plate_at + duration * loads.plate_speed,
-        loads.plate_speed,
-        loads.plate_stiffness,
-    )
-
-
-@jit
-def depth_of(loads: Loads, tip: Array) -> float:
-    """How far the tip is behind the plate's face, m; negative where it is clear of it."""
-    along: float = loads.plate[0] * tip[0] + loads.plate[1] * tip[1] + loads.plate[2] * tip[2]
-    return loads.plate_at - along
-
-
-@jit
-def external_forces(rod: Rod, loads: Loads, R: Array, r: Array, J: Array, out: Array) -> None:
-    """Generalised forces (n,) of gravity and wrench."""
-    n = len(out)
-    last = len(r) - 1
-    out[:] = 0.0
-    wrench, down = np.empty(6), np.empty(3)
-    for node in range(1, last + 1):
-        turn = R[node]
-        mass, mx, my = rod.mass[node, 0, 0], rod.mass[node, 0, 1], rod.mass[node, 0, 2]
-        for i in range(3):
-            down[i] = 0.0
-            for j in range(3):
-                down[i] += turn[j, i] * rod.gravity[j]
-            wrench[i] = mass * down[i]
-        wrench[3] = my * down[2]
-        wrench[4] = -mx * down[2]
-        wrench[5] = mx * down[1] - my * down[0]
-        if node == loads.node:
-            for i in range(3):
-                for j in range(3):
-                    along = (1.0 if i == j else 0.0) if loads.follows else turn[j, i]
-                    wrench[i] += along * loads.force[j]
-                    wrench[3 + i] += along * loads.moment[j]
-        for k in range(n):
-            total = 0.0
-            for i in range(6):
-                total += J[node, k, i] * wrench[i]
-            out[k] += total
-
-
-@jit
-def contact_force(loads: Loads, depth: float) -> float:
-    """Force of the plate on the tip at some depth, N: ``k max(depth, 0)``, rounded at 0."""
-    if loads.plate_stiffness == 0:
-        return 0.0
-    rounded: float = 0.5 * loads.plate_stiffness * (depth + math.hypot(depth, _SOFT))
-    return rounded
-
-
-@jit
-def contact_energy(loads: Loads, depth: float) -> float:
-    """Integral of `contact_force`, J, but for a constant."""
-    around = math.hypot(depth, _SOFT)
-    energy: float = depth * (depth + around) + _SOFT**2 * math.asinh(depth / _SOFT)
-    return 0.25 * loads.plate_stiffness * energy
-
-
-@jit
-def add_contact(loads: Loads, depth: float, R: Array, J: Array, out: Array) -> None:
-    """Add the plate's generalised forces (n,) on the tip, with axes R (3, 3) and Jacobian J."""
-    push = contact_force(loads, depth)
-    if push == 0:
-        return
-    for i in range(3):
-        along = push * (
-            R[0, i] * loads.plate[0] + R[1, i] * loads.plate[1] + R[2, i] * loads.plate[2]
-        )
-        for k in range(len(out)):
-            out[k] += J[k, i] * along
 
 
 @jit
@@ -479,37 +377,6 @@ def step(
     state.rotations[:] = work.rotations
     state.positions[:] = work.positions
     return True
-
-
-@jit
-def mass_matrix(rod: Rod, R: Array, J: Array, out: Array) -> None:
-    """Mass matrix (n, n) of the coefficients."""
-    n = len(out)
-    out[:] = 0.0
-    A = np.empty((6, 6))
-    for node in range(1, len(R)):
-        m = rod.mass[node]
-        A[:] = 0.0
-        for i in range(3):
-            A[i, i] = m[0, 0]
-        A[2, 3], A[2, 4] = m[0, 2], -m[0, 1]  # v z is the mass's moment times w, and so on
-        A[0, 5], A[1, 5] = -m[0, 2], m[0, 1]
-        A[3, 3], A[4, 4] = m[2, 2], m[1, 1]
-        A[3, 4] = -m[1, 2]
-        A[5, 5] = m[1, 1] + m[2, 2]
-        for i in range(6):
-            for j in range(i):
-                A[i, j] = A[j, i]
-        for k in range(n):
-            for j in range(k + 1):
-                total = 0.0
-                for a in range(6):
-                    for b in range(6):
-                        total += J[node, k, a] * A[a, b] * J[node, j, b]
-                out[k, j] += total
-    for k in range(n):
-        for j in range(k):
-            out[j, k] = out[k, j]
 
 
 @jit

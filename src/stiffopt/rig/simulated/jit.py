@@ -19,13 +19,12 @@ __all__ = ["jit"]
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
-_FILES = ("rod.py", "material.py", "dynamics.py", "regulators.py")
 _REORDER = {"contract", "reassoc", "arcp", "nsz"}  # but NaN and infinity stay what they are
 
 
 def _folder() -> str:
-    here = Path(__file__).parent
-    text = b"".join((here / name).read_bytes() for name in _FILES)
+    texts = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
+    text = b"".join(text for text in texts if b"@jit" in text)
     root = os.environ.get("STIFFOPT_CACHE_DIR") or Path.home() / ".cache" / "stiffopt"
     return str(Path(root) / "simulator" / hashlib.sha256(text).hexdigest()[:16])
 

@@ -19,7 +19,8 @@ from stiffopt.errors import EquilibriumError, InputError, PressureError, Stiffop
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.simulated import dynamics, material, rod
 from stiffopt.rig.simulated.build import make_material, make_rod, node_at
-from stiffopt.rig.simulated.dynamics import Loads, State
+from stiffopt.rig.simulated.dynamics import State
+from stiffopt.rig.simulated.loads import Loads, contact_energy, contact_force, depth_of
 from stiffopt.rig.simulated.material import Memory, Scheme
 from stiffopt.rig.simulated.mismatch import draw
 from stiffopt.rig.simulated.settings import Load, PlantSettings
@@ -196,9 +197,7 @@ class Plant:
     def contact_force(self) -> float:
         """Force with which the plate pushes the tip, in N."""
         loads = self._loads()
-        return float(
-            dynamics.contact_force(loads, dynamics.depth_of(loads, self._state.positions[-1]))
-        )
+        return float(contact_force(loads, depth_of(loads, self._state.positions[-1])))
 
     def advance(self, duration: float, pressures: ArrayLike) -> None:
         """Let time pass at constant pressures in the chambers.
@@ -293,14 +292,14 @@ class Plant:
         for m, R, r in zip(self._rod.mass, state.rotations, state.positions, strict=True):
             weight += m[0, 0] * r + R[:, :2] @ m[0, 1:]
         loads = self._loads()
-        depth = dynamics.depth_of(loads, state.positions[-1])
+        depth = depth_of(loads, state.positions[-1])
         return Energies(
             kinetic=0.5 * float(state.momentum @ speed),
             elastic=float(
                 material.stored(self._rod, self._material, state.memory, self._last_acting, state.q)
             ),
             gravity=-float(self._rod.gravity @ weight),
-            contact=float(dynamics.contact_energy(loads, depth)),
+            contact=float(contact_energy(loads, depth)),
             dissipated=float(state.totals[0]),
             work=float(state.totals[1]),
             load_work=float(state.totals[2]),
@@ -339,7 +338,7 @@ class Plant:
         n = len(self._state.q)
         J, M = np.empty((len(self._rod.mass), n, 6)), np.empty((n, n))
         rod.jacobians(self._rod, self._state.q, J)
-        dynamics.mass_matrix(self._rod, self._state.rotations, J, M)
+        rod.mass_matrix(self._rod, self._state.rotations, J, M)
         return M
 
     def _loads(self) -> Loads:

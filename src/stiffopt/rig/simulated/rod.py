@@ -255,3 +255,34 @@ def _carry(twist: Array, dR: Array, dr: Array, out: Array) -> None:
     for i in range(3):
         out[i] = dR[0, i] * v0 + dR[1, i] * v1 + dR[2, i] * v2
         out[3 + i] = dR[0, i] * twist[3] + dR[1, i] * twist[4] + dR[2, i] * twist[5]
+
+
+@jit
+def mass_matrix(rod: Rod, R: Array, J: Array, out: Array) -> None:
+    """Mass matrix (n, n) of the coefficients."""
+    n = len(out)
+    out[:] = 0.0
+    A = np.empty((6, 6))
+    for node in range(1, len(R)):
+        m = rod.mass[node]
+        A[:] = 0.0
+        for i in range(3):
+            A[i, i] = m[0, 0]
+        A[2, 3], A[2, 4] = m[0, 2], -m[0, 1]  # v z is the mass's moment times w, and so on
+        A[0, 5], A[1, 5] = -m[0, 2], m[0, 1]
+        A[3, 3], A[4, 4] = m[2, 2], m[1, 1]
+        A[3, 4] = -m[1, 2]
+        A[5, 5] = m[1, 1] + m[2, 2]
+        for i in range(6):
+            for j in range(i):
+                A[i, j] = A[j, i]
+        for k in range(n):
+            for j in range(k + 1):
+                total = 0.0
+                for a in range(6):
+                    for b in range(6):
+                        total += J[node, k, a] * A[a, b] * J[node, j, b]
+                out[k, j] += total
+    for k in range(n):
+        for j in range(k):
+            out[j, k] = out[k, j]

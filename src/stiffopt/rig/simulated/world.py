@@ -8,16 +8,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt import lie
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.interface import Clock, PressureLimits
+from stiffopt.rig.simulated.camera import Camera, Frame
 from stiffopt.rig.simulated.plant import Plant
 from stiffopt.rig.simulated.regulators import Regulators, regulate
 from stiffopt.rig.simulated.settings import (
@@ -26,8 +24,9 @@ from stiffopt.rig.simulated.settings import (
     SimulatedSupplySettings,
     SimulatedTrackerSettings,
 )
+from stiffopt.rig.simulated.stage import Stage
 
-__all__ = ["FAULTS", "Frame", "World"]
+__all__ = ["FAULTS", "World", "WorldClock"]
 
 Array = NDArray[np.float64]
 
@@ -39,31 +38,10 @@ FAULTS = {
 """What can be injected, by device. ``stuck`` holds the last value, ``wrong`` is plausible but off,
 ``garbage`` is not plausible at all; ``high`` is a regulator stuck at its highest pressure."""
 
-_IMMOBILE = ("off", "stuck")  # faults of a stage that does not move
-_SLOW = 0.5  # s, by which a slow device is late
+_SLOW = 0.5  # s, by which the lag of a slow regulator is longer
 _LEAK = 0.3  # s; time constant of an injected leak
-_AWAY = np.array([0.02, -0.015, 0.01])  # m, by which a wrong tracker is off
-_KEPT = 4096  # frames that wait to be read
+_LONG = 1_000_000  # steps; there is no need to stop for this long
 _LONGEST = 1.0  # s of real time that is caught up with at once; more than that is skipped
-
-
-@dataclass(frozen=True)
-class Frame:
-    """A frame of the tracker, in its own terms.
-
-    Attributes
-    ----------
-    number : counted from 1.
-    captured, delivered : when, in s.
-    position : of the sensor in the tracker's frame (3,), in m; NaN where it is not seen.
-    quaternion : (4,), w first, of any sign.
-    """
-
-    number: int
-    captured: float
-    delivered: float
-    position: Array
-    quaternion: Array
 
 
 class World:
@@ -94,7 +72,7 @@ class World:
     ) -> None:
         self.plant = Plant(robot, plant)
         self.lock = threading.RLock()
-        self.supply, self.tracker, self.probe = supply, tracker, probe
+        self.supply = supply
         self.faults = dict.fromkeys(FAULTS, "ok")
         self._faulty: dict[int, str] = {}
         self._real_time = real_time
@@ -118,15 +96,9 @@ class World:
         self.pressures = np.zeros(n)
         """In the chambers (n,), in Pa."""
         streams = np.random.SeedSequence([plant.seed, 2]).spawn(4)
-        self._ripple, self._gauge, self._optics, self._balance = map(np.random.default_rng, streams)
-        self._frames: deque[Frame] = deque(maxlen=_KEPT)
-        self._captured = 0
-        self._last_frame: Frame | None = None
-        self._axis: Array | None = None
-        self._stage_origin = 0.0
-        self.stage_position = 0.0
-        self._stage_target = 0.0
-        self._stage_speed = 0.0
+        self._ripple, self._gauge, optics, balance = map(np.random.default_rng, streams)
+        self.camera = None if tracker is None else Camera(tracker, self.plant, optics)
+        self.stage = None if probe is None else Stage(probe, self.plant, balance)
         self._run(0)  # compiles what has not been compiled yet: no time for that later
         self.plant.contact_force()
         self._epoch = time.monotonic()
@@ -167,20 +139,14 @@ class World:
     def _next_event(self, here: int) -> int:
         """Return the step at which something other than physics happens next."""
         step = self.plant.step
-        events = [here + 1_000_000]
-        if self.tracker is not None:
-            events.append(self._capture_step(self._captured))
-        if self._stage_speed:
-            distance = abs(self._stage_target - self.stage_position)
-            events.append(here + max(1, int(distance / self._stage_speed / step)))
+        events = [here + _LONG]
+        if self.camera is not None:
+            events.append(self.camera.next_step())
+        if self.stage is not None and (left := self.stage.steps_left()) is not None:
+            events.append(here + left)
         if self.supply.watchdog is not None and self.set_point.any():
             events.append(int(np.ceil((self._commanded_at + self.supply.watchdog) / step)))
         return max(here + 1, min(events))
-
-    def _capture_step(self, count: int) -> int:
-        """Return the step in which a frame (counted from 0) is captured."""
-        rate = self.tracker.rate if self.tracker else 1.0
-        return round((count + 1) / rate / self.plant.step)
 
     def _run(self, steps: int) -> None:
         trace = np.empty((steps, self._n))
@@ -194,12 +160,14 @@ class World:
             ripple,
             trace,
         )
-        self._place_plate(steps)
+        if self.stage is not None:
+            self.stage.place_plate(moving=steps > 0)
         self.plant.follow(trace)
-        self._move_stage(steps)
+        if self.stage is not None:
+            self.stage.advance(steps)
         here = round(self.time / self.plant.step)
-        if self.tracker is not None and steps and here >= self._capture_step(self._captured):
-            self._capture()
+        if self.camera is not None and here >= self.camera.next_step():
+            self.camera.capture(self.faults["tracker"])
         watchdog = self.supply.watchdog
         if watchdog is not None and self.time - self._commanded_at >= watchdog:
             self.set_point[:] = 0.0
@@ -246,123 +214,45 @@ class World:
         """Whether the dump valve is open."""
         return bool(self._regulators.dumped)
 
-    # Tracker -------------------------------------------------------------------------------------
+    # Tracker and probe ---------------------------------------------------------------------------
 
     def frames(self) -> list[Frame]:
-        """Return the frames that have been delivered since the last call."""
+        """Return the tracker's frames that have been delivered since the last call."""
         with self.lock:
-            ready = []
-            while self._frames and self._frames[0].delivered <= self.now() + 1e-9:
-                ready.append(self._frames.popleft())
-            return ready
+            return [] if self.camera is None else self.camera.delivered(self.now())
 
-    def _capture(self) -> None:
-        tracker, fault = self.tracker, self.faults["tracker"]
-        self._captured += 1
-        if tracker is None:
-            return
-        chances = self._optics.random(3)  # drawn in every frame, so that faults shift no stream
-        noise = self._optics.standard_normal(6)
-        if fault == "off" or chances[0] < tracker.missing:
-            return
-        T = self._as_tracked(noise)
-        position, q = T[:3, 3].copy(), np.asarray(lie.quaternion_from_rotation(T[:3, :3]))
-        if fault == "missing" or chances[1] < tracker.dropouts:
-            position, q = np.full(3, np.nan), np.full(4, np.nan)
-        elif fault == "wrong":
-            position = position + _AWAY
-        elif fault == "garbage":
-            position, q = position * 1e3 * noise[:3], np.full(4, np.nan)
-        if chances[2] < tracker.flips or (fault == "flip" and self._captured % 2):
-            q = -q
-        late = tracker.latency + (_SLOW if fault == "slow" else 0.0)
-        captured = self.time
-        frame = Frame(self._captured, captured, captured + late, position, q)
-        if fault == "stuck" and self._last_frame is not None:
-            last = self._last_frame
-            frame = Frame(
-                last.number, last.captured, captured + late, last.position, last.quaternion
-            )
-        self._last_frame = frame
-        self._frames.append(frame)
-
-    def _as_tracked(self, noise: Array) -> Array:
-        """Pose (4, 4) of the sensor in the tracker's frame, with the tracker's noise."""
-        tracker = self.tracker
-        tip = np.linalg.inv(self.plant.mismatch.registration.transform()) @ self.plant.tip_pose()
-        if tracker is None:
-            return tip
-        T = tracker.registration.sensor_in_tracker(tip)
-        T[:3, 3] += tracker.noise * noise[:3]
-        turn = np.concatenate((np.zeros(3), tracker.angular_noise * noise[3:]))
-        T[:3, :3] = T[:3, :3] @ np.asarray(lie.exp(turn))[:3, :3]
-        return T
-
-    # Probe ---------------------------------------------------------------------------------------
-
-    def align_stage(self, direction: ArrayLike | None) -> None:
-        """Mount the stage along a unit vector (3,) just clear of the tip, or take it away."""
+    def mount_stage(self, direction: ArrayLike | None) -> None:
+        """Mount the stage along a vector (3,) just clear of the tip, or take it away."""
         with self.lock:
-            if direction is None or self.probe is None:
-                self._axis = None
-            else:
-                self._axis = np.array(direction, dtype=float)
-                self._axis /= np.linalg.norm(self._axis)
-                tip = self.plant.tip_pose()[:3, 3]
-                self._stage_origin = float(self._axis @ tip) - self.probe.clearance
-            self.stage_position = self._stage_target = self._stage_speed = 0.0
-            self._place_plate(0)
+            if self.stage is not None:
+                self.stage.mount(direction)
 
     def move_stage(self, position: float, speed: float) -> None:
         """Let the stage start to move, m and m/s."""
         with self.lock:
-            if self.probe is None:
-                return
-            speed = min(speed, self.probe.speed)
-            if self.faults["probe"] == "slow":
-                speed /= 10
-            self._stage_target = position
-            moving = position != self.stage_position and self.faults["probe"] not in _IMMOBILE
-            self._stage_speed = speed if moving else 0.0
+            if self.stage is not None:
+                self.stage.move(position, speed, self.faults["probe"])
 
     def stop_stage(self) -> None:
         """Stop the stage."""
         with self.lock:
-            self._stage_speed = 0.0
+            if self.stage is not None:
+                self.stage.speed = 0.0
+
+    @property
+    def stage_position(self) -> float:
+        """Where the stage is, m."""
+        return 0.0 if self.stage is None else self.stage.position
 
     @property
     def stage_moving(self) -> bool:
         """Whether the stage moves."""
-        return self._stage_speed > 0
+        return self.stage is not None and self.stage.speed > 0
 
     def force(self) -> float:
         """Force that the sensor at the stage feels, in N."""
         with self.lock:
-            noise = (self.probe.noise if self.probe else 0.0) * self._balance.standard_normal()
-            force = self.plant.contact_force() if self._axis is not None else 0.0
-            fault = self.faults["probe"]
-            if fault == "garbage":
-                return float("nan") if noise > 0 else 1e6 * noise
-            return (0.5 * force + 0.1 if fault == "wrong" else force) + noise
-
-    def _place_plate(self, steps: int) -> None:
-        if self._axis is None or self.probe is None:
-            self.plant.set_plate(None)
-            return
-        direction = np.sign(self._stage_target - self.stage_position)
-        at = self._stage_origin + self.stage_position
-        speed = direction * self._stage_speed if steps else 0.0
-        self.plant.set_plate(self._axis, at, self.probe.stiffness, speed)
-
-    def _move_stage(self, steps: int) -> None:
-        if self._stage_speed:
-            distance = self._stage_target - self.stage_position
-            moved = self._stage_speed * steps * self.plant.step
-            if moved >= abs(distance) - 1e-9:
-                self.stage_position, self._stage_speed = self._stage_target, 0.0
-            else:
-                self.stage_position += float(np.sign(distance)) * moved
-        self._place_plate(0)
+            return 0.0 if self.stage is None else self.stage.force(self.faults["probe"])
 
     # Faults --------------------------------------------------------------------------------------
 
@@ -393,8 +283,8 @@ class World:
             self.faults[device] = fault
             if device == "supply":
                 self._set_faulty(fault, range(self._n) if channel is None else [channel])
-            if device == "probe" and fault in _IMMOBILE:
-                self._stage_speed = 0.0
+            if device == "probe" and self.stage is not None:
+                self.stage.stop_if(fault)
 
     def _set_faulty(self, fault: str, channels: range | list[int]) -> None:
         regulators, settings = self._regulators, self.supply
