@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from stiffopt.cli.console import report_error, report_note, write_line
+from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
 from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED
 from stiffopt.errors import InputError, StiffoptError
 from stiffopt.files import file_text, save_file
@@ -28,7 +28,9 @@ def run(rig: str, out: str | None, supply: str, tracker: str, *, quiet: bool) ->
         description = load_rig_description(rig)
         folder = Path(rig).parent
         robot = load_description(description.robot, base=folder)
-        with VirtualLab(description, robot, supply, tracker) as lab, _until_signal() as ended:
+        with warnings_as_notes(quiet=quiet):
+            virtual_lab = VirtualLab(description, robot, supply, tracker)
+        with virtual_lab as lab, _until_signal() as ended:
             addressed = lab.start().model_copy(
                 update={"robot": robot_path(description.robot, folder)}
             )

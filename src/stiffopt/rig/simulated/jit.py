@@ -9,24 +9,36 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from stiffopt.errors import MissingExtraError
+from stiffopt.errors import MissingExtraError, SlowWarning
 
-__all__ = ["jit"]
+__all__ = ["jit", "tell_if_new"]
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 _REORDER = {"contract", "reassoc", "arcp", "nsz"}  # but NaN and infinity stay what they are
 
 
+@cache
 def _folder() -> str:
     texts = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
     text = b"".join(text for text in texts if b"@jit" in text)
     root = os.environ.get("STIFFOPT_CACHE_DIR") or Path.home() / ".cache" / "stiffopt"
     return str(Path(root) / "simulator" / hashlib.sha256(text).hexdigest()[:16])
+
+
+@cache
+def tell_if_new() -> None:
+    """Warn, once, if nothing is kept yet and all must be compiled."""
+    if not any(Path(_folder()).glob("*.nbi")):
+        warnings.warn(
+            "the simulator is compiled, once; that takes half a minute", SlowWarning, stacklevel=2
+        )
 
 
 def jit(function: FunctionT) -> FunctionT:

@@ -20,6 +20,7 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.rig.simulated import dynamics, material, rod
 from stiffopt.rig.simulated.build import make_material, make_rod, node_at
 from stiffopt.rig.simulated.dynamics import State
+from stiffopt.rig.simulated.jit import tell_if_new
 from stiffopt.rig.simulated.loads import Loads, contact_energy, contact_force, depth_of
 from stiffopt.rig.simulated.material import Memory, Scheme
 from stiffopt.rig.simulated.mismatch import draw
@@ -82,6 +83,7 @@ class Plant:
     """
 
     def __init__(self, robot: RobotDescription, settings: PlantSettings | None = None) -> None:
+        tell_if_new()
         self.robot = robot
         self.settings = settings or PlantSettings()
         self.mismatch = draw(robot, self.settings)
