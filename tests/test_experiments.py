@@ -6,6 +6,7 @@ import math
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -833,3 +834,50 @@ def test_an_alignment_that_takes_long_finds_the_pressure_again(tmp_path: Path) -
     log = read_log(tmp_path / "stiffness_1.csv")
     assert log.measured is not None
     assert np.isnan(log.measured[:, 0]).sum() > 1000  # nobody read it then
+
+
+class _ByHand:
+    """A probe that a person mounts: `align` lasts until the rig has been spoken to for a while."""
+
+    def __init__(self, rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.rig, self.writes = rig, [0]
+        self.fail: Exception | None = None
+        align = rig.probe.align  # type: ignore[union-attr]
+
+        def by_hand(direction: tuple[float, ...]) -> None:
+            world = world_of(rig)
+            before, began = len(world.writes), world.t
+            world.seen = False  # a hand before the sensor
+            while world.t < began + 30 and not self.fail:
+                time.sleep(0.001)
+            world.seen = True
+            if self.fail:
+                raise self.fail
+            self.writes.append(len(world.writes) - before)
+            align(direction)
+
+        monkeypatch.setattr(rig.probe, "align", by_hand)
+        monkeypatch.setattr(type(rig.probe), "needs_a_person", True)
+
+
+def test_pressures_are_held_while_a_person_mounts_the_probe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = fake_rig(stiffness=golden)
+    person = _ByHand(rig, monkeypatch)
+    with rig:
+        run_stiffness(rig, tmp_path, quick(directions=((1.0, 0.0, 0.0),)), model(), rate=50.0)
+    assert person.writes[-1] > 1000  # 30 s at 50 Hz: no watchdog would have run out
+    _, pressures_then = world_of(rig).alignments[-1]
+    assert pressures_then[0] == pytest.approx(0.4e5, abs=20)
+
+
+def test_what_goes_wrong_while_the_probe_is_mounted_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = fake_rig(stiffness=golden)
+    _ByHand(rig, monkeypatch).fail = DeviceError("nobody is at the terminal")
+    settings = quick(directions=((1.0, 0.0, 0.0),))
+    with rig, pytest.raises(DeviceError, match="nobody is at"):
+        run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
+    assert not world_of(rig).commanded.any()

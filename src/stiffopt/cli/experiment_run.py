@@ -70,7 +70,7 @@ class _Plan:
 def run(experiment: str, options: Options) -> int:
     """Do an experiment, or go on with it; report and draw; return the exit code."""
     try:
-        with Interruptible():
+        with Interruptible(), warnings_as_notes(quiet=options.quiet):
             plan = _planned(experiment, options)
     except KeyboardInterrupt:
         return INTERRUPTED

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -112,6 +113,7 @@ class Conductor:
         self._setpoint = np.array(rig.supply.commanded, dtype=float)
         self._moments: deque[_Moment] = deque(maxlen=_KEPT)
         self._last = self._deadline = self.clock.now()
+        self._hidden = False  # somebody may stand before the tracker
 
     @property
     def n(self) -> int:
@@ -161,7 +163,7 @@ class Conductor:
         self._moments.append(_Moment(now, self._setpoint, reading.pressures, force, stage))
         for sample in self.tracker.read():
             self._take(sample)
-        if LOST < self.tracker.age() < np.inf:
+        if LOST < self.tracker.age() < np.inf and not self._hidden:
             raise DeviceError(f"the tracker has not seen the tip for {LOST:g} s")
         self._deadline += self._period
         if self._deadline <= self.clock.now():
@@ -197,6 +199,34 @@ class Conductor:
         return around[0], nearest
 
     # -- longer manoeuvres ------------------------------------------------------------------
+
+    def meanwhile(self, task: Callable[[], None]) -> None:
+        """Hold the pressures while a task, in a thread of its own, waits for a person.
+
+        The supply is spoken to all the time, for its watchdog; that the tip is hidden is no fault.
+        Whatever the task raises is raised here.
+        """
+        failures: list[BaseException] = []
+
+        def work() -> None:
+            try:
+                task()
+            except BaseException as error:  # told by who waits
+                failures.append(error)
+
+        thread = threading.Thread(target=work, name="person", daemon=True)
+        self._hidden = True
+        try:
+            thread.start()
+            while thread.is_alive():
+                self.tick(self._setpoint)
+            done = self.clock.now()
+            while self.tracker.age() > _NEAR and self.clock.now() - done < _FIRST and not failures:
+                self.tick(self._setpoint)  # whoever stood before the tracker steps aside
+        finally:
+            self._hidden = False
+        if failures:
+            raise failures[0]
 
     def ramp(self, target: ArrayLike, slew: float = GENTLE) -> None:
         """Bring the pressures (n,) somewhere; from what is measured, should they have fallen."""

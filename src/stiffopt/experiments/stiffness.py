@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -231,8 +232,7 @@ class _Run:
             conductor.ramp(np.zeros(settings.channels))  # each repetition starts from nothing
             self._rest(np.zeros(settings.channels))
         self._rest(p)
-        with self._aside():
-            self._probing.probe.align(key.direction)
+        self._by_hand(partial(self._probing.probe.align, key.direction))
         at_rest_then = self._rest(p)  # whoever aligned it may have taken long, or touched the arm
         points = self._probing.run(p, self._planned(p, key))
         self._restless += not at_rest_then
@@ -241,8 +241,15 @@ class _Run:
         self._points.append(key, points)
 
     def _withdraw(self) -> None:
+        self._by_hand(self._probing.probe.withdraw)
+
+    def _by_hand(self, task: Callable[[], None]) -> None:
+        """Let the probe do what a person may have to help with."""
         with self._aside():
-            self._probing.probe.withdraw()
+            if self._probing.probe.needs_a_person:
+                self._conductor.meanwhile(task)
+            else:
+                task()
 
     def wind_down(self) -> None:
         """Take the probe away, let the pressure down, close the recording."""

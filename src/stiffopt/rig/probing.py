@@ -33,6 +33,11 @@ class ForceSample:
 class ForceProbe(Device):
     """Pushes on the tip along one axis and feels the force."""
 
+    @property
+    def needs_a_person(self) -> bool:
+        """Whether `align` and `withdraw` wait for a person: hold the pressures meanwhile."""
+        return False
+
     @abstractmethod
     def align(self, direction: Iterable[float]) -> None:
         """Make a unit vector (3,) in the base frame the axis; on a real rig, ask that it be done.

@@ -128,6 +128,11 @@ class ZaberProbe(ForceProbe):
         self._zero = 0.0
         self._aligned = False
 
+    @property
+    def needs_a_person(self) -> bool:
+        """True: the rail is mounted by hand."""
+        return True
+
     def align(self, direction: Iterable[float]) -> None:
         """Ask that the rail be mounted along a unit vector (3,) in the base frame; tare there.
 

@@ -35,7 +35,7 @@ def _folder() -> str:
 @cache
 def tell_if_new() -> None:
     """Warn, once, if nothing is kept yet and all must be compiled."""
-    if not any(Path(_folder()).glob("*.nbi")):
+    if not any(Path(_folder()).rglob("*.nbi")):
         warnings.warn(
             "the simulator is compiled, once; that takes half a minute", SlowWarning, stacklevel=2
         )
