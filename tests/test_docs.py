@@ -12,6 +12,8 @@ import pytest
 from pydantic import BaseModel
 
 import stiffopt
+from examples import run_examples
+from stiffopt.logs import read_log
 from stiffopt.model.description import (
     Chambers,
     Compensation,
@@ -23,13 +25,53 @@ from stiffopt.model.description import (
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task
+from stiffopt.rig.config import (
+    LabSettings,
+    LogSettings,
+    RigDescription,
+    Safety,
+    limits_of,
+    load_rig_description,
+)
+from stiffopt.rig.drivers import modbus_registers, nidaq, nidaq_valve
+from stiffopt.rig.drivers.aurora import AuroraSettings
+from stiffopt.rig.drivers.modbus import ModbusSettings, SerialLine, Tcp
+from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
+from stiffopt.rig.drivers.probe import ForceSettings, ProbeSettings
+from stiffopt.rig.drivers.zaber import StageSettings
+from stiffopt.rig.registration import Placement, Registration
+from stiffopt.rig.simulated import settings as simulated
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "rig/README.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 SCHEMAS: list[type[BaseModel]] = [
     *(RobotDescription, Segment, Chambers, Material, Compensation, PressureLimits),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
+    *(RigDescription, Safety, LogSettings, LabSettings, Registration, Placement),
+    *(simulated.PlantSettings, simulated.Silicone, simulated.Creep, simulated.Hysteresis),
+    *(simulated.Mismatch, simulated.Spread, simulated.Load, simulated.Discretisation),
+    *(simulated.SimulatedSupplySettings, simulated.SimulatedTrackerSettings),
+    simulated.SimulatedProbeSettings,
+    *(ModbusSettings, Tcp, SerialLine, modbus_registers.Channel, modbus_registers.Scale),
+    *(modbus_registers.SetPoint, modbus_registers.Reading, modbus_registers.RegisterValue),
+    *(modbus_registers.Watchdog, modbus_registers.DumpValve),
+    *(nidaq.NidaqSettings, nidaq.RegulatorChannel, nidaq.Output, nidaq.Input),
+    nidaq_valve.DumpValve,
+    *(AuroraSettings, OpenIGTLinkSettings, ProbeSettings, StageSettings, ForceSettings),
 ]
+SECTIONS = {  # of files.md, by how the module of a schema begins; the first that fits
+    "stiffopt.rig.drivers.modbus": "Driver modbus",
+    "stiffopt.rig.drivers.nidaq": "Driver nidaq",
+    "stiffopt.rig.drivers.aurora": "Drivers aurora and openigtlink",
+    "stiffopt.rig.drivers.openigtlink": "Drivers aurora and openigtlink",
+    "stiffopt.rig.drivers": "Driver probe",
+    "stiffopt.rig": "Rig file",
+    "stiffopt.model": "Robot file",
+    "stiffopt.optimise": "Task file",
+}
 
 
 def yaml_examples() -> list[object]:
@@ -55,6 +97,10 @@ def test_yaml_example_loads(text: str, tmp_path: Path) -> None:
         task = stiffopt.load_task(path)
         lower, upper = task.pressure_bounds(task.resolve_robot())
         assert (lower < upper).all()
+    elif "stiffopt-rig/" in text:
+        rig = load_rig_description(path)
+        robot = stiffopt.load_robot(rig.robot)
+        assert limits_of(rig, robot.description).n == robot.n_pressures
     else:
         pytest.fail(f"a YAML example that says nothing of its format:\n{text}")
 
@@ -62,9 +108,30 @@ def test_yaml_example_loads(text: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("schema", SCHEMAS, ids=lambda schema: schema.__name__)
 def test_files_page_names_every_key(schema: type[BaseModel]) -> None:
     page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    title = next(title for begin, title in SECTIONS.items() if schema.__module__.startswith(begin))
+    found = re.search(rf"^(#+) {title}\n(.*?)(?=^\1 |^## |\Z)", page, re.M | re.S)
+    assert found, title
     keys = {name for name, info in schema.model_fields.items() if not info.exclude}
-    missing = {key for key in keys if not re.search(rf"[`.]{key}[`.]", page)}
-    assert not missing, f"docs/files.md does not describe {sorted(missing)}"
+    if title.startswith("Driver"):
+        keys.discard("driver")
+    missing = {key for key in keys if not re.search(rf"[`.]{key}[`.]", found[2])}
+    assert not missing, f"'{title}' of docs/files.md does not describe {sorted(missing)}"
+
+
+@pytest.mark.filterwarnings("ignore:the simulator is compiled")
+def test_rig_page_examples_print_what_stands_below_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    assert run_examples((ROOT / "docs" / "rig.md").read_text(encoding="utf-8"), "rig.md") == 2
+
+
+def test_files_page_shows_a_log_that_can_be_read(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"^```text\n(time_s,.*?)^```", page, re.M | re.S)
+    (tmp_path / "log.csv").write_text(example, encoding="utf-8")
+    log = read_log(tmp_path / "log.csv")
+    assert (log.n, len(log)) == (3, 2)
+    for column in log.layout.columns:
+        assert f"`{column}`" in page or re.match(r"pm?3_pa", column)
 
 
 def solve_pressure(*arguments: str) -> str:

@@ -43,7 +43,7 @@ _CLOSE = 1e-9  # strain by which a step may still be wrong
 _SLOWEST = 0.3  # share of the correction before; if one is larger, the tangent is made anew
 _ITERATIONS = 40
 _SHORTEST = 1 / 64  # share of a step; one that does not work is divided down to this
-_NUDGE = 1e-7  # strain, for the finite differences
+NUDGE = 1e-7  # strain, for the finite differences
 _STRIDE = 0.3  # strain; no iteration goes further
 _REACH = 0.015  # m; turns curvatures into strains
 
@@ -157,7 +157,7 @@ class Work(NamedTuple):
 
 
 @jit
-def _residual(
+def residual(
     rod: Rod,
     material: Material,
     scheme: Scheme,
@@ -201,7 +201,7 @@ def _residual(
 
 
 @jit
-def _in_strain(rod: Rod, k: int) -> float:
+def in_strain(rod: Rod, k: int) -> float:
     """How much strain a unit of a coefficient is."""
     return _REACH if k % rod.per_segment >= rod.first[3] else 1.0
 
@@ -215,7 +215,7 @@ def _correction(rod: Rod, state: State, work: Work) -> float:
         for k in range(len(work.trial)):
             total -= state.inverse[i, k] * work.residual[k]
         work.trial[i] = total
-        largest = max(largest, abs(total) * _in_strain(rod, i))
+        largest = max(largest, abs(total) * in_strain(rod, i))
         if np.isnan(total):
             return np.nan
     return largest
@@ -237,10 +237,10 @@ def _make_tangent(
     n = len(q)
     args = (rod, material, scheme, loads, inertia, state, pressures, work)
     for k in range(n):
-        nudge = _NUDGE / _in_strain(rod, k)
+        nudge = NUDGE / in_strain(rod, k)
         kept = q[k]
         q[k] = kept + nudge
-        _residual(*args, q, work.nudged)
+        residual(*args, q, work.nudged)
         q[k] = kept
         for i in range(n):
             work.tangent[i, k] = (work.nudged[i] - work.residual[i]) / nudge
@@ -261,21 +261,21 @@ def _solve(
 ) -> bool:
     """Bring q (n,), at first a guess, to the end of a step; return whether that worked.
 
-    What `_residual` leaves in `work` is then that of q.
+    What `residual` leaves in `work` is then that of q.
     """
     n = len(q)
     kind = (2.0 if inertia else 1.0) + (4.0 if scheme.history else 0.0)
     args = (rod, material, scheme, loads, inertia, state, pressures, work)
     before = np.inf
     for iteration in range(_ITERATIONS):
-        _residual(*args, q, work.residual)
+        residual(*args, q, work.residual)
         known = state.tangent_of[0] == scheme.step and state.tangent_of[1] == kind
         largest = _correction(rod, state, work) if known else np.inf
         # An old tangent may no longer serve; NaN comes here too.
         if not known or not largest <= _SLOWEST * before:
             if not _make_tangent(*args, q):
                 return False
-            _residual(*args, q, work.residual)
+            residual(*args, q, work.residual)
             state.tangent_of[0] = scheme.step
             state.tangent_of[1] = kind
             largest = _correction(rod, state, work)
@@ -409,29 +409,3 @@ def run(
             else:
                 return i
     return len(pressures)
-
-
-@jit
-def stiffness(
-    rod: Rod,
-    material: Material,
-    scheme: Scheme,
-    loads: Loads,
-    state: State,
-    pressures: Array,
-    out: Array,
-) -> None:
-    """Derivative (n, n) of the imbalance without inertia by the end of a step from the state."""
-    n = len(state.q)
-    work = make_work(n, len(state.positions))
-    q = state.q.copy()
-    args = (rod, material, scheme, loads, False, state, pressures, work, q)
-    for k in range(n):
-        nudge = _NUDGE / _in_strain(rod, k)
-        q[k] = state.q[k] + nudge
-        _residual(*args, work.nudged)
-        q[k] = state.q[k] - nudge
-        _residual(*args, work.residual)
-        q[k] = state.q[k]
-        for i in range(n):
-            out[i, k] = (work.nudged[i] - work.residual[i]) / (2 * nudge)

@@ -329,12 +329,20 @@ class Plant:
         return omega / (2 * math.pi), damped / (2 * omega)
 
     def _tangent(self, parts: material.Material, scheme: Scheme) -> Array:
-        n = len(self._state.q)
-        out = np.empty((n, n))
-        dynamics.stiffness(
-            self._rod, parts, scheme, self._loads(), self._state, self._last_acting, out
-        )
-        return out
+        """Change of the imbalance without inertia (n, n) with the end of a step from here."""
+        q, n = self._state.q.copy(), len(self._state.q)
+        work = dynamics.make_work(n, len(self._state.positions))
+        K, high, low = np.empty((n, n)), np.empty(n), np.empty(n)
+        step = (self._rod, parts, scheme, self._loads(), False, self._state, self._last_acting)
+        for k in range(n):
+            nudge = dynamics.NUDGE / dynamics.in_strain(self._rod, k)
+            q[k] = self._state.q[k] + nudge
+            dynamics.residual(*step, work, q, high)
+            q[k] = self._state.q[k] - nudge
+            dynamics.residual(*step, work, q, low)
+            q[k] = self._state.q[k]
+            K[:, k] = (high - low) / (2 * nudge)
+        return K
 
     def _mass(self) -> Array:
         n = len(self._state.q)
