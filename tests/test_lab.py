@@ -196,40 +196,52 @@ def start(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
+def told(process: subprocess.Popen[str], words: str) -> str:
+    """Return the first line of stderr that has these words."""
+    assert process.stderr is not None
+    for line in process.stderr:
+        if words in line:
+            return line
+    raise AssertionError(f"the command ended without saying '{words}'")
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
+    for stream in (process.stdin, process.stdout, process.stderr):
+        if stream is not None and not stream.closed:
+            stream.close()
+
+
 def test_the_command_writes_a_file_takes_commands_and_ends(tmp_path: Path) -> None:
     rig_file, out = tmp_path / "rig.yaml", tmp_path / "lab.yaml"
     save_file(rig_file, "rig", anywhere(load_rig_description(RIGS / "virtual-lab.yaml")))
     process = start(str(rig_file), "--out", str(out))
     try:
         assert process.stdin is not None
-        assert process.stderr is not None
-        assert "the lab runs" in process.stderr.readline()
+        told(process, "the lab runs")
         with open_rig(out) as rig:
             assert rig.supply.read().pressures.max() < 5e3
             process.stdin.write("fault supply wrong 2\nfault door open\nmount 0 1 0\nstatus\n")
             process.stdin.flush()
             wait_for(lambda: rig.supply.read().pressures[1] > 1e4)
-        said = [process.stderr.readline() for _ in range(4)]
-        assert "there is no fault 'open' of 'door'" in said[1]
-        assert "rail is along 0 1 0" in said[2]
-        assert "faults: supply wrong" in said[3]
+        told(process, "there is no fault 'open' of 'door'")
+        told(process, "rail is along 0 1 0")
+        told(process, "faults: supply wrong")
         process.send_signal(signal.SIGTERM)
         assert process.wait(10) == 0
     finally:
-        process.kill()
-        process.communicate()
+        end(process)
 
 
 def test_the_rig_file_is_printed(tmp_path: Path) -> None:
     process = start(str(RIGS / "sim.yaml"), "--supply", "nidaq", "--tracker", "openigtlink")
     try:
-        assert process.stderr is not None
-        assert "the lab runs" in process.stderr.readline()
+        told(process, "the lab runs")
         out, _ = process.communicate("quit\n", 15)
         assert process.returncode == 0
     finally:
-        process.kill()
-        process.wait()
+        end(process)
     printed = tmp_path / "printed.yaml"
     printed.write_text(out)
     description = read_file(printed, "rig", RigDescription)

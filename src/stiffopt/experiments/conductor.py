@@ -20,7 +20,9 @@ __all__ = ["Conductor", "Row", "at_rest", "check_pressures"]
 Array = NDArray[np.float64]
 
 LOST = 2.0
-"""Seconds without sight of the tip after which an experiment is given up."""
+"""Seconds without sight of the tip after which an experiment is given up, if no rig file says."""
+VALID = 0.5
+"""Seconds for which a command holds, if no rig file says."""
 GENTLE = 5e4
 """Rate in Pa/s at which pressures are brought to where an experiment wants them."""
 _FIRST = 5.0  # s that a tracker may take to see the tip for the first time
@@ -113,6 +115,9 @@ class Conductor:
         self._setpoint = np.array(rig.supply.commanded, dtype=float)
         self._moments: deque[_Moment] = deque(maxlen=_KEPT)
         self._last = self._deadline = self.clock.now()
+        safety = None if rig.settings is None else rig.settings.safety
+        self._valid = VALID if safety is None else safety.command_timeout
+        self._lost = LOST if safety is None else safety.tracker_timeout
         self._hidden = False  # somebody may stand before the tracker
 
     @property
@@ -155,7 +160,7 @@ class Conductor:
         wanted = np.where((target == 0) & (wanted < limits.low), 0.0, wanted)
         self._setpoint = limits.clamp(wanted)
         self._last = now
-        reading = self.rig.supply.exchange(PressureCommand(self._setpoint, now))
+        reading = self.rig.supply.exchange(PressureCommand(self._setpoint, now, self._valid))
         force, stage = np.nan, np.nan
         if self.probing and self.rig.probe is not None:
             felt = self.rig.probe.sample()
@@ -163,8 +168,8 @@ class Conductor:
         self._moments.append(_Moment(now, self._setpoint, reading.pressures, force, stage))
         for sample in self.tracker.read():
             self._take(sample)
-        if LOST < self.tracker.age() < np.inf and not self._hidden:
-            raise DeviceError(f"the tracker has not seen the tip for {LOST:g} s")
+        if self._lost < self.tracker.age() < np.inf and not self._hidden:
+            raise DeviceError(f"the tracker has not seen the tip for {self._lost:g} s")
         self._deadline += self._period
         if self._deadline <= self.clock.now():
             self._deadline = self.clock.now() + self._period
