@@ -32,6 +32,8 @@ def _blocks(rows: list[list[Array]]) -> Array:
     """Assemble a matrix from blocks in either library."""
     if any(_is_casadi(block) for row in rows for block in row):
         return ca.vertcat(*[ca.horzcat(*row) for row in rows])
+    if np.ndim(rows[0][0]) == 0:
+        return np.array(rows, dtype=float)  # many times faster than np.block
     return np.block(rows)
 
 

@@ -18,12 +18,14 @@ Array = NDArray[np.float64]
 
 
 @lru_cache(maxsize=64)
-def _transform(position: tuple[float, ...], orientation: tuple[float, ...]) -> Array:
-    """Transform (4, 4), not to be written to: there is one for all who ask."""
+def _transform(position: tuple[float, ...], orientation: tuple[float, ...]) -> tuple[Array, Array]:
+    """Transform (4, 4) and its inverse, not to be written to: they are shared."""
     rotation = lie.rotation_from_quaternion(np.array(orientation))
     transform = np.asarray(lie.transform(rotation, np.array(position)))
-    transform.flags.writeable = False
-    return transform
+    inverse = np.linalg.inv(transform)
+    for matrix in (transform, inverse):
+        matrix.flags.writeable = False
+    return transform, inverse
 
 
 class Placement(Schema):
@@ -40,7 +42,11 @@ class Placement(Schema):
 
     def transform(self) -> Array:
         """Transform (4, 4) of coordinates in this frame to those in the other."""
-        return _transform(self.position, self.orientation)
+        return _transform(self.position, self.orientation)[0]
+
+    def inverse(self) -> Array:
+        """Transform (4, 4) of coordinates in the other frame to those in this."""
+        return _transform(self.position, self.orientation)[1]
 
 
 class Registration(Schema):
@@ -74,8 +80,4 @@ class Registration(Schema):
 
     def sensor_in_tracker(self, tip: Array) -> Array:
         """Return what a perfect tracker reads (4, 4) where the tip (4, 4) is in the base frame."""
-        return (
-            np.linalg.inv(self.tracker_in_base.transform())
-            @ tip
-            @ np.linalg.inv(self.tip_in_sensor.transform())
-        )
+        return self.tracker_in_base.inverse() @ tip @ self.tip_in_sensor.inverse()

@@ -99,9 +99,10 @@ class Camera:
     def sensor_in_tracker(self, noise: Array) -> Array:
         """Pose (4, 4) of the sensor in the tracker's frame; `noise` (6,) in standard deviations."""
         settings = self.settings
-        off = self._plant.mismatch.registration.transform()
-        T = settings.registration.sensor_in_tracker(np.linalg.inv(off) @ self._plant.tip_pose())
+        off = self._plant.mismatch.registration.inverse()
+        T = settings.registration.sensor_in_tracker(off @ self._plant.tip_pose())
         T[:3, 3] += settings.noise * noise[:3]
-        turn = np.concatenate((np.zeros(3), settings.angular_noise * noise[3:]))
-        T[:3, :3] = T[:3, :3] @ np.asarray(lie.exp(turn))[:3, :3]
+        small = np.concatenate(([1.0], 0.5 * settings.angular_noise * noise[3:]))
+        turn = lie.rotation_from_quaternion(small / np.linalg.norm(small))
+        T[:3, :3] = T[:3, :3] @ turn
         return T

@@ -140,6 +140,25 @@ def _invert(A: Array, out: Array) -> bool:
     return True
 
 
+class Step(NamedTuple):
+    """A step to be taken.
+
+    Attributes
+    ----------
+    rod, material, scheme : see there.
+    loads : at its end.
+    inertia : whether the arm has any.
+    pressures : in the chambers, constant (n,), Pa.
+    """
+
+    rod: Rod
+    material: Material
+    scheme: Scheme
+    loads: Loads
+    inertia: bool
+    pressures: Array
+
+
 class Work(NamedTuple):
     """Room for a step: Jacobians, poses and forces. Made once per call."""
 
@@ -157,25 +176,16 @@ class Work(NamedTuple):
 
 
 @jit
-def residual(
-    rod: Rod,
-    material: Material,
-    scheme: Scheme,
-    loads: Loads,
-    inertia: bool,
-    state: State,
-    pressures: Array,
-    work: Work,
-    q: Array,
-    out: Array,
-) -> None:
+def residual(step: Step, state: State, work: Work, q: Array, out: Array) -> None:
     """Imbalance (n,) of a step that ends at q, in N m or the like."""
-    h = scheme.step
+    rod, loads, h = step.rod, step.loads, step.scheme.step
     last = len(state.positions) - 1
     poses(rod, q, work.rotations, work.positions)
-    internal_forces(rod, material, scheme, state.memory, pressures, state.q, q, work.inner)
+    internal_forces(
+        rod, step.material, step.scheme, state.memory, step.pressures, state.q, q, work.inner
+    )
     depth = depth_of(loads, work.positions[last])
-    if inertia:  # work.jacobian and work.outer are those of the beginning
+    if step.inertia:  # work.jacobian and work.outer are those of the beginning
         _inertia(
             rod,
             work.jacobian,
@@ -222,25 +232,14 @@ def _correction(rod: Rod, state: State, work: Work) -> float:
 
 
 @jit
-def _make_tangent(
-    rod: Rod,
-    material: Material,
-    scheme: Scheme,
-    loads: Loads,
-    inertia: bool,
-    state: State,
-    pressures: Array,
-    work: Work,
-    q: Array,
-) -> bool:
+def _make_tangent(step: Step, state: State, work: Work, q: Array) -> bool:
     """Put the inverse of the tangent (n, n) at q into the state; return whether there is one."""
     n = len(q)
-    args = (rod, material, scheme, loads, inertia, state, pressures, work)
     for k in range(n):
-        nudge = NUDGE / in_strain(rod, k)
+        nudge = NUDGE / in_strain(step.rod, k)
         kept = q[k]
         q[k] = kept + nudge
-        residual(*args, q, work.nudged)
+        residual(step, state, work, q, work.nudged)
         q[k] = kept
         for i in range(n):
             work.tangent[i, k] = (work.nudged[i] - work.residual[i]) / nudge
@@ -248,37 +247,27 @@ def _make_tangent(
 
 
 @jit
-def _solve(
-    rod: Rod,
-    material: Material,
-    scheme: Scheme,
-    loads: Loads,
-    inertia: bool,
-    state: State,
-    pressures: Array,
-    work: Work,
-    q: Array,
-) -> bool:
+def _solve(step: Step, state: State, work: Work, q: Array) -> bool:
     """Bring q (n,), at first a guess, to the end of a step; return whether that worked.
 
     What `residual` leaves in `work` is then that of q.
     """
     n = len(q)
-    kind = (2.0 if inertia else 1.0) + (4.0 if scheme.history else 0.0)
-    args = (rod, material, scheme, loads, inertia, state, pressures, work)
+    h = step.scheme.step
+    kind = (2.0 if step.inertia else 1.0) + (4.0 if step.scheme.history else 0.0)
     before = np.inf
     for iteration in range(_ITERATIONS):
-        residual(*args, q, work.residual)
-        known = state.tangent_of[0] == scheme.step and state.tangent_of[1] == kind
-        largest = _correction(rod, state, work) if known else np.inf
+        residual(step, state, work, q, work.residual)
+        known = state.tangent_of[0] == h and state.tangent_of[1] == kind
+        largest = _correction(step.rod, state, work) if known else np.inf
         # An old tangent may no longer serve; NaN comes here too.
         if not known or not largest <= _SLOWEST * before:
-            if not _make_tangent(*args, q):
+            if not _make_tangent(step, state, work, q):
                 return False
-            residual(*args, q, work.residual)
-            state.tangent_of[0] = scheme.step
+            residual(step, state, work, q, work.residual)
+            state.tangent_of[0] = h
             state.tangent_of[1] = kind
-            largest = _correction(rod, state, work)
+            largest = _correction(step.rod, state, work)
             if not np.isfinite(largest):
                 state.tangent_of[0] = 0.0
                 return False
@@ -311,44 +300,35 @@ def make_work(n: int, nodes: int) -> Work:
 
 
 @jit
-def step(
-    rod: Rod,
-    material: Material,
-    scheme: Scheme,
-    loads: Loads,
-    inertia: bool,
-    state: State,
-    pressures: Array,
-    work: Work,
-) -> bool:
-    """Take one step at constant pressures (n,); return whether that worked.
+def take(step: Step, before: Loads, state: State, work: Work) -> bool:
+    """Take one step; return whether that worked.
 
-    With inertia, the Jacobians and the loads of the beginning are in `work`, and those of the end
-    are left there.
+    `before` are the loads at its beginning, those of the step are at its end. With inertia, the
+    Jacobians and the external forces of the beginning are in `work`, and those of the end are left
+    there.
     """
-    n = len(state.q)
-    h = scheme.step
-    q = work.guess
-    end = loads_after(loads, h)
-    args = (rod, material, scheme, end, inertia, state, pressures, work)
+    rod, end, h = step.rod, step.loads, step.scheme.step
+    n, q = len(state.q), work.guess
     for k in range(n):
         q[k] = state.q[k] + h * (2 * state.rate[k] - state.last_rate[k])
-    if not _solve(*args, q):
-        return False
+    if not _solve(step, state, work, q):
+        q[:] = state.q  # the guess may have led astray
+        if not _solve(step, state, work, q):
+            return False
     last = len(state.positions) - 1
-    mean = 0.5 * (depth_of(end, work.positions[last]) + depth_of(loads, state.positions[last]))
-    if not inertia:
+    mean = 0.5 * (depth_of(end, work.positions[last]) + depth_of(before, state.positions[last]))
+    if not step.inertia:
         mean = depth_of(end, work.positions[last])
-    done = contact_force(loads, mean) * loads.plate_speed * h
+    done = contact_force(end, mean) * end.plate_speed * h
     for i in range(3):
-        force = loads.force[i]
-        if loads.follows:
+        force = end.force[i]
+        if end.follows:
             force = 0.0
             for j in range(3):
-                turn = state.rotations[loads.node, i, j] + work.rotations[loads.node, i, j]
-                force += 0.5 * turn * loads.force[j]
-        done += force * (work.positions[loads.node, i] - state.positions[loads.node, i])
-    if inertia:
+                turn = state.rotations[end.node, i, j] + work.rotations[end.node, i, j]
+                force += 0.5 * turn * end.force[j]
+        done += force * (work.positions[end.node, i] - state.positions[end.node, i])
+    if step.inertia:
         jacobians(rod, q, work.jacobian)
         _inertia(
             rod,
@@ -366,7 +346,9 @@ def step(
         for k in range(n):
             force = work.inner[k] - work.outer[k] - work.touch[k]
             state.momentum[k] = work.residual[k] / h - 0.5 * h * force
-    lost, pushed = remember(rod, material, scheme, state.memory, pressures, state.q, q)
+    lost, pushed = remember(
+        rod, step.material, step.scheme, state.memory, step.pressures, state.q, q
+    )
     state.totals[0] += lost
     state.totals[1] += pushed
     state.totals[2] += done
@@ -401,9 +383,11 @@ def run(
         h, left = scheme.step, scheme.step
         while left > 1e-9 * scheme.step:
             part = Scheme(min(h, left), scheme.share, scheme.history)
-            if step(rod, material, part, loads, inertia, state, pressures[i], work):
+            end = loads_after(loads, part.step)
+            step = Step(rod, material, part, end, inertia, pressures[i])
+            if take(step, loads, state, work):
                 left -= part.step
-                loads = loads_after(loads, part.step)
+                loads = end
             elif h > _SHORTEST * scheme.step:
                 h *= 0.5
             else:

@@ -333,13 +333,13 @@ class Plant:
         q, n = self._state.q.copy(), len(self._state.q)
         work = dynamics.make_work(n, len(self._state.positions))
         K, high, low = np.empty((n, n)), np.empty(n), np.empty(n)
-        step = (self._rod, parts, scheme, self._loads(), False, self._state, self._last_acting)
+        step = dynamics.Step(self._rod, parts, scheme, self._loads(), False, self._last_acting)
         for k in range(n):
             nudge = dynamics.NUDGE / dynamics.in_strain(self._rod, k)
             q[k] = self._state.q[k] + nudge
-            dynamics.residual(*step, work, q, high)
+            dynamics.residual(step, self._state, work, q, high)
             q[k] = self._state.q[k] - nudge
-            dynamics.residual(*step, work, q, low)
+            dynamics.residual(step, self._state, work, q, low)
             q[k] = self._state.q[k]
             K[:, k] = (high - low) / (2 * nudge)
         return K
