@@ -184,14 +184,35 @@ class SupplyContract:
         supply.vent()
         assert not ready.told().any()
         assert not supply.commanded.any()
+        assert not supply.armed
         if ready.valve_open is not None:
             assert ready.valve_open()
-            with pytest.raises(CommandError):
-                supply.command(ready.some())
-            supply.arm()
+        with pytest.raises(CommandError, match="arm it"):
+            supply.command(ready.some())
+        supply.command(np.zeros(supply.n))  # to ask for nothing is always allowed
+        assert not ready.told().any()
+        supply.arm()
+        if ready.valve_open is not None:
             assert not ready.valve_open()
+        assert not ready.told().any()
         supply.command(ready.some())
         assert ready.told().any()
+
+    def test_arming_begins_from_nothing(self, ready: Case) -> None:
+        if ready.disturb is None:
+            pytest.skip("nothing can be set behind its back")
+        ready.supply.vent()
+        ready.disturb()
+        assert ready.told().any()
+        ready.supply.arm()
+        assert not ready.told().any()
+
+    def test_it_opens_vented(self, case: Case) -> None:
+        with case.supply as supply:
+            assert not supply.armed
+            with pytest.raises(CommandError, match="arm it"):
+                supply.exchange(case.some())
+            assert not case.told().any()
 
     def test_valve_and_its_description_agree(self, case: Case) -> None:
         assert case.supply.has_dump_valve == (case.valve_open is not None)

@@ -54,6 +54,7 @@ def test_every_simulated_rig_runs(path: Path) -> None:
         assert tracker is not None
         rig.clock.sleep(0.5)
         before = tracker.latest
+        rig.supply.arm()
         rig.command(np.linspace(0, 8e4, rig.supply.n))
         rig.clock.sleep(2.0)
         observation = rig.observe()

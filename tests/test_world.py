@@ -24,7 +24,9 @@ def make(
     probe: dict[str, Any] | None = None,
     plant: dict[str, Any] | None = None,
     robot: Any = ROBOT,
+    armed: bool = True,
 ) -> SimulatedRig:
+    """Return a rig that is armed as soon as it is open."""
     description = RigDescription(
         robot="stiff-flop-1",
         supply={"driver": "simulated", **SILENT, **(supply or {})},
@@ -32,7 +34,15 @@ def make(
         probe={"driver": "simulated", "noise": 0.0, **(probe or {})},
         plant={"dynamics": "quasi-static", "faults": True, **(plant or {})},
     )
-    return simulated_rig(description, robot, limits_of(description, robot))
+    rig = simulated_rig(description, robot, limits_of(description, robot))
+
+    def open_and_arm() -> None:
+        SimulatedRig.open(rig)
+        rig.supply.arm()
+
+    if armed:
+        rig.open = open_and_arm  # type: ignore[method-assign]
+    return rig
 
 
 def readings(rig: SimulatedRig, duration: float, every: float = 0.001) -> np.ndarray:
@@ -98,8 +108,8 @@ def test_the_watchdog_vents_when_commands_stop() -> None:
 
 
 def test_a_dump_valve_empties_what_a_stuck_regulator_holds() -> None:
-    with make({"dump_valve": True}) as rig:
-        with pytest.raises(CommandError, match="arm the supply"):
+    with make({"dump_valve": True}, armed=False) as rig:
+        with pytest.raises(CommandError, match="arm it"):
             rig.command([1e5, 0, 0])
         rig.supply.arm()
         rig.command([1e5, 0, 0])
@@ -321,6 +331,7 @@ def test_real_time_passes_by_itself() -> None:
     description = RigDescription(robot="stiff-flop-1", supply={"driver": "simulated"})
     rig = simulated_rig(description, ROBOT, limits_of(description, ROBOT), real_time=True)
     with rig:
+        rig.supply.arm()
         rig.command([5e4, 0, 0])
         begin = rig.clock.now()
         rig.clock.sleep(0.3)

@@ -41,6 +41,7 @@ def _speed(name: str, dynamics: str, step: float, sizes: Settings) -> float:
     duration = 2.0 if sizes.quick else 10.0
     speeds = []
     with make_rig(description, load_description(name)) as rig:
+        rig.supply.arm()
         phases = np.linspace(0, 2, rig.supply.n)
         for _ in range(min(5, sizes.repetitions)):
             begin = perf_counter()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import sys
+import threading
 from abc import abstractmethod
 from dataclasses import dataclass
 
@@ -122,7 +123,8 @@ class PressureSupply(Device):
 
     Nothing reaches a device that is out of range or not finite: `command` refuses it, and what is
     handed to the driver's `_write` has been clamped once more. A supply vents when it is opened,
-    when it is closed, also by an exception, and when the interpreter exits.
+    when it is closed, also by an exception, and when the interpreter exits; once vented it takes
+    no pressure until it is armed. Any thread may call any method.
     """
 
     def __init__(self, limits: PressureLimits, clock: Clock | None = None) -> None:
@@ -130,7 +132,8 @@ class PressureSupply(Device):
         self.limits = limits
         self.commanded: Array = np.zeros(limits.n)
         """What was last written (n,), in Pa."""
-        self._valve_open = False
+        self._armed = False
+        self._lock = threading.RLock()  # what was checked is written before anything else happens
 
     @property
     def n(self) -> int:
@@ -139,15 +142,16 @@ class PressureSupply(Device):
 
     def open(self) -> None:
         """Connect, and vent."""
-        if self._is_open:
-            return
-        super().open()
-        _open_supplies.add(self)
-        try:
-            self.vent()
-        except BaseException:
-            self.close()
-            raise
+        with self._lock:
+            if self._is_open:
+                return
+            super().open()
+            _not_known_to_be_vented.add(self)
+            try:
+                self.vent()
+            except BaseException:
+                self.close()
+                raise
 
     def close(self) -> None:
         """Vent and disconnect.
@@ -155,15 +159,24 @@ class PressureSupply(Device):
         Raises
         ------
         DeviceError
-            The device did not take the command to vent; it is disconnected all the same.
+            The device did not take the command to vent; it is disconnected all the same, and
+            venting is tried again when the interpreter exits.
         """
-        if not self._is_open:
-            return
-        try:
-            self.vent()
-        finally:
-            _open_supplies.discard(self)
-            super().close()
+        with self._lock:
+            if not self._is_open:
+                return
+            try:
+                try:
+                    self.vent()
+                except DeviceError:
+                    self.vent()  # once more
+                except BaseException:  # Ctrl-C does not keep an arm under pressure
+                    self.vent()
+                    _not_known_to_be_vented.discard(self)
+                    raise
+                _not_known_to_be_vented.discard(self)
+            finally:
+                super().close()
 
     def command(self, pressures: ArrayLike | PressureCommand) -> None:
         """Set the pressures (n,), in Pa.
@@ -171,11 +184,13 @@ class PressureSupply(Device):
         Raises
         ------
         CommandError
-            Wrong number, not finite, out of range or expired: nothing was written.
+            Wrong number, not finite, out of range, expired, or the supply is not armed: nothing
+            was written.
         DeviceError
             The device did not take it.
         """
-        self._write_clamped(self._checked(pressures))
+        with self._lock:
+            self._write_clamped(self._checked(pressures))
 
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
         """Set the pressures and read the measured ones, in one exchange where the device can.
@@ -187,13 +202,14 @@ class PressureSupply(Device):
         DeviceError
             The device did not take it or does not answer.
         """
-        last = self.limits.clamp(self._checked(pressures))
-        values = self._exchange(last)
-        if values is None:
-            self._write_clamped(last)
-            return self.read()
-        self.commanded = last
-        return self._reading(values)
+        with self._lock:
+            last = self.limits.clamp(self._checked(pressures))
+            values = self._exchange(last)
+            if values is None:
+                self._write_clamped(last)
+                return self.read()
+            self.commanded = last
+            return self._reading(values)
 
     def read(self) -> PressureReading:
         """Read the measured pressures.
@@ -203,14 +219,9 @@ class PressureSupply(Device):
         DeviceError
             The device does not answer.
         """
-        self._must_be_open()
-        return self._reading(self._read())
-
-    def _reading(self, pressures: ArrayLike) -> PressureReading:
-        values = np.array(pressures, dtype=float)
-        if values.shape != (self.n,):
-            raise DeviceError(f"the supply reads {values.size} pressures; expected {self.n}")
-        return PressureReading(self.clock.now(), values)
+        with self._lock:
+            self._must_be_open()
+            return self._reading(self._read())
 
     def vent(self) -> None:
         """Set all channels to 0 Pa and, where there is a dump valve, open it.
@@ -220,26 +231,46 @@ class PressureSupply(Device):
         DeviceError
             The device did not take it.
         """
-        self._must_be_open()
-        try:
-            self._write_clamped(np.zeros(self.n))
-        finally:
-            self._valve_open = self.has_dump_valve
-            self._dump(open_valve=True)
+        with self._lock:
+            self._must_be_open()
+            self._armed = False
+            try:
+                self._write_clamped(np.zeros(self.n))
+            finally:
+                self._dump(open_valve=True)
 
     @property
     def has_dump_valve(self) -> bool:
         """Whether `vent` also opens a valve that needs no regulator's cooperation."""
         return False
 
-    def arm(self) -> None:
-        """Close the dump valve, which `vent` opens: until then commands are refused.
+    @property
+    def armed(self) -> bool:
+        """Whether commands of pressure are taken; not so after `open` and `vent`."""
+        return self._armed
 
-        Without a valve this does nothing.
+    def arm(self) -> None:
+        """Take commands from now on, and close the dump valve, which `vent` opens.
+
+        All set-points are 0 then: that was written before the valve closed.
+
+        Raises
+        ------
+        DeviceError
+            The device did not take it; the supply is not armed.
         """
-        self._must_be_open()
-        self._dump(open_valve=False)
-        self._valve_open = False
+        with self._lock:
+            self._must_be_open()
+            if not self._armed:
+                self._write_clamped(np.zeros(self.n))
+            self._dump(open_valve=False)
+            self._armed = True
+
+    def _reading(self, pressures: ArrayLike) -> PressureReading:
+        values = np.array(pressures, dtype=float)
+        if values.shape != (self.n,):
+            raise DeviceError(f"the supply reads {values.size} pressures; expected {self.n}")
+        return PressureReading(self.clock.now(), values)
 
     def _checked(self, pressures: ArrayLike | PressureCommand) -> Array:
         """Return the pressures (n,) of a command that may be carried out; refuse all others."""
@@ -249,8 +280,8 @@ class PressureSupply(Device):
                 raise CommandError("the command has expired; nothing was written")
             pressures = pressures.pressures
         checked = self.limits.check(pressures)
-        if self._valve_open and checked.any():
-            raise CommandError("the dump valve is open and nothing was written; arm the supply")
+        if checked.any() and not self._armed:
+            raise CommandError("the supply is vented and nothing was written; arm it first")
         return checked
 
     def _write_clamped(self, pressures: Array) -> None:
@@ -277,13 +308,14 @@ class PressureSupply(Device):
         """Open or close the dump valve, where there is one."""
 
 
-_open_supplies: set[PressureSupply] = set()  # held, so that none is forgotten while it is open
+_not_known_to_be_vented: set[PressureSupply] = set()  # held, so that none is forgotten
 
 
 @atexit.register
-def _vent_what_is_open() -> None:
-    for supply in list(_open_supplies):
+def _vent_all() -> None:
+    for supply in list(_not_known_to_be_vented):
         try:
+            supply.open()  # which vents; does nothing if it is open
             supply.close()
-        except Exception as error:  # the other supplies must be vented too
-            print(f"a supply could not be vented: {error}", file=sys.stderr)
+        except BaseException as error:  # the other supplies must be vented too, also after Ctrl-C
+            print(f"A SUPPLY COULD NOT BE VENTED: {error}", file=sys.stderr)
