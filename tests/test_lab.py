@@ -259,6 +259,51 @@ def test_a_port_in_use_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "Traceback" not in error
 
 
+def test_the_rig_file_is_not_overwritten(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (RIGS / "sim.yaml").read_text()
+    rig_file = tmp_path / "rig.yaml"
+    rig_file.write_text(text)
+    assert main(["lab", str(rig_file), "--out", str(tmp_path / "." / "rig.yaml")]) == 2
+    assert "is the rig file itself" in capsys.readouterr().err
+    assert rig_file.read_text() == text
+
+
+def test_without_numba_there_is_no_lab() -> None:
+    script = (
+        "import sys; sys.modules['numba'] = None\n"
+        f"from stiffopt.cli.main import main; sys.exit(main(['lab', {str(RIGS / 'sim.yaml')!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "pip install 'stiffopt[sim]'" in " ".join(done.stderr.split())
+
+
+def test_two_labs_run_beside_each_other_and_without_anybody_at_the_terminal(
+    tmp_path: Path,
+) -> None:
+    command = [sys.executable, "-c", "from stiffopt.cli.main import main; main()", "lab"]
+    outs = [tmp_path / f"{k}.yaml" for k in range(2)]
+    labs = [
+        subprocess.Popen(
+            [*command, str(RIGS / "sim.yaml"), "--quiet", "--out", str(out)],
+            stdin=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for out in outs
+    ]
+    try:
+        for out in outs:
+            wait_for(out.exists, 60.0)
+            with open_rig(out) as rig:
+                assert rig.supply.read().pressures.max() < 5e3
+    finally:
+        for lab in labs:
+            end(lab)
+
+
 def test_unknown_drivers_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["lab", str(RIGS / "sim.yaml"), "--supply", "steam"]) == 2
     assert "modbus or nidaq" in capsys.readouterr().err

@@ -146,6 +146,25 @@ def written(tmp_path: Path, text: str) -> Path:
         ("tracker: {driver: simulated}", "plant: {mismatch: {gain: [1, 1]}}", 5, "2 values"),
         ("tracker: {driver: simulated}", "plant: {dynamics: slow}", 5, "is not one of"),
         ("name: mine", "rate: 0 Hz", 2, "greater than 0"),
+        ("tracker: {driver: simulated}", "safety: {max_pressure: -1 bar}", 5, "below the robot's"),
+        (
+            "tracker: {driver: simulated}",
+            "tracker: {driver: simulated, rate: 2000 Hz}",
+            5,
+            "faster than the steps",
+        ),
+        (
+            "tracker: {driver: simulated}",
+            "plant: {discretisation: {sub_intervals: 3}}",
+            5,
+            "too few for these degrees",
+        ),
+        (
+            "supply: {driver: simulated}\n",
+            MODBUS.replace("{setpoint: 1}]", "{setpoint: 1, max: 9 bar}, {setpoint: 2}]"),
+            8,
+            "9 bar is above the robot's 1.5 bar",
+        ),
     ],
 )
 def test_mistakes_are_told(tmp_path: Path, old: str, new: str, line: int | None, said: str) -> None:

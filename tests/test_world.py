@@ -10,7 +10,10 @@ import pytest
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.config import RigDescription, limits_of
+from stiffopt.rig.interface import PressureCommand
+from stiffopt.rig.simulated.plant import Plant, SimulationError
 from stiffopt.rig.simulated.rig import SimulatedRig, simulated_rig
+from stiffopt.rig.simulated.settings import Discretisation, Load, PlantSettings
 from stiffopt.rig.simulated.world import FAULTS
 
 ROBOT = load_description("stiff-flop-1")
@@ -338,3 +341,141 @@ def test_real_time_passes_by_itself() -> None:
         assert rig.clock.now() - begin >= 0.3
         assert rig.supply.read().pressures[0] > 2e4
         assert rig.world.time <= rig.clock.now() + 0.01
+
+
+def test_a_clock_that_was_held_up_does_not_go_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    description = RigDescription(
+        robot="stiff-flop-1", supply={"driver": "simulated"}, tracker={"driver": "simulated"}
+    )
+    rig = simulated_rig(description, ROBOT, limits_of(description, ROBOT), real_time=True)
+    with rig:
+        rig.supply.arm()
+        rig.world._epoch -= 100.0  # the machine slept
+        before = rig.clock.now()
+        monkeypatch.setattr("stiffopt.rig.simulated.world._LONGEST", 0.2)
+        poses = rig.observe().poses
+        assert rig.clock.now() >= before
+        assert rig.world.time == pytest.approx(rig.clock.now(), abs=0.5)
+        rig.command(PressureCommand(np.array([1e4, 0, 0]), rig.clock.now()))
+        assert len(poses) < 20  # nobody saw the arm in the time that was skipped
+        assert all(pose.time > before - 0.5 for pose in poses)
+
+
+def test_an_arm_that_cannot_be_followed_is_vented_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def lost(pressures: np.ndarray) -> None:
+        raise SimulationError("the simulated arm cannot be followed beyond 1 s")
+
+    rig = make()
+    rig.open()
+    rig.command([1e5, 0, 0])
+    monkeypatch.setattr(rig.world.plant, "follow", lost)
+    with pytest.raises(DeviceError, match="beyond"):
+        rig.clock.sleep(1)
+    rig.close()
+    assert not rig.world.set_point.any()
+
+
+@pytest.mark.parametrize("leak", [0.002, 0.05])
+def test_a_fast_leak_only_empties(leak: float) -> None:
+    coarse = {"discretisation": {"step": 0.02}}
+    with make({"leak": leak}, {"rate": 40.0}, plant=coarse) as rig:
+        rig.command([1e4, 1e4, 1e4])
+        p = readings(rig, 1.0, 0.02)
+        assert (p >= 0).all()
+        assert p.max() <= 1e4
+
+
+def test_the_force_does_not_jump_when_the_stage_stops() -> None:
+    with make(probe={"stiffness": 2000.0, "clearance": 0.0}) as rig:
+        probe = rig.probe
+        assert probe is not None
+        probe.align([1, 0, 0])
+        probe.move_to(0.003, 0.02)
+        rig.world.move_stage(0.0050001, 0.02)
+        forces = []
+        while rig.world.stage_moving:
+            rig.clock.sleep(0.001)
+            forces.append(probe.sample().force)
+        for _ in range(5):
+            rig.clock.sleep(0.001)
+            forces.append(probe.sample().force)
+        assert rig.world.stage_position == 0.0050001
+        assert np.abs(np.diff(forces, 2)).max() < 0.05 * max(forces)  # no kink but the stop itself
+
+
+def test_frames_never_overtake_each_other() -> None:
+    with make() as rig:
+        tracker = rig.tracker
+        assert tracker is not None
+        seen: list[Any] = []
+        for fault in ("ok", "slow", "ok"):
+            rig.world.inject("tracker", fault)
+            for _ in range(20):
+                rig.clock.sleep(0.05)
+                seen += tracker.read()
+        received = [sample.received for sample in seen]
+        assert received == sorted(received)
+        assert [sample.frame for sample in seen] == sorted(sample.frame for sample in seen)
+
+
+# Loads somewhere on the arm --------------------------------------------------------------------
+
+
+def with_connectors() -> Any:
+    (segment,) = ROBOT.segments
+    link = segment.model_copy(update={"connector": 0.02})
+    return ROBOT.model_copy(update={"segments": (link, link)})
+
+
+def bent(load: Load | None, plant: dict[str, Any] | None = None) -> np.ndarray:
+    silicone = {"law": "linear", "creep": (), "hysteresis": ()}
+    arm = Plant(with_connectors(), PlantSettings(silicone=silicone, **(plant or {})))
+    arm.settle(np.zeros(6), load)
+    return np.asarray(arm.tip_pose())
+
+
+def test_a_load_at_the_full_length_is_at_the_tip() -> None:
+    for frame in ("base", "tip"):
+        force = Load(force=(0.05, 0.02, 0.0), moment=(0.0, 0.001, 0.0005), frame=frame)
+        there = force.model_copy(update={"at": 0.22})
+        np.testing.assert_allclose(bent(there), bent(force), atol=1e-9)
+
+
+def test_a_connector_is_a_lever() -> None:
+    """A force on a connector is the force at its beginning and a moment."""
+    for far in (0.095, 0.105, 0.11):
+        lever = far - 0.09
+        force = Load(force=(0.1, 0.0, 0.0), frame="tip", at=far)
+        same = Load(force=(0.1, 0.0, 0.0), moment=(0.0, 0.1 * lever, 0.0), frame="tip", at=0.09)
+        np.testing.assert_allclose(bent(force), bent(same), atol=1e-9)
+    a, b = (bent(Load(force=(0.1, 0, 0), at=at))[0, 3] for at in (0.09, 0.11))
+    assert b > a * 1.1
+
+
+def test_a_load_off_the_arm_is_refused() -> None:
+    with pytest.raises(InputError, match="220 mm long"):
+        bent(Load(force=(0.1, 0, 0), at=0.23))
+    with pytest.raises(InputError, match="at least 0"):
+        Load(force=(0.1, 0, 0), at=-0.01)
+
+
+def test_a_load_finds_its_place_on_an_arm_that_is_shorter_than_its_file() -> None:
+    short = {"mismatch": {"length": (0.9, 0.9)}}
+    tip, there = Load(force=(0.05, 0, 0)), Load(force=(0.05, 0, 0), at=0.22)
+    np.testing.assert_allclose(bent(there, short), bent(tip, short), atol=1e-9)
+
+
+@pytest.mark.parametrize("degrees", [(3, 2), (8, 2), (8, 8), (0, 0), (2, 5)])
+def test_the_fewest_sub_intervals_that_are_taken_work(degrees: tuple[int, int]) -> None:
+    given = {"bending_degree": degrees[0], "shear_degree": degrees[1]}
+    for m in range(2, 12):
+        try:
+            grid = Discretisation(sub_intervals=m, **given)
+        except InputError:
+            continue
+        frequencies, _ = Plant(ROBOT, PlantSettings(discretisation=grid)).modes(2)
+        assert frequencies[0] > 1
+        return
+    pytest.fail("none was taken")

@@ -65,6 +65,8 @@ def write_line(text: str) -> None:
     Closed
         Nobody reads stdout any more.
     """
+    if sys.stdout is None:  # closed by whoever started us
+        return
     with _noticing_closed_pipe():
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()

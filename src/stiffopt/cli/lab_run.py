@@ -7,9 +7,9 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
 from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED
@@ -17,7 +17,9 @@ from stiffopt.errors import InputError, StiffoptError
 from stiffopt.files import file_text, save_file
 from stiffopt.model.robot_files import load_description, robot_path
 from stiffopt.rig.config import load_rig_description
-from stiffopt.rig.lab.virtual import VirtualLab
+
+if TYPE_CHECKING:
+    from stiffopt.rig.lab.virtual import VirtualLab
 
 _TICK = 0.2  # s, between looks at whether the arm still moves
 
@@ -25,6 +27,9 @@ _TICK = 0.2  # s, between looks at whether the arm still moves
 def run(rig: str, out: str | None, supply: str, tracker: str, *, quiet: bool) -> int:
     """Run the lab until it is ended; return the exit code."""
     try:
+        from stiffopt.rig.lab.virtual import VirtualLab  # here: without numba there is none
+
+        _refuse_to_overwrite(rig, out)
         description = load_rig_description(rig)
         folder = Path(rig).parent
         robot = load_description(description.robot, base=folder)
@@ -72,9 +77,19 @@ def _serve(lab: VirtualLab, ended: threading.Event, *, quiet: bool) -> None:
 
 
 def _listen(lines: queue.SimpleQueue[str]) -> None:
-    for line in sys.stdin:
-        if line.strip():
-            lines.put(line)
+    """Pass on what is typed; in the background of a terminal, or without one, that is nothing."""
+    if sys.stdin is None:
+        return
+    with suppress(OSError, ValueError):
+        for line in sys.stdin:
+            if line.strip():
+                lines.put(line)
+
+
+def _refuse_to_overwrite(rig: str, out: str | None) -> None:
+    if out is not None and Path(out).exists() and Path(rig).exists():
+        if Path(out).samefile(rig):
+            raise InputError(f"--out {out} is the rig file itself; give another name")
 
 
 def _obey(lab: VirtualLab, words: list[str]) -> str:
@@ -122,7 +137,10 @@ def _until_signal() -> Iterator[threading.Event]:
     def end(number: int, frame: Any) -> None:
         ended.set()
 
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers: dict[int, Any] = {signal.SIGINT: end, signal.SIGTERM: end}
+    if hasattr(signal, "SIGTTIN"):  # to read a terminal from the background would stop the lab
+        handlers[signal.SIGTTIN] = signal.SIG_IGN
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield ended
     finally:

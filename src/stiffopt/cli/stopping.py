@@ -31,7 +31,8 @@ class Stopping:
         """Context in which signals are handled so."""
         before: dict[int, Any] = {}
         if threading.current_thread() is threading.main_thread():
-            before = {number: signal.signal(number, self._handle) for number in _SIGNALS}
+            heard = [n for n in _SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]  # nohup
+            before = {number: signal.signal(number, self._handle) for number in heard}
         try:
             yield
         finally:

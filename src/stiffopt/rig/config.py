@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
-from stiffopt.errors import FileError, InputError, shown
+from stiffopt.errors import FileError, InputError, dotted, shown
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import PerChannelPressure, PerChannelRate, RobotDescription
 from stiffopt.model.robot_files import load_description
@@ -184,7 +184,7 @@ def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
         raise
     except _MisfitError as error:
         raise FileError(
-            path, str(error), line=line_of(path, *error.place), key=".".join(error.place)
+            path, str(error), line=line_of(path, *error.place), key=dotted(error.place)
         ) from None
     except InputError as error:
         raise FileError(path, str(error), line=line_of(path, "robot"), key="robot") from None
@@ -194,7 +194,7 @@ def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
 class _MisfitError(InputError):
     """A part of the rig file does not fit the robot."""
 
-    def __init__(self, reason: str, *place: str) -> None:
+    def __init__(self, reason: str, *place: str | int) -> None:
         super().__init__(reason)
         self.place = place
 
@@ -214,6 +214,14 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
         raise _MisfitError(
             f"has {len(channels)} channels; the robot '{robot.name}' has {n}", "supply", "channels"
         )
+    for index, channel in enumerate(channels or ()):
+        limit = robot.pressure_max[index]
+        if channel.max is not None and channel.max > limit * (1 + 1e-9):
+            raise _MisfitError(
+                f"{channel.max * 1e-5:g} bar is above the robot's {limit * 1e-5:g} bar "
+                f"({robot.channel_name(index)})",
+                *("supply", "channels", index, "max"),
+            )
     for key, highest, unit, factor in (
         ("max_pressure", robot.pressure_max, "bar", 1e-5),
         ("max_slew", robot.pressure_slew, "bar/s", 1e-5),
@@ -232,6 +240,25 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
                     "safety",
                     key,
                 )
+    highest_allowed = description.safety.max_pressure
+    if highest_allowed is not None:
+        for index, given in enumerate(np.broadcast_to(highest_allowed, n)):
+            if given < robot.pressure_min[index]:
+                raise _MisfitError(
+                    f"{given * 1e-5:g} bar is below the robot's min of "
+                    f"{robot.pressure_min[index] * 1e-5:g} bar ({robot.channel_name(index)})",
+                    "safety",
+                    "max_pressure",
+                )
+    plant, tracker = description.plant or PlantSettings(), description.tracker
+    if isinstance(tracker, SimulatedTrackerSettings):
+        fastest = 1 / plant.discretisation.step
+        if tracker.rate > fastest * (1 + 1e-9):
+            raise _MisfitError(
+                f"{tracker.rate:g} Hz is faster than the steps of the simulation, {fastest:g} Hz",
+                "tracker",
+                "rate",
+            )
     simulated = [
         name
         for name in ("supply", "tracker", "probe")

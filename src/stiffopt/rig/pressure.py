@@ -56,9 +56,12 @@ class PressureLimits:
             Wrong number, not finite or out of range; it names the channel.
         """
         try:
-            p = np.array(pressures, dtype=float)
-        except (TypeError, ValueError):
-            raise CommandError("expected one pressure in Pa for each channel") from None
+            given = np.asarray(pressures)
+        except ValueError:  # ragged
+            given = np.array("")
+        if given.dtype.kind not in "fiu":  # text and booleans are no pressures
+            raise CommandError("expected one pressure in Pa for each channel")
+        p = given.astype(float)
         if p.shape != self.low.shape:
             raise CommandError(f"expected {self.n} pressures, not an array of shape {p.shape}")
         for index in np.flatnonzero(~np.isfinite(p)):
@@ -130,8 +133,7 @@ class PressureSupply(Device):
     def __init__(self, limits: PressureLimits, clock: Clock | None = None) -> None:
         super().__init__(clock)
         self.limits = limits
-        self.commanded: Array = np.zeros(limits.n)
-        """What was last written (n,), in Pa."""
+        self._commanded: Array = np.zeros(limits.n)
         self._armed = False
         self._lock = threading.RLock()  # what was checked is written before anything else happens
 
@@ -139,6 +141,11 @@ class PressureSupply(Device):
     def n(self) -> int:
         """Number of channels."""
         return self.limits.n
+
+    @property
+    def commanded(self) -> Array:
+        """What was last written (n,), in Pa; a copy."""
+        return self._commanded.copy()
 
     def open(self) -> None:
         """Connect, and vent."""
@@ -208,7 +215,7 @@ class PressureSupply(Device):
             if values is None:
                 self._write_clamped(last)
                 return self.read()
-            self.commanded = last
+            self._commanded = last
             return self._reading(values)
 
     def read(self) -> PressureReading:
@@ -287,7 +294,7 @@ class PressureSupply(Device):
     def _write_clamped(self, pressures: Array) -> None:
         last = self.limits.clamp(pressures)
         self._write(last)
-        self.commanded = last
+        self._commanded = last
 
     @abstractmethod
     def _write(self, pressures: Array) -> None:

@@ -6,12 +6,12 @@ others as NI's server refuses what it does not know.
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from threading import Event, RLock, Timer
 from typing import Any
+from uuid import uuid4
 
 from stiffopt.errors import DeviceError
 from stiffopt.rig.drivers.daqmx import library
@@ -120,7 +120,6 @@ class DaqServer:
         self._extra = extra
         self._sessions: dict[str, _Session] = {}
         self._locked = False  # by a watchdog that has expired: digital writes are refused
-        self._names = itertools.count(1)
         self._lock = RLock()
         self._closing = Event()
         self._server: Any = None
@@ -218,7 +217,7 @@ class DaqServer:
         return fault != "off"
 
     def _created(self, session: _Session) -> dict[str, Any]:
-        name = f"task{next(self._names)}"
+        name = f"task-{uuid4()}"  # one that no server before this one has given away
         self._sessions[name] = session
         return {"task": {"name": name}, "new_session_initialized": True}
 

@@ -69,7 +69,7 @@ def _modbus(n: int) -> ModbusSettings:
     """Return a coupler with a set-point and a reading per channel, a watchdog and a dump valve."""
     return ModbusSettings(
         driver="modbus",
-        tcp={"host": "127.0.0.1", "port": 5020},
+        tcp={"host": "127.0.0.1", "port": 0},
         scale={"counts": (0, 32767), "pressure": (0.0, _FULL_SCALE)},
         table="holding",
         channels=[{"setpoint": 0x0800 + i, "reading": i} for i in range(n)],

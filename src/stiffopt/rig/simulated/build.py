@@ -43,11 +43,11 @@ def make_rod(
     bending, shear = grid.bending_degree + 1, grid.shear_degree + 1
     count = np.array([shear, shear, shear, bending, bending, shear])
     basis_size = max(bending, shear)
-    points, weights = legendre.leggauss(grid.bending_degree + 2)
+    points, weights = legendre.leggauss(max(grid.bending_degree, grid.shear_degree) + 2)
     lengths = _lengths(robot, mismatch)
     cuts = [_cuts(grid.sub_intervals) for _ in robot.segments]
     if station is not None:
-        segment, place = station_of(robot, mismatch, station)
+        segment, place, _ = station_of(robot, station)
         if np.abs(cuts[segment] - place).min() > _SAME:
             cuts[segment] = np.sort(np.append(cuts[segment], place))
     most = max(len(c) - 1 for c in cuts)
@@ -83,8 +83,15 @@ def make_rod(
     )
 
 
-def station_of(robot: RobotDescription, mismatch: Mismatch, at: float) -> tuple[int, float]:
-    """Segment (from 0) and place within it (0 to 1) at an arc length at rest, in m.
+def station_of(robot: RobotDescription, at: float) -> tuple[int, float, float]:
+    """Segment (from 0), place within it (0 to 1) and lever on its connector (m) of a place.
+
+    Parameters
+    ----------
+    robot :
+        Its lengths count, not those of the arm that is simulated.
+    at :
+        Arc length at rest, connectors included, in m.
 
     Raises
     ------
@@ -92,15 +99,16 @@ def station_of(robot: RobotDescription, mismatch: Mismatch, at: float) -> tuple[
         There is no such place on the arm.
     """
     begin = 0.0
-    for s, length in enumerate(_lengths(robot, mismatch)):
-        if begin <= at <= begin + length:
-            return s, (at - begin) / length
-        begin += length + robot.segments[s].connector
-        if at < begin:
-            return s, 1.0  # on a connector
-    if at <= begin * (1 + 1e-9):
-        return robot.n_segments - 1, 1.0
-    raise InputError(f"the load acts at {at * 1e3:g} mm; the arm is {begin * 1e3:g} mm long")
+    for s, segment in enumerate(robot.segments):
+        end = begin + segment.length
+        if begin <= at <= end:
+            return s, (at - begin) / segment.length, 0.0
+        begin = end + segment.connector
+        if end < at <= begin * (1 + 1e-9):
+            return s, 1.0, at - end
+    raise InputError(
+        f"a load at {at * 1e3:g} mm is not on the arm, which is {begin * 1e3:g} mm long"
+    )
 
 
 def _lengths(robot: RobotDescription, mismatch: Mismatch) -> Array:
@@ -260,9 +268,9 @@ def _channels(robot: RobotDescription, mismatch: Mismatch) -> tuple[Array, Array
     return np.array(force), np.array(first)
 
 
-def node_at(robot: RobotDescription, mismatch: Mismatch, rod: Rod, at: float) -> int:
-    """Node of a rod that was made with a station there."""
-    segment, place = station_of(robot, mismatch, at)
+def node_at(robot: RobotDescription, rod: Rod, at: float) -> tuple[int, float]:
+    """Node and lever (m) of a place on a rod that was made with a station there."""
+    segment, place, lever = station_of(robot, at)
     m = int(rod.intervals[segment])
     cuts = np.concatenate(([0.0], np.cumsum(rod.interval[segment, :m]))) / rod.length[segment]
-    return int(rod.first_node[segment]) + int(np.abs(cuts - place).argmin())
+    return int(rod.first_node[segment]) + int(np.abs(cuts - place).argmin()), lever

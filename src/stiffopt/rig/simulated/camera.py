@@ -62,6 +62,10 @@ class Camera:
         """Step of the plant in which the next frame is captured."""
         return round((self.count + 1) / self.settings.rate / self._plant.step)
 
+    def skip(self) -> None:
+        """Lose the frames of a time that was skipped."""
+        self.count = max(self.count, int(self._plant.time * self.settings.rate))
+
     def delivered(self, now: float) -> list[Frame]:
         """Return the frames that have arrived by now and were not returned before."""
         ready = []
@@ -89,6 +93,8 @@ class Camera:
             q = -q
         now = self._plant.time
         arrival = now + settings.latency + (_LATE if fault == "slow" else 0.0)
+        if self._last is not None:
+            arrival = max(arrival, self._last.delivered)  # none overtakes another
         if fault == "stuck" and self._last is not None:
             frame = replace(self._last, delivered=arrival)
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import suppress
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +19,7 @@ from stiffopt.rig.interface import (
     RawPose,
 )
 from stiffopt.rig.registration import Registration
+from stiffopt.rig.simulated.plant import SimulationError
 from stiffopt.rig.simulated.world import World
 
 __all__ = ["SimulatedProbe", "SimulatedSupply", "SimulatedTracker"]
@@ -51,8 +53,14 @@ class SimulatedSupply(PressureSupply):
         return self._world.supply.dump_valve
 
     def _write(self, pressures: Array) -> None:
-        self._answer()
-        self._world.command(pressures)
+        if pressures.any():
+            self._answer()
+            self._world.command(pressures)
+        else:  # also to an arm that cannot be followed any more
+            with suppress(SimulationError):
+                self._world.catch_up()
+            self._world.command(pressures)
+            self._answer()
 
     def _read(self) -> ArrayLike:
         self._answer()
@@ -60,7 +68,8 @@ class SimulatedSupply(PressureSupply):
 
     def _dump(self, *, open_valve: bool) -> None:
         if self.has_dump_valve:  # the valve is wired past the supply, which may be off
-            self._world.catch_up()
+            with suppress(SimulationError):
+                self._world.catch_up()
             self._world.dump(open_valve=open_valve)
 
 

@@ -42,6 +42,7 @@ Array = Any
 _CLOSE = 1e-9  # strain by which a step may still be wrong
 _SLOWEST = 0.3  # share of the correction before; if one is larger, the tangent is made anew
 _ITERATIONS = 40
+_LONGEST = 0.004  # s; with inertia, longer steps are taken in parts: weight is explicit
 _SHORTEST = 1 / 64  # share of a step; one that does not work is divided down to this
 NUDGE = 1e-7  # strain, for the finite differences
 _STRIDE = 0.3  # strain; no iteration goes further
@@ -327,7 +328,9 @@ def take(step: Step, before: Loads, state: State, work: Work) -> bool:
             for j in range(3):
                 turn = state.rotations[end.node, i, j] + work.rotations[end.node, i, j]
                 force += 0.5 * turn * end.force[j]
-        done += force * (work.positions[end.node, i] - state.positions[end.node, i])
+        moved = work.positions[end.node, i] - state.positions[end.node, i]
+        turned = work.rotations[end.node, i, 2] - state.rotations[end.node, i, 2]
+        done += force * (moved + end.lever * turned)
     if step.inertia:
         jacobians(rod, q, work.jacobian)
         _inertia(
@@ -380,7 +383,8 @@ def run(
         jacobians(rod, state.q, work.jacobian)
         external_forces(rod, loads, state.rotations, state.positions, work.jacobian, work.outer)
     for i in range(len(pressures)):
-        h, left = scheme.step, scheme.step
+        left = scheme.step
+        h = min(left, _LONGEST) if inertia else left
         while left > 1e-9 * scheme.step:
             part = Scheme(min(h, left), scheme.share, scheme.history)
             end = loads_after(loads, part.step)

@@ -21,6 +21,7 @@ class Loads(NamedTuple):
     Attributes
     ----------
     node : on which the wrench acts.
+    lever : how far beyond the node along its z axis, on a connector, m.
     force, moment : (3,), N and N m.
     follows : whether they turn with the node's section.
     plate : unit normal of the probe's plate (3,), from the probe towards the tip.
@@ -30,6 +31,7 @@ class Loads(NamedTuple):
     """
 
     node: int
+    lever: float
     force: Array
     moment: Array
     follows: bool
@@ -44,6 +46,7 @@ def loads_after(loads: Loads, duration: float) -> Loads:
     """Loads after some time: the plate moves."""
     return Loads(
         loads.node,
+        loads.lever,
         loads.force,
         loads.moment,
         loads.follows,
@@ -98,10 +101,14 @@ def external_forces(rod: Rod, loads: Loads, R: Array, r: Array, J: Array, out: A
         wrench[5] = mx * down[1] - my * down[0]
         if node == loads.node:
             for i in range(3):
+                down[i] = 0.0
                 for j in range(3):
                     along = (1.0 if i == j else 0.0) if loads.follows else turn[j, i]
-                    wrench[i] += along * loads.force[j]
+                    down[i] += along * loads.force[j]
                     wrench[3 + i] += along * loads.moment[j]
+                wrench[i] += down[i]
+            wrench[3] -= loads.lever * down[1]
+            wrench[4] += loads.lever * down[0]
         for k in range(n):
             total = 0.0
             for i in range(6):

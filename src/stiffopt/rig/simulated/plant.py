@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.errors import EquilibriumError, InputError, PressureError, StiffoptError
+from stiffopt.errors import DeviceError, EquilibriumError, InputError, PressureError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.simulated import dynamics, material, rod
 from stiffopt.rig.simulated.build import make_material, make_rod, node_at
@@ -32,11 +32,12 @@ Array = NDArray[np.float64]
 
 _LONG = 1e9  # s; a step after which viscosity has nothing more to say
 _FIRST_STEP = 0.02  # s
+_SHORTEST = 1e-6  # s
 _TRIES = 400
 _STILL = 1e-3  # s; step for stiffness to motions so fast that nothing creeps or slips
 
 
-class SimulationError(StiffoptError):
+class SimulationError(DeviceError):
     """The simulated arm cannot be followed: a load or a pressure is far beyond what it bears."""
 
 
@@ -241,9 +242,13 @@ class Plant:
         self._steps += int(done)
         if done < len(pressures):
             raise SimulationError(
-                f"the simulated arm cannot be followed beyond {self.time:.3f} s: a load, a "
-                "contact or a pressure is far beyond what it bears"
+                f"the simulated arm cannot be followed beyond {self.time:.3f} s: a load, a contact "
+                "or a pressure is far beyond what it bears, or the time step is too long"
             )
+
+    def skip(self, duration: float) -> None:
+        """Let time pass in which nothing happens, in s; rounded down to whole steps."""
+        self._steps += int(duration / self.step)
 
     def settle(self, pressures: ArrayLike, load: Load | None = None) -> None:
         """Bring the arm to rest in equilibrium, with all creep done and no hysteresis left.
@@ -278,6 +283,8 @@ class Plant:
                 step *= 3
             else:
                 step /= 5
+                if step < _SHORTEST:
+                    raise EquilibriumError("the simulated arm finds no equilibrium")
             self._state.rate[:] = 0.0
             self._state.last_rate[:] = 0.0
         else:
@@ -355,15 +362,13 @@ class Plant:
         load, plate = self._load, self._plate
         last = len(self._rod.mass) - 1
         normal, at, speed, stiffness = (np.zeros(3), 0.0, 0.0, 0.0) if plate is None else plate
-        if load is None:
-            node, force, moment, follows = last, np.zeros(3), np.zeros(3), False
-        else:
-            node = (
-                last if load.at is None else node_at(self.robot, self.mismatch, self._rod, load.at)
-            )
+        node, lever, force, moment, follows = last, 0.0, np.zeros(3), np.zeros(3), False
+        if load is not None:
+            if load.at is not None:
+                node, lever = node_at(self.robot, self._rod, load.at)
             force, moment = np.array(load.force), np.array(load.moment)
             follows = load.frame == "tip"
-        return Loads(node, force, moment, follows, normal, at, speed, stiffness)
+        return Loads(node, lever, force, moment, follows, normal, at, speed, stiffness)
 
     def _checked(self, pressures: ArrayLike) -> Array:
         p = np.array(pressures, dtype=float)

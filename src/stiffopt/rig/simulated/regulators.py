@@ -82,7 +82,8 @@ def regulate(
             if regulators.lag[c] > 0:
                 change *= 1 - math.exp(-h / regulators.lag[c])
             limit = regulators.slew[c] * h
-            change = min(max(change, -limit), limit) - regulators.leak[c] * h * before
+            change = min(max(change, -limit), limit)
+            change -= (1 - math.exp(-regulators.leak[c] * h)) * before
             if regulators.dumped:
                 change = -emptying * before
             pressure[c] = before + change

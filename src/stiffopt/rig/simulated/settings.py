@@ -7,12 +7,12 @@ values are those of a perfect copy but for the material's, which are typical of 
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from stiffopt.rig.registration import Placement, Registration
-from stiffopt.schema import Items, Schema, Vector
+from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import (
     Acceleration,
     Angle,
@@ -143,13 +143,14 @@ class Load(Schema):
     ----------
     force, moment : in N and N m.
     frame : ``base``: keeps its direction; ``tip``: follows the section it acts on.
-    at : arc length of that section at rest, in m; the tip by default.
+    at : arc length of that section at rest, connectors included and as in the robot file, in m;
+        the tip by default.
     """
 
     force: Vector[Force] = (0.0, 0.0, 0.0)
     moment: Vector[Moment] = (0.0, 0.0, 0.0)
     frame: Literal["base", "tip"] = "base"
-    at: Length | None = None
+    at: Annotated[Length, NotNegative] | None = None
 
 
 class Discretisation(Schema):
@@ -160,13 +161,24 @@ class Discretisation(Schema):
     bending_degree : of the Legendre polynomials of curvature.
     shear_degree : of those of stretch, shear and twist.
     sub_intervals : over which the strains are integrated to poses.
-    step : in time, in s.
+    step : in time, in s; with inertia, steps above 4 ms are taken in parts.
     """
 
     bending_degree: Annotated[int, Field(ge=0, le=8)] = 3
     shear_degree: Annotated[int, Field(ge=0, le=8)] = 2
     sub_intervals: Annotated[int, Field(ge=2, le=16)] = 5
     step: Annotated[Duration, Field(gt=0, le=0.02)] = 0.001
+
+    @model_validator(mode="after")
+    def _has_enough_nodes(self) -> Self:
+        # in each plane, places and turns of the nodes must tell bending from shear
+        least = max(self.shear_degree + 1, -(-(self.bending_degree + self.shear_degree + 2) // 2))
+        if self.sub_intervals < least:
+            raise BadKeyError(
+                "sub_intervals",
+                f"{self.sub_intervals} are too few for these degrees; expected at least {least}",
+            )
+        return self
 
 
 class PlantSettings(Schema):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -45,7 +47,7 @@ class Stage:
             tip = self._plant.tip_pose()[:3, 3]
             self._origin = float(self._axis @ tip) - self.settings.clearance
         self.position = self._target = self.speed = 0.0
-        self.place_plate(moving=False)
+        self.place_plate(0)
 
     def move(self, position: float, speed: float, fault: str) -> None:
         """Start to move to a place, m, at a speed, m/s."""
@@ -60,30 +62,34 @@ class Stage:
             self.speed = 0.0
 
     def steps_left(self) -> int | None:
-        """Whole steps of the plant until the stage is there, or None while it rests."""
+        """Steps of the plant until the stage is there, or None while it rests."""
         if not self.speed:
             return None
-        return max(1, int(abs(self._target - self.position) / self.speed / self._plant.step))
+        steps = abs(self._target - self.position) / self.speed / self._plant.step
+        return max(1, math.ceil(steps - 1e-6))
 
-    def place_plate(self, *, moving: bool) -> None:
+    def place_plate(self, steps: int) -> None:
         """Tell the plant where the plate is, and how it moves in the steps to come."""
         if self._axis is None:
             self._plant.set_plate(None)
             return
-        speed = float(np.sign(self._target - self.position)) * self.speed if moving else 0.0
+        duration = steps * self._plant.step
+        speed = self._movement(duration) / duration if steps else 0.0
         at = self._origin + self.position
         self._plant.set_plate(self._axis, at, self.settings.stiffness, speed)
 
     def advance(self, steps: int) -> None:
         """Be where the stage is after some steps of the plant."""
         if self.speed:
-            left = self._target - self.position
-            moved = self.speed * steps * self._plant.step
-            if moved >= abs(left) - 1e-9:
+            self.position += self._movement(steps * self._plant.step)
+            if abs(self._target - self.position) < 1e-9:
                 self.position, self.speed = self._target, 0.0
-            else:
-                self.position += float(np.sign(left)) * moved
-        self.place_plate(moving=False)
+        self.place_plate(0)
+
+    def _movement(self, duration: float) -> float:
+        """How far the stage goes in some time, m; not beyond its target."""
+        far = self.speed * duration
+        return float(np.clip(self._target - self.position, -far, far))
 
     def force(self, fault: str) -> float:
         """Force that the sensor feels, N."""

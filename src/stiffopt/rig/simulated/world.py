@@ -41,7 +41,7 @@ FAULTS = {
 _SLOW = 0.5  # s, by which the lag of a slow regulator is longer
 _LEAK = 0.3  # s; time constant of an injected leak
 _LONG = 1_000_000  # steps; there is no need to stop for this long
-_LONGEST = 1.0  # s of real time that is caught up with at once; more than that is skipped
+_LONGEST = 30.0  # s of real time that is caught up with at once; more than that is skipped
 
 
 class World:
@@ -123,10 +123,12 @@ class World:
         """Let the world reach the present; does nothing unless it runs in real time."""
         if self._real_time:
             with self.lock:
-                behind = self.now() - self.time
-                if behind > _LONGEST:  # a busy machine: that time did not happen
-                    self._epoch += behind - _LONGEST
-                self.advance_to(self.now())
+                now = self.now()
+                if now - self.time > _LONGEST:  # a busy machine: nothing happened in that time
+                    self.plant.skip(now - self.time - _LONGEST)
+                    if self.camera is not None:
+                        self.camera.skip()
+                self.advance_to(now)
 
     def advance_to(self, moment: float) -> None:
         """Let the world run until it is at a moment, in s."""
@@ -161,7 +163,7 @@ class World:
             trace,
         )
         if self.stage is not None:
-            self.stage.place_plate(moving=steps > 0)
+            self.stage.place_plate(steps)
         self.plant.follow(trace)
         if self.stage is not None:
             self.stage.advance(steps)
@@ -169,7 +171,7 @@ class World:
         if self.camera is not None and here >= self.camera.next_step():
             self.camera.capture(self.faults["tracker"])
         watchdog = self.supply.watchdog
-        if watchdog is not None and self.time - self._commanded_at >= watchdog:
+        if watchdog is not None and self.time - self._commanded_at >= watchdog - 1e-9:
             self.set_point[:] = 0.0
 
     # Supply --------------------------------------------------------------------------------------
@@ -277,7 +279,7 @@ class World:
             known = "; ".join(f"{name}: {', '.join(names)}" for name, names in FAULTS.items())
             raise InputError(f"there is no fault '{fault}' of '{device}'; there are {known}")
         if channel is not None and (device != "supply" or not 0 <= channel < self._n):
-            raise InputError(f"there is no channel {channel} of '{device}'")
+            raise InputError(f"there is no channel {channel + 1} of '{device}'")
         with self.lock:
             self.catch_up()
             self.faults[device] = fault
