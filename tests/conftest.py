@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -61,3 +63,12 @@ def _no_network(monkeypatch: pytest.MonkeyPatch) -> None:
         connect(self, address)
 
     monkeypatch.setattr(socket.socket, "connect", guarded)
+
+
+@pytest.fixture(autouse=True)
+def _forget_supplies() -> Iterator[None]:
+    """Let what a test left under pressure on purpose not be vented at the end of all tests."""
+    yield
+    pressure = sys.modules.get("stiffopt.rig.pressure")
+    if pressure is not None:
+        pressure._not_known_to_be_vented.clear()

@@ -24,6 +24,7 @@ from modbus_device import HandmadeDevice
 from stiffopt.errors import DeviceError, FileError, InputError, MissingExtraError
 from stiffopt.files import read_file
 from stiffopt.rig.drivers.modbus import ModbusSettings, ModbusSupply
+from stiffopt.rig.drivers.modbus_line import ModbusLine, Tcp
 from stiffopt.rig.drivers.modbus_registers import Point, Scale
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.lab.modbus_peer import ModbusPeer
@@ -91,12 +92,33 @@ def test_counts_never_say_more_than_the_limit(
     point = Point(7, "holding", kind, order, scale)
     per_count = abs(np.diff(scale.pressure)[0] / np.diff(scale.counts)[0])
     for highest, slack in ((pressure, 1.0), (1e9, 0.5)):
-        registers = point.encode(pressure, highest)
+        registers = point.encode(pressure, highest=highest)
         assert len(registers) == point.width
         assert all(0 <= word <= 0xFFFF for word in registers)
         said = point.decode(registers)
         assert said <= highest + 1e-9 * highest
         assert abs(said - pressure) <= (slack + 1e-3) * per_count
+
+
+@given(
+    st.sampled_from(TYPES),
+    st.sampled_from(SCALES),
+    st.lists(st.floats(-1.5e5, 1.5e5), min_size=3, max_size=3),
+)
+def test_counts_stay_within_both_limits(kind: Any, scale: Scale, pressures: list[float]) -> None:
+    low, pressure, high = sorted(pressures)
+    point = Point(7, "holding", kind, "big", scale)
+    per_count = abs(np.diff(scale.pressure)[0] / np.diff(scale.counts)[0])
+    reach = point.pressure_range()
+    try:
+        said = point.decode(point.encode(pressure, lowest=low, highest=high))
+    except InputError:  # only where the register can say nothing between them
+        assert min(high, reach[1]) - max(low, reach[0]) < 1.001 * per_count
+    else:
+        assert low <= said <= high or (pressure == 0 and said <= max(high, 0))
+        assert abs(said - pressure) <= 1.001 * per_count or not reach[0] <= pressure <= reach[1]
+    vented = point.decode(point.encode(0.0, lowest=low, highest=high))
+    assert -1.001 * per_count <= vented <= max(high, 0.0)
 
 
 def test_words_are_in_order() -> None:
@@ -242,6 +264,46 @@ def test_limits_of_channels_and_registers_hold(device: HandmadeDevice) -> None:
         settings().device(PressureLimits(np.full(3, 1e9), np.full(3, 2e9)))
 
 
+FALLING = {"counts": [0, 1000], "pressure": ["1 bar", "0 bar"]}
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "asked", "count", "scale"),
+    [
+        (-50060.0, 0.0, -50060.0, -500, "1 mbar"),
+        (-1e5, -20040.0, -20040.0, -201, "1 mbar"),
+        (30040.0, 1e5, 30040.0, 301, "1 mbar"),
+        (0.0, 30060.0, 30060.0, 300, "1 mbar"),
+        (30040.0, 1e5, 30040.0, 699, FALLING),
+        (0.0, 30060.0, 30060.0, 700, FALLING),
+    ],
+)
+def test_what_is_on_the_wire_is_within_both_limits(
+    device: HandmadeDevice, low: float, high: float, asked: float, count: int, scale: Any
+) -> None:
+    limits = PressureLimits(np.array([low]), np.array([high]))
+    given = settings(device.port, channels=[{"setpoint": 0, "reading": 1}], scale=scale)
+    given = given.model_copy(update={"table": "holding"})
+    with given.device(limits) as supply:
+        supply.arm()
+        for write, size in ((supply.command, 5), (supply.exchange, 9)):
+            device.requests.clear()
+            write([asked])
+            assert struct.unpack(">h", device.requests[0][-2:]) == (count,), size
+        supply.command([0.0])  # whatever the limits
+        assert device.holding[0] == (1000 if scale is FALLING else 0)
+
+
+def test_limits_between_two_counts_leave_nothing() -> None:
+    made = settings(channels=[{"setpoint": 0}])
+    with pytest.raises(
+        InputError, match=r"channel 1: its register can say nothing from 0\.3004 to"
+    ):
+        made.device(PressureLimits(np.array([30040.0]), np.array([30060.0])))
+    made.device(PressureLimits(np.array([0.0]), np.array([60.0])))
+    made.device(PressureLimits(np.array([0.0]), np.array([0.0])))
+
+
 # driver: failures --------------------------------------------------------------------------------
 
 
@@ -342,6 +404,7 @@ def test_venting_goes_on_to_other_registers(device: HandmadeDevice) -> None:
 
     supply = settings(device.port, channels=channels).device(LIMITS)
     supply.open()
+    supply.arm()
     supply.command(P)
     device.answers[16] = stubborn
     with pytest.raises(DeviceError, match=r"channel 2 \(holding register 20\)"):
@@ -351,6 +414,108 @@ def test_venting_goes_on_to_other_registers(device: HandmadeDevice) -> None:
     supply.close()
 
 
+def test_venting_goes_on_after_a_register_that_does_not_answer(device: HandmadeDevice) -> None:
+    def partly_silent(request: bytes) -> bytes:
+        return b"" if request[1:3] == b"\0\0" else device._answer(request)
+
+    channels = [{"setpoint": 0}, {"setpoint": 10}, {"setpoint": 20}]
+    with opened(device, channels=channels, timeout=0.15) as supply:
+        supply.command(P)
+        device.answers[16] = partly_silent
+        with pytest.raises(DeviceError, match=r"write channel 1 \(holding register 0\)"):
+            supply.command(np.array(P) / 2)
+        assert (device.holding[10], device.holding[20]) == (500, 1200)  # not so if it is no vent
+        with pytest.raises(DeviceError, match=r"write channel 1 \(holding register 0\)"):
+            supply.vent()
+        assert [device.holding[i] for i in (0, 10, 20)] == [1000, 0, 0]
+        device.answers.clear()
+
+
+@pytest.mark.parametrize(
+    ("method", "request_"), [("_write", "ask"), ("_exchange", "ask_registers")]
+)
+def test_what_was_checked_before_close_is_not_written_after_it(
+    device: HandmadeDevice, monkeypatch: pytest.MonkeyPatch, method: str, request_: str
+) -> None:
+    supply = settings(device.port, table="holding", verify=False).device(LIMITS)
+    supply.open()
+    supply.arm()
+    checked, closed = threading.Event(), threading.Event()
+    send = getattr(supply._line, request_)
+    failed: list[DeviceError] = []
+
+    def late(*args: Any, **options: Any) -> Any:
+        if threading.current_thread() is thread:
+            checked.set()
+            assert closed.wait(5)
+        return send(*args, **options)
+
+    def write() -> None:
+        try:
+            getattr(supply, method)(np.array(P))
+        except DeviceError as error:
+            failed.append(error)
+
+    monkeypatch.setattr(supply._line, request_, late)
+    thread = threading.Thread(target=write)
+    thread.start()
+    assert checked.wait(5)
+    supply.close()
+    before = list(device.requests)
+    closed.set()
+    thread.join(5)
+    assert not thread.is_alive()
+    assert "is closed; nothing was sent" in str(failed[0])
+    assert device.requests == before
+    assert device.connections == 1
+    assert not any(device.holding[0x800 + i] for i in range(3))
+    supply.open()  # and then it is another line
+    supply.close()
+
+
+def test_a_closed_line_stays_closed(device: HandmadeDevice) -> None:
+    line = ModbusLine(Tcp(host="127.0.0.1", port=device.port), 1, 2.0)
+    line.connect()
+    line.close()
+    line.close()
+    for use in (line.connect, lambda: line.write(1, 2), lambda: line.read("it", "input", 0, 1)):
+        with pytest.raises(DeviceError, match="is closed; nothing was sent"):
+            use()
+    line.disconnect()
+    with pytest.raises(DeviceError, match="is closed"):
+        line.write(1, 2)
+    assert until(lambda: device.connections == 1)
+    assert not device.requests
+
+
+@pytest.mark.parametrize("end", [ModbusLine.close, ModbusLine.disconnect])
+def test_a_line_is_closed_after_the_request_under_way(
+    device: HandmadeDevice, end: Callable[[ModbusLine], None]
+) -> None:
+    go = threading.Event()
+
+    def late(request: bytes) -> bytes:
+        assert go.wait(5)
+        return bytes.fromhex("04 02 0007")
+
+    device.answers[4] = late
+    line = ModbusLine(Tcp(host="127.0.0.1", port=device.port), 1, 2.0)
+    got: list[Any] = []
+    reader = threading.Thread(target=lambda: got.append(line.read("it", "input", 0, 1)))
+    closer = threading.Thread(target=lambda: end(line))
+    reader.start()
+    assert until(lambda: bool(device.requests))
+    closer.start()
+    closer.join(0.1)
+    assert closer.is_alive()
+    go.set()
+    for thread in (reader, closer):
+        thread.join(5)
+        assert not thread.is_alive()
+    assert got == [[7]]
+    line.close()
+
+
 def test_close_without_a_peer_ends_in_time(device: HandmadeDevice) -> None:
     supply = settings(device.port, dump_valve={"coil": 4}, timeout=0.3).device(LIMITS)
     supply.open()
@@ -358,7 +523,7 @@ def test_close_without_a_peer_ends_in_time(device: HandmadeDevice) -> None:
     began = time.monotonic()
     with pytest.raises(DeviceError):
         supply.close()
-    assert time.monotonic() - began < 2.5
+    assert time.monotonic() - began < 4.0  # eight requests of 0.3 s: both outputs, all insisted on
     assert not supply.is_open
 
 
@@ -436,6 +601,7 @@ def test_watchdog_is_started_before_anything_moves(device: HandmadeDevice) -> No
             bytes.fromhex("06 1001 8000"),
             bytes.fromhex("10 0800 0003 06 0000 0000 0000"),
         ]
+        supply.arm()
         device.requests.clear()
         supply.command(P)
         supply.exchange(P)
@@ -643,6 +809,7 @@ def test_peer_hides_set_points_behind_readings_as_couplers_do() -> None:
     with peer_for(channels=channels, table="holding") as (given, bench):
         bench.readings = np.array([100.0, 200.0, 300.0])
         with given.device(LIMITS) as supply, Raw(port_of(given)) as raw:
+            supply.arm()
             reading = supply.exchange(P)
             np.testing.assert_allclose(reading.pressures, bench.readings)
             np.testing.assert_allclose(bench.pressures, P)
@@ -658,6 +825,7 @@ def test_peer_and_driver_in_wide_registers(kind: str, order: str) -> None:
     channels = [{"setpoint": 2 * i, "reading": 10 + 2 * i} for i in range(3)]
     wide = {"type": kind, "word_order": order, "scale": "1 Pa", "table": "holding"}
     with peer_for(channels=channels, **wide) as (given, bench), given.device(LIMITS) as supply:
+        supply.arm()
         np.testing.assert_allclose(supply.exchange(P).pressures, P)
         np.testing.assert_allclose(bench.pressures, P)
         bench.readings = np.array([np.nan, 1e5, 2e5])
@@ -696,6 +864,7 @@ def test_peer_without_a_watchdog_keeps_pressures() -> None:
 
 def test_peer_that_is_off_or_slow() -> None:
     with peer_for(timeout=0.6) as (given, bench), given.device(LIMITS) as supply:
+        supply.arm()
         supply.command(P)
         bench.faults["supply"] = "off"
         with pytest.raises(DeviceError, match="does not answer"):
@@ -733,6 +902,7 @@ def test_peer_leaves_nothing_behind() -> None:
             bench = FakeBench()
             peer = ModbusPeer(settings(**changes), bench)
             with peer.start().device(LIMITS) as supply:
+                supply.arm()
                 supply.command(P)
             peer.close()
             peer.close()

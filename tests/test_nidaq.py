@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import grpc
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -19,7 +20,12 @@ from pydantic import ValidationError
 from fake_bench import FakeBench
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
 from stiffopt.rig.drivers.daqmx import Daqmx
-from stiffopt.rig.drivers.daqmx_tasks import AnalogueInput, InputChannel, Watchdog
+from stiffopt.rig.drivers.daqmx_tasks import (
+    AnalogueInput,
+    AnalogueOutput,
+    InputChannel,
+    Watchdog,
+)
 from stiffopt.rig.drivers.nidaq import NidaqSettings, NidaqSupply
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.lab.daq_server import DaqHardware, DaqServer
@@ -137,6 +143,7 @@ def wires() -> Iterator[Wires]:
 def test_volts_are_those_of_the_wiring(wires: Wires) -> None:
     with settings(grpc=wires.server.start()).device(LIMITS) as supply:
         assert wires.out == {"Dev2/ao0": 0.0, "Dev2/ao1": 0.0}
+        supply.arm()
         supply.command([1.5e5, 0.3e5])
         assert wires.out == pytest.approx({"Dev2/ao0": 5.0, "Dev2/ao1": 1.0})
         wires.into = {"Dev1/ai0": 2.75, "Dev1/ai1": 0.44}  # a quarter of the way, and below zero
@@ -149,6 +156,7 @@ def test_a_regulator_whose_zero_is_not_0_v_vents_at_its_zero(wires: Wires) -> No
     made = settings(grpc=wires.server.start(), channels=channels(output=output))
     with made.device(PressureLimits(np.array([-0.5e5, 0]), np.full(2, 1.5e5))) as supply:
         assert wires.out["Dev2/ao0"] == pytest.approx(7.0)
+        supply.arm()
         supply.command([-0.5e5, 0.0])
         assert wires.out["Dev2/ao0"] == pytest.approx(8.0)
     assert wires.out["Dev2/ao0"] == pytest.approx(7.0)
@@ -180,11 +188,13 @@ def test_a_channel_without_an_input_reads_nan(started: Any) -> None:
     made = channels()
     del made[0]["input"]
     with started(channels=made) as supply:
+        supply.arm()
         supply.command([1e5, 0.6e5])
         np.testing.assert_allclose(supply.read().pressures, [np.nan, 0.6e5])
     for each in made:
         each.pop("input", None)
     with started(channels=made) as supply:
+        supply.arm()
         assert np.isnan(supply.exchange([1e5, 0.6e5]).pressures).all()
 
 
@@ -196,6 +206,7 @@ def test_an_output_that_is_not_where_it_should_be(wires: Wires, method: str) -> 
     made = made.model_copy(update={"channels": (made.channels[0], settings().channels[1])})
     wires.into["Dev1/ai1"] = 0.03
     with made.device(LIMITS) as supply:
+        supply.arm()
         wires.into["Dev1/ai1"] = 4.97
         getattr(supply, method)([1.5e5, 0])
         wires.into["Dev1/ai1"] = 4.5
@@ -349,6 +360,7 @@ def test_a_server_that_accepts_and_says_nothing() -> None:
 def test_a_device_that_goes_silent_does_not_hang_its_user(started: Any, bench: FakeBench) -> None:
     supply = started(timeout=0.5)
     supply.open()
+    supply.arm()
     supply.command([1e5, 1e5])
     bench.faults["supply"] = "off"
     uses = (lambda: supply.command([1e5, 0]), supply.read, supply.vent, supply.close)
@@ -362,8 +374,69 @@ def test_a_device_that_goes_silent_does_not_hang_its_user(started: Any, bench: F
     assert bench.pressures[1] == pytest.approx(1e5)
 
 
+@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("how", ["silent", "unreachable"])
+def test_tasks_that_could_not_be_closed_are_closed_when_it_comes_back(
+    started: Any, bench: FakeBench, how: str, same: bool
+) -> None:
+    first = started(timeout=0.2, dump_valve=VALVE, watchdog=5.0 if how == "silent" else None)
+    first.open()
+    first.arm()
+    first.command([1e5, 1e5])
+    server = first.peer._server
+    if how == "silent":
+        bench.faults["supply"] = "off"
+        first._valve._watchdog.stop = lambda: None  # else `close` waits for it
+        first._valve._watchdog.running = False
+    else:
+        server._answers = lambda context: context.abort(grpc.StatusCode.UNAVAILABLE, "")
+    with pytest.raises(DeviceError, match=r"has not answered|cannot be reached"):
+        first.close()
+    assert bench.pressures == pytest.approx([1e5, 1e5])
+    again = first if same else first._settings.device(LIMITS)
+    for _ in range(2):  # as long as it is away
+        with pytest.raises(DeviceError, match=r"has not answered|cannot be reached"):
+            again.open()
+    bench.faults.clear()
+    vars(server).pop("_answers", None)
+    with again:
+        assert not bench.pressures.any()
+        assert bench.valve_open
+        again.arm()
+        again.command([0.5e5, 0.5e5])
+        assert bench.pressures == pytest.approx([0.5e5, 0.5e5])
+    assert not bench.pressures.any()
+    assert not server._sessions
+
+
+def test_a_server_that_has_started_anew_knows_no_tasks(bench: FakeBench) -> None:
+    peer = NidaqPeer(settings(), bench)
+    made = peer.start()
+    supply = made.device(LIMITS)
+    supply.open()
+    supply.arm()
+    supply.command([1e5, 1e5])
+    peer.close()
+    with pytest.raises(DeviceError, match="cannot be reached"):
+        supply.close()
+    anew = NidaqPeer(made, bench)
+    anew.start()
+    other = Daqmx(made.grpc, 1.0, "nidaq")  # asks for what was left to be closed
+    sensor = AnalogueInput(other, [InputChannel("Dev1/ai1", "rse", -10.0, 10.0)], shared=True)
+    with made.model_copy(update={"share_inputs": True}).device(LIMITS):
+        assert not bench.pressures.any()
+        assert np.isfinite(sensor.read()).all()
+    sensor.close()
+    other.close()
+    supply.open()
+    supply.close()
+    assert not anew._server._sessions
+    anew.close()
+
+
 def test_a_device_that_comes_back(started: Any, bench: FakeBench) -> None:
     with started(timeout=0.5) as supply:
+        supply.arm()
         bench.faults["supply"] = "off"
         with pytest.raises(DeviceError):
             supply.read()
@@ -374,6 +447,7 @@ def test_a_device_that_comes_back(started: Any, bench: FakeBench) -> None:
 
 def test_a_slow_device_still_serves(started: Any, bench: FakeBench) -> None:
     with started() as supply:
+        supply.arm()
         bench.faults["supply"] = "slow"
         began = time.monotonic()
         supply.command([1e5, 1e5])
@@ -385,6 +459,7 @@ def test_a_slow_device_still_serves(started: Any, bench: FakeBench) -> None:
 def test_a_server_that_dies(started: Any) -> None:
     supply = started(timeout=10.0)
     supply.open()
+    supply.arm()
     supply.peer.close()
     began = time.monotonic()
     with pytest.raises(DeviceError, match="cannot be reached"):
@@ -410,8 +485,45 @@ def test_a_channel_that_the_device_has_not(bench: FakeBench) -> None:
     peer.close()
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dump_valve": {"line": "Dev1/port0/line7"}}, "opening Dev1/port0/line7 failed"),
+        ({"channels": channels(input={"channel": "Dev1/ai7"})}, "opening Dev1/ai7, Dev1/ai1 fail"),
+    ],
+)
+def test_an_opening_that_fails_leaves_no_pressure(
+    wires: Wires, monkeypatch: pytest.MonkeyPatch, changes: dict[str, Any], message: str
+) -> None:
+    made = settings(grpc=wires.server.start(), **changes)
+    for index in (0, 1):
+        wires.out[f"Dev2/ao{index}"] = 3.3  # of an earlier program
+    with pytest.raises(DeviceError, match=message):
+        made.device(LIMITS).open()
+    assert wires.out == {"Dev2/ao0": 0.0, "Dev2/ao1": 0.0}
+    assert not wires.server._sessions
+
+    def fail(self: AnalogueOutput, volts: Any) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(AnalogueOutput, "write", fail)
+    with pytest.raises(DeviceError, match=message):  # the first error is told
+        made.device(LIMITS).open()
+    assert not wires.server._sessions
+
+
+def test_an_opening_that_fails_writes_the_zero_of_the_regulator(wires: Wires) -> None:
+    output = {"volts": ["9 V", "1 V"], "pressures": ["-1 bar", "3 bar"]}
+    valve = {"line": "Dev1/port0/line7"}
+    made = settings(grpc=wires.server.start(), channels=channels(output=output), dump_valve=valve)
+    with pytest.raises(DeviceError, match="line7"):
+        made.device(LIMITS).open()
+    assert wires.out == pytest.approx({"Dev2/ao0": 7.0, "Dev2/ao1": 0.0})
+
+
 def test_a_device_that_is_taken(started: Any) -> None:
     with started() as supply:
+        supply.arm()
         with pytest.raises(DeviceError, match=r"-50103.*close the program that uses the device"):
             supply._settings.device(LIMITS).open()
         supply.command([1e5, 1e5])  # the first is not disturbed
@@ -421,6 +533,7 @@ def test_inputs_are_shared_where_the_rig_file_says_so(started: Any, bench: FakeB
     other = [InputChannel("Dev1/ai1", "rse", -10.0, 10.0)]
     for shared in (True, False):
         with started(share_inputs=shared, timeout=0.2) as supply:
+            supply.arm()
             supply.command([1e5, 0.6e5])
             daq = Daqmx(supply._settings.grpc, 0.2, "nidaq")
             sensor = AnalogueInput(daq, other, shared=True)
@@ -471,7 +584,6 @@ def test_the_peer_listens_where_it_is_told_and_only_on_this_machine(bench: FakeB
 
 
 def test_the_peer_refuses_what_it_does_not_know(started: Any) -> None:
-    import grpc
     from nidaqmx.errors import RpcError
     from nidaqmx.grpc_session_options import GrpcSessionOptions
     from nidaqmx.system import System

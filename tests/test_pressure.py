@@ -77,16 +77,10 @@ def supply() -> Recorded:
     return supply
 
 
-@pytest.fixture(autouse=True)
-def _forget() -> object:
-    yield
-    pressure._not_known_to_be_vented.clear()
-
-
 def test_opening_vents_and_arming_shuts_the_valve_last() -> None:
     supply = Recorded()
     supply.open()
-    assert supply.story == ["connected", "zeros", "open"]
+    assert supply.story == ["connected", "open", "zeros"]
     with pytest.raises(CommandError, match="vented"):
         supply.command(SOME)
     supply.arm()
@@ -181,7 +175,7 @@ def test_no_thread_writes_after_closing(supply: Recorded) -> None:
     for thread in (writer, closer):
         thread.join(5)
         assert not thread.is_alive()
-    assert supply.story[-3:] == ["zeros", "open", "disconnected"]
+    assert supply.story[-3:] == ["open", "zeros", "disconnected"]
     assert not supply.wire.any()
 
 

@@ -18,7 +18,8 @@ from pydantic import ValidationError
 from fake_bench import FakeBench
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
 from stiffopt.rig.drivers.probe import ProbeSettings, ZaberProbe, ask_at_the_terminal
-from stiffopt.rig.drivers.zaber import StageSettings
+from stiffopt.rig.drivers.zaber import Stage, StageSettings
+from stiffopt.rig.interface import SystemClock
 from stiffopt.rig.lab.probe_peer import ProbePeer
 from stiffopt.rig.lab.zaber_peer import ZaberPeer
 
@@ -453,6 +454,56 @@ def test_a_stage_that_accepts_and_says_nothing(started: Any) -> None:
         with pytest.raises(DeviceError, match=r"has not responded"):
             lost.open()
         assert time.monotonic() - began < 3.0
+
+
+def test_a_port_that_takes_no_connection() -> None:
+    with socket.socket() as full:
+        full.bind(("127.0.0.1", 0))
+        full.listen(0)
+        callers = [socket.socket() for _ in range(4)]  # more than can wait there
+        for caller in callers:
+            caller.setblocking(False)
+            caller.connect_ex(full.getsockname())
+        port = full.getsockname()[1]
+        failed: list[DeviceError] = []
+
+        def connect() -> None:
+            try:
+                Stage(StageSettings(host="127.0.0.1", port=port), 0.3, SystemClock())
+            except DeviceError as error:
+                failed.append(error)
+
+        thread = threading.Thread(target=connect, name="caller")
+        thread.start()
+        thread.join(2.0)
+        in_time = not thread.is_alive()
+        for caller in callers:
+            caller.close()
+    thread.join(30)  # what still waits is refused now
+    assert in_time
+    assert f"connecting to the stage at 127.0.0.1:{port} failed: no answer for 0.3 s" in str(failed)
+
+
+def test_a_name_that_no_host_has() -> None:
+    for host in ("stage.invalid", "a..b"):
+        with pytest.raises(
+            DeviceError, match=rf"connecting to the stage at {host}:55550 failed: \w"
+        ):
+            Stage(StageSettings(host=host), 0.5, SystemClock())
+
+
+def test_a_stage_that_takes_one_connection_at_a_time(started: Any) -> None:
+    rig = started()
+    taken: list[float] = []
+
+    def is_free(*_: Any) -> bool:
+        taken.append(time.monotonic())
+        return len(taken) == 1 or taken[-1] - taken[-2] > 0.05  # it takes a moment to see the end
+
+    rig.peer._stage._server.verify_request = is_free
+    with rig.probe as probe:
+        assert probe.sample().position == pytest.approx(0, abs=MICROSTEP)
+    assert len(taken) == 2
 
 
 def test_no_sensor(started: Any) -> None:

@@ -47,6 +47,7 @@ def kinematics_facts(
             ),
             ("recordings", f"{result.repetitions}, {len(result.errors):,} samples compared"),
             *_spread(result),
+            *(("DOUBT", doubt) for doubt in result.doubts),
         ),
         heading=("tip error", "mm", "% of length"),
         rows=(

@@ -1,6 +1,7 @@
 """What `stiffopt experiment` does with its arguments."""
 
 import re
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -22,7 +23,13 @@ from stiffopt.experiments import (
     run_kinematics,
     run_stiffness,
 )
-from stiffopt.experiments.folder import check_same, create_folder, open_folder, remove_folder
+from stiffopt.experiments.folder import (
+    alone_in,
+    check_same,
+    create_folder,
+    open_folder,
+    remove_folder,
+)
 from stiffopt.experiments.kinematics import missing_repetitions, sequence_for
 from stiffopt.experiments.kinematics_result import read_recordings
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
@@ -131,10 +138,18 @@ def _planned(experiment: str, options: Options) -> _Plan:
         sequence_for(rig, settings)
     else:
         check_stiffness(rig, settings)
+        _check_that_somebody_is_there(rig)
     is_new = options.resume is None
     if is_new:
         create_folder(folder, settings)
     return _Plan(rig, rate, folder, settings, model, is_new)
+
+
+def _check_that_somebody_is_there(rig: Rig) -> None:
+    """Refuse a probe that must be mounted by hand where nobody can be asked to."""
+    by_hand = rig.probe is not None and rig.probe.needs_a_person
+    if by_hand and (sys.stdin is None or not sys.stdin.isatty()):
+        raise InputError("this probe is mounted by hand; run the experiment at a terminal")
 
 
 def _rig(path: str) -> tuple[Rig, str, float, str]:
@@ -220,7 +235,7 @@ def _do(plan: _Plan, options: Options) -> None:
             **common,
         )
 
-    with stopping.handled(), display.shown():
+    with alone_in(plan.folder), stopping.handled(), display.shown():
         _open(plan)
         notes = _on_rig(plan.rig, work, stopping)
     if not options.quiet:

@@ -87,9 +87,9 @@ def _listen(lines: queue.SimpleQueue[str]) -> None:
 
 
 def _refuse_to_overwrite(rig: str, out: str | None) -> None:
-    if out is not None and Path(out).exists() and Path(rig).exists():
-        if Path(out).samefile(rig):
-            raise InputError(f"--out {out} is the rig file itself; give another name")
+    files = [Path(path) for path in (rig, out) if path is not None]
+    if len(files) == 2 and all(path.exists() for path in files) and files[0].samefile(files[1]):
+        raise InputError(f"--out {out} is the rig file itself; give another name")
 
 
 def _obey(lab: VirtualLab, words: list[str]) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
@@ -14,7 +14,7 @@ from stiffopt.files import read_file, save_file
 from stiffopt.logs import LogLayout, LogRow, LogWriter, McapLogWriter
 from stiffopt.schema import Schema
 
-__all__ = ["SETTINGS", "Recording", "create_folder", "open_folder"]
+__all__ = ["SETTINGS", "Recording", "alone_in", "create_folder", "open_folder"]
 
 SETTINGS = "experiment.yaml"
 
@@ -51,6 +51,28 @@ def open_folder(path: Path, schema: type[SchemaT]) -> SchemaT:
     if not (path / SETTINGS).is_file():
         raise FileError(path, f"holds no experiment; expected a folder with {SETTINGS} in it")
     return read_file(path / SETTINGS, "experiment", schema)
+
+
+@contextmanager
+def alone_in(path: Path) -> Iterator[None]:
+    """Context in which no other process works in the folder of an experiment.
+
+    Raises
+    ------
+    InputError
+        One does.
+    """
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    with (path / SETTINGS).open("rb") as held:
+        try:
+            fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(f"another process is at work in {path}; wait for its end") from None
+        yield
 
 
 def remove_folder(path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from stiffopt.errors import InputError
 from stiffopt.experiments.conductor import Array
+from stiffopt.experiments.doubts import doubts
 from stiffopt.experiments.kinematics import KinematicsSettings, recording_name
 from stiffopt.logs import Log, read_log
 from stiffopt.model.manipulator import Manipulator
@@ -36,6 +37,7 @@ class KinematicsResult:
     component_error : the mean of modelled less measured tip over the repetitions (K, 3), in m.
     errors : distances at all samples of all recordings (M,), in m.
     length : of the arm at rest, in m.
+    doubts : sentences on what makes one doubt the recordings.
     """
 
     repetitions: int
@@ -48,6 +50,7 @@ class KinematicsResult:
     component_error: Array
     errors: Array
     length: float
+    doubts: tuple[str, ...] = ()
 
     @property
     def mean(self) -> float:
@@ -115,6 +118,7 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
         component_error=_mean_of_known(models - tips),
         errors=np.concatenate([one.errors for one in each]),
         length=model.length,
+        doubts=doubts(logs),
     )
 
 

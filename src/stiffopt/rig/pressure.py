@@ -231,7 +231,7 @@ class PressureSupply(Device):
             return self._reading(self._read())
 
     def vent(self) -> None:
-        """Set all channels to 0 Pa and, where there is a dump valve, open it.
+        """Open the dump valve, where there is one, and set all channels to 0 Pa.
 
         Raises
         ------
@@ -242,9 +242,9 @@ class PressureSupply(Device):
             self._must_be_open()
             self._armed = False
             try:
-                self._write_clamped(np.zeros(self.n))
+                self._dump(open_valve=True)  # first: it needs no regulator
             finally:
-                self._dump(open_valve=True)
+                self._write_clamped(np.zeros(self.n))
 
     @property
     def has_dump_valve(self) -> bool:

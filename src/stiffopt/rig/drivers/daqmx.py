@@ -1,7 +1,8 @@
 """NI-DAQmx, on this machine or behind NI's gRPC device server, for the drivers that use it.
 
 nidaqmx gives its gRPC calls no deadline: a server that hangs would hang its caller for ever. Here
-every call gets one, and every failure becomes a `DeviceError`.
+every call gets one, and every failure becomes a `DeviceError`. A server that is gone when tasks
+are closed still holds their channels when it comes back: they are closed then.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Lock
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field
@@ -37,6 +39,7 @@ Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
 Terminals = Literal["default", "rse", "nrse", "differential", "pseudo-differential"]
 
 RESERVED = -50103
+_NO_ANSWER = ("DEADLINE_EXCEEDED", "UNAVAILABLE", "CANCELLED")  # by the names of gRPC
 _EXPIRED = (-200678, -200644)  # a write, a reset of the timer after the watchdog has expired
 _HINTS = {
     RESERVED: "close the program that uses the device, or reset the device in NI MAX",
@@ -84,11 +87,30 @@ def library(module: str, package: str, extra: str) -> Any:
 
 
 class SilentError(DeviceError):
-    """The server has not answered in time."""
+    """The server has not answered, or not in time."""
+
+
+class _LeftTasks:
+    """Tasks that this program could not close, by the address of the server that holds them."""
+
+    def __init__(self) -> None:
+        self._handles: dict[str, list[Any]] = {}
+        self._lock = Lock()
+
+    def add(self, address: str, handle: Any) -> None:
+        with self._lock:
+            self._handles.setdefault(address, []).append(handle)
+
+    def take(self, address: str) -> list[Any]:
+        with self._lock:
+            return self._handles.pop(address, [])
+
+
+_left = _LeftTasks()
 
 
 class Daqmx:
-    """What makes tasks.
+    """What makes tasks, after closing those that this program has left on the server.
 
     Parameters
     ----------
@@ -98,6 +120,11 @@ class Daqmx:
         Of every call, in s.
     extra :
         Of stiffopt that brings nidaqmx, for the message when it is missing.
+
+    Raises
+    ------
+    DeviceError
+        The server still does not answer, and tasks have been left on it.
     """
 
     def __init__(self, address: str | None, timeout: float, extra: str) -> None:
@@ -105,6 +132,7 @@ class Daqmx:
         self.nidaqmx = library("nidaqmx", "nidaqmx", extra)
         self.silent = False
         """Whether the server has left a task that was to be closed without an answer."""
+        self._address = address
         self._where = f"the NI-DAQ server at {address}" if address else "NI-DAQmx"
         self._channel: Any = None
         self._grpc: Any = None
@@ -112,11 +140,42 @@ class Daqmx:
             self._grpc = library("grpc", "nidaqmx[grpc]", extra)
             options = [("grpc.enable_http_proxy", 0)]  # the server is on the lab's own network
             self._channel = self._grpc.insecure_channel(address, options=options)
+            try:
+                self._close_left(address)
+            except BaseException:
+                self.close()
+                raise
 
     def close(self) -> None:
         """Close the connection to the server."""
         if self._channel is not None:
             self._channel.close()
+
+    def leave(self, handle: Any) -> None:
+        """Keep in mind a task that the server did not close, by nidaqmx's name for it."""
+        if self._address and handle is not None:
+            _left.add(self._address, handle)
+
+    def _close_left(self, address: str) -> None:
+        handles = _left.take(address)
+        if not handles:
+            return
+        interpreter = importlib.import_module("nidaqmx._grpc_interpreter").GrpcStubInterpreter(
+            self.options["grpc_options"]
+        )
+        try:
+            while handles:
+                try:
+                    with self.errors("closing a task that was left behind"):
+                        interpreter.clear_task(handles[-1])
+                except SilentError:
+                    raise
+                except DeviceError:
+                    pass  # the server has started anew and does not know it
+                handles.pop()
+        finally:
+            for handle in handles:
+                _left.add(address, handle)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -136,7 +195,7 @@ class Daqmx:
         except (errors.DaqNotFoundError, errors.DaqNotSupportedError):
             raise DeviceError(f"{doing} failed: {_INSTALL}") from None
         except errors.RpcError as error:
-            silent = getattr(error.rpc_code, "name", "") == "DEADLINE_EXCEEDED"
+            silent = getattr(error.rpc_code, "name", "") in _NO_ANSWER
             kind = SilentError if silent else DeviceError
             raise kind(f"{doing} failed: {self._unreachable(error)}") from None
         except errors.DaqError as error:

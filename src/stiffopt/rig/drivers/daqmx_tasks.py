@@ -56,15 +56,19 @@ class _Task:
         task, self._task = self._task, None
         if task is None:
             return
+        handle, left = task._handle, True  # nidaqmx forgets it even if it could not close
         try:
             if not self._daq.silent:
                 with self._daq.errors(self._doing):
                     task.close()  # stops it first
+                left = False
         except SilentError:
             self._daq.silent = True  # one wait is enough
         except DeviceError:
-            pass  # there is no one left who would care
+            left = False  # there is no one left who would care
         finally:
+            if left:
+                self._daq.leave(handle)
             task._handle = None  # else it complains when it is collected
 
 

@@ -150,6 +150,11 @@ class ModbusSettings(Schema):
             high[index] = min(high[index], highest, *([] if channel.max is None else [channel.max]))
             if low[index] > high[index]:
                 raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
+            try:
+                at = float(low[index] or high[index])
+                point.encode(at, lowest=low[index], highest=high[index])
+            except InputError as error:
+                raise InputError(f"channel {index + 1}: {error}; widen its limits") from None
         return PressureLimits(low, high)
 
     def device(self, limits: PressureLimits, clock: Clock | None = None) -> ModbusSupply:
@@ -207,11 +212,11 @@ class ModbusSupply(PressureSupply):
         except BaseException:
             with suppress(DeviceError):  # what a watchdog has to say must not keep it from venting
                 self._write_once(self._encoded(np.zeros(self.n)), whatever_happens=True)
-            self._line.disconnect()
+            self._line.close()
             raise
 
     def _close(self) -> None:
-        self._line.disconnect()
+        self._line.close()
 
     def _watch(self) -> None:
         """Start the device's watchdog, once on every connection: the device may be a fresh one."""
@@ -239,9 +244,11 @@ class ModbusSupply(PressureSupply):
     def _encoded(self, pressures: Array) -> Registers:
         """Return the registers of each channel: within its limits, whatever the pressures are."""
         last = self.limits.clamp(pressures)
-        highest = np.maximum(self.limits.high, 0.0)  # 0 may be commanded below the lowest limit
-        points = enumerate(self._setpoints)
-        return {i: point.encode(float(last[i]), float(highest[i])) for i, point in points}
+        channels = zip(self._setpoints, last, self.limits.low, self.limits.high, strict=True)
+        return {
+            index: point.encode(float(pressure), lowest=float(low), highest=float(high))
+            for index, (point, pressure, low, high) in enumerate(channels)
+        }
 
     def _write(self, pressures: Array) -> None:
         registers = self._encoded(pressures)
@@ -259,7 +266,7 @@ class ModbusSupply(PressureSupply):
                 self._line.ask(f"write {run}", "write_registers", run.start, values)
             except DeviceError as error:
                 errors.append(error)
-                if not (whatever_happens and isinstance(error, RefusedError)):
+                if not whatever_happens:
                     break
         if errors:
             raise errors[0]

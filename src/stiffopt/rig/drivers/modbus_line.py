@@ -106,7 +106,8 @@ class ModbusLine:
     """Sends requests to a device and returns its answers.
 
     A request that fails ends the connection; the next one connects anew, once. No request is
-    ever sent twice.
+    ever sent twice, and none is sent after `close`: a closed line stays closed. Any thread may call
+    any method.
 
     Parameters
     ----------
@@ -134,12 +135,14 @@ class ModbusLine:
         self.connections = 0
         self._client = address.client(timeout=timeout, retries=0)
         self._failures = (library("pymodbus.exceptions").ModbusException, *_FAILURES)
-        self._connected = False
+        self._connected = self._closed = False
         self._lock = RLock()
 
     def connect(self) -> None:
         """Connect, where there is no connection."""
         with self._lock:
+            if self._closed:
+                raise DeviceError(f"the connection to {self.address} is closed; nothing was sent")
             if self._connected:
                 return
             if not self._client.connect():
@@ -148,9 +151,16 @@ class ModbusLine:
             self.connections += 1
 
     def disconnect(self) -> None:
-        """End the connection."""
-        self._connected = False
-        self._client.close()
+        """End the connection; the next request makes a new one."""
+        with self._lock:
+            self._connected = False
+            self._client.close()
+
+    def close(self) -> None:
+        """End the connection for good, when the request that is under way has its answer."""
+        with self._lock:
+            self._closed = True
+            self.disconnect()
 
     def ask(self, what: str, function: str, *args: Any, **options: Any) -> Any:
         """Send one request and return the answer.
@@ -181,11 +191,11 @@ class ModbusLine:
                     raise
                 reason = _reason(error, self.timeout)
                 raise DeviceError(f"{self.address} does not answer: {what}; {reason}") from None
-        code = answer.function_code
-        echo = answer.address if function.startswith("write") and code < 0x80 else None
-        if code & 0x7F != _CODES[function] or (echo is not None and echo != args[0]):
-            self.disconnect()  # it may be the answer to an earlier request; pymodbus lets it pass
-            raise DeviceError(f"{self.address} answers something else: {what}")
+            code = answer.function_code
+            echo = answer.address if function.startswith("write") and code < 0x80 else None
+            if code & 0x7F != _CODES[function] or (echo is not None and echo != args[0]):
+                self.disconnect()  # it may answer an earlier request; pymodbus lets it pass
+                raise DeviceError(f"{self.address} answers something else: {what}")
         if code >= 0x80:
             reason = _EXCEPTIONS.get(answer.exception_code, "it does not say why")
             message = f"{self.address} refuses: {what}; exception {answer.exception_code}, {reason}"
@@ -194,11 +204,12 @@ class ModbusLine:
 
     def ask_registers(self, what: str, n: int, function: str, *args: Any, **opts: Any) -> list[int]:
         """Send a request that is answered with `n` registers, and return these."""
-        registers = self.ask(what, function, *args, **opts).registers
-        if len(registers) != n:
-            self.disconnect()
-            got = len(registers)
-            raise DeviceError(f"{self.address} sends {got} registers, not {n}: {what}")
+        with self._lock:
+            registers = self.ask(what, function, *args, **opts).registers
+            if len(registers) != n:
+                self.disconnect()
+                got = len(registers)
+                raise DeviceError(f"{self.address} sends {got} registers, not {n}: {what}")
         return list(registers)
 
     def read(self, what: str, table: str, start: int, n: int) -> list[int]:

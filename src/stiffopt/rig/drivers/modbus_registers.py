@@ -256,13 +256,31 @@ class Point:
         ends = sorted(self.scale.to_pressure(count) for count in _RANGES[self.type])
         return ends[0], ends[1]
 
-    def encode(self, pressure: float, highest: float = math.inf) -> tuple[int, ...]:
-        """Return the registers for what is nearest to a finite pressure, but not above a limit."""
+    def encode(
+        self, pressure: float, *, lowest: float = -math.inf, highest: float = math.inf
+    ) -> tuple[int, ...]:
+        """Return the registers for what is nearest to a finite pressure, but within limits.
+
+        0 is written whatever the limits are, and never as more than the highest, if that is
+        above 0.
+
+        Raises
+        ------
+        InputError
+            The pressure is not finite, or no count is within the limits.
+        """
         if not math.isfinite(pressure):
             raise InputError(f"{pressure} is not a finite pressure")
+        if pressure == 0:
+            lowest, highest = -math.inf, max(highest, 0.0)
         count = self._rounded(self.scale.to_count(pressure))
-        if self.scale.to_pressure(count) > highest:
-            count = self._next(count, -1 if self.scale.rises else 1)
+        said = self.scale.to_pressure(count)
+        if not lowest <= said <= highest:
+            count = self._next(count, 1 if (said < lowest) == self.scale.rises else -1)
+            if pressure != 0 and not lowest <= self.scale.to_pressure(count) <= highest:
+                raise InputError(
+                    f"its register can say nothing from {lowest * 1e-5:g} to {highest * 1e-5:g} bar"
+                )
         return self.registers(count)
 
     def registers(self, count: float) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -213,15 +213,25 @@ class NidaqSupply(PressureSupply):
                 ],
             )
             stack.callback(self._outputs.close)
-            self._inputs: AnalogueInput | None = None
-            if channels := self._input_channels():
-                self._inputs = AnalogueInput(daq, channels, shared=settings.share_inputs)
-                stack.callback(self._inputs.close)
-            self._valve: Valve | None = None
-            if settings.dump_valve is not None:
-                self._valve = Valve(daq, settings.dump_valve, settings.watchdog)
-                stack.callback(self._valve.close, self.clock)
+            try:
+                self._open_rest(daq, stack)
+            except BaseException:
+                # An earlier program may have left the outputs at some pressure.
+                with suppress(Exception):  # the first error is the one to tell
+                    self._outputs.write(self._vented)
+                raise
             self._opened = stack.pop_all()
+
+    def _open_rest(self, daq: Daqmx, stack: ExitStack) -> None:
+        settings = self._settings
+        self._inputs: AnalogueInput | None = None
+        if channels := self._input_channels():
+            self._inputs = AnalogueInput(daq, channels, shared=settings.share_inputs)
+            stack.callback(self._inputs.close)
+        self._valve: Valve | None = None
+        if settings.dump_valve is not None:
+            self._valve = Valve(daq, settings.dump_valve, settings.watchdog)
+            stack.callback(self._valve.close, self.clock)
 
     def _close(self) -> None:
         self._opened.close()

@@ -6,6 +6,7 @@ converts by itself.
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Annotated, Any, Literal, Self
@@ -26,6 +27,7 @@ SPEED_FACTOR = 1.6384
 _POLL = 0.002  # s between two looks at a moving stage
 _ARRIVED = 5e-6  # m from the target
 _PATIENCE = 2.0  # s longer than a move should take
+_MOMENT = 0.1  # s after which a device that takes one connection takes the next
 
 
 class StageSettings(Schema):
@@ -84,13 +86,7 @@ class Stage:
         self._clock = clock
         ascii_protocol = library("zaber_motion.ascii", "zaber-motion", "probe")
         self._failure = library("zaber_motion", "zaber-motion", "probe").MotionLibException
-        with self._errors("connecting to"):
-            connect = ascii_protocol.Connection
-            self._connection = (
-                connect.open_serial_port(settings.serial)
-                if settings.serial is not None
-                else connect.open_tcp(settings.host, settings.port)
-            )
+        self._connection = self._connect(ascii_protocol.Connection, timeout)
         try:
             with self._errors("setting up"):
                 self._connection.default_request_timeout = max(1, round(1000 * timeout))
@@ -99,6 +95,33 @@ class Stage:
         except BaseException:
             self.close()
             raise
+
+    def _connect(self, connection: Any, timeout: float) -> Any:
+        settings = self.settings
+        if settings.serial is not None:
+            with self._errors("connecting to"):
+                return connection.open_serial_port(settings.serial)
+        self._must_accept(timeout)
+        give_up = self._clock.now() + timeout
+        while True:
+            self._clock.sleep(_MOMENT)
+            try:
+                with self._errors("connecting to"):
+                    return connection.open_tcp(settings.host, settings.port)
+            except DeviceError:
+                if self._clock.now() > give_up:
+                    raise
+
+    def _must_accept(self, timeout: float) -> None:
+        """Refuse a host that takes no connection in time; zaber-motion waits for minutes."""
+        settings = self.settings
+        try:
+            socket.create_connection((settings.host or "", settings.port), timeout).close()
+        except (OSError, ValueError) as error:  # ValueError: no name that a host could have
+            reason = f"no answer for {timeout:g} s"
+            if not isinstance(error, TimeoutError):
+                reason = getattr(error, "strerror", None) or str(error)
+            raise DeviceError(f"connecting to {settings.where} failed: {reason}") from None
 
     def close(self) -> None:
         """Disconnect; the stage goes on with what it does."""
