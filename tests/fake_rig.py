@@ -46,10 +46,16 @@ class FakeWorld(Clock):
         seed: int = 0,
     ) -> None:
         self.t = 100.0
+        self.written = self.t
         self.tip, self.stiffness, self.noise = tip, stiffness, noise
         self.random = np.random.default_rng(seed)
         self.commanded, self.pressures = np.zeros(n), np.zeros(n)
         self.writes: list[tuple[float, Array]] = []
+        self.chambers: list[Array] = []
+        """True pressures when something was written."""
+        self.watchdog = math.inf
+        """Seconds after which the supply vents if nothing is written."""
+        self.gauge: Callable[[Array], Array] = lambda p: p
         self.frames: list[tuple[float, int, Array]] = []
         self.axis: Array | None = None
         self.stage = 0.0
@@ -68,9 +74,11 @@ class FakeWorld(Clock):
         while self.t < moment:
             frame = (math.floor(self.t / FRAME + 1e-9) + 1) * FRAME
             step = min(moment, frame)
-            self.pressures = self.commanded + (self.pressures - self.commanded) * math.exp(
-                -(step - self.t) / LAG
-            )
+            expiry = self.written + self.watchdog
+            if self.t < expiry:
+                step = min(step, expiry)
+            held = self.commanded if self.t < expiry else np.zeros_like(self.commanded)
+            self.pressures = held + (self.pressures - held) * math.exp(-(step - self.t) / LAG)
             self.t = step
             if step == frame and self.seen:
                 self.frames.append((frame, round(frame / FRAME), self.position()))
@@ -111,10 +119,12 @@ class FakeSupply(PressureSupply):
         if self.world.axis is not None and not np.array_equal(pressures, self.world.commanded):
             self.world.swept += 1
         self.world.commanded = pressures.copy()
+        self.world.written = self.world.t
+        self.world.chambers.append(self.world.pressures.copy())
         self.world.writes.append((self.world.t, pressures.copy()))
 
     def _read(self) -> ArrayLike:
-        return self.world.pressures
+        return self.world.gauge(self.world.pressures)
 
 
 class FakeTracker(PoseTracker):
@@ -182,7 +192,8 @@ def fake_rig(
     stiffness: Callable[[Array, Array], float] = lambda p, d: 20.0,
     *,
     robot: str = "stiff-flop-1",
-    slew: float = 1e5,
+    slew: float | None = 1e5,
+    low: float = 0.0,
     high: float = 1.5e5,
     probe: bool = True,
     tracker: bool = True,
@@ -194,7 +205,7 @@ def fake_rig(
     description = load_description(robot)
     n = description.n_pressures
     world = FakeWorld(n, tip, stiffness, noise, seed)
-    limits = PressureLimits(np.zeros(n), np.full(n, high))
+    limits = PressureLimits(np.full(n, low), np.full(n, high))
     return Rig(
         description,
         FakeSupply(world, limits),

@@ -12,10 +12,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import example, given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
 from scipy import stats
 
 import stiffopt
-from fake_rig import CLEARANCE, FakeSupply, FakeWorld, fake_rig, straight
+from fake_rig import CLEARANCE, LAG, FakeSupply, FakeWorld, fake_rig, straight
 from stiffopt.cli import experiment_run
 from stiffopt.cli.main import main
 from stiffopt.cli.quantities import directions, pressures
@@ -29,10 +32,13 @@ from stiffopt.experiments import (
     run_kinematics,
     run_stiffness,
 )
+from stiffopt.experiments.conductor import STEEPEST, Conductor, steepest
+from stiffopt.experiments.folder import alone_in, create_folder
 from stiffopt.experiments.kinematics_result import read_recordings
 from stiffopt.experiments.points import PointsFile
 from stiffopt.experiments.slope import Line, combine, fit_line, fit_lines, student_t
 from stiffopt.logs import read_log, read_mcap_log, read_stiffness_table
+from stiffopt.rig.config import load_rig_description, make_rig
 from stiffopt.rig.interface import PressureLimits, Rig
 
 GOLDEN = {  # bar: stiffness along x, y, z in N/m; reference/paper-notes.md
@@ -41,6 +47,9 @@ GOLDEN = {  # bar: stiffness along x, y, z in N/m; reference/paper-notes.md
     1.0: (13.91, 9.33, 31.89),
     1.5: (28.23, 7.24, 11.63),
 }
+
+
+SIM = Path(__file__).resolve().parent.parent / "rig" / "sim.yaml"
 
 
 def world_of(rig: Rig) -> FakeWorld:
@@ -881,3 +890,300 @@ def test_what_goes_wrong_while_the_probe_is_mounted_is_told(
     with rig, pytest.raises(DeviceError, match="nobody is at"):
         run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
     assert not world_of(rig).commanded.any()
+
+
+# -- what reaches the supply ----------------------------------------------------------------------
+
+RATE = 100.0  # Hz
+
+
+def began(rig: Rig, target: float, rate: float = RATE) -> Conductor:
+    """Bring an open rig to a pressure."""
+    conductor = Conductor(rig, rate)
+    conductor.start()
+    conductor.ramp(np.full(3, target))
+    conductor.settle(np.full(3, target), lambda rows: False, 1.0)
+    return conductor
+
+
+def stall(rig: Rig, seconds: float) -> None:
+    world_of(rig).sleep_until(world_of(rig).t + seconds)
+
+
+def hold(conductor: Conductor, target: float, seconds: float) -> None:
+    conductor.settle(np.full(3, target), lambda rows: False, seconds)
+
+
+def written(rig: Rig, start: int = 0) -> np.ndarray:
+    return np.array([value[0] for _, value in world_of(rig).writes[start:]])
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["pressure", "vacuum"])
+@pytest.mark.parametrize("error", [0.0, 0.245e5, -0.245e5])
+@pytest.mark.parametrize("pause", [0.32, 0.36, 1.0])
+def test_after_the_watchdog_has_vented_pressure_comes_back_slowly(
+    sign: int, error: float, pause: float
+) -> None:
+    rig = fake_rig(slew=1e5, low=-1.5e5)
+    world = world_of(rig)
+    world.watchdog, world.gauge = 0.3, lambda p: p + error
+    with rig:
+        conductor = began(rig, sign * 1e5)
+        before = len(world.writes)
+        stall(rig, pause)
+        hold(conductor, sign * 1e5, 2.0)
+        after = sign * written(rig, before)
+    assert after[0] <= 2001
+    assert np.diff(np.concatenate([[0], after[:-1]])).max() <= 2001
+    assert after[-2] == 1e5  # and it does come back
+
+
+def test_a_supply_without_gauges_is_not_believed_to_hold_what_has_expired() -> None:
+    rig = fake_rig(slew=1e5)
+    world_of(rig).gauge = lambda p: np.full(3, np.nan)
+    with rig:
+        conductor = began(rig, 1e5)
+        before = len(world_of(rig).writes)
+        stall(rig, 0.4)
+        conductor.tick(np.full(3, 1e5))
+        assert written(rig, before).tolist() == [1e5]  # as a command holds for 0.5 s
+        stall(rig, 0.6)
+        conductor.tick(np.full(3, 1e5))
+        assert written(rig, before)[1] <= 2000
+
+
+@pytest.mark.parametrize("start", [1.5e5, -0.2e5])
+@pytest.mark.parametrize("error", [-0.245e5, 0.245e5, -0.15e5, 0.15e5])
+@pytest.mark.parametrize("pause", [0.0, 0.4])
+def test_a_gauge_that_is_wrong_moves_nothing(start: float, error: float, pause: float) -> None:
+    rig = fake_rig(slew=1e5, low=-0.6e5)
+    world_of(rig).gauge = lambda p: p + error
+    with rig:
+        conductor = began(rig, start)
+        before = len(world_of(rig).writes)
+        for target in (start, start / 2, start):
+            stall(rig, pause)
+            conductor.ramp(np.full(3, target))
+        moved = np.diff(written(rig, before - 1))
+    assert np.abs(moved).max() <= 1001
+
+
+@pytest.mark.parametrize("shown", [0.0, 1.5e5, np.nan])
+@pytest.mark.parametrize("pause", [0.0, 0.4])
+def test_one_or_two_bad_readings_move_nothing(shown: float, pause: float) -> None:
+    rig = fake_rig(slew=1e5)
+    world = world_of(rig)
+    bad: list[float] = []
+    world.gauge = lambda p: np.full(3, bad.pop()) if bad else p
+    with rig:
+        conductor = began(rig, 1e5)
+        before = len(world.writes)
+        for count in (1, 2):
+            bad.extend([shown] * count)
+            stall(rig, pause)
+            conductor.ramp(np.full(3, 1e5))
+            hold(conductor, 1e5, 1.0)
+        assert set(written(rig, before)) == {1e5}
+        conductor.ramp(np.zeros(3))
+    assert np.diff(written(rig, before)[:-1]).min() >= -1001
+
+
+def test_slow_regulators_are_not_taken_for_lost_pressure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fake_rig.LAG", 2.0)
+    rig = fake_rig(slew=1e5)
+    with rig:
+        conductor = began(rig, 1.5e5)
+        hold(conductor, 1.5e5, 5.0)
+        conductor.ramp(np.full(3, 0.2e5), slew=1e5)
+        before = len(world_of(rig).writes)
+        for pause in (0.0, 0.2, 0.4, 0.4):
+            stall(rig, pause)
+            hold(conductor, 0.2e5, 3.0)
+        assert set(written(rig, before)) == {0.2e5}
+
+
+def test_pressure_that_goes_while_the_loop_runs_comes_back_slowly() -> None:
+    """Somebody has shut the air and opens it again."""
+    rig = fake_rig(slew=1e5)
+    world, shut = world_of(rig), [False]
+    advance = world.sleep_until
+
+    def without_air(moment: float) -> None:
+        advance(moment)
+        if shut[0]:
+            world.pressures = np.zeros(3)
+
+    world.sleep_until = without_air  # type: ignore[method-assign]
+    with rig:
+        conductor = began(rig, 1e5)
+        shut[0] = True
+        hold(conductor, 1e5, 0.1)
+        shut[0] = False
+        before = len(world.writes)
+        hold(conductor, 1e5, 2.0)
+        after = written(rig, before)
+    assert after[0] < 0.1e5
+    assert after[-2] == 1e5
+
+
+def test_a_loop_that_was_held_up_does_not_jump_on_a_rig_without_slew(tmp_path: Path) -> None:
+    rig = fake_rig(slew=None)
+    assert steepest(rig).tolist() == [STEEPEST] * 3
+    stalls = iter([False] * 400 + [True] + [False] * 10000)
+
+    def check() -> None:
+        if next(stalls):
+            stall(rig, 1.9)
+
+    with rig:
+        run_kinematics(rig, tmp_path, short(repetitions=1, period=4.0), rate=RATE, check=check)
+    values = written(rig)
+    assert values.max() > 0.45e5
+    assert np.abs(np.diff(values)).max() <= STEEPEST * 2 / RATE + 1e-6
+    quick_teeth = PressureSequence.sawtooth(np.zeros(3), [1.5e5], 0.1, steepest(rig))
+    assert quick_teeth.times[1] == pytest.approx(1.5e5 / STEEPEST)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.6e5, -0.1e5), (0.1e5, 0.6e5), (-0.6e5, 0.6e5)])
+def test_every_arm_can_be_ramped_down(low: float, high: float) -> None:
+    rig = fake_rig(slew=1e5, low=low, high=high)
+    target = 0.3e5 if high > 0 else -0.3e5
+    with rig:
+        conductor = began(rig, target)
+        assert world_of(rig).commanded.tolist() == [target] * 3
+        started = world_of(rig).t
+        conductor.ramp(np.zeros(3))
+        assert not world_of(rig).commanded.any()
+        assert world_of(rig).t - started < 1.0
+
+
+def test_a_ramp_that_gets_nowhere_ends() -> None:
+    rig = fake_rig(slew=1e5, high=0.2e5)
+    with rig:
+        conductor = Conductor(rig, RATE, check=lambda: stall(rig, 0.31))
+        conductor.start()
+        world_of(rig).watchdog = 0.3
+        world_of(rig).gauge = lambda p: np.full(3, np.nan)
+        conductor._valid = 0.3
+        with pytest.raises(DeviceError, match="fall again and again"):
+            conductor.ramp(np.full(3, 0.2e5))
+    assert max(value.max() for _, value in world_of(rig).writes) <= 2001
+
+
+def test_a_slew_of_nothing_is_refused() -> None:
+    with fake_rig(slew=0.0) as rig, pytest.raises(InputError, match="slew of this rig"):
+        Conductor(rig, RATE)
+
+
+LIMITS = [(0.0, 1.5e5), (-0.6e5, -0.1e5), (0.1e5, 1e5), (-0.6e5, 0.6e5), (-0.9e5, 0.0)]
+STEPS = st.tuples(
+    st.sampled_from(["tick", "ramp", "stall", "spike"]), st.floats(0, 1), st.booleans()
+)
+
+
+@examples(max_examples=120, deadline=None, derandomize=True)
+@example(LIMITS[0], 0.3, 0.0, [("ramp", 0.7, True), ("stall", 1.0, True), ("tick", 0.7, True)], 0)
+@example(LIMITS[1], 0.3, 0.0, [("ramp", 0.2, True), ("stall", 1.0, True), ("ramp", 0.2, False)], 0)
+@example(LIMITS[4], math.inf, -0.15e5, [("ramp", 0.7, True)] * 3, 1)
+@given(
+    limits=st.sampled_from(LIMITS),
+    watchdog=st.sampled_from([0.3, 0.5, math.inf]),
+    error=st.sampled_from([0.0, 0.245e5, -0.245e5]),
+    steps=st.lists(STEPS, min_size=1, max_size=7),
+    seed=st.integers(0, 99),
+)
+def test_commands_keep_their_promises(
+    limits: tuple[float, float],
+    watchdog: float,
+    error: float,
+    steps: list[tuple[str, float, bool]],
+    seed: int,
+) -> None:
+    low, high = limits
+    slew = [1e5, 0.3e5, None][seed % 3]
+    rig = fake_rig(slew=slew, low=low, high=high)
+    world, bad = world_of(rig), [0]
+    world.watchdog = watchdog
+
+    def gauge(p: np.ndarray) -> np.ndarray:
+        bad[0] = max(bad[0] - 1, 0)
+        return p + error if not bad[0] else np.full(3, 7e4 * (seed % 5 - 2))
+
+    world.gauge = gauge
+    with rig:
+        conductor = began(rig, min(max(0.0, low), high))
+        for what, share, long in steps:
+            target = np.array([share, 1 - share, 0.5]) * (high - low) + low
+            target = np.where([long, True, not long], target, 0.0)
+            if what == "stall":
+                stall(rig, (2.0 if long else 0.6) * share)
+            elif what == "spike":
+                bad[0] = 2  # the next reading but none after it
+            elif what == "ramp":
+                conductor.ramp(target)
+                assert world.commanded.tolist() == target.tolist()
+            for _ in range(20 if long else 3):
+                conductor.tick(target)
+        conductor.ramp(np.zeros(3))
+        assert not world.commanded.any()
+        ended = len(world.writes)
+    times = np.array([time for time, _ in world.writes[:ended]])
+    values = np.array([value for _, value in world.writes[:ended]])
+    chambers = np.array(world.chambers[:ended])
+    assert ((values == 0) | ((values >= low) & (values <= high))).all()
+    edge = min(max(0.0, low), high)  # what is nearest to nothing that can be held
+    rate = STEEPEST if slew is None else slew
+    for k in range(1, ended):
+        step = rate * min(times[k] - times[k - 1], 2 / RATE) + 1e-6
+        for old, new, chamber in zip(values[k - 1], values[k], chambers[k], strict=True):
+            smooth = abs(new - old) <= step
+            gap = (old, new) == (0, edge) or (new == 0 and 0 < abs(edge) >= abs(old) - step)
+            gone = abs(chamber) < abs(old) - 0.05e5 or times[k] - times[k - 1] > 0.5
+            restarted = gone and abs(new) <= max(step, abs(edge))
+            assert smooth or gap or restarted
+            if times[k] - times[k - 1] > 0.15 and watchdog < times[k] - times[k - 1]:
+                slack = 0.15e5 + rate * (LAG + 3 / RATE) + abs(error)
+                assert abs(new) <= abs(chamber) + max(slack, abs(edge) + step)
+
+
+def test_two_processes_do_not_share_a_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    create_folder(folder, short(rig="sim", robot="stiff-flop-1"))
+    with alone_in(folder):
+        code = main(["experiment", "kinematics", str(SIM), "--resume", str(folder), "--no-plot"])
+    assert code == 2
+    assert "another process is at work" in " ".join(capsys.readouterr().err.split())
+    assert [path.name for path in folder.iterdir()] == ["experiment.yaml"]
+
+
+def test_a_probe_that_is_mounted_by_hand_needs_somebody(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "stiffopt.rig.simulated.devices.SimulatedProbe.needs_a_person", True, raising=False
+    )
+    folder = tmp_path / "run"
+    code = main(["experiment", "stiffness", str(SIM), "--out", str(folder), "--no-plot"])
+    assert code == 2
+    assert "at a terminal" in " ".join(capsys.readouterr().err.split())
+    assert not folder.exists()
+
+
+def test_readings_that_cannot_be_end_the_experiment(tmp_path: Path) -> None:
+    description = load_rig_description(SIM)
+    plant = description.plant.model_copy(update={"faults": True, "dynamics": "quasi-static"})
+    rig = make_rig(
+        description.model_copy(update={"plant": plant}),
+        stiffopt.load_robot("stiff-flop-1").description,
+    )
+    world = rig.world  # type: ignore[attr-defined]
+
+    def spoil(done: float, total: float, text: str) -> None:
+        if world.time > 3 and world.faults["supply"] == "ok":
+            world.inject("supply", "garbage", 1)
+
+    with rig, pytest.raises(DeviceError, match=r"channel 2, of which at most 1\.5 bar"):
+        run_kinematics(rig, tmp_path, short(), rate=50.0, progress=spoil)
+    assert not world.set_point.any()

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import DeviceError, InputError
+from stiffopt.experiments.gauges import AGREE, Gauges
 from stiffopt.logs import LogRow
 from stiffopt.rig.interface import PoseSample, PressureCommand, Rig
 
-__all__ = ["Conductor", "Row", "at_rest", "check_pressures"]
+__all__ = ["Conductor", "Row", "at_rest", "check_pressures", "steepest"]
 
 Array = NDArray[np.float64]
 
@@ -25,13 +26,19 @@ VALID = 0.5
 """Seconds for which a command holds, if no rig file says."""
 GENTLE = 5e4
 """Rate in Pa/s at which pressures are brought to where an experiment wants them."""
+STEEPEST = 5e5
+"""Rate in Pa/s of a channel for which neither robot nor rig file has a limit."""
 _FIRST = 5.0  # s that a tracker may take to see the tip for the first time
-_LONGEST_STEP = 0.1  # s; a loop that was held up does not catch up with a jump
+_MOST_PERIODS = 2.0  # that count in one step: a loop that was held up does not catch up with a jump
+_PAUSE = 0.15  # s without a command after which a device may have vented by itself
+_GLANCE = 0.01  # s between two readings after a pause
+_MOST_LOOKS = 20  # after a pause, at pressures that change all the time
+_FAR = 0.1e5  # Pa by which a pressure must have fallen, for noise and lag
 _LOOK = 0.1  # s between two looks at whether something has settled
 _KEPT = 4096  # rows and moments
 _RECENT = 200  # moments among which that of a frame is looked for
 _NEAR = 0.1  # s between a frame and readings that belong to it
-_STEEPEST = 1e12  # Pa/s, in place of no limit
+_PATIENCE = 10  # times the steps that a ramp over the whole range takes
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,10 @@ class _Moment:
 class Conductor:
     """Steps a rig at a fixed rate: a command, a look at all devices, a wait for the next moment.
 
-    Commands never change faster than the rig's slew and are within its limits.
+    Commands are within the rig's limits and never change faster than its slew (`steepest`). A loop
+    that was held up goes on from where it was. Where the pressure has gone meanwhile, because a
+    device's own watchdog has vented, the channel is vented and comes up again under the slew. No
+    reading of a gauge is ever commanded.
 
     Parameters
     ----------
@@ -103,6 +113,8 @@ class Conductor:
     def __init__(self, rig: Rig, rate: float, check: Callable[[], None] = lambda: None) -> None:
         if rig.tracker is None:
             raise InputError("this rig has no tracker; the experiment needs one")
+        if not np.all(rig.slew > 0):
+            raise InputError("the slew of this rig must be above 0 for each channel")
         self.rig = rig
         self.tracker = rig.tracker
         self.clock = rig.clock
@@ -111,8 +123,9 @@ class Conductor:
         self.probing = False
         self._period = 1.0 / rate
         self._check = check
-        self._slew = np.minimum(rig.slew, _STEEPEST)
+        self._slew = steepest(rig)
         self._setpoint = np.array(rig.supply.commanded, dtype=float)
+        self._gauges = Gauges(self.n)
         self._moments: deque[_Moment] = deque(maxlen=_KEPT)
         self._last = self._deadline = self.clock.now()
         safety = None if rig.settings is None else rig.settings.safety
@@ -152,15 +165,19 @@ class Conductor:
             A device fails, or the tracker has lost the tip.
         """
         self._check()
+        gone = self._gone()
         now = self.clock.now()
         reach = self._slew if slew is None else np.minimum(self._slew, slew)
-        reach = reach * min(max(now - self._last, 0.0), _LONGEST_STEP)
+        reach = reach * min(max(now - self._last, 0.0), _MOST_PERIODS * self._period)
         limits, target = self.rig.supply.limits, np.asarray(target, dtype=float)
-        wanted = np.clip(target, self._setpoint - reach, self._setpoint + reach)
-        wanted = np.where((target == 0) & (wanted < limits.low), 0.0, wanted)
-        self._setpoint = limits.clamp(wanted)
+        before, start = self._setpoint, np.where(gone, 0.0, self._setpoint)
+        wanted = np.clip(target, start - reach, start + reach)
+        outside = (wanted < limits.low) | (wanted > limits.high)
+        self._setpoint = limits.clamp(np.where((target == 0) & outside, 0.0, wanted))
         self._last = now
         reading = self.rig.supply.exchange(PressureCommand(self._setpoint, now, self._valid))
+        self._gauges.note(now, before, self._setpoint, reading.pressures)
+        self._gauges.refuse_nonsense(limits)
         force, stage = np.nan, np.nan
         if self.probing and self.rig.probe is not None:
             felt = self.rig.probe.sample()
@@ -174,6 +191,27 @@ class Conductor:
         if self._deadline <= self.clock.now():
             self._deadline = self.clock.now() + self._period
         self.clock.sleep_until(self._deadline)
+
+    def _gone(self) -> NDArray[np.bool_]:
+        """Say in which channels (n,) the pressure is no longer what it was commanded to be.
+
+        After a pause nothing is commanded before that is known. Where the command has expired and
+        no gauge shows that it still holds, it is taken for gone: to vent is always allowed.
+        """
+        half = 0.5 * np.abs(self._setpoint)
+        pause = self.clock.now() - self._last
+        if pause <= max(_PAUSE, 3 * self._period):
+            return self._gauges.fallen(self._setpoint, np.maximum(half, _FAR))
+        for count in range(_MOST_LOOKS):
+            if count >= AGREE and self._gauges.steady():
+                break
+            if count:
+                self.clock.sleep(_GLANCE)
+            self._gauges.look(self.rig.supply.read().pressures)
+        gone = self._gauges.fallen(self._setpoint, _FAR)
+        if pause > self._valid:
+            gone |= ~(self._gauges.shown(self._setpoint) >= half)
+        return gone
 
     def _take(self, sample: PoseSample) -> None:
         """Put a frame together with what held when it was captured."""
@@ -234,13 +272,25 @@ class Conductor:
             raise failures[0]
 
     def ramp(self, target: ArrayLike, slew: float = GENTLE) -> None:
-        """Bring the pressures (n,) somewhere; from what is measured, should they have fallen."""
-        target = self.rig.supply.limits.clamp(np.asarray(target, dtype=float))
-        measured = self.rig.supply.read().pressures
-        fallen = np.isfinite(measured) & (measured < self._setpoint - 0.1e5)
-        self._setpoint = np.where(fallen, np.maximum(measured, 0.0), self._setpoint)
-        while not np.array_equal(self._setpoint, target):
-            self.tick(target, slew)
+        """Bring the pressures (n,) somewhere.
+
+        Raises
+        ------
+        DeviceError
+            They do not get there, for the supply vents by itself again and again.
+        """
+        limits = self.rig.supply.limits
+        target = limits.clamp(np.asarray(target, dtype=float))
+        span = np.maximum(limits.high, 0.0) - np.minimum(limits.low, 0.0)
+        steps = float(np.max(span / np.minimum(self._slew, slew))) / self._period
+        for _ in range(_PATIENCE * (int(steps) + 10)):
+            self.tick(target, slew)  # at least one: they may have fallen
+            if np.array_equal(self._setpoint, target):
+                return
+        raise DeviceError(
+            "the pressures do not get to where they shall be: they fall again and again; "
+            "is there air, does the supply's watchdog wait long enough?"
+        )
 
     def settle(
         self, target: ArrayLike, settled: Callable[[Sequence[Row]], bool], timeout: float
@@ -263,6 +313,11 @@ class Conductor:
                 break
             found.append(row)
         return found[::-1]
+
+
+def steepest(rig: Rig) -> Array:
+    """Return the rates (n,) in Pa/s that no command exceeds: the rig's slew, or `STEEPEST`."""
+    return np.where(np.isfinite(rig.slew), rig.slew, STEEPEST)
 
 
 def at_rest(

@@ -15,9 +15,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from stiffopt.experiments.conductor import Array, Conductor, Row, at_rest, check_pressures
+from stiffopt.errors import FileError
+from stiffopt.experiments.conductor import (
+    Array,
+    Conductor,
+    Row,
+    at_rest,
+    check_pressures,
+    steepest,
+)
 from stiffopt.experiments.folder import Recording
-from stiffopt.logs import LogLayout
+from stiffopt.logs import LogLayout, read_log
 from stiffopt.rig.interface import Rig
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration, Pressure
@@ -125,7 +133,7 @@ def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
     limits = rig.supply.limits
     check_pressures(rig, settings.pressures, range(limits.n))
     base = limits.clamp(np.clip(0.0, limits.low, limits.high))
-    return PressureSequence.sawtooth(base, settings.pressures, settings.period, rig.slew)
+    return PressureSequence.sawtooth(base, settings.pressures, settings.period, steepest(rig))
 
 
 def recording_name(repetition: int) -> str:
@@ -135,8 +143,16 @@ def recording_name(repetition: int) -> str:
 
 def missing_repetitions(folder: Path, settings: KinematicsSettings) -> list[int]:
     """Repetitions that are not complete in a folder, counted from 1."""
-    every = range(1, settings.repetitions + 1)
-    return [k for k in every if not (folder / f"{recording_name(k)}.csv").exists()]
+    return [k for k in range(1, settings.repetitions + 1) if not _is_whole(folder, k)]
+
+
+def _is_whole(folder: Path, repetition: int) -> bool:
+    """Whether both recordings of a repetition are there and the table can be read."""
+    name = recording_name(repetition)
+    try:
+        return (folder / f"{name}.mcap").exists() and len(read_log(folder / f"{name}.csv").time) > 1
+    except FileError:  # damaged or not there: it is done again
+        return False
 
 
 def run_kinematics(
