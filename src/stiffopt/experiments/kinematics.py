@@ -25,9 +25,10 @@ from stiffopt.experiments.conductor import (
     steepest,
 )
 from stiffopt.experiments.folder import Recording
+from stiffopt.experiments.settings import ExperimentSettings, Progress
 from stiffopt.logs import LogLayout, read_log
 from stiffopt.rig.interface import Rig
-from stiffopt.schema import Items, Schema
+from stiffopt.schema import Items
 from stiffopt.units import Duration, Pressure
 
 __all__ = ["KinematicsSettings", "PressureSequence", "recording_name", "run_kinematics"]
@@ -37,33 +38,24 @@ SETTLE = 20.0
 _TAIL = 1.0  # s that the last frames may take to arrive
 _AFTER = 0.2  # s that are recorded after the last tooth
 
-Progress = Callable[[float, float, str], None]
 
-
-class KinematicsSettings(Schema):
+class KinematicsSettings(ExperimentSettings):
     """What is done.
 
     Attributes
     ----------
     experiment : says which.
-    rig, robot : names, for people.
-    channels : number of channels.
     pressures : peaks of the teeth of each channel, in Pa.
     period : of a tooth, up and down, in s.
-    repetitions : of the whole sequence.
     """
 
     experiment: Literal["kinematics"] = "kinematics"
-    rig: str = "rig"
-    robot: str = "robot"
-    channels: Annotated[int, Field(ge=1)]
     pressures: Annotated[Items[Annotated[Pressure, Field(gt=0)]], Field(min_length=1)] = (
         0.4e5,
         0.8e5,
         1.0e5,
     )
     period: Annotated[Duration, Field(gt=0)] = 40.0 / 9.0
-    repetitions: Annotated[int, Field(ge=1, le=1000)] = 5
 
 
 @dataclass(frozen=True, eq=False)

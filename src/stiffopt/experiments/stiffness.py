@@ -22,9 +22,10 @@ from stiffopt.experiments.conductor import Array, Conductor, Row, at_rest, check
 from stiffopt.experiments.points import PointsFile, SeriesKey
 from stiffopt.experiments.probing import Probing, Series
 from stiffopt.experiments.raw import RawRecording
+from stiffopt.experiments.settings import ExperimentSettings, Progress
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.interface import Rig
-from stiffopt.schema import Items, Schema
+from stiffopt.schema import Items
 from stiffopt.units import Duration, Force, Length, Pressure
 
 __all__ = ["StiffnessSettings", "direction_name", "run_stiffness"]
@@ -33,32 +34,24 @@ HARD_STOP = 5.0
 """Times the force that is meant not to be exceeded, at which a series ends."""
 _REST_WINDOW = 4.0  # s
 
-Progress = Callable[[float, float, str], None]
 
-
-class StiffnessSettings(Schema):
+class StiffnessSettings(ExperimentSettings):
     """What is done.
 
     Attributes
     ----------
     experiment : says which.
-    rig, robot : names, for people.
-    channels : number of channels.
     channel : which of them is pressurised, counted from 1.
     pressures : of that channel, in Pa.
     directions : along which the probe pushes, in the base frame.
     displacement : of the stage beyond the first contact, in m.
     force : that steps are kept small for, where the model expects more, in N.
     steps : of a series, each way.
-    repetitions : of all.
     settle : seconds for which the arm may take to come to rest.
     reach : how far the stage looks for the tip, in m.
     """
 
     experiment: Literal["stiffness"] = "stiffness"
-    rig: str = "rig"
-    robot: str = "robot"
-    channels: Annotated[int, Field(ge=1)]
     channel: Annotated[int, Field(ge=1)] = 1
     pressures: Annotated[Items[Pressure], Field(min_length=1)] = (
         0.0,
@@ -77,7 +70,6 @@ class StiffnessSettings(Schema):
     displacement: Annotated[Length, Field(gt=0, le=0.1)] = 0.003
     force: Annotated[Force, Field(gt=0)] = 0.2
     steps: Annotated[int, Field(ge=2, le=1000)] = 5
-    repetitions: Annotated[int, Field(ge=1, le=1000)] = 5
     settle: Annotated[Duration, Field(gt=0)] = 60.0
     reach: Annotated[Length, Field(gt=0, le=0.1)] = 0.01
 

@@ -9,7 +9,7 @@ from typing import Self
 
 from stiffopt.errors import DeviceError
 
-__all__ = ["Clock", "Device", "SystemClock"]
+__all__ = ["Clock", "Device", "Opened", "SystemClock"]
 
 
 class Clock(ABC):
@@ -42,7 +42,31 @@ class SystemClock(Clock):
             time.sleep(remaining)
 
 
-class Device(ABC):
+class Opened(ABC):
+    """Something that `with` opens, and closes at its end."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Connect."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Disconnect."""
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class Device(Opened):
     """Something that is opened once, used and closed.
 
     A driver's `_open` must leave nothing open when it raises.
@@ -76,18 +100,6 @@ class Device(ABC):
         if self._is_open:
             self._is_open = False
             self._close()
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _must_be_open(self) -> None:
         if not self._is_open:

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from stiffopt.model.description import RobotDescription
-from stiffopt.rig.device import Clock, Device, SystemClock
+from stiffopt.rig.device import Clock, Device, Opened, SystemClock
 from stiffopt.rig.pressure import (
     PressureCommand,
     PressureLimits,
@@ -69,7 +68,7 @@ class Observation:
     poses: tuple[PoseSample, ...] = field(default=())
 
 
-class Rig:
+class Rig(Opened):
     """An arm with its devices, real or simulated: what controllers and experiments see.
 
     Parameters
@@ -130,18 +129,6 @@ class Rig:
         with ExitStack() as stack:
             for device in self.devices:
                 stack.callback(device.close)
-
-    def __enter__(self) -> Self:
-        self.open()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def observe(self) -> Observation:
         """Read the pressures and collect what the tracker has delivered since the last call.
