@@ -110,6 +110,20 @@ def test_the_watchdog_vents_when_commands_stop() -> None:
         assert rig.supply.read().pressures[0] < 1e-3
 
 
+@pytest.mark.parametrize("begin", [0.1, 0.3, 0.7, 1.1, 2.3])
+def test_the_watchdog_is_never_late(begin: float) -> None:
+    """A long sleep vents at the same moment as one that is looked at in every step."""
+    ends = []
+    for every in (0.001, 0.2):
+        with make({"watchdog": 0.1, "lag": 0.02, "dead_time": 0.0}, {"rate": 3.0}) as rig:
+            rig.clock.sleep_until(begin)
+            rig.command([1e5, 0, 0])
+            for _ in range(round(0.2 / every)):
+                rig.clock.sleep(every)
+            ends.append(rig.world.pressures[0])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-9)
+
+
 def test_a_dump_valve_empties_what_a_stuck_regulator_holds() -> None:
     with make({"dump_valve": True}, armed=False) as rig:
         with pytest.raises(CommandError, match="arm it"):

@@ -147,7 +147,8 @@ class World:
         if self.stage is not None and (left := self.stage.steps_left()) is not None:
             events.append(here + left)
         if self.supply.watchdog is not None and self.set_point.any():
-            events.append(int(np.ceil((self._commanded_at + self.supply.watchdog) / step)))
+            runs_out = self._commanded_at + self.supply.watchdog
+            events.append(int(np.ceil(runs_out / step - 1e-6)))
         return max(here + 1, min(events))
 
     def _run(self, steps: int) -> None:
