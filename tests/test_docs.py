@@ -25,6 +25,7 @@ from stiffopt.model.description import (
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task
+from stiffopt.registration import Placement, Registration
 from stiffopt.rig.config import (
     LabSettings,
     LogSettings,
@@ -39,7 +40,6 @@ from stiffopt.rig.drivers.modbus import ModbusSettings, SerialLine, Tcp
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.drivers.probe import ForceSettings, ProbeSettings
 from stiffopt.rig.drivers.zaber import StageSettings
-from stiffopt.rig.registration import Placement, Registration
 from stiffopt.rig.simulated import settings as simulated
 
 ROOT = Path(__file__).resolve().parent.parent

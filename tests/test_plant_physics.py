@@ -26,7 +26,7 @@ from references import (
 )
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
-from stiffopt.rig.registration import Placement
+from stiffopt.registration import Placement
 from stiffopt.rig.simulated.plant import Plant
 from stiffopt.rig.simulated.settings import (
     Creep,

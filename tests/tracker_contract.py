@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from stiffopt.errors import DeviceError
+from stiffopt.registration import Placement, Registration
 from stiffopt.rig.interface import PoseSample, PoseTracker
-from stiffopt.rig.registration import Placement, Registration
 
 PLACE = (0.0123, -0.0456, -0.1512)  # m
 TURN = tuple(np.array([0.2, 0.4, -0.5, 0.7]) / np.sqrt(0.94))  # w first, all different

@@ -121,15 +121,32 @@ class StrainLaw(ABC):
     def margin(self, p: ca.SX) -> ca.SX:
         """Scalar that is positive where the law holds at pressures p (c,)."""
 
-    def _axial_force(self, p: ca.SX) -> ca.SX:
-        """Force of the pressure on the section, ``f_z = sum P A_c``, in N."""
-        return ca.dot(ca.DM(self.geometry.channel_force), p)
+    def _acting(self, p: ca.SX) -> ca.SX:
+        """Pressures (c,) that act in the chambers: ``gain p + offset``."""
+        corrections = self.segment.corrections
+        if corrections is None:
+            return p
+        if len(corrections.gain):
+            p = p * ca.vertcat(*corrections.gain)
+        if len(corrections.offset):
+            p = p + ca.vertcat(*corrections.offset)
+        return p
 
-    def _moment_about_centroid(self, p: ca.SX) -> ca.SX:
-        """Moment (M_x, M_y) of the pressure about the section's centroid, in N m."""
-        geometry = self.geometry
-        lever = geometry.channel_moment - np.outer(geometry.channel_force, geometry.centroid)
-        first = ca.DM(lever.T) @ p  # (2,): int r P dA
+    def _axial_force(self, acting: ca.SX) -> ca.SX:
+        """Force of the acting pressures on the section, ``f_z = sum P A_c``, in N."""
+        return ca.dot(ca.DM(self.geometry.channel_force), acting)
+
+    def _moment_about_centroid(self, acting: ca.SX) -> ca.SX:
+        """Moment (M_x, M_y) of the acting pressures about the section's centroid, in N m."""
+        geometry, corrections = self.geometry, self.segment.corrections
+        lever = ca.SX(ca.sparsify(ca.DM(geometry.channel_moment.T)))  # (2, c): int r dA
+        if corrections is not None and len(corrections.azimuth):
+            turn = ca.vertcat(*corrections.azimuth).T
+            c, s = ca.cos(turn), ca.sin(turn)
+            lever = ca.vertcat(c * lever[0, :] - s * lever[1, :], s * lever[0, :] + c * lever[1, :])
+        if geometry.centroid.any():
+            lever -= ca.DM(np.outer(geometry.centroid, geometry.channel_force))
+        first = lever @ acting  # (2,): int r P dA
         return ca.vertcat(first[1], -first[0])
 
     def _compliance_about_centroid(
@@ -158,16 +175,16 @@ class PaperLaw(StrainLaw):
 
     limit = "the pressure drives the compensated modulus of this segment to zero"
 
-    def _modulus(self, p: ca.SX) -> ca.SX:
+    def _modulus(self, acting: ca.SX) -> ca.SX:
         modulus = self.segment.material.youngs_modulus
         compensation = self.segment.compensation
-        if compensation is None or compensation.modulus_per_pressure == 0:
+        if compensation is None or ca.SX(compensation.modulus_per_pressure).is_zero():
             return ca.SX(modulus)
-        return modulus + compensation.modulus_per_pressure * smooth_norm(p)
+        return modulus + compensation.modulus_per_pressure * smooth_norm(acting)
 
     def margin(self, p: ca.SX) -> ca.SX:
         """Compensated modulus over a thousandth of the nominal one, less one."""
-        return self._modulus(p) / (1e-3 * self.segment.material.youngs_modulus) - 1
+        return self._modulus(self._acting(p)) / (1e-3 * self.segment.material.youngs_modulus) - 1
 
     def section(self, p: ca.SX) -> Section:
         """Section of eqs 8-10; see `StrainLaw.section`."""
@@ -176,19 +193,20 @@ class PaperLaw(StrainLaw):
         scale_inertia = compensation.inertia if compensation else 1.0
         geometry = self.geometry
         area = scale_area * geometry.area
-        inertia = scale_inertia * geometry.second_moment
-        E = self._modulus(p)
+        inertia = scale_inertia * ca.DM(geometry.second_moment)
+        acting = self._acting(p)
+        E = self._modulus(acting)
         G = E / (2 * (1 + self.segment.material.poisson_ratio))
         per_deformed_length = self._about_axis(
             self._compliance_about_centroid(
                 shear=G * area,
                 axial=E * area,
-                bending=E * _bending(ca.DM(inertia)),
-                torsion=G * np.trace(inertia),
+                bending=E * _bending(inertia),
+                torsion=G * ca.trace(inertia),
             ),
             ca.SX(geometry.centroid),
         )
-        force, moment = self._axial_force(p), self._moment_about_centroid(p)
+        force, moment = self._axial_force(acting), self._moment_about_centroid(acting)
         kappa = ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E
         c = geometry.centroid
         stretch = 1 + force / (E * area)  # of the line of centroids
@@ -220,14 +238,15 @@ class NeoHookeanLaw(StrainLaw):
 
     def margin(self, p: ca.SX) -> ca.SX:
         """Distance of the axial load N / (mu A) from the largest compression."""
-        load = self._axial_force(p) / (self._shear_modulus() * self.geometry.area)
+        load = self._axial_force(self._acting(p)) / (self._shear_modulus() * self.geometry.area)
         return load - self._lowest_load
 
     def section(self, p: ca.SX) -> Section:
         """Section about the stretched state; see `StrainLaw.section`."""
         geometry = self.geometry
         mu = self._shear_modulus()
-        load = self._axial_force(p) / (mu * geometry.area)
+        acting = self._acting(p)
+        load = self._axial_force(acting) / (mu * geometry.area)
         stretch = neo_hookean_stretch(load)
         tangent_modulus = mu * (1 + 2 * stretch**-3)
         shrink = 1 / ca.sqrt(stretch)
@@ -242,7 +261,7 @@ class NeoHookeanLaw(StrainLaw):
             ),
             centroid,
         )
-        omega = ca.inv_minor(bending) @ (shrink * self._moment_about_centroid(p))
+        omega = ca.inv_minor(bending) @ (shrink * self._moment_about_centroid(acting))
         axis_stretch = stretch + omega[1] * centroid[0] - omega[0] * centroid[1]
         return Section(ca.vertcat(0, 0, axis_stretch, omega, 0), compliance)
 

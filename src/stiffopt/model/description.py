@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from stiffopt.errors import InputError, shown
+from stiffopt.model.history import History
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import (
     Acceleration,
@@ -25,11 +26,13 @@ from stiffopt.units import (
     Number,
     Pressure,
     PressureRate,
+    Ratio,
 )
 
 __all__ = [
     "Chambers",
     "Compensation",
+    "Corrections",
     "Material",
     "PressureLimits",
     "RobotDescription",
@@ -121,6 +124,21 @@ class Compensation(Schema):
     inertia: Annotated[Number, Field(gt=0)] = 1.0
 
 
+class Corrections(Schema):
+    """How the channels of a segment act, where that is not as drawn; one value for each.
+
+    Attributes
+    ----------
+    gain : pressure that acts per pressure.
+    offset : pressure that acts in addition, in Pa.
+    azimuth : turns the channel's chambers about the axis, from x towards y, in rad.
+    """
+
+    gain: Items[Annotated[Ratio, Field(gt=0)]] = ()
+    offset: Items[Pressure] = ()
+    azimuth: Items[Angle] = ()
+
+
 class Segment(Schema):
     """One segment of the arm, followed by a rigid connector.
 
@@ -131,6 +149,8 @@ class Segment(Schema):
     channels : for each regulator the chambers it feeds, counted from 1.
     material : what the tube is made of.
     compensation : the paper's lambda, or None for none.
+    corrections : of the channels, or None for none.
+    history : how the shape lags behind the pressures, or None if it does not.
     connector : rigid length after the segment, in m.
     strain_law : how pressures strain the segment.
     """
@@ -144,6 +164,8 @@ class Segment(Schema):
     ]
     material: Material
     compensation: Compensation | None = None
+    corrections: Corrections | None = None
+    history: History | None = None
     connector: Annotated[Length, Field(ge=0)] = 0.0
     strain_law: Literal["paper", "neo-hookean"] = "paper"
 
@@ -156,6 +178,12 @@ class Segment(Schema):
     def _check(self) -> Segment:
         self._check_walls()
         self._check_channels()
+        for name, values in self.corrections or ():
+            if values and len(values) != self.n_channels:
+                raise BadKeyError(
+                    f"corrections.{name}",
+                    f"has {len(values)} values; expected {self.n_channels}, one for each channel",
+                )
         if self.strain_law == "neo-hookean":
             if self.material.poisson_ratio != 0.5:
                 raise BadKeyError(

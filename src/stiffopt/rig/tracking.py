@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.registration import Registration
 from stiffopt.rig.device import Clock, Device
-from stiffopt.rig.registration import Registration
 
 __all__ = ["PoseSample", "PoseTracker", "RawPose"]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
+from stiffopt.registration import Registration
 from stiffopt.rig.interface import Clock, PoseTracker, RawPose
-from stiffopt.rig.registration import Registration
 from stiffopt.schema import Schema
 from stiffopt.units import Duration, Length
 

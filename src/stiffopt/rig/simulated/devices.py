@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import CommandError, DeviceError
+from stiffopt.registration import Registration
 from stiffopt.rig.interface import (
     Clock,
     ForceProbe,
@@ -18,7 +19,6 @@ from stiffopt.rig.interface import (
     PressureSupply,
     RawPose,
 )
-from stiffopt.rig.registration import Registration
 from stiffopt.rig.simulated.plant import SimulationError
 from stiffopt.rig.simulated.world import World
 

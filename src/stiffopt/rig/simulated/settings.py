@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stiffopt.rig.registration import Placement, Registration
+from stiffopt.registration import Placement, Registration
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import (
     Acceleration,
