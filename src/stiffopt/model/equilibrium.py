@@ -200,7 +200,7 @@ class Equilibrium:
             upright = np.array([1.0, 0.0, 0.0, 0.0])
             steps = self._function("newton", at).size2_in(1)
             states = np.repeat(np.concatenate([upright, np.zeros(3)])[:, np.newaxis], steps, 1)
-            pressures = np.zeros(self.shooting.description.n_pressures)
+            pressures = np.zeros(self.shooting.n_variables)
             straight = State(pressures, upright, states, none)
             weighted = straight._replace(loads=none._replace(gravity=gravity))
             self._rest[key] = self.follow(straight, weighted, at)

@@ -86,13 +86,18 @@ class History(Schema):
 
     @model_validator(mode="after")
     def _check(self) -> History:
-        total = sum(part.share for part in (*self.play, *self.creep))
+        total = sum(part.share for part in self.parts)
         if total >= 1:
             raise BadKeyError(
                 "play" if self.play else "creep",
                 f"the shares of play and creep add up to {total:g}; expected less than 1",
             )
         return self
+
+    @property
+    def parts(self) -> tuple[Play | Creep, ...]:
+        """What has a share, in the order of its states."""
+        return (*self.play, *self.creep)
 
     @property
     def largest_memory(self) -> float:
@@ -102,7 +107,7 @@ class History(Schema):
     @property
     def n_states(self) -> int:
         """Number of states of one channel: x, each y and each z."""
-        return 1 + len(self.play) + len(self.creep)
+        return 1 + len(self.parts)
 
     def next_state(self, state: ca.SX, before: ca.SX, now: ca.SX, step: ca.SX) -> ca.SX:
         """State (m,) of a channel after a step, through which the (delayed) pressure runs evenly.
@@ -135,7 +140,7 @@ class History(Schema):
     def effective(self, state: ca.SX) -> ca.SX:
         """Pressure u that in equilibrium would give the shape which belongs to a state (m,)."""
         x = u = state[0]
-        for index, part in enumerate((*self.play, *self.creep), start=1):
+        for index, part in enumerate(self.parts, start=1):
             u = u + part.share * (state[index] - x)
         return u
 
@@ -155,12 +160,9 @@ class History(Schema):
 
     def from_rest(self, pressure: float) -> Array:
         """State (m,) long after a rise from no pressure, on an arm that knew none before."""
-        plays = [float(np.clip(0.0, pressure - w, pressure + w)) for w in self._widths]
+        widths = [play.width for play in self.play]
+        plays = [float(np.clip(0.0, pressure - w, pressure + w)) for w in widths]
         return np.array([pressure, *plays, *[pressure] * len(self.creep)])
-
-    @property
-    def _widths(self) -> list[float]:
-        return [play.width for play in self.play]
 
 
 NO_HISTORY = History()
@@ -180,6 +182,10 @@ class Memory:
         self._ends = np.cumsum([history.n_states for history in self._histories])
         self._dead_times = np.array([history.dead_time for history in self._histories])
         self._step = self._step_function()
+        self._state = np.zeros(self._ends[-1])
+        self._time = 0.0
+        self._commands: deque[tuple[float, Array]] = deque()
+        self.effective = np.zeros(len(self._histories))
         self.start(np.zeros(len(self._histories)))
 
     def start(self, pressures: ArrayLike) -> None:
@@ -216,7 +222,8 @@ class Memory:
     def _begin(self, states: list[Array], pressures: Array) -> None:
         self._state = np.concatenate(states)
         self._time = 0.0
-        self._commands = deque([(-np.inf, pressures)])
+        self._commands.clear()
+        self._commands.append((-np.inf, pressures))
         parts = np.split(self._state, self._ends[:-1])
         self.effective = np.array(
             [float(h.effective(ca.DM(x))) for h, x in zip(self._histories, parts, strict=True)]

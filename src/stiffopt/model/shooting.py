@@ -288,6 +288,11 @@ class Shooting:
             for section, geometry in zip(actuation.sections, self._geometry, strict=True)
         ]
 
+    @property
+    def n_variables(self) -> int:
+        """Number of what the sections depend on: pressures, and parameters if there are any."""
+        return int(self.sections.numel_in(0))
+
     def pieces(self, cuts: Sequence[float]) -> list[Piece]:
         """The arm from tip to base, cut at the given arc lengths."""
         pieces: list[Piece] = []
@@ -306,8 +311,7 @@ class Shooting:
 
     def chain(self, at: float | None = None) -> Chain:
         """Symbolic shooting map with the station at arc length `at` (None: the tip)."""
-        n_pressures = self.description.n_pressures
-        q, x = ca.MX.sym("q", 4), ca.MX.sym("x", 3 + n_pressures + 6)
+        q, x = ca.MX.sym("q", 4), ca.MX.sym("x", 3 + self.n_variables + 6)
         gravity, tip, station = ca.MX.sym("g", 3), ca.MX.sym("tip", 12), ca.MX.sym("station", 12)
         delta, p, added = x[:3], x[3:-6], x[-6:]
         sections = self.sections.call([p])

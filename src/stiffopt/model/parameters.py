@@ -1,0 +1,251 @@
+"""Parameters of an arm: numbers of its robot file by name, which may be varied symbolically.
+
+A parameter is named by its key in the robot file, ``segments[0].material.youngs_modulus``.  Its
+*coordinate* is zero at the value that the description has: the difference for an angle or an
+offset, the logarithm of the ratio for what must stay positive.  Coordinates are what derivatives
+are taken by and what a covariance is in.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import InputError, shown
+from stiffopt.model.actuation import Section
+from stiffopt.model.description import (
+    Compensation,
+    Corrections,
+    RobotDescription,
+    Segment,
+)
+from stiffopt.model.history import History
+from stiffopt.model.kinematics import Actuation
+from stiffopt.schema import Schema
+
+__all__ = ["Parameter", "Unit", "parametric", "with_values"]
+
+Vector = NDArray[np.float64]
+Unit = Literal["", "m", "rad", "Pa", "s"]
+_SchemaT = TypeVar("_SchemaT", bound=Schema)
+_Path = tuple[str | int, ...]
+
+_STEP = re.compile(r"([a-z_]+)|\[(\d{1,4})\]")
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What is known of a key whatever the robot.
+
+    Attributes
+    ----------
+    unit : in SI.
+    positive : its coordinate is a logarithm.
+    words : what people call it.
+    """
+
+    unit: Unit
+    positive: bool
+    words: str
+
+
+_KINDS = {
+    "length": _Kind("m", True, "rest length"),
+    "material.youngs_modulus": _Kind("Pa", True, "Young's modulus"),
+    "compensation.modulus_per_pressure": _Kind("", False, "change of modulus with pressure"),
+    "compensation.area": _Kind("", True, "factor on the area"),
+    "compensation.inertia": _Kind("", True, "factor on the second moment of area"),
+    "corrections.gain": _Kind("", True, "gain"),
+    "corrections.offset": _Kind("Pa", False, "offset"),
+    "corrections.azimuth": _Kind("rad", False, "azimuth"),
+    "history.dead_time": _Kind("s", False, "dead time"),
+    "history.lag": _Kind("s", True, "lag"),
+    "history.play.share": _Kind("", False, "share of play"),
+    "history.creep.share": _Kind("", False, "share of creep"),
+}
+"""Keys of a segment that can be parameters, without their indices."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a robot file.
+
+    Attributes
+    ----------
+    key : where it is in the file, for example ``segments[0].corrections.gain[2]``.
+    """
+
+    key: str
+
+    @property
+    def _path(self) -> _Path:
+        steps: list[str | int] = []
+        place = 0
+        for found in _STEP.finditer(self.key):
+            if self.key[place : found.start()] not in ("", "."):
+                break
+            steps.append(found[1] if found[2] is None else int(found[2]))
+            place = found.end()
+        if place != len(self.key) or len(steps) < 3 or steps[0] != "segments":
+            raise InputError(f"{shown(self.key)} is not the key of a parameter of a robot")
+        return tuple(steps)
+
+    @property
+    def _kind(self) -> _Kind:
+        name = ".".join(step for step in self._path[2:] if isinstance(step, str))
+        if name not in _KINDS:
+            raise InputError(
+                f"{shown(self.key)} cannot be a parameter; of a segment, {', '.join(_KINDS)} can"
+            )
+        return _KINDS[name]
+
+    @property
+    def segment(self) -> int:
+        """Index of the segment that it belongs to, from 0."""
+        index = self._path[1]
+        assert isinstance(index, int)
+        return index
+
+    @property
+    def unit(self) -> Unit:
+        """SI unit of its value; empty for a plain number."""
+        return self._kind.unit
+
+    @property
+    def is_positive(self) -> bool:
+        """Whether its coordinate is the logarithm of its value over the nominal one."""
+        return self._kind.positive
+
+    @property
+    def is_history(self) -> bool:
+        """Whether it concerns the way to an equilibrium only."""
+        return self._path[2] == "history"
+
+    @property
+    def name(self) -> str:
+        """What people call it: ``gain, segment 1 channel 3``."""
+        place = f"segment {self.segment + 1}"
+        last = self._path[-1]
+        if isinstance(last, int):
+            place += f" channel {last + 1}"
+        elif isinstance(self._path[-2], int) and len(self._path) > 3:
+            place += f" number {self._path[-2] + 1}"
+        return f"{self._kind.words}, {place}"
+
+    def value(self, description: RobotDescription) -> float:
+        """Return its value in SI.
+
+        Raises
+        ------
+        InputError
+            The robot has no such number.
+        """
+        found: Any = explicit(description)
+        for step in self._path:
+            try:
+                found = found[step] if isinstance(step, int) else getattr(found, step)
+            except (AttributeError, IndexError, TypeError):
+                raise InputError(
+                    f"robot '{description.name}' has no parameter {shown(self.key)}"
+                ) from None
+        return float(found)
+
+    def at(self, nominal: float, coordinate: Any) -> Any:
+        """Value of a coordinate, both numbers or both symbols."""
+        if self.is_positive:
+            factor = ca.exp(coordinate) if isinstance(coordinate, ca.SX) else np.exp(coordinate)
+            return nominal * factor
+        return nominal + coordinate
+
+    def coordinate(self, nominal: float, value: float) -> float:
+        """Coordinate of a value."""
+        return math.log(value / nominal) if self.is_positive else value - nominal
+
+    def per_coordinate(self, value: float) -> float:
+        """Change of the value per change of the coordinate."""
+        return value if self.is_positive else 1.0
+
+
+def explicit(description: RobotDescription) -> RobotDescription:
+    """The same robot with every default of a correction written out."""
+
+    def spelled(segment: Segment) -> Segment:
+        count = segment.n_channels
+        given = segment.corrections or Corrections()
+        corrections = Corrections(
+            gain=given.gain or (1.0,) * count,
+            offset=given.offset or (0.0,) * count,
+            azimuth=given.azimuth or (0.0,) * count,
+        )
+        update: dict[str, Any] = {
+            "corrections": corrections,
+            "history": segment.history or History(),
+        }
+        if segment.strain_law == "paper":
+            update["compensation"] = segment.compensation or Compensation()
+        return segment.model_copy(update=update)
+
+    segments = tuple(spelled(segment) for segment in description.segments)
+    return description.model_copy(update={"segments": segments})
+
+
+def with_values(
+    description: RobotDescription, values: Mapping[Parameter, float]
+) -> RobotDescription:
+    """Robot with other values of some parameters, checked as if read from a file."""
+    changed = _replaced(explicit(description), {p._path: value for p, value in values.items()})
+    return RobotDescription.model_validate(changed.model_dump())
+
+
+def parametric(
+    description: RobotDescription, parameters: Sequence[Parameter]
+) -> tuple[Actuation, ca.SX]:
+    """Actuation of a robot whose parameters may vary, and their coordinates (k,).
+
+    Rest lengths act by stretching the section, which is the same: all stays per length at rest
+    *in the description*.
+    """
+    coordinates = ca.SX.sym("coordinates", len(parameters))
+    changes: dict[_Path, Any] = {}
+    stretch: dict[int, Any] = {}
+    for index, parameter in enumerate(parameters):
+        nominal = parameter.value(description)
+        value = parameter.at(nominal, coordinates[index])
+        if parameter._path[2:] == ("length",):
+            stretch[parameter.segment] = value / nominal
+        elif not parameter.is_history:
+            changes[parameter._path] = value
+    actuation = Actuation.of(_replaced(explicit(description), changes))
+    sections = [
+        Section(section.strain * stretch[s], section.compliance * stretch[s])
+        if s in stretch
+        else section
+        for s, section in enumerate(actuation.sections)
+    ]
+    return replace(actuation, sections=tuple(sections)), coordinates
+
+
+def _replaced(schema: _SchemaT, changes: Mapping[_Path, Any]) -> _SchemaT:
+    """Copy with other values at some paths, unchecked: they may be symbols."""
+    result = _with(schema, dict(changes))
+    assert isinstance(result, type(schema))
+    return result
+
+
+def _with(node: Any, changes: dict[_Path, Any]) -> Any:
+    if () in changes:
+        return changes[()]
+    inner: dict[str | int, dict[_Path, Any]] = {}
+    for path, value in changes.items():
+        inner.setdefault(path[0], {})[path[1:]] = value
+    if isinstance(node, tuple):
+        return tuple(_with(item, inner[i]) if i in inner else item for i, item in enumerate(node))
+    update = {str(key): _with(getattr(node, str(key)), rest) for key, rest in inner.items()}
+    return node.model_copy(update=update)

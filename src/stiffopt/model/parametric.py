@@ -1,0 +1,160 @@
+"""An arm as a function of its parameters too: poses and stiffnesses with their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.arguments import Measure
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.equilibrium import Equilibrium, Loads, State
+from stiffopt.model.kinematics import body_jacobian
+from stiffopt.model.native_calls import InterpretedFunction
+from stiffopt.model.native_source import dense
+from stiffopt.model.parameters import Parameter, parametric
+from stiffopt.model.shape import FreeShape, Shape, stiffness_along
+from stiffopt.model.shooting import Shooting
+
+__all__ = ["ParametricArm", "Poses"]
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Poses of a point of the arm and their derivatives, as body twists, linear part first.
+
+    Attributes
+    ----------
+    transforms : ndarray
+        (N, 4, 4), in the base frame.
+    per_pressure : ndarray
+        Twists (N, 6, n) per Pa.
+    per_coordinate : ndarray
+        Twists (N, 6, k) per unit of a parameter's coordinate.
+    """
+
+    transforms: Vector
+    per_pressure: Vector
+    per_coordinate: Vector
+
+
+class ParametricArm:
+    """A robot of which some parameters may vary.
+
+    Parameters
+    ----------
+    description : RobotDescription
+        Where the parameters have the coordinate zero.
+    parameters : sequence of Parameter
+        What varies, k in number; those of histories have no effect here.
+    """
+
+    def __init__(self, description: RobotDescription, parameters: Sequence[Parameter]) -> None:
+        self.description = description
+        self.parameters = tuple(parameters)
+        self._actuation, self._coordinates = parametric(description, parameters)
+        self._functions: dict[Hashable, InterpretedFunction] = {}
+        self._near: dict[Hashable, list[State]] = {}
+        self._equilibrium: Equilibrium | None = None
+        if any(description.gravity):
+            # the parameters travel with the pressures; both have their derivatives there
+            variables = ca.vertcat(self._actuation.pressures, self._coordinates)
+            actuation = replace(self._actuation, pressures=variables)
+            self._equilibrium = Equilibrium(Shooting(description, actuation))
+
+    def poses(self, pressures: Vector, coordinates: Vector, at: float | None = None) -> Poses:
+        """Poses at pressures (N, n) and coordinates (k,), of the tip or at an arc length in m.
+
+        Raises
+        ------
+        EquilibriumError
+            A loaded arm buckles or falls over.
+        """
+
+        def outputs(shape: Shape) -> list[ca.SX | ca.MX]:
+            if isinstance(shape, FreeShape):
+                variables = ca.vertcat(self._actuation.pressures, self._coordinates)
+                return [shape.transform, body_jacobian(shape.transform, variables)]
+            return [shape.transform, shape.jacobian]
+
+        transforms, twists = self._evaluate("pose", outputs, pressures, coordinates, at)
+        n = self.description.n_pressures
+        return Poses(transforms, twists[..., :n], twists[..., n:])
+
+    def stiffnesses(
+        self, pressures: Vector, coordinates: Vector, measure: Measure
+    ) -> tuple[Vector, Vector, Vector]:
+        """Stiffness of the tip (N,), its derivatives by pressures (N, n) and coordinates (N, k)."""
+
+        def outputs(shape: Shape) -> list[ca.SX | ca.MX]:
+            k = stiffness_along(
+                shape,
+                ca.DM(measure.direction),
+                frame=measure.frame,
+                kind=measure.kind,
+                boundary=measure.boundary,
+            )
+            if isinstance(shape, FreeShape):
+                variables = ca.vertcat(self._actuation.pressures, self._coordinates)
+                return [k, ca.jacobian(k, variables)]
+            return [k, shape.total_jacobian(k)]
+
+        key = ("stiffness", measure)
+        values, gradient = self._evaluate(key, outputs, pressures, coordinates, None)
+        n = self.description.n_pressures
+        return values[:, 0, 0], gradient[:, 0, :n], gradient[:, 0, n:]
+
+    def _evaluate(
+        self,
+        key: Hashable,
+        outputs: object,
+        pressures: Vector,
+        coordinates: Vector,
+        at: float | None,
+    ) -> list[Vector]:
+        assert callable(outputs)
+        if (key, at) not in self._functions:
+            shape = self._shape(at)
+            inputs = list(shape.inputs)
+            if isinstance(shape, FreeShape):
+                inputs.append(self._coordinates)
+            found = [ca.densify(value) for value in outputs(shape)]
+            if isinstance(shape, FreeShape):
+                found = ca.cse(found)
+            self._functions[key, at] = InterpretedFunction(
+                dense(ca.Function("parametric", inputs, found))
+            )
+        function = self._functions[key, at]
+        if self._equilibrium is None:
+            return function.many(pressures, coordinates)
+        states = self._states(pressures, coordinates)
+        rows = [function(*self._equilibrium.arguments(state)) for state in states]
+        return [np.array(column) for column in zip(*rows, strict=True)]
+
+    def _shape(self, at: float | None) -> Shape:
+        if self._equilibrium is not None:
+            return self._equilibrium.shooting.chain(at)
+        return FreeShape.of(self.description, self._actuation, at)
+
+    def _states(self, pressures: Vector, coordinates: Vector) -> list[State]:
+        """Equilibria (N,), each found from the one that this row had the last time."""
+        assert self._equilibrium is not None
+        loads = Loads(np.array(self.description.gravity), np.zeros(12), np.zeros(12))
+        near = self._near.get(len(pressures), [])
+        states: list[State] = []
+        for row, p in enumerate(pressures):
+            variables = np.concatenate([p, coordinates])
+            start = near[row] if near else (states[-1] if states else None)
+            state = None
+            if start is not None:
+                end = start._replace(pressures=variables, loads=loads)
+                path = self._equilibrium.follow(start, end, shortest=0.1, stable=False)
+                state = path.state if path.share == 1.0 else None
+            states.append(state or self._equilibrium.settle(variables, loads))
+        self._near[len(pressures)] = states
+        return states
