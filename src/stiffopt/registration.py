@@ -48,6 +48,14 @@ class Placement(Schema):
         """Transform (4, 4) of coordinates in the other frame to those in this."""
         return _transform(self.position, self.orientation)[1]
 
+    @classmethod
+    def of(cls, transform: Array) -> Placement:
+        """Return the placement that has this transform (4, 4)."""
+        quaternion = np.asarray(lie.quaternion_from_rotation(transform[:3, :3]))
+        return cls(
+            position=tuple(transform[:3, 3].tolist()), orientation=tuple(quaternion.tolist())
+        )
+
 
 class Registration(Schema):
     """How a tracker's readings become the pose of the tip in the base frame.

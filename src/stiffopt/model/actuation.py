@@ -8,6 +8,7 @@ model need not know.  To add a law, subclass `StrainLaw` and enter it in `STRAIN
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -171,16 +172,27 @@ class PaperLaw(StrainLaw):
     eq. 17 integrated over deformed length (slip 8 of the notes).  Where the centroid is off the
     axis, which the paper does not treat, all this holds for the line of centroids, and the
     compensated second moment is that about the centroid.
+
+    Loads meet the modulus ``stiffness (E + softening slope |p|)``, the paper's own where both
+    factors are 1, see `stiffopt.model.description.Compensation`.
     """
 
     limit = "the pressure drives the compensated modulus of this segment to zero"
 
-    def _modulus(self, acting: ca.SX) -> ca.SX:
+    def _modulus(self, acting: ca.SX, softening: Any = 1.0) -> ca.SX:
         modulus = self.segment.material.youngs_modulus
         compensation = self.segment.compensation
-        if compensation is None or ca.SX(compensation.modulus_per_pressure).is_zero():
+        if compensation is None:
             return ca.SX(modulus)
-        return modulus + compensation.modulus_per_pressure * smooth_norm(acting)
+        slope = ca.SX(softening * compensation.modulus_per_pressure)
+        return ca.SX(modulus) if slope.is_zero() else modulus + slope * smooth_norm(acting)
+
+    def _loaded_modulus(self, acting: ca.SX) -> ca.SX:
+        """Modulus with which the section gives way to loads."""
+        compensation = self.segment.compensation
+        if compensation is None:
+            return self._modulus(acting)
+        return compensation.stiffness * self._modulus(acting, compensation.softening)
 
     def margin(self, p: ca.SX) -> ca.SX:
         """Compensated modulus over a thousandth of the nominal one, less one."""
@@ -196,12 +208,13 @@ class PaperLaw(StrainLaw):
         inertia = scale_inertia * ca.DM(geometry.second_moment)
         acting = self._acting(p)
         E = self._modulus(acting)
-        G = E / (2 * (1 + self.segment.material.poisson_ratio))
+        loaded = self._loaded_modulus(acting)
+        G = loaded / (2 * (1 + self.segment.material.poisson_ratio))
         per_deformed_length = self._about_axis(
             self._compliance_about_centroid(
                 shear=G * area,
-                axial=E * area,
-                bending=E * _bending(inertia),
+                axial=loaded * area,
+                bending=loaded * _bending(inertia),
                 torsion=G * ca.trace(inertia),
             ),
             ca.SX(geometry.centroid),

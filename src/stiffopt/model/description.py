@@ -15,12 +15,15 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from stiffopt.errors import InputError, shown
+from stiffopt.model.calibration import Calibration
 from stiffopt.model.history import History
+from stiffopt.registration import Placement, Registration
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import (
     Acceleration,
     Angle,
     Density,
+    Duration,
     Length,
     Mass,
     Number,
@@ -35,8 +38,11 @@ __all__ = [
     "Corrections",
     "Material",
     "PressureLimits",
+    "Recordings",
     "RobotDescription",
     "Segment",
+    "Tolerances",
+    "TrackedBody",
 ]
 
 _SLACK = 1e-9  # m; two circles that touch may overlap by rounding
@@ -117,11 +123,19 @@ class Compensation(Schema):
     modulus_per_pressure : change of E per norm of a segment's pressures, Pa/Pa.
     area : factor on A.
     inertia : factor on I.
+    stiffness : factor on E where the arm gives way to loads. Free shapes depend on pressure over
+        E alone: 1.4 means an arm that is 1.4 times as stiff as E and on which pressure acts 1.4
+        times as strongly as drawn. 1 in the paper.
+    softening : share of `modulus_per_pressure` by which the arm gives way to loads more easily;
+        the rest is pressure that acts ever more strongly, as in chambers that swell. 1 in the
+        paper.
     """
 
     modulus_per_pressure: Number = 0.0
     area: Annotated[Number, Field(gt=0)] = 1.0
     inertia: Annotated[Number, Field(gt=0)] = 1.0
+    stiffness: Annotated[Number, Field(gt=0)] = 1.0
+    softening: Annotated[Number, Field(ge=0, le=1)] = 1.0
 
 
 class Corrections(Schema):
@@ -260,6 +274,77 @@ class PressureLimits(Schema):
     slew: PerChannelRate | None = None
 
 
+class TrackedBody(Schema):
+    """A body that is tracked beside the tip.
+
+    Attributes
+    ----------
+    at : arc length of the point of the arm that it moves with, at rest, from the base, in m.
+    point_in_sensor : that point's frame, in the frame of the tracked body.
+    """
+
+    at: Annotated[Length, Field(gt=0)]
+    point_in_sensor: Placement = Placement()
+
+
+class Recordings(Schema):
+    """How logs of this arm are read.
+
+    Attributes
+    ----------
+    channels : for each channel of the robot the pressure column of a log, counted from 1.
+    frame : tracked body in whose frame everything is meant, or None: the tracker's own.
+    registration : where that frame is with respect to the base, and the sensor to the tip.
+    bodies : tracked beside the tip, by name.
+    """
+
+    channels: Items[Annotated[ChamberNumber, Field(ge=1)]] = ()
+    frame: str | None = None
+    registration: Registration = Registration()
+    bodies: dict[str, TrackedBody] = Field(default={})
+
+
+class Tolerances(Schema):
+    """How well a robot file knows the arm: what a calibration takes for one standard deviation.
+
+    Attributes
+    ----------
+    length : of a segment, relative.
+    youngs_modulus, area, stiffness, gain : relative.
+    modulus_per_pressure : in Pa/Pa.
+    softening : as it is.
+    offset : of a channel, in Pa.
+    azimuth : of a channel, in rad.
+    base_position, base_tilt, base_turn : of the base in the tracker's frame; its position, its
+        axis and its turn about that.
+    sensor_position, sensor_angle : of the tracked sensor on the tip.
+    body_position, body_angle : of other tracked bodies.
+    zero : of the position from log to log, where logs are zeroed anew, in m.
+    lag : of a segment, relative; dead_time : in s; share : of an operator of its history.
+    """
+
+    length: Annotated[Ratio, Field(gt=0)] = 0.03
+    youngs_modulus: Annotated[Ratio, Field(gt=0)] = 0.3
+    modulus_per_pressure: Annotated[Number, Field(gt=0)] = 0.2
+    area: Annotated[Ratio, Field(gt=0)] = 0.3
+    stiffness: Annotated[Ratio, Field(gt=0)] = 0.2
+    gain: Annotated[Ratio, Field(gt=0)] = 0.05
+    offset: Annotated[Pressure, Field(gt=0)] = 1e3
+    azimuth: Annotated[Angle, Field(gt=0)] = 0.05
+    softening: Annotated[Number, Field(gt=0)] = 0.5
+    lag: Annotated[Ratio, Field(gt=0)] = 1.0
+    dead_time: Annotated[Duration, Field(gt=0)] = 0.3
+    share: Annotated[Ratio, Field(gt=0)] = 0.2
+    base_position: Annotated[Length, Field(gt=0)] = 0.005
+    base_tilt: Annotated[Angle, Field(gt=0)] = 0.05
+    base_turn: Annotated[Angle, Field(gt=0)] = 0.1
+    sensor_position: Annotated[Length, Field(gt=0)] = 0.002
+    sensor_angle: Annotated[Angle, Field(gt=0)] = 0.05
+    body_position: Annotated[Length, Field(gt=0)] = 0.02
+    body_angle: Annotated[Angle, Field(gt=0)] = 0.2
+    zero: Annotated[Length, Field(gt=0)] = 0.001
+
+
 class RobotDescription(Schema):
     """An arm: its segments from the base to the tip, what it carries and what drives it.
 
@@ -270,6 +355,9 @@ class RobotDescription(Schema):
     tip_mass : mass fixed at the tip, in kg.
     gravity : acceleration in the base frame, in m/s^2; z runs along the straight arm.
     pressure : limits of the regulators.
+    recordings : how logs of this arm are read.
+    tolerances : how well all this is known before a calibration.
+    calibration : how well it is known after one, or None.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -277,6 +365,9 @@ class RobotDescription(Schema):
     tip_mass: Annotated[Mass, Field(ge=0)] = 0.0
     gravity: Vector[Acceleration] = (0.0, 0.0, 0.0)
     pressure: PressureLimits
+    recordings: Recordings | None = None
+    tolerances: Tolerances | None = None
+    calibration: Calibration | None = None
 
     @property
     def n_segments(self) -> int:

@@ -22,9 +22,9 @@ calibration can run the same operators.
 
 from __future__ import annotations
 
-from collections import deque
+import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
@@ -40,6 +40,9 @@ __all__ = ["Creep", "History", "Memory", "Play"]
 Array = NDArray[np.float64]
 
 _Share = Annotated[Ratio, Field(ge=0, lt=1)]
+
+_SAME = 1e-9  # s; moments that are closer are one, whatever was lost by rounding
+_CLOSE = 1e-3  # below it, a series is better than a difference of exponentials
 
 
 class Play(Schema):
@@ -112,6 +115,9 @@ class History(Schema):
     def next_state(self, state: ca.SX, before: ca.SX, now: ca.SX, step: ca.SX) -> ca.SX:
         """State (m,) of a channel after a step, through which the (delayed) pressure runs evenly.
 
+        Lag and creep are exact however long the step.  So is play while the lagged pressure runs
+        one way, which it does under a constant pressure.
+
         Parameters
         ----------
         state : (m,)
@@ -121,20 +127,23 @@ class History(Schema):
         step : scalar
             In s, positive.
         """
-        x = state[0]
+        ramp = (now - before) / step
         if ca.SX(self.lag).is_zero():
-            following = now
-        else:  # x - p + lag p' decays; p' is constant
-            decay = ca.exp(-step / self.lag)
-            behind = self.lag / step * (now - before)
-            following = now - behind + (x - before + behind) * decay
+            start, transient, following = before, None, now
+        else:  # x(t) = start + ramp t + transient exp(-t / lag)
+            start = before - ramp * self.lag
+            transient = state[0] - start
+            following = now - ramp * self.lag + transient * ca.exp(-step / self.lag)
         end: list[ca.SX] = [following]
         for index, play in enumerate(self.play, start=1):
             y = state[index]
             end.append(ca.fmax(following - play.width, ca.fmin(following + play.width, y)))
         for index, creep in enumerate(self.creep, start=1 + len(self.play)):
-            z, decay = state[index], ca.exp(-step / creep.time)
-            end.append(decay * z + (1 - decay) * (x + following) / 2)
+            decay = ca.exp(-step / creep.time)
+            late = (1 - decay) * start + ramp * (step - creep.time * (1 - decay))
+            if transient is not None:
+                late += transient * _convolution(step / creep.time, step / self.lag)
+            end.append(decay * state[index] + late)
         return ca.vertcat(*end)
 
     def effective(self, state: ca.SX) -> ca.SX:
@@ -168,24 +177,41 @@ class History(Schema):
 NO_HISTORY = History()
 
 
+def _convolution(a: ca.SX, b: ca.SX) -> ca.SX:
+    """``int_0^1 a exp(-a (1 - t)) exp(-b t) dt``, also where the rates a and b are the same."""
+    apart = ca.fabs(a - b)
+    far = ca.fmax(apart, _CLOSE)
+    series = 1 - apart / 2 * (1 - apart / 3 * (1 - apart / 4))
+    mean = ca.if_else(apart < _CLOSE, series, (1 - ca.exp(-far)) / far)
+    return a * ca.exp(-ca.fmin(a, b)) * mean
+
+
 class Memory:
     """The histories of all channels of an arm, run as time goes by.
+
+    ``copy.copy`` of one goes its own way.
 
     Parameters
     ----------
     histories : sequence
         One per channel; None for a channel whose shape follows at once.
+
+    Attributes
+    ----------
+    effective : ndarray
+        Effective pressures (n,) now, in Pa.
     """
 
     def __init__(self, histories: Sequence[History | None]) -> None:
+        if not histories:
+            raise InputError("expected the history of at least one channel")
         self._histories = [history or NO_HISTORY for history in histories]
         self._ends = np.cumsum([history.n_states for history in self._histories])
         self._dead_times = np.array([history.dead_time for history in self._histories])
+        self._delays = np.unique(self._dead_times)
+        self._late = bool(self._dead_times.any())
         self._step = self._step_function()
-        self._state = np.zeros(self._ends[-1])
-        self._time = 0.0
-        self._commands: deque[tuple[float, Array]] = deque()
-        self.effective = np.zeros(len(self._histories))
+        self.effective: Array
         self.start(np.zeros(len(self._histories)))
 
     def start(self, pressures: ArrayLike) -> None:
@@ -210,36 +236,90 @@ class Memory:
         pressures :
             In Pa.
         """
-        if not step > 0:
-            raise InputError(f"a step takes time; expected a positive number of s, not {step!r}")
-        self._commands.append((self._time, self._checked(pressures)))
-        self._time += step
-        delayed = self._delayed_to(self._time - self._dead_times)
-        state, effective = self._step(self._state, delayed, step)
-        self._state, self.effective = np.asarray(state)[:, 0], np.asarray(effective)[:, 0]
+        self.run(step, self._checked(pressures)[None, :])
         return self.effective
+
+    def run(self, step: float, pressures: ArrayLike) -> Array:
+        """Take one step at each row of commanded pressures.
+
+        The result does not depend on how a time of constant pressures is cut into steps.
+
+        Parameters
+        ----------
+        step :
+            In s, positive.
+        pressures :
+            Constant during each step (m, n), in Pa.
+
+        Returns
+        -------
+        Effective pressures (m, n) at the end of each step, in Pa.
+        """
+        if not 0 < step < math.inf:
+            raise InputError(f"a step takes time; expected a positive number of s, not {step!r}")
+        p = self._checked(pressures, rows=True)
+        if not len(p):
+            return p
+        effective = self._follow_late(step, p) if self._late else self._follow(step, p)
+        self.effective = effective[-1].copy()
+        return effective
 
     def _begin(self, states: list[Array], pressures: Array) -> None:
         self._state = np.concatenate(states)
         self._time = 0.0
-        self._commands.clear()
-        self._commands.append((-np.inf, pressures))
-        parts = np.split(self._state, self._ends[:-1])
+        self._times = np.array([-np.inf])  # from when on each of the commands (k, n) was given
+        self._commands = pressures[None, :]
         self.effective = np.array(
-            [float(h.effective(ca.DM(x))) for h, x in zip(self._histories, parts, strict=True)]
+            [float(h.effective(ca.DM(x))) for h, x in zip(self._histories, states, strict=True)]
         )
 
-    def _delayed_to(self, times: Array) -> Array:
-        """Pressures (n,) that were commanded at one time (n,) for each channel."""
-        while len(self._commands) > 1 and self._commands[1][0] < times.min():
-            self._commands.popleft()
-        delayed = np.empty(len(times))
-        for channel, time in enumerate(times):
-            sent = next(p for at, p in reversed(self._commands) if at < time)
-            delayed[channel] = sent[channel]
-        return delayed
+    def _follow_late(self, step: float, pressures: Array) -> Array:
+        """Effective pressures (m, n) after equal steps at pressures (m, n), dead times included."""
+        ends: Array = self._time + step * np.arange(len(pressures) + 1, dtype=np.float64)
+        times = np.concatenate([self._times, ends[:-1]])
+        commands = np.concatenate([self._commands, pressures])
+        marks = self._marks(times, ends)
+        middles = (marks[1:] + marks[:-1]) / 2
+        sent = np.searchsorted(times, middles[:, None] - self._dead_times, side="right") - 1
+        delayed = commands[sent, np.arange(len(self._histories))]
+        at_marks = self._follow(np.diff(marks), delayed)
+        self._time = float(ends[-1])
+        oldest = np.searchsorted(times, self._time - self._delays[-1], side="right") - 1
+        self._times, self._commands = times[oldest:], commands[oldest:]
+        effective: Array = at_marks[np.searchsorted(marks, ends[1:]) - 1]
+        return effective
 
-    def _step_function(self) -> ca.Function:
+    def _marks(self, times: Array, ends: Array) -> Array:
+        """Ends of steps (m + 1,) and, between them, moments at which a command begins to act."""
+        acting = (times[1:, None] + self._delays).ravel()
+        acting = acting[(acting > ends[0] + _SAME) & (acting < ends[-1] - _SAME)]
+        if not len(acting):
+            return ends
+        after = np.searchsorted(ends, acting)
+        apart = np.minimum(acting - ends[after - 1], ends[after] - acting)
+        acting = np.sort(acting[apart > _SAME])
+        acting = acting[np.diff(acting, prepend=-np.inf) > _SAME]
+        return np.sort(np.concatenate([ends, acting]))
+
+    def _follow(self, steps: float | Array, delayed: Array) -> Array:
+        """Effective pressures (k, n) after steps (k,) at constant delayed pressures (k, n)."""
+        state, end = self._state.copy(), np.empty_like(self._state)
+        p, step, u = np.empty(delayed.shape[1]), np.empty(1), np.empty(delayed.shape[1])
+        # A call with arrays costs ten times as much as one in place.
+        buffer, take = self._step.buffer()
+        for place, values in enumerate((state, p, step)):
+            buffer.set_arg(place, values.data)
+        for place, values in enumerate((end, u)):
+            buffer.set_res(place, values.data)
+        effective = np.empty_like(delayed)
+        for i, duration in enumerate(np.broadcast_to(steps, len(delayed)).tolist()):
+            p[:], step[0] = delayed[i], duration
+            take()
+            state[:], effective[i] = end, u
+        self._state = state
+        return effective
+
+    def _step_function(self) -> Any:
         state, delayed = ca.SX.sym("state", self._ends[-1]), ca.SX.sym("p", len(self._histories))
         step = ca.SX.sym("step")
         parts = ca.vertsplit(state, [0, *self._ends.tolist()])
@@ -248,12 +328,15 @@ class Memory:
             for c, (h, x) in enumerate(zip(self._histories, parts, strict=True))
         ]
         effective = [h.effective(x) for h, x in zip(self._histories, ends, strict=True)]
-        return ca.Function(
-            "advance", [state, delayed, step], [ca.vertcat(*ends), ca.vertcat(*effective)]
-        )
+        outputs = [ca.densify(ca.vertcat(*ends)), ca.densify(ca.vertcat(*effective))]
+        return ca.Function("advance", [state, delayed, step], outputs)
 
-    def _checked(self, pressures: ArrayLike) -> Array:
+    def _checked(self, pressures: ArrayLike, *, rows: bool = False) -> Array:
         p = np.array(pressures, dtype=float)
-        if p.shape != (len(self._histories),) or not np.isfinite(p).all():
-            raise InputError(f"expected {len(self._histories)} finite pressures, not {p}")
+        n = len(self._histories)
+        if p.ndim != 1 + rows or p.shape[-1] != n:
+            expected = f"rows of {n} pressures" if rows else f"{n} pressures"
+            raise InputError(f"expected {expected}, not an array of shape {p.shape}")
+        if not np.isfinite(p).all():
+            raise InputError("expected finite pressures")
         return p

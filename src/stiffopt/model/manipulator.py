@@ -25,6 +25,7 @@ from stiffopt.model.numeric import checked_integer
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.screws import Twist, Wrench
 from stiffopt.model.shape import Shape, stiffness_along
+from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
 
 Vector = NDArray[np.float64]
 Method = Literal["equilibrium", "first-order", "elementwise"]
@@ -171,6 +172,20 @@ class Manipulator(Arm):
         return self._evaluate(
             ("stiffness gradient", measure), lambda tip: tip.total_jacobian(stiffness(tip)), p
         )[..., 0, :]
+
+    def tip_uncertainty(self, p: ArrayLike) -> TipUncertainty:
+        """How well a calibration knows the tip at pressures p (n,), and its stiffness.
+
+        Raises
+        ------
+        InputError
+            The robot was not calibrated.
+        """
+        p = self._single(p)
+        known = self.kept(
+            ("uncertainty", self.tip_load), lambda: Uncertainty(self.description, self.tip_load)
+        )
+        return known.at(p)
 
     # -- screws and loads -------------------------------------------------------------------
 

@@ -62,6 +62,8 @@ _KINDS = {
     "compensation.modulus_per_pressure": _Kind("", False, "change of modulus with pressure"),
     "compensation.area": _Kind("", True, "factor on the area"),
     "compensation.inertia": _Kind("", True, "factor on the second moment of area"),
+    "compensation.stiffness": _Kind("", True, "factor on the stiffness"),
+    "compensation.softening": _Kind("", False, "share of softening"),
     "corrections.gain": _Kind("", True, "gain"),
     "corrections.offset": _Kind("Pa", False, "offset"),
     "corrections.azimuth": _Kind("rad", False, "azimuth"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -52,16 +52,24 @@ class ParametricArm:
         Where the parameters have the coordinate zero.
     parameters : sequence of Parameter
         What varies, k in number; those of histories have no effect here.
+    tip_load : sequence of float
+        Dead and follower wrench (12,) on the tip, see `stiffopt.model.equilibrium.Loads`.
     """
 
-    def __init__(self, description: RobotDescription, parameters: Sequence[Parameter]) -> None:
+    def __init__(
+        self,
+        description: RobotDescription,
+        parameters: Sequence[Parameter],
+        tip_load: Sequence[float] = (0.0,) * 12,
+    ) -> None:
         self.description = description
         self.parameters = tuple(parameters)
         self._actuation, self._coordinates = parametric(description, parameters)
         self._functions: dict[Hashable, InterpretedFunction] = {}
         self._near: dict[Hashable, list[State]] = {}
         self._equilibrium: Equilibrium | None = None
-        if any(description.gravity):
+        self._loads = Loads(np.array(description.gravity), np.array(tip_load), np.zeros(12))
+        if any(description.gravity) or any(tip_load):
             # the parameters travel with the pressures; both have their derivatives there
             variables = ca.vertcat(self._actuation.pressures, self._coordinates)
             actuation = replace(self._actuation, pressures=variables)
@@ -112,12 +120,11 @@ class ParametricArm:
     def _evaluate(
         self,
         key: Hashable,
-        outputs: object,
+        outputs: Callable[[Shape], list[ca.SX | ca.MX]],
         pressures: Vector,
         coordinates: Vector,
         at: float | None,
     ) -> list[Vector]:
-        assert callable(outputs)
         if (key, at) not in self._functions:
             shape = self._shape(at)
             inputs = list(shape.inputs)
@@ -144,7 +151,7 @@ class ParametricArm:
     def _states(self, pressures: Vector, coordinates: Vector) -> list[State]:
         """Equilibria (N,), each found from the one that this row had the last time."""
         assert self._equilibrium is not None
-        loads = Loads(np.array(self.description.gravity), np.zeros(12), np.zeros(12))
+        loads = self._loads
         near = self._near.get(len(pressures), [])
         states: list[State] = []
         for row, p in enumerate(pressures):

@@ -3,24 +3,60 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
-from stiffopt.model.description import RobotDescription, Segment
+from stiffopt.model.description import Corrections, RobotDescription, Segment
+from stiffopt.model.history import NO_HISTORY, Memory
 from stiffopt.rig.simulated.material import LINEAR, YEOH, Material
 from stiffopt.rig.simulated.rod import Rod
 from stiffopt.rig.simulated.settings import Mismatch, PlantSettings
 
-__all__ = ["make_material", "make_rod", "node_at"]
+__all__ = ["Channels", "make_channels", "make_material", "make_memory", "make_rod", "node_at"]
 
 Array = NDArray[np.float64]
 
 _ON_RING = 6  # fibres on each of two rings
 _SAME = 1e-6  # of a segment's length; a load so near to a node acts on the node
 _DENSITY = 1070.0  # kg/m^3; of silicone, for robots that have no gravity and name no density
+
+
+class Channels(NamedTuple):
+    """How the channels act: as the robot file corrects them, and the mismatch on top.
+
+    Attributes
+    ----------
+    gain, offset : (n,); ``gain p + offset`` acts where the shape is that of the pressure p, Pa.
+    angle : by which the channel's chambers are turned about the axis (n,), rad.
+    """
+
+    gain: Array
+    offset: Array
+    angle: Array
+
+
+def make_channels(robot: RobotDescription, mismatch: Mismatch) -> Channels:
+    """Return how the channels of an arm act that differs from its robot file by a mismatch."""
+    parts = [(s.corrections or Corrections(), s.n_channels) for s in robot.segments]
+    gain = np.concatenate([corrections.gain or (1.0,) * n for corrections, n in parts])
+    offset = np.concatenate([corrections.offset or (0.0,) * n for corrections, n in parts])
+    angle = np.concatenate([corrections.azimuth or (0.0,) * n for corrections, n in parts])
+    further = np.array(mismatch.gain or (1.0,) * robot.n_pressures)
+    return Channels(
+        gain=further * gain,
+        offset=further * offset + np.array(mismatch.offset or (0.0,) * robot.n_pressures),
+        angle=angle + np.array(mismatch.angle or (0.0,) * robot.n_pressures),
+    )
+
+
+def make_memory(robot: RobotDescription) -> Memory | None:
+    """Return the histories of the channels, or None if shapes follow the pressures at once."""
+    histories = [s.history or NO_HISTORY for s in robot.segments for _ in range(s.n_channels)]
+    return None if all(history == NO_HISTORY for history in histories) else Memory(histories)
 
 
 def make_rod(
@@ -162,7 +198,11 @@ def _section_moments(segment: Segment) -> Array:
 
 
 def make_material(
-    robot: RobotDescription, settings: PlantSettings, mismatch: Mismatch, viscosity: float
+    robot: RobotDescription,
+    settings: PlantSettings,
+    mismatch: Mismatch,
+    channels: Channels,
+    viscosity: float,
 ) -> Material:
     """Return the sections of the arm; `viscosity` is that of the dashpot over E, in s."""
     silicone = settings.silicone
@@ -181,7 +221,7 @@ def make_material(
         in_shear = 1 / (2 * (1 + segment.material.poisson_ratio))  # G / E
         shear[s] = in_shear * area[s].sum()
         torsion[s] = in_shear * (area[s] @ ((fibres[s] - centroid[s]) ** 2).sum(axis=1))
-    force, first = _channels(robot, mismatch)
+    force, first = _chambers(robot, channels)
     return Material(
         law=LINEAR if silicone.law == "linear" else YEOH,
         stiffening=silicone.stiffening if silicone.law == "yeoh" else 0.0,
@@ -253,10 +293,10 @@ def _quadrature(segment: Segment) -> tuple[Array, Array, Array]:
     return np.concatenate(xs), np.concatenate(ys), np.concatenate(areas)
 
 
-def _channels(robot: RobotDescription, mismatch: Mismatch) -> tuple[Array, Array]:
+def _chambers(robot: RobotDescription, channels: Channels) -> tuple[Array, Array]:
     """Area (n,) and first moments of area (n, 2) of the channels' chambers."""
     force, first = [], []
-    turns = iter(mismatch.angle or (0.0,) * robot.n_pressures)
+    turns = iter(channels.angle)
     for segment in robot.segments:
         chambers = segment.chambers
         hole = math.pi * chambers.radius**2

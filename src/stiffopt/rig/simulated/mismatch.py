@@ -73,8 +73,4 @@ def draw(robot: RobotDescription, settings: PlantSettings) -> Mismatch:
 
 def _moved(given: Placement, rng: np.random.Generator, shift: float, turn: float) -> Placement:
     twist = np.clip(rng.standard_normal(6), -3, 3) * np.repeat([shift, turn], 3)
-    T = given.transform() @ np.asarray(lie.exp(twist))
-    return Placement(
-        position=tuple(T[:3, 3].tolist()),
-        orientation=tuple(np.asarray(lie.quaternion_from_rotation(T[:3, :3])).tolist()),
-    )
+    return Placement.of(given.transform() @ np.asarray(lie.exp(twist)))

@@ -5,10 +5,14 @@ shear and stretch; its silicone is hyperelastic, creeps and has hysteresis. Pres
 the section: the force p A on each section at the chamber's centre, constant in the section's axes,
 which is conjugate to the volume that a chamber of constant bore sweeps. (Along the chamber instead
 of normal to the section would change the compliance of a bent arm by about 3 %.)
+
+What the robot file says of its channels, this arm does: their history, between the pressures in
+the chambers and those that act, then their corrections. Silicone and mismatch come on top.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -18,7 +22,13 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import DeviceError, EquilibriumError, InputError, PressureError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.simulated import dynamics, material, rod
-from stiffopt.rig.simulated.build import make_material, make_rod, node_at
+from stiffopt.rig.simulated.build import (
+    make_channels,
+    make_material,
+    make_memory,
+    make_rod,
+    node_at,
+)
 from stiffopt.rig.simulated.dynamics import State
 from stiffopt.rig.simulated.jit import tell_if_new
 from stiffopt.rig.simulated.loads import Loads, contact_energy, contact_force, depth_of
@@ -88,12 +98,12 @@ class Plant:
         self.robot = robot
         self.settings = settings or PlantSettings()
         self.mismatch = draw(robot, self.settings)
-        self._gain = np.array(self.mismatch.gain or (1.0,) * robot.n_pressures)
-        self._offset = np.array(self.mismatch.offset or (0.0,) * robot.n_pressures)
+        self._channels = make_channels(robot, self.mismatch)
+        self._past = make_memory(robot)
         self._steps = 0
         self._load: Load | None = None
         self._plate: tuple[Array, float, float, float] | None = None
-        self._material = make_material(robot, self.settings, self.mismatch, 0.0)
+        self._material = make_material(robot, self.settings, self.mismatch, self._channels, 0.0)
         self._mesh(None)
         self._state = self._at_rest()
         self.set_load(self.settings.load)
@@ -230,6 +240,9 @@ class Plant:
         """
         full = self.settings.dynamics == "full"
         scheme = Scheme(self.step, 0.5 if full else 1.0, True)
+        before, effective = copy.copy(self._past), pressures
+        if self._past is not None:
+            effective = self._past.run(self.step, pressures)
         done = dynamics.run(
             self._rod,
             self._material,
@@ -237,10 +250,13 @@ class Plant:
             self._loads(),
             full,
             self._state,
-            self._acting(pressures),
+            self._acting(effective),
         )
         self._steps += int(done)
         if done < len(pressures):
+            if before is not None:
+                before.run(self.step, pressures[:done])
+                self._past = before
             raise SimulationError(
                 f"the simulated arm cannot be followed beyond {self.time:.3f} s: a load, a contact "
                 "or a pressure is far beyond what it bears, or the time step is too long"
@@ -252,6 +268,9 @@ class Plant:
 
     def settle(self, pressures: ArrayLike, load: Load | None = None) -> None:
         """Bring the arm to rest in equilibrium, with all creep done and no hysteresis left.
+
+        That is, none of its silicone. A history in the robot file begins anew with a rise from no
+        pressure to these, see `stiffopt.model.history.Memory.start`.
 
         Parameters
         ----------
@@ -267,7 +286,11 @@ class Plant:
         """
         if load is not None:
             self.set_load(load)
-        acting = self._acting(self._checked(pressures)[None, :])
+        p = self._checked(pressures)
+        if self._past is not None:
+            self._past.start(p)
+            p = self._past.effective
+        acting = self._acting(p[None, :])
         # Viscosity slows an arm without inertia down: steps of growing length follow it to rest.
         slow = self._material._replace(viscosity=max(self._material.viscosity, 0.02))
         self._state.rate[:] = 0.0
@@ -378,8 +401,8 @@ class Plant:
             raise PressureError("the pressures are not finite")
         return p
 
-    def _acting(self, pressures: Array) -> Array:
-        acting = np.ascontiguousarray(pressures * self._gain + self._offset)
+    def _acting(self, effective: Array) -> Array:
+        acting = np.ascontiguousarray(effective * self._channels.gain + self._channels.offset)
         if len(acting):
             self._last_acting = acting[-1]
         return acting

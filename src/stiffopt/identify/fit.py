@@ -1,0 +1,187 @@
+"""Robust nonlinear least squares with priors, and how well the result is known.
+
+Residuals of real arms are not noise: what a model cannot say changes slowly, so that neighbouring
+rows err alike.  Rows therefore count for as many as are independent, by the autocorrelation of
+the residuals, and are divided by their own robust spread; only so are priors and covariance what
+they claim to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.identify.problem import Noise, Predicted, Problem
+from stiffopt.model.description import RobotDescription
+
+__all__ = ["Fit", "fit"]
+
+Array = NDArray[np.float64]
+
+_LOSS_SCALE = 2.0  # residuals beyond so many deviations count less and less (soft L1)
+_ROUNDS = 3  # of fitting with the spread that the last one left
+_TOLERANCE = 1e-6
+_MOST_EVALUATIONS = 60
+_LEAST_POSITION, _LEAST_ANGLE = 1e-6, 1e-5  # m and rad, of the spread: logs have few digits
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A minimum.
+
+    Attributes
+    ----------
+    problem : Problem
+        With the noise and the weights that were used at last.
+    x : ndarray
+        Scaled coordinates (d,).
+    cost : float
+        Half the sum of the squared residuals, with the loss and the prior.
+    covariance : ndarray
+        Of x, (d, d): unknowns that nothing was learnt of have the variance one.
+    independent : float
+        How many rows are one independent one.
+    """
+
+    problem: Problem
+    x: Array
+    cost: float
+    covariance: Array
+    independent: float
+
+    @property
+    def robot(self) -> RobotDescription:
+        """The robot with the fitted parameters."""
+        return self.problem.robot(self.x)
+
+    @property
+    def predicted(self) -> Predicted:
+        """What it says of the rows of the samples."""
+        return self.problem.predict(self.x)
+
+    @property
+    def deviations(self) -> Array:
+        """Standard deviations (d,) of the unscaled coordinates."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)) * self.problem.scale)
+
+
+def fit(problem: Problem, starts: Sequence[Array], tell: Callable[[], None] = lambda: None) -> Fit:
+    """Fit from several starts and return the best minimum.
+
+    Parameters
+    ----------
+    problem : Problem
+    starts : sequence of (d,)
+        Scaled coordinates.
+    tell :
+        Is called at every evaluation of the problem, to show progress or to stop by raising.
+    """
+    begun = [_minimum(problem, start, tell) for start in starts]
+    x, _ = min(begun, key=lambda found: found[1])
+    independent = 1.0
+    for _ in range(_ROUNDS):
+        problem, independent = _reweighted(problem, x, independent)
+        x, cost = _minimum(problem, x, tell)
+    return Fit(problem, x, cost, _covariance(problem, x), independent)
+
+
+def _minimum(problem: Problem, start: Array, tell: Callable[[], None]) -> tuple[Array, float]:
+    """Scaled coordinates (d,) of a minimum near a start, and its cost."""
+    from scipy.optimize import least_squares  # a large library; only fits need it
+
+    memory: dict[bytes, tuple[Array, Array]] = {}
+
+    def both(x: Array) -> tuple[Array, Array]:
+        key = x.tobytes()
+        if key not in memory:
+            tell()
+            memory.clear()
+            value, slope = problem.residuals(x)
+            memory[key] = np.concatenate([value, x]), np.vstack([slope, np.eye(problem.size)])
+        return memory[key]
+
+    margin = 1e-9
+    inside = np.clip(start, problem.low + margin, problem.high - margin)
+    found = least_squares(
+        lambda x: both(x)[0],
+        inside,
+        lambda x: both(x)[1],
+        bounds=(problem.low, problem.high),
+        method="trf",
+        loss=_loss(problem.size),
+        ftol=_TOLERANCE,
+        xtol=_TOLERANCE,
+        gtol=_TOLERANCE,
+        max_nfev=_MOST_EVALUATIONS,
+    )
+    return np.asarray(found.x), float(found.cost)
+
+
+def _loss(n_prior: int) -> Callable[[Array], Array]:
+    """Soft L1 for the data, none for the prior: values, first and second derivatives."""
+
+    def loss(squared: Array) -> Array:
+        z = squared / _LOSS_SCALE**2
+        root = np.sqrt(1 + z)
+        rho = np.stack([2 * _LOSS_SCALE**2 * (root - 1), 1 / root, -0.5 / root**3 / _LOSS_SCALE**2])
+        rho[:, -n_prior:] = np.stack([squared[-n_prior:], np.ones(n_prior), np.zeros(n_prior)])
+        return rho
+
+    return loss
+
+
+def _reweighted(problem: Problem, x: Array, independent: float) -> tuple[Problem, float]:
+    """The problem with the noise and weights that fit its residuals, and rows per independent."""
+    predicted = problem.predict(x)
+    position = _spread(np.concatenate(predicted.errors), _LEAST_POSITION)
+    turns = [read.turn for read in predicted.read if read.turn is not None]
+    angle = _spread(np.concatenate(turns), _LEAST_ANGLE) if turns else problem.noise.angle
+    if not problem.samples:
+        return problem, 1.0
+    found = _rows_per_independent(problem, predicted)
+    factor = np.sqrt(independent / found)
+    samples = [replace(sample, weight=sample.weight * factor) for sample in problem.samples]
+    return problem.with_samples(samples, Noise(position, angle)), found
+
+
+def _spread(errors: Array, least: float) -> float:
+    """Robust root mean square of errors (M, 3), each axis alike."""
+    known = errors[np.isfinite(errors).all(axis=1)]
+    if not len(known):
+        return least
+    middle = 1.4826 * float(np.median(np.abs(known)))
+    kept = np.clip(known, -4 * middle, 4 * middle)
+    return max(float(np.sqrt(np.mean(kept**2))), least)
+
+
+def _rows_per_independent(problem: Problem, predicted: Predicted) -> float:
+    """Integrated autocorrelation of the tip's errors along the rows, at least 1."""
+    starts = problem.starts
+    longest = max(1, min(len(s.rows) for s in problem.samples) // 3)
+    total: Array = np.zeros(longest)
+    for begin, end in pairwise(starts):
+        errors = predicted.errors[0][begin:end]
+        known = np.where(np.isfinite(errors), errors, 0.0)
+        size = 2 * len(known)
+        spectrum = np.abs(np.fft.rfft(known, size, axis=0)) ** 2
+        products: Array = np.fft.irfft(spectrum, size, axis=0)
+        total += products[:longest].sum(axis=1)
+    if total[0] <= 0:
+        return 1.0
+    correlation = total / total[0]
+    negative = np.flatnonzero(correlation < 0.05)
+    stop = negative[0] if len(negative) else longest
+    return float(max(1.0, 1 + 2 * correlation[1:stop].sum()))
+
+
+def _covariance(problem: Problem, x: Array) -> Array:
+    """Inverse of the normal matrix with the weights of the loss; the prior is part of it."""
+    value, slope = problem.residuals(x)
+    weight = 1 / np.sqrt(1 + value**2 / _LOSS_SCALE**2)
+    normal = slope.T @ (slope * weight[:, np.newaxis]) + np.eye(problem.size)
+    found: Array = np.linalg.inv(normal)
+    return (found + found.T) / 2

@@ -1,0 +1,266 @@
+"""Effective pressures along a recording, and how they depend on the history of a segment.
+
+The operators are those of `stiffopt.model.history`; here they are run over a whole log at once,
+with their derivatives by lag, dead time, shares and the state in which the log begins.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.history import NO_HISTORY, History
+
+__all__ = ["Effective", "Past", "Start"]
+
+Array = NDArray[np.float64]
+
+_CHUNK = 2000  # rows that are run at once; only the wanted ones are kept
+_BETWEEN_LOGS = 60.0  # s at the last pressures, between two logs of a sequence
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """In which state the channels of a segment (c) begin.
+
+    Attributes
+    ----------
+    states : ndarray
+        Of the operators (m, c).
+    per_side : ndarray
+        Their derivatives (m, c) by the side of each channel, see `History.settled`.
+    before : ndarray
+        Pressures (c,) until the first row, in Pa.
+    """
+
+    states: Array
+    per_side: Array
+    before: Array
+
+    @classmethod
+    def from_rest(cls, history: History, pressures: Array) -> Start:
+        """After a rise from no pressure to these (c,)."""
+        states = np.stack([history.from_rest(p) for p in pressures.tolist()], axis=1)
+        return cls(states, np.zeros_like(states), pressures)
+
+    @classmethod
+    def settled(cls, history: History, pressures: Array, sides: Array) -> Start:
+        """Long at these pressures (c,), with each channel on a side (c,) of its plays."""
+        pairs = list(zip(pressures.tolist(), sides.tolist(), strict=True))
+        states = np.stack([history.settled(p, side) for p, side in pairs], axis=1)
+        middle = np.stack([history.settled(p, 0.0) for p, _ in pairs], axis=1)
+        farthest = np.stack([history.settled(p, 1.0) for p, _ in pairs], axis=1)
+        return cls(states, farthest - middle, pressures)
+
+
+@dataclass(frozen=True, eq=False)
+class Effective:
+    """Effective pressures at some rows of a log.
+
+    Attributes
+    ----------
+    pressures : ndarray
+        (M, c), in Pa.
+    per_lag, per_dead_time, per_side : ndarray
+        (M, c); by lag and dead time in s, and by the side of the same channel.
+    per_share : ndarray
+        (M, c, parts).
+    end : Start
+        State in which another log of the sequence begins.
+    """
+
+    pressures: Array
+    per_lag: Array
+    per_dead_time: Array
+    per_side: Array
+    per_share: Array
+    end: Start
+
+
+class Past:
+    """Runs the history of one segment's channels along logs.
+
+    Parameters
+    ----------
+    history : History or None
+        Widths and times of its operators count; lag and shares are given for each run.
+    channels : int
+        Number of channels c.
+    """
+
+    def __init__(self, history: History | None, channels: int) -> None:
+        self.history = history or NO_HISTORY
+        self._channels = channels
+        self._runs = {lagging: self._run_function(lagging) for lagging in (False, True)}
+
+    def effective(
+        self,
+        time: Array,
+        pressures: Array,
+        wanted: NDArray[np.intp],
+        start: Start,
+        history: History,
+    ) -> Effective:
+        """Run along a log.
+
+        Parameters
+        ----------
+        time : (N,)
+            In s, increasing.
+        pressures : (N, c)
+            Commanded, in Pa; they run evenly from row to row.
+        wanted : (M,)
+            Rows whose effective pressures are returned, increasing.
+        start :
+            State before the first row.
+        history :
+            With the values to use; its operators are those of this object.
+        """
+        delayed, slope = _delayed(time, pressures, start.before, history.dead_time)
+        steps = np.diff(time, prepend=time[0] - np.median(np.diff(time)) if len(time) > 1 else 1.0)
+        before = np.vstack([start.before, delayed[:-1]])
+        # a later command acts: d p(t - dead) / d dead = -p'
+        changes = np.vstack([np.zeros(self._channels), -slope[:-1]]), -slope
+        run = self._runs[history.lag > 0]
+        state = np.concatenate(
+            [
+                start.states,
+                np.zeros_like(start.states),
+                np.zeros_like(start.states),
+                start.per_side,
+            ],
+            axis=1,
+        )
+        kept = np.empty((len(wanted), *state.shape))
+        for begin in range(0, len(time), _CHUNK):
+            block = slice(begin, min(begin + _CHUNK, len(time)))
+            found = run(
+                state, before[block], delayed[block], changes[0][block], changes[1][block],
+                steps[block], max(history.lag, 1e-12),
+            )  # fmt: skip
+            inside = (wanted >= block.start) & (wanted < block.stop)
+            kept[inside] = found[wanted[inside] - begin]
+            state = found[-1]
+        shares = np.array([part.share for part in history.parts])
+        c = self._channels
+        values, by_lag, by_dead, by_side = (kept[:, :, k * c : (k + 1) * c] for k in range(4))
+
+        def mixed(states: Array) -> Array:
+            return (1 - shares.sum()) * states[:, 0] + np.einsum("j,mjc->mc", shares, states[:, 1:])
+
+        end = Start(state[:, :c], state[:, 3 * c :], pressures[-1])
+        return Effective(
+            pressures=mixed(values),
+            per_lag=mixed(by_lag),
+            per_dead_time=mixed(by_dead),
+            per_side=mixed(by_side),
+            per_share=np.swapaxes(values[:, 1:] - values[:, :1], 1, 2),
+            end=self._rested(end, history),
+        )
+
+    def _rested(self, end: Start, history: History) -> Start:
+        """State a while later, at the last pressures."""
+        c = self._channels
+        state = np.concatenate(
+            [end.states, np.zeros_like(end.states), np.zeros_like(end.states), end.per_side], axis=1
+        )
+        same, none = end.before[np.newaxis], np.zeros((1, c))
+        (state,) = self._runs[history.lag > 0](
+            state, same, same, none, none, np.array([_BETWEEN_LOGS]), max(history.lag, 1e-12)
+        )
+        return Start(state[:, :c], state[:, 3 * c :], end.before)
+
+    def _run_function(self, lagging: bool) -> _Run:
+        return _Run(self.history, self._channels, lagging)
+
+
+class _Run:
+    """The operators of several channels over many rows, with their derivatives carried along.
+
+    A state is (m, 4 c): the operators of each channel, then their derivatives by lag, dead time
+    and side.
+    """
+
+    def __init__(self, history: History, channels: int, lagging: bool) -> None:
+        self._shape = (history.n_states, 4 * channels)
+        self._function = _steps(history, channels, lagging).mapaccum("run", _CHUNK)
+
+    def __call__(
+        self,
+        state: Array,
+        before: Array,
+        now: Array,
+        before_change: Array,
+        now_change: Array,
+        steps: Array,
+        lag: float,
+    ) -> Array:
+        """States (N, m, 4 c) after each of N steps; the pressures and their changes are (N, c)."""
+        count = len(steps)
+        fill = _CHUNK - count
+
+        def columns(values: Array) -> Array:
+            return np.pad(values.reshape(count, -1), ((0, fill), (0, 0)), mode="edge").T
+
+        found = self._function(
+            state,
+            *(columns(each) for each in (before, now, before_change, now_change, steps)),
+            ca.repmat(ca.DM(lag), 1, _CHUNK),
+        )
+        rows, width = self._shape
+        states = np.asarray(found.full()).reshape(rows, _CHUNK, width)
+        return np.asarray(np.swapaxes(states[:, :count], 0, 1))
+
+
+def _steps(history: History, channels: int, lagging: bool) -> ca.Function:
+    """One step of `_Run`: state, pressures, their changes, length in s, lag in s -> state."""
+    m = history.n_states
+    value, by_lag, by_dead, by_side = (ca.SX.sym(name, m) for name in ("y", "l", "d", "s"))
+    before, now, before_change, now_change = (ca.SX.sym(name) for name in ("a", "b", "da", "db"))
+    step, lag = ca.SX.sym("step"), ca.SX.sym("lag")
+    end = history.model_copy(update={"lag": lag if lagging else 0.0}).next_state(
+        value, before, now, step
+    )
+    moved = ca.jtimes(end, ca.vertcat(before, now), ca.vertcat(before_change, now_change))
+    ends = [
+        end,
+        ca.jtimes(end, value, by_lag) + ca.jacobian(end, lag),
+        ca.jtimes(end, value, by_dead) + moved,
+        ca.jtimes(end, value, by_side),
+    ]
+    one = ca.Function(
+        "one",
+        [value, by_lag, by_dead, by_side, before, now, before_change, now_change, step, lag],
+        ends,
+    )
+    state = ca.SX.sym("state", m, 4 * channels)
+    pressures = [ca.SX.sym("p", channels) for _ in range(4)]
+    blocks: list[list[ca.SX]] = [[], [], [], []]
+    for c in range(channels):
+        parts = [state[:, k * channels + c] for k in range(4)]
+        found = one.call([*parts, *(p[c] for p in pressures), step, lag])
+        for block, part in zip(blocks, found, strict=True):
+            block.append(part)
+    all_ends = ca.horzcat(*[part for block in blocks for part in block])
+    return ca.Function("step", [state, *pressures, step, lag], [all_ends])
+
+
+def _delayed(time: Array, pressures: Array, before: Array, dead_time: float) -> tuple[Array, Array]:
+    """Pressures (N, c) that were commanded a dead time earlier, and their slopes in time."""
+    if dead_time == 0:
+        slope = np.zeros_like(pressures)
+        if len(time) > 1:
+            slope[1:] = np.diff(pressures, axis=0) / np.diff(time)[:, np.newaxis]
+        return pressures, slope
+    first = time[0] - (np.median(np.diff(time)) if len(time) > 1 else 1.0)
+    knots = np.concatenate([[first], time])
+    values = np.vstack([before, pressures])
+    asked = time - dead_time
+    interval = np.clip(np.searchsorted(knots, asked, side="left") - 1, 0, len(knots) - 2)
+    slope = np.diff(values, axis=0) / np.diff(knots)[:, np.newaxis]
+    slope = np.where((asked < first)[:, np.newaxis], 0.0, slope[interval])
+    base = np.where((asked < first)[:, np.newaxis], before, values[interval])
+    return base + slope * (asked - knots[interval])[:, np.newaxis], slope

@@ -1,0 +1,400 @@
+"""The least-squares problem of a calibration: residuals of logs and tables, and their slopes.
+
+What is read of a point of the arm follows from the commanded pressures in three steps, each with
+its derivatives: the history of every segment (`stiffopt.identify.past`), the equilibrium at the
+effective pressures (`stiffopt.model.parametric`) and the tracker (`stiffopt.identify.sensing`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from typing import Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.identify.past import Effective, Past, Start
+from stiffopt.identify.recording import Recording
+from stiffopt.identify.sensing import Readings, readings
+from stiffopt.identify.unknowns import Unknown
+from stiffopt.logs import StiffnessTable
+from stiffopt.model.arguments import checked_measure
+from stiffopt.model.compliance import Boundary
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.history import NO_HISTORY, History
+from stiffopt.model.parameters import with_values
+from stiffopt.model.parametric import ParametricArm
+
+__all__ = ["Begin", "Noise", "Point", "Predicted", "Problem", "Sample", "Unknowns"]
+
+Array = NDArray[np.float64]
+
+
+Begin = Literal["rest", "previous", "unknown"]
+"""How a log begins: after a rise from no pressure, as the previous one ended, or nobody knows."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Rows of a recording that are compared with the model.
+
+    Attributes
+    ----------
+    recording : Recording
+    rows : ndarray
+        (M,), increasing.
+    weight : ndarray
+        (M,): how much each counts.
+    begin : str
+        The state in which the arm comes to it.
+    """
+
+    recording: Recording
+    rows: NDArray[np.intp]
+    weight: Array
+    begin: Begin = "rest"
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A point of the arm that is tracked.
+
+    Attributes
+    ----------
+    name : of its track.
+    at : arc length at rest, in m; None is the tip.
+    sensor : pose (4, 4) of the sensor in the point's frame, where its unknown twist is zero.
+    turns : whether its orientation counts.
+    """
+
+    name: str
+    at: float | None
+    sensor: Array
+    turns: bool
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of what a model leaves: of each axis of a position, and of an angle."""
+
+    position: float
+    angle: float
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """Everything that a fit may change, in this order.
+
+    Attributes
+    ----------
+    parameters : of the robot: shape, then histories.
+    base : twist of the base in the tracker's frame, six or none.
+    sensors : twists of the sensors, for each point.
+    zeros : shift of each recording, three each or none.
+    sides : on which side of its plays each channel begins, for each recording that needs it.
+    """
+
+    parameters: tuple[Unknown, ...]
+    base: tuple[Unknown, ...] = ()
+    sensors: tuple[tuple[Unknown, ...], ...] = ()
+    zeros: tuple[tuple[Unknown, ...], ...] = ()
+    sides: tuple[tuple[Unknown, ...], ...] = ()
+
+    @property
+    def all(self) -> tuple[Unknown, ...]:
+        """All of them, in order."""
+        groups = (self.parameters, self.base, *self.sensors, *self.zeros, *self.sides)
+        return tuple(unknown for group in groups for unknown in group)
+
+    def slices(self) -> tuple[slice, list[slice], list[slice], list[slice]]:
+        """Where the base's, the sensors', the zeros' and the sides' are among all."""
+        begin = len(self.parameters)
+        found: list[slice] = []
+        for group in (self.base, *self.sensors, *self.zeros, *self.sides):
+            found.append(slice(begin, begin + len(group)))
+            begin += len(group)
+        n, m = len(self.sensors), len(self.zeros)
+        return found[0], found[1 : 1 + n], found[1 + n : 1 + n + m], found[1 + n + m :]
+
+
+@dataclass(frozen=True, eq=False)
+class Predicted:
+    """What the model says of the rows of all samples.
+
+    Attributes
+    ----------
+    effective : ndarray
+        Pressures (M, n) of the equilibria, in Pa.
+    poses : tuple of ndarray
+        Of each point in the base frame (M, 4, 4).
+    read : tuple of Readings
+        Of each point, in the frame of the recordings.
+    errors : tuple of ndarray
+        Measured less read (M, 3), of each point; NaN where nothing was measured.
+    """
+
+    effective: Array
+    poses: tuple[Array, ...]
+    read: tuple[Readings, ...]
+    errors: tuple[Array, ...]
+
+
+class Problem:
+    """Residuals of samples and of tables of stiffness.
+
+    Parameters
+    ----------
+    description : RobotDescription
+        Where all unknowns are zero.
+    unknowns : Unknowns
+        What may change.
+    samples : sequence of Sample
+        In the order in which they were recorded.
+    points : sequence of Point
+        The tip first.
+    base_in_tracker : ndarray
+        Pose (4, 4) of the base where its unknown twist is zero.
+    tables : sequence of StiffnessTable
+        Fitted together with the samples.
+    noise : Noise
+        What the residuals are divided by.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        unknowns: Unknowns,
+        samples: Sequence[Sample],
+        points: Sequence[Point],
+        base_in_tracker: Array,
+        noise: Noise,
+        tables: Sequence[StiffnessTable] = (),
+    ) -> None:
+        self.description = description
+        self.unknowns = unknowns
+        self.samples = tuple(samples)
+        self.points = tuple(points)
+        self.base_in_tracker = base_in_tracker
+        self.noise = noise
+        self.tables = tuple(tables)
+        self.scale = np.array([unknown.deviation for unknown in unknowns.all])
+        self.low = np.array([unknown.low for unknown in unknowns.all]) / self.scale
+        self.high = np.array([unknown.high for unknown in unknowns.all]) / self.scale
+        self._parameters = [u.parameter for u in unknowns.parameters if u.parameter is not None]
+        self._arm = ParametricArm(description, self._parameters)
+        self._pasts = [Past(s.history, s.n_channels) for s in description.segments]
+        self._index = {parameter.key: i for i, parameter in enumerate(self._parameters)}
+        self._measured = [self._measurements(point) for point in self.points]
+        self._weights = np.concatenate([sample.weight for sample in self.samples] or [np.zeros(0)])
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self.scale)
+
+    @property
+    def starts(self) -> list[int]:
+        """Where each sample begins among the rows of all, and their end."""
+        return [0, *np.cumsum([len(sample.rows) for sample in self.samples]).tolist()]
+
+    def with_samples(self, samples: Sequence[Sample], noise: Noise) -> Problem:
+        """The same problem with samples of other weights, and another noise."""
+        other = copy(self)
+        other.samples, other.noise = tuple(samples), noise
+        other._weights = np.concatenate([sample.weight for sample in samples])
+        return other
+
+    def robot(self, x: Array) -> RobotDescription:
+        """Robot with the parameters of scaled coordinates x (d,)."""
+        coordinates = x * self.scale
+        return with_values(
+            self.description,
+            {
+                parameter: float(parameter.at(parameter.value(self.description), coordinates[i]))
+                for i, parameter in enumerate(self._parameters)
+            },
+        )
+
+    def residuals(self, x: Array) -> tuple[Array, Array]:
+        """Residuals (m,) of samples and tables at scaled coordinates, and their Jacobian (m, d).
+
+        Rows without a measurement are zero.  The prior is not among them.
+        """
+        predicted, slopes = self._predict(x)
+        values: list[Array] = []
+        jacobians: list[Array] = []
+        for error, read, (moved, turned) in zip(
+            predicted.errors, predicted.read, slopes, strict=True
+        ):
+            self._append(values, jacobians, error, -moved, self.noise.position)
+            turn = read.turn
+            if turn is not None and turned is not None:
+                self._append(values, jacobians, -turn, -turned, self.noise.angle)
+        for table in self.tables:
+            value, jacobian = self._stiffness_residuals(table, x)
+            values.append(value)
+            jacobians.append(jacobian)
+        return np.concatenate(values), np.concatenate(jacobians) * self.scale
+
+    def predict(self, x: Array) -> Predicted:
+        """What the model says at scaled coordinates (d,)."""
+        return self._predict(x)[0]
+
+    def _append(
+        self, values: list[Array], jacobians: list[Array], error: Array, slope: Array, scale: float
+    ) -> None:
+        """Add weighted residuals (M, 3) and their slopes (M, 3, d) by unscaled coordinates."""
+        known = ~np.isnan(error.sum(axis=1))
+        weight = np.where(known, self._weights, 0.0) / scale
+        values.append((np.where(known[:, np.newaxis], error, 0.0) * weight[:, np.newaxis]).ravel())
+        jacobians.append((slope * weight[:, np.newaxis, np.newaxis]).reshape(-1, self.size))
+
+    def _predict(self, x: Array) -> tuple[Predicted, list[tuple[Array, Array | None]]]:
+        """Prediction, and the slopes (M, 3, d) of each point's position and turn."""
+        coordinates = x * self.scale
+        base, sensors, zeros, sides = self.unknowns.slices()
+        effective, by_history = self._effective(coordinates, sides)
+        k = len(self._parameters)
+        starts = self.starts
+        poses, read, errors, slopes = [], [], [], []
+        for point, sensor, (position, rotation) in zip(
+            self.points, sensors, self._measured, strict=True
+        ):
+            found = self._arm.poses(effective, coordinates[:k], point.at)
+            sensor_twist = np.zeros(6)
+            sensor_twist[: sensor.stop - sensor.start] = coordinates[sensor]
+            base_twist = np.zeros(6)
+            base_twist[: base.stop - base.start] = coordinates[base]
+            seen = readings(
+                found.transforms, self.base_in_tracker, base_twist,
+                point.sensor, sensor_twist, rotation,
+            )  # fmt: skip
+            twist = np.zeros((len(effective), 6, self.size))  # of the point, in its axes
+            twist[:, :, :k] = found.per_coordinate
+            twist += found.per_pressure @ by_history
+
+            def slope(per: Array, twist: Array = twist, sensor: slice = sensor) -> Array:
+                total: Array = per[:, :, :6] @ twist
+                total[:, :, base] += per[:, :, 6 : 6 + base.stop - base.start]
+                total[:, :, sensor] += per[:, :, 12 : 12 + sensor.stop - sensor.start]
+                return total
+
+            moved = slope(seen.per_twist)
+            place = seen.position.copy()
+            for own, begin, end in zip(zeros, starts[:-1], starts[1:], strict=False):
+                if own.stop > own.start:
+                    place[begin:end] += coordinates[own]
+                    moved[begin:end, :, own] += np.eye(3)
+            turned = None if seen.turn_per_twist is None else slope(seen.turn_per_twist)
+            poses.append(found.transforms)
+            read.append(replace(seen, position=place))
+            errors.append(position - place)
+            slopes.append((moved, turned))
+        return Predicted(effective, tuple(poses), tuple(read), tuple(errors)), slopes
+
+    def _effective(self, coordinates: Array, sides: Sequence[slice]) -> tuple[Array, Array]:
+        """Effective pressures (M, n) of all samples and their slopes (M, n, d)."""
+        starts, n = self.starts, self.description.n_pressures
+        effective = np.zeros((starts[-1], n))
+        slopes = np.zeros((starts[-1], n, self.size))
+        first = 0
+        for s, (segment, past) in enumerate(
+            zip(self.description.segments, self._pasts, strict=True)
+        ):
+            channels = slice(first, first + segment.n_channels)
+            first += segment.n_channels
+            history = self._history(s, coordinates)
+            end: Start | None = None
+            for i, sample in enumerate(self.samples):
+                pressures = sample.recording.pressures[:, channels]
+                if sample.begin == "previous" and end is not None:
+                    start = end
+                elif sample.begin == "unknown" and sides[i].stop > sides[i].start:
+                    own = coordinates[sides[i]][channels]
+                    start = Start.settled(history, pressures[0], own)
+                else:
+                    start = Start.from_rest(history, pressures[0])
+                found = past.effective(
+                    sample.recording.time, pressures, sample.rows, start, history
+                )
+                end = found.end
+                rows = slice(starts[i], starts[i + 1])
+                effective[rows, channels] = found.pressures
+                self._enter(slopes[rows, channels], s, history, found)
+                if sample.begin == "unknown" and sides[i].stop > sides[i].start:
+                    for c in range(channels.start, channels.stop):
+                        local = c - channels.start
+                        slopes[rows, c, sides[i].start + c] = found.per_side[:, local]
+        return effective, slopes
+
+    def _enter(self, slopes: Array, s: int, history: History, found: Effective) -> None:
+        """Write the slopes (M, c, d) by a segment's history."""
+        prefix = f"segments[{s}].history"
+        lag = self._index.get(f"{prefix}.lag")
+        if lag is not None:
+            slopes[:, :, lag] = found.per_lag * history.lag
+        dead_time = self._index.get(f"{prefix}.dead_time")
+        if dead_time is not None:
+            slopes[:, :, dead_time] = found.per_dead_time
+        names = [f"play[{j}]" for j in range(len(history.play))]
+        names += [f"creep[{j}]" for j in range(len(history.creep))]
+        for j, name in enumerate(names):
+            share = self._index.get(f"{prefix}.{name}.share")
+            if share is not None:
+                slopes[:, :, share] = found.per_share[:, :, j]
+
+    def _history(self, s: int, coordinates: Array) -> History:
+        """History of a segment with the values of these coordinates."""
+        history = self.description.segments[s].history or NO_HISTORY
+        prefix = f"segments[{s}].history"
+
+        def value(name: str, nominal: float) -> float:
+            i = self._index.get(f"{prefix}.{name}")
+            if i is None:
+                return nominal
+            return float(self._parameters[i].at(nominal, coordinates[i]))
+
+        return history.model_copy(
+            update={
+                "dead_time": value("dead_time", history.dead_time),
+                "lag": value("lag", history.lag),
+                "play": tuple(
+                    play.model_copy(update={"share": value(f"play[{j}].share", play.share)})
+                    for j, play in enumerate(history.play)
+                ),
+                "creep": tuple(
+                    creep.model_copy(update={"share": value(f"creep[{j}].share", creep.share)})
+                    for j, creep in enumerate(history.creep)
+                ),
+            }
+        )
+
+    def _measurements(self, point: Point) -> tuple[Array, Array | None]:
+        """Positions (M, 3) and rotations (M, 3, 3) of a point in the rows of all samples."""
+        positions, rotations = [np.zeros((0, 3))], [np.zeros((0, 3, 3))]
+        for sample in self.samples:
+            track = sample.recording.track(point.name)
+            positions.append(track.position[sample.rows])
+            if track.rotation is None or not point.turns:
+                rotations.append(np.full((len(sample.rows), 3, 3), np.nan))
+            else:
+                rotations.append(track.rotation[sample.rows])
+        return np.concatenate(positions), np.concatenate(rotations) if point.turns else None
+
+    def _stiffness_residuals(self, table: StiffnessTable, x: Array) -> tuple[Array, Array]:
+        """Residuals (r,) of a table over its sigmas, and their slopes (r, d)."""
+        coordinates = (x * self.scale)[: len(self._parameters)]
+        value, slope = np.zeros(len(table)), np.zeros((len(table), self.size))
+        known = np.isfinite(table.stiffness) & np.isfinite(table.sigma) & (table.sigma > 0)
+        kinds = list(zip(map(tuple, table.directions.tolist()), table.boundaries, strict=True))
+        for direction, boundary in sorted(set(kinds)):
+            rows = known & np.array([kind == (direction, boundary) for kind in kinds])
+            measure = checked_measure(direction, "translation", cast(Boundary, boundary), "base")
+            k, _, per_coordinate = self._arm.stiffnesses(
+                table.pressures[rows], coordinates, measure
+            )
+            value[rows] = (table.stiffness[rows] - k) / table.sigma[rows]
+            slope[rows, : len(coordinates)] = -per_coordinate / table.sigma[rows, np.newaxis]
+        return value, slope

@@ -1,0 +1,111 @@
+"""What a tracker says of a point of the arm, and how that depends on where the tracker is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.model.native_calls import InterpretedFunction
+from stiffopt.model.native_source import dense
+
+__all__ = ["Readings", "readings", "turned_by"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """What a perfect tracker reads of a point in N rows.
+
+    Derivatives are by the twist (6) of the point in its own axes, by the twist of the base in the
+    tracker's frame (in base axes), and by that of the sensor on the point (in the point's axes).
+
+    Attributes
+    ----------
+    position : ndarray
+        (N, 3), in m.
+    per_twist : ndarray
+        (N, 3, 18), of the position.
+    turn : ndarray or None
+        (N, 3): the rotation from what was measured to what is read, as the sine of its angle
+        along its axis, in the axes of the sensor; None if no rotation was measured.
+    turn_per_twist : ndarray or None
+        (N, 3, 18).
+    """
+
+    position: Array
+    per_twist: Array
+    turn: Array | None
+    turn_per_twist: Array | None
+
+
+def readings(
+    point: Array,
+    base_in_tracker: Array,
+    base_twist: Array,
+    sensor_in_point: Array,
+    sensor_twist: Array,
+    measured: Array | None,
+) -> Readings:
+    """Read a point whose poses in the base frame are (N, 4, 4).
+
+    Parameters
+    ----------
+    point : (N, 4, 4)
+    base_in_tracker, sensor_in_point : (4, 4)
+    base_twist, sensor_twist : (6,)
+        Move these frames: ``base_in_tracker exp(base_twist)``, ``exp(sensor_twist) sensor``.
+    measured : (N, 3, 3) or None
+        Orientations of the sensor in the tracker's frame.
+    """
+    count = len(point)
+    rotation = np.broadcast_to(np.eye(3), (count, 3, 3)) if measured is None else measured
+    position, per_twist, turn, turn_per_twist = _function().many(
+        _flat(point),
+        _flat(rotation),
+        _flat(base_in_tracker[np.newaxis])[0],
+        base_twist,
+        _flat(sensor_in_point[np.newaxis])[0],
+        sensor_twist,
+    )
+    if measured is None:
+        return Readings(position[..., 0], per_twist, None, None)
+    return Readings(position[..., 0], per_twist, turn[..., 0], turn_per_twist)
+
+
+def turned_by(turn: Array) -> Array:
+    """Angles (N,) in rad of `Readings.turn`, up to a quarter turn."""
+    return np.asarray(np.arcsin(np.clip(np.linalg.norm(turn, axis=-1), 0.0, 1.0)))
+
+
+def _flat(matrices: Array) -> Array:
+    """Matrices (N, r, c) as CasADi stores them, (N, r c)."""
+    return np.ascontiguousarray(np.swapaxes(matrices, 1, 2)).reshape(len(matrices), -1)
+
+
+@cache
+def _function() -> InterpretedFunction:
+    point, rotation = ca.SX.sym("T", 16), ca.SX.sym("R", 9)
+    base, sensor = ca.SX.sym("B", 16), ca.SX.sym("S", 16)
+    moved, base_twist, sensor_twist = (ca.SX.sym(name, 6) for name in ("x", "b", "s"))
+    T = (
+        ca.reshape(base, 4, 4)
+        @ lie.exp(base_twist)
+        @ ca.reshape(point, 4, 4)
+        @ lie.exp(moved)
+        @ lie.exp(sensor_twist)
+        @ ca.reshape(sensor, 4, 4)
+    )
+    difference = ca.reshape(rotation, 3, 3).T @ T[:3, :3]
+    twice_sine = difference - difference.T
+    turn = ca.vertcat(twice_sine[2, 1], twice_sine[0, 2], twice_sine[1, 0]) / 2
+    twists = ca.vertcat(moved, base_twist, sensor_twist)
+    inputs = [point, rotation, base, base_twist, sensor, sensor_twist]
+    outputs = [T[:3, 3], ca.jacobian(T[:3, 3], twists), turn, ca.jacobian(turn, twists)]
+    still = ca.substitute(outputs, [moved], [ca.SX.zeros(6)])
+    return InterpretedFunction(dense(ca.Function("readings", inputs, ca.cse(still))))

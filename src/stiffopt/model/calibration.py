@@ -1,0 +1,102 @@
+"""What a calibration leaves in the robot file beside the values: how well they are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from stiffopt.schema import BadKeyError, Items, Schema
+from stiffopt.units import Angle, Length, Number, Pressure
+
+__all__ = ["Calibration", "FittedParameter"]
+
+Array = NDArray[np.float64]
+_POSITIVE = Field(ge=0)
+_ROUNDING = 1e-3  # of correlations, which are written with few digits
+_SLACK = 0.02  # of the recorded pressures; so little beyond them is not beyond
+
+
+class FittedParameter(Schema):
+    """A number of the robot file that was fitted, and how well it is known.
+
+    Attributes
+    ----------
+    key : where it is in the file, for example ``segments[0].material.youngs_modulus``.
+    deviation : standard deviation of its coordinate: relative for what must be positive
+        (modulus, length, gain, area, ...), else in SI units.
+    prior : the same before the calibration.
+    """
+
+    key: str
+    deviation: Annotated[Number, _POSITIVE]
+    prior: Annotated[Number, _POSITIVE]
+
+
+class Calibration(Schema):
+    """How well a calibration knows the arm.
+
+    Attributes
+    ----------
+    logs : names of what it was fitted to.
+    parameters : that were fitted.
+    correlation : of their errors, one row for each.
+    position_residual, angle_residual : root mean square of what the model leaves of the recorded
+        positions (each axis) and angles.
+    pressure_min, pressure_max : between which each channel was recorded, in Pa.
+    pressure_norm : largest norm that was recorded of each segment's pressures, in Pa.
+    """
+
+    logs: Items[str] = ()
+    parameters: Items[FittedParameter] = ()
+    correlation: Items[Items[Number]] = ()
+    position_residual: Annotated[Length, _POSITIVE] = 0.0
+    angle_residual: Annotated[Angle, _POSITIVE] | None = None
+    pressure_min: Items[Pressure] = ()
+    pressure_max: Items[Pressure] = ()
+    pressure_norm: Items[Pressure] = ()
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (k, k) of the parameters' coordinates."""
+        deviations = np.array([parameter.deviation for parameter in self.parameters])
+        matrix = np.array(self.correlation, dtype=float).reshape(len(deviations), len(deviations))
+        return matrix * np.outer(deviations, deviations)
+
+    def covers(self, channels: Sequence[int], pressures: Array) -> NDArray[np.bool_]:
+        """Say which pressures (N, n) lie within what was recorded.
+
+        Parameters
+        ----------
+        channels :
+            Number of channels of each segment.
+        pressures : (N, n)
+            In Pa.
+        """
+        low, high = np.array(self.pressure_min), np.array(self.pressure_max)
+        slack = _SLACK * np.max(np.abs([low, high]), initial=0.0)
+        inside = ((pressures >= low - slack) & (pressures <= high + slack)).all(axis=1)
+        ends = np.cumsum([0, *channels])
+        for begin, end, norm in zip(ends, ends[1:], self.pressure_norm, strict=False):
+            inside &= np.linalg.norm(pressures[:, begin:end], axis=1) <= norm + slack
+        return np.asarray(inside)
+
+    @model_validator(mode="after")
+    def _check(self) -> Calibration:
+        k = len(self.parameters)
+        rows = [len(row) for row in self.correlation]
+        if rows != [k] * k:
+            raise BadKeyError("correlation", f"expected {k} rows of {k} numbers, one per parameter")
+        matrix = np.array(self.correlation, dtype=float).reshape(k, k)
+        if k and not (
+            np.allclose(matrix, matrix.T, atol=_ROUNDING)
+            and np.allclose(np.diag(matrix), 1, atol=_ROUNDING)
+            and np.linalg.eigvalsh(matrix).min() > -k * _ROUNDING
+        ):
+            raise BadKeyError(
+                "correlation", "is not a matrix of correlations: symmetric, ones on the diagonal"
+            )
+        return self
