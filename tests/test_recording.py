@@ -230,6 +230,7 @@ def test_orientations_that_agree_with_no_neighbour_are_not_used() -> None:
     for start, count in strays.items():
         wrong[start : start + count] = wrong[start : start + count] @ placed((0.3, 0.3, 0.3))
     assert angles(wrong, BASE[1] @ turns).max() == pytest.approx(np.sqrt(0.27))
+    wrong[402:450] = wrong[402:450] @ matrices_identity_first()[7]
     recording = prepared(changed(log, quaternion=quaternions(wrong)))
     rotation = recording.tracks[0].rotation
     assert rotation is not None
@@ -238,6 +239,7 @@ def test_orientations_that_agree_with_no_neighbour_are_not_used() -> None:
         expected[start : start + count] = True
     np.testing.assert_array_equal(np.isnan(rotation[:, 0, 0]), expected)
     assert angles(rotation[~expected], turns[~expected]).max() < 1e-6
+    assert "in 2 rows" in remark(recording, "flips about")
     assert "agrees with no row near it in 6 rows" in remark(recording, "agrees with no")
     assert np.isfinite(recording.tracks[0].position).all()
 

@@ -305,15 +305,9 @@ def _in_frame(
     moved = {
         track.name: Track(
             track.name,
-            (track.position - origin) @ axes,
-            None if track.rotation is None else _turned(axes.T, track.rotation),
+            np.einsum("nj,ji->ni", track.position - origin, axes),
+            None if track.rotation is None else np.einsum("ji,njk->nik", axes, track.rotation),
         )
         for track in tracks.values()
     }
     return moved, remarks
-
-
-def _turned(axes: Array, rotation: Array) -> Array:
-    """``axes @ rotation`` for rotations (N, 3, 3), as one product of large matrices."""
-    columns = np.ascontiguousarray(rotation.transpose(0, 2, 1)).reshape(-1, 3)
-    return (columns @ axes.T).reshape(-1, 3, 3).transpose(0, 2, 1)

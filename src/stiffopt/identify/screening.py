@@ -101,7 +101,7 @@ def jumps(time: Array, position: Array, reach: Array, length: float) -> Rows:
     usual = _SIGMAS * float(np.median(roughness(time[seen], position[seen]))) / MEDIAN_NORM
     least = max(usual, _LEAST * length)
     pause = _PAUSE * float(np.median(np.diff(time[seen])))
-    for count in 1 * (*range(1, _RUN + 1),):  # twice, as one jump may hide another near it
+    for count in 2 * (*range(1, _RUN + 1),):  # twice, as one jump may hide another near it
         rows = np.flatnonzero(whole(position) & ~bad)
         if len(rows) < count + 2:
             break
