@@ -92,9 +92,7 @@ class Comparison:
     def outside(self) -> Errors:
         """Errors of the rows whose pressures the calibration had not seen."""
         beyond = ~self.inside
-        return Errors.of(
-            self.distance[beyond], None if self.angle is None else self.angle[beyond]
-        )
+        return Errors.of(self.distance[beyond], None if self.angle is None else self.angle[beyond])
 
 
 def together(comparisons: Sequence[Comparison]) -> Errors:

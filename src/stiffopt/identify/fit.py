@@ -23,7 +23,7 @@ __all__ = ["Fit", "fit"]
 Array = NDArray[np.float64]
 
 _LOSS_SCALE = 2.0  # residuals beyond so many deviations count less and less (soft L1)
-_ROUNDS = 3  # of fitting with the spread that the last one left
+ROUNDS = 3  # of fitting with the spread that the last one left
 _TOLERANCE = 1e-6
 _MOST_EVALUATIONS = 60
 _LEAST_POSITION, _LEAST_ANGLE = 1e-6, 1e-5  # m and rad, of the spread: logs have few digits
@@ -69,7 +69,12 @@ class Fit:
         return np.asarray(np.sqrt(np.diag(self.covariance)) * self.problem.scale)
 
 
-def fit(problem: Problem, starts: Sequence[Array], tell: Callable[[], None] = lambda: None) -> Fit:
+def fit(
+    problem: Problem,
+    starts: Sequence[Array],
+    tell: Callable[[], None] = lambda: None,
+    rounds: int = ROUNDS,
+) -> Fit:
     """Fit from several starts and return the best minimum.
 
     Parameters
@@ -79,11 +84,13 @@ def fit(problem: Problem, starts: Sequence[Array], tell: Callable[[], None] = la
         Scaled coordinates.
     tell :
         Is called at every evaluation of the problem, to show progress or to stop by raising.
+    rounds : int
+        How often the noise and the weights are made to fit the residuals.
     """
     begun = [_minimum(problem, start, tell) for start in starts]
-    x, _ = min(begun, key=lambda found: found[1])
+    x, cost = min(begun, key=lambda found: found[1])
     independent = 1.0
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         problem, independent = _reweighted(problem, x, independent)
         x, cost = _minimum(problem, x, tell)
     return Fit(problem, x, cost, _covariance(problem, x), independent)
@@ -169,7 +176,7 @@ def _rows_per_independent(problem: Problem, predicted: Predicted) -> float:
         size = 2 * len(known)
         spectrum = np.abs(np.fft.rfft(known, size, axis=0)) ** 2
         products: Array = np.fft.irfft(spectrum, size, axis=0)
-        total += products[:longest].sum(axis=1)
+        total += np.asarray(products[:longest].sum(axis=1), dtype=float)
     if total[0] <= 0:
         return 1.0
     correlation = total / total[0]
@@ -183,5 +190,5 @@ def _covariance(problem: Problem, x: Array) -> Array:
     value, slope = problem.residuals(x)
     weight = 1 / np.sqrt(1 + value**2 / _LOSS_SCALE**2)
     normal = slope.T @ (slope * weight[:, np.newaxis]) + np.eye(problem.size)
-    found: Array = np.linalg.inv(normal)
-    return (found + found.T) / 2
+    found = np.linalg.inv(normal)
+    return np.asarray((found + found.T) / 2, dtype=float)

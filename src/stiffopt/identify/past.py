@@ -149,7 +149,8 @@ class Past:
         values, by_lag, by_dead, by_side = (kept[:, :, k * c : (k + 1) * c] for k in range(4))
 
         def mixed(states: Array) -> Array:
-            return (1 - shares.sum()) * states[:, 0] + np.einsum("j,mjc->mc", shares, states[:, 1:])
+            slow: Array = np.einsum("j,mjc->mc", shares, states[:, 1:])
+            return (1 - float(shares.sum())) * states[:, 0] + slow
 
         end = Start(state[:, :c], state[:, 3 * c :], pressures[-1])
         return Effective(

@@ -25,6 +25,7 @@ _AXES = ("x", "y", "z")
 BASE = "base in the tracker's frame"
 SENSOR = "sensor on the tip"
 _LARGEST_SHARE = 0.9
+_SIDE = 0.6  # deviation; all between -1 and 1 are about as likely
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def shape_unknowns(
         for name in names:
             field = name.rpartition(".")[2]
             keys = [f"segments[{s}].{name}"]
-            if name.startswith("corrections."):
+            if name.startswith("corrections.") and field != "dead_band":
                 keys = [f"{keys[0]}[{c}]" for c in range(segment.n_channels)]
             if name.startswith("compensation.") and segment.strain_law == "neo-hookean":
                 continue
@@ -124,3 +125,16 @@ def placement_unknowns(name: str, position: Array, angle: Array, turns: bool) ->
 def _between(value: float, low: float, high: float) -> tuple[float, float]:
     """Bounds of the coordinate of a value that lies between two others."""
     return low - value, high - value
+
+
+def side_unknowns(description: RobotDescription, name: str) -> list[Unknown]:
+    """On which side of its plays each channel begins, from -1 after a rise to 1 after a fall."""
+    return [
+        Unknown(f"{description.channel_name(c)} at the beginning of {name}", "", _SIDE, -1.0, 1.0)
+        for c in range(description.n_pressures)
+    ]
+
+
+def zero_unknowns(name: str, tolerances: Tolerances) -> list[Unknown]:
+    """By how much the positions of a recording are shifted."""
+    return [Unknown(f"zero of {name}, {axis}", "m", tolerances.zero) for axis in _AXES]

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt import lie
 from stiffopt.identify.comparison import Comparison
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import Noise, Point, Predicted, Problem, Sample, Unknowns
@@ -16,6 +15,7 @@ from stiffopt.identify.recording import Recording, Track, aligned
 from stiffopt.identify.samples import begins, chosen_rows, thinned
 from stiffopt.identify.unknowns import Unknown, side_unknowns, zero_unknowns
 from stiffopt.model.description import Recordings, RobotDescription, Tolerances
+from stiffopt.registration import Placement
 
 __all__ = ["compare", "points_of"]
 
@@ -68,8 +68,151 @@ def compare(
     predicted = Problem(description, unknowns, samples, points, base, _NOISE).predict(x)
     starts = np.cumsum([0, *(len(sample.rows) for sample in samples)])
     return tuple(
-        _comparison(description, recording, rows, predicted, slice(begin, end), points[0])
-        for recording, rows, begin, end in zip(
-            recordings, kept, starts[:-1], starts[1:], strict=True
+        _comparison(
+            description, recording, rows, sample, predicted, slice(begin, end), base, points[0]
         )
+        for recording, rows, sample, begin, end in zip(
+            recordings, kept, samples, starts[:-1], starts[1:], strict=True
+        )
+    )
+
+
+def placements(description: RobotDescription) -> Recordings:
+    """How the robot's logs are read, or what is usual."""
+    return description.recordings or Recordings()
+
+
+def points_of(description: RobotDescription, recordings: Sequence[Recording]) -> tuple[Point, ...]:
+    """Tracked points of an arm, the tip first, where the robot file says that their sensors are."""
+    given = placements(description)
+    places: dict[str, tuple[float | None, Placement]] = {
+        "tip": (None, given.registration.tip_in_sensor)
+    }
+    places |= {name: (body.at, body.point_in_sensor) for name, body in given.bodies.items()}
+    return tuple(
+        Point(
+            name,
+            at,
+            placement.inverse(),
+            turns=all(recording.track(name).rotation is not None for recording in recordings),
+        )
+        for name, (at, placement) in places.items()
+    )
+
+
+def oriented(
+    description: RobotDescription,
+    samples: Sequence[Sample],
+    points: Sequence[Point],
+    base: Array,
+) -> list[Sample]:
+    """Samples whose bodies are turned by what their markers cannot tell, to what is predicted."""
+    if not any(point.turns for point in points):
+        return list(samples)
+    predicted = Problem(description, _none(samples, points), samples, points, base, _NOISE).predict(
+        np.zeros(0)
+    )
+    starts = np.cumsum([0, *(len(sample.rows) for sample in samples)])
+    found = []
+    for sample, begin, end in zip(samples, starts[:-1], starts[1:], strict=True):
+        tracks: list[Track] = []
+        for track in sample.recording.tracks:
+            k = [point.name for point in points].index(track.name)
+            if points[k].turns and track.rotation is not None:
+                expected = base[:3, :3] @ predicted.poses[k][begin:end, :3, :3]
+                expected = expected @ points[k].sensor[:3, :3]
+                track = replace(track, rotation=_turned(track.rotation, sample.rows, expected))
+            tracks.append(track)
+        found.append(replace(sample, recording=replace(sample.recording, tracks=tuple(tracks))))
+    return found
+
+
+def _turned(rotation: Array, rows: NDArray[np.intp], expected: Array) -> Array:
+    """The version of rotations (N, 3, 3) whose wanted rows are nearest to what is expected."""
+    between = np.swapaxes(expected, 1, 2) @ rotation[rows]
+    if not np.isfinite(between).all(axis=(1, 2)).any():
+        return rotation
+    version = np.swapaxes(between, 1, 2) @ aligned(between, np.eye(3))
+    known = np.isfinite(version).all(axis=(1, 2))
+    return np.asarray(rotation @ version[known][0])
+
+
+def _none(samples: Sequence[Sample], points: Sequence[Point]) -> Unknowns:
+    """Nothing that may change."""
+    nothing: tuple[tuple[Unknown, ...], ...] = ((),)
+    each = nothing * len(samples)
+    return Unknowns((), (), nothing * len(points), each, each)
+
+
+def _beginnings(
+    description: RobotDescription,
+    samples: Sequence[Sample],
+    points: Sequence[Point],
+    base: Array,
+    rezero: bool,
+    settle: float,
+    tell: Callable[[], None],
+) -> tuple[Unknowns, Array]:
+    """Zeros and states of the recordings, as their own beginnings tell them."""
+    tolerances = description.tolerances or Tolerances()
+    remembers = any(segment.history and segment.history.play for segment in description.segments)
+    all_zeros, all_sides, found = [], [], []
+    for sample in samples:
+        name = sample.recording.name
+        zeros = tuple(zero_unknowns(name, tolerances)) if rezero else ()
+        unknown = sample.begin == "unknown" and remembers
+        sides = tuple(side_unknowns(description, name)) if unknown else ()
+        all_zeros.append(zeros)
+        all_sides.append(sides)
+        x = np.zeros(len(zeros) + len(sides))
+        time = sample.recording.time[sample.rows]
+        first = sample.rows[time <= time[0] + settle] if len(time) else sample.rows
+        if len(x) and len(first):
+            begun = replace(sample, rows=first, weight=np.ones(len(first)) / np.sqrt(len(first)))
+            if begun.begin == "previous":
+                begun = replace(begun, begin="rest")
+            own = replace(_none([begun], points), zeros=(zeros,), sides=(sides,))
+            problem = Problem(description, own, [begun], points, base, _NOISE)
+            x = fit(problem, [x], tell, rounds=0).x
+        found.append(x)
+    unknowns = replace(_none(samples, points), zeros=tuple(all_zeros), sides=tuple(all_sides))
+    # zeros of all recordings come before all sides
+    zeros_first = [x[: len(zeros)] for x, zeros in zip(found, all_zeros, strict=True)]
+    sides_last = [x[len(zeros) :] for x, zeros in zip(found, all_zeros, strict=True)]
+    return unknowns, np.concatenate([np.zeros(0), *zeros_first, *sides_last])
+
+
+def _comparison(
+    description: RobotDescription,
+    recording: Recording,
+    rows: NDArray[np.intp],
+    sample: Sample,
+    predicted: Predicted,
+    own: slice,
+    base: Array,
+    tip: Point,
+) -> Comparison:
+    angle = None
+    track = sample.recording.track(tip.name)
+    if track.rotation is not None:
+        there = track.rotation[sample.rows] @ tip.sensor[:3, :3].T[:, 2]
+        expected = base[:3, :3] @ predicted.poses[0][own, :3, 2, np.newaxis]
+        cosine = np.einsum("ni,ni->n", there, expected[..., 0])
+        angle = np.arccos(np.clip(cosine, -1, 1))
+    pressures = recording.pressures[rows]
+    inside = np.ones(len(rows), dtype=bool)
+    if description.calibration is not None:
+        counts = [segment.n_channels for segment in description.segments]
+        inside = description.calibration.covers(counts, pressures)
+    position = predicted.read[0].position[own]
+    return Comparison(
+        name=recording.name,
+        time=recording.time[rows],
+        pressures=pressures,
+        effective=predicted.effective[own],
+        measured=position + predicted.errors[0][own],
+        predicted=position,
+        angle=angle,
+        inside=inside,
+        remarks=recording.remarks,
     )

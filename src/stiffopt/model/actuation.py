@@ -94,6 +94,17 @@ def smooth_norm(p: ca.SX) -> ca.SX:
     return ca.sqrt(ca.sumsqr(p) + NORM_SMOOTHING**2) - NORM_SMOOTHING
 
 
+def onset(p: ca.SX, dead_band: ca.SX | float) -> ca.SX:
+    """Pressure less a dead band: ``w ln((1 + e^((p - b) / w)) / (1 + e^(-b / w)))``.
+
+    Monotone, zero at p = 0, and its slope rises from 0.12 to 1; the width w is half the band b.
+    """
+    w = dead_band / 2
+    z = (p - dead_band) / w
+    # ln(1 + e^z) without overflow
+    return w * (ca.fmax(z, 0) + ca.log1p(ca.exp(-ca.fabs(z))) - np.log1p(np.exp(-2.0)))
+
+
 def _bending(second_moment: ca.SX) -> ca.SX:
     """Turn ``int r r^T dA`` into the matrix that maps (kappa_x, kappa_y) to (M_x, M_y) / E.
 
@@ -102,6 +113,17 @@ def _bending(second_moment: ca.SX) -> ca.SX:
     """
     quarter_turn = ca.DM([[0, 1], [-1, 0]])
     return quarter_turn @ second_moment @ quarter_turn.T
+
+
+def _limited(kappa: ca.SX, radius: ca.SX | float) -> tuple[ca.SX, ca.SX]:
+    """Curvature (2,) that approaches 1 / radius, and the root (2, 2) of its slope by the old one.
+
+    The slope is ``((1 - n n') / (1 + z)^(1/2) + n n' / (1 + z)^(3/2))`` with z = R^2 |kappa|^2
+    and n along kappa; its root, applied from both sides, keeps a flexibility symmetric.
+    """
+    root = ca.sqrt(1 + radius**2 * ca.sumsqr(kappa))
+    along = radius**2 / (root * (1 + root)) * (kappa @ kappa.T)
+    return kappa / root, (ca.SX.eye(2) - along) / ca.sqrt(root)
 
 
 class StrainLaw(ABC):
@@ -123,10 +145,12 @@ class StrainLaw(ABC):
         """Scalar that is positive where the law holds at pressures p (c,)."""
 
     def _acting(self, p: ca.SX) -> ca.SX:
-        """Pressures (c,) that act in the chambers: ``gain p + offset``."""
+        """Pressures (c,) that act in the chambers: ``gain onset(p) + offset``."""
         corrections = self.segment.corrections
         if corrections is None:
             return p
+        if not ca.SX(corrections.dead_band).is_zero():
+            p = onset(p, corrections.dead_band)
         if len(corrections.gain):
             p = p * ca.vertcat(*corrections.gain)
         if len(corrections.offset):
@@ -151,10 +175,10 @@ class StrainLaw(ABC):
         return ca.vertcat(first[1], -first[0])
 
     def _compliance_about_centroid(
-        self, shear: ca.SX, axial: ca.SX, bending: ca.SX, torsion: ca.SX
+        self, shear: ca.SX, axial: ca.SX, flexibility: ca.SX, torsion: ca.SX
     ) -> ca.SX:
-        """``diag(GA, GA, EA, EI_x, EI_y, GJ)^-1`` with a full bending block (2, 2)."""
-        return ca.diagcat(1 / shear, 1 / shear, 1 / axial, ca.inv_minor(bending), 1 / torsion)
+        """``diag(GA, GA, EA, EI_x, EI_y, GJ)^-1`` with a full block (2, 2) of flexibility."""
+        return ca.diagcat(1 / shear, 1 / shear, 1 / axial, flexibility, 1 / torsion)
 
     def _about_axis(self, compliance: ca.SX, centroid: ca.SX) -> ca.SX:
         """Move a compliance from the centroid to the backbone axis (eq. 16)."""
@@ -174,7 +198,9 @@ class PaperLaw(StrainLaw):
     compensated second moment is that about the centroid.
 
     Loads meet the modulus ``stiffness (E + softening slope |p|)``, the paper's own where both
-    factors are 1, see `stiffopt.model.description.Compensation`.
+    factors are 1.  Where there is a least bending radius R, the curvature is
+    ``kappa / sqrt(1 + R^2 |kappa|^2)`` instead, and loads meet the derivative of that by the
+    moment.  See `stiffopt.model.description.Compensation`.
     """
 
     limit = "the pressure drives the compensated modulus of this segment to zero"
@@ -203,6 +229,8 @@ class PaperLaw(StrainLaw):
         compensation = self.segment.compensation
         scale_area = compensation.area if compensation else 1.0
         scale_inertia = compensation.inertia if compensation else 1.0
+        radius = compensation.bending_radius if compensation else 0.0
+        lengthening = compensation.lengthening if compensation else 0.0
         geometry = self.geometry
         area = scale_area * geometry.area
         inertia = scale_inertia * ca.DM(geometry.second_moment)
@@ -210,19 +238,25 @@ class PaperLaw(StrainLaw):
         E = self._modulus(acting)
         loaded = self._loaded_modulus(acting)
         G = loaded / (2 * (1 + self.segment.material.poisson_ratio))
+        force, moment = self._axial_force(acting), self._moment_about_centroid(acting)
+        kappa = ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E
+        flexibility = ca.inv_minor(loaded * _bending(inertia))
+        if not ca.SX(radius).is_zero():
+            kappa, less = _limited(kappa, radius)
+            flexibility = less @ flexibility @ less
         per_deformed_length = self._about_axis(
             self._compliance_about_centroid(
                 shear=G * area,
                 axial=loaded * area,
-                bending=loaded * _bending(inertia),
+                flexibility=flexibility,
                 torsion=G * ca.trace(inertia),
             ),
             ca.SX(geometry.centroid),
         )
-        force, moment = self._axial_force(acting), self._moment_about_centroid(acting)
-        kappa = ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E
         c = geometry.centroid
         stretch = 1 + force / (E * area)  # of the line of centroids
+        if not ca.SX(lengthening).is_zero():
+            stretch += lengthening * self.segment.outer_radius**2 * ca.sumsqr(kappa)
         strain = stretch * ca.vertcat(0, 0, 1 + kappa[1] * c[0] - kappa[0] * c[1], kappa, 0)
         return Section(strain, stretch * per_deformed_length)
 
@@ -269,7 +303,7 @@ class NeoHookeanLaw(StrainLaw):
             self._compliance_about_centroid(
                 shear=mu * geometry.area,
                 axial=tangent_modulus * geometry.area,
-                bending=bending,
+                flexibility=ca.inv_minor(bending),
                 torsion=mu * np.trace(geometry.second_moment) / stretch,
             ),
             centroid,

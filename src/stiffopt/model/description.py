@@ -129,6 +129,10 @@ class Compensation(Schema):
     softening : share of `modulus_per_pressure` by which the arm gives way to loads more easily;
         the rest is pressure that acts ever more strongly, as in chambers that swell. 1 in the
         paper.
+    bending_radius : that pressure bends to at the most, in m: the silicone stiffens towards it.
+        0 in the paper, which knows no limit.
+    lengthening : stretch of the axis per squared strain ``(outer_radius / bending radius)^2`` of
+        the wall that bending stretches most. 0 in the paper.
     """
 
     modulus_per_pressure: Number = 0.0
@@ -136,20 +140,24 @@ class Compensation(Schema):
     inertia: Annotated[Number, Field(gt=0)] = 1.0
     stiffness: Annotated[Number, Field(gt=0)] = 1.0
     softening: Annotated[Number, Field(ge=0, le=1)] = 1.0
+    bending_radius: Annotated[Length, Field(ge=0)] = 0.0
+    lengthening: Number = 0.0
 
 
 class Corrections(Schema):
-    """How the channels of a segment act, where that is not as drawn; one value for each.
+    """How the channels of a segment act, where that is not as drawn; lists have one value for each.
 
     Attributes
     ----------
     gain : pressure that acts per pressure.
     offset : pressure that acts in addition, in Pa.
+    dead_band : of all channels: pressure up to which hardly anything moves, in Pa.
     azimuth : turns the channel's chambers about the axis, from x towards y, in rad.
     """
 
     gain: Items[Annotated[Ratio, Field(gt=0)]] = ()
     offset: Items[Pressure] = ()
+    dead_band: Annotated[Pressure, Field(ge=0)] = 0.0
     azimuth: Items[Angle] = ()
 
 
@@ -193,7 +201,7 @@ class Segment(Schema):
         self._check_walls()
         self._check_channels()
         for name, values in self.corrections or ():
-            if values and len(values) != self.n_channels:
+            if isinstance(values, tuple) and values and len(values) != self.n_channels:
                 raise BadKeyError(
                     f"corrections.{name}",
                     f"has {len(values)} values; expected {self.n_channels}, one for each channel",
@@ -312,7 +320,8 @@ class Tolerances(Schema):
     length : of a segment, relative.
     youngs_modulus, area, stiffness, gain : relative.
     modulus_per_pressure : in Pa/Pa.
-    softening : as it is.
+    softening, lengthening : as they are.
+    bending_radius, dead_band : relative.
     offset : of a channel, in Pa.
     azimuth : of a channel, in rad.
     base_position, base_tilt, base_turn : of the base in the tracker's frame; its position, its
@@ -332,6 +341,9 @@ class Tolerances(Schema):
     offset: Annotated[Pressure, Field(gt=0)] = 1e3
     azimuth: Annotated[Angle, Field(gt=0)] = 0.05
     softening: Annotated[Number, Field(gt=0)] = 0.5
+    bending_radius: Annotated[Ratio, Field(gt=0)] = 0.5
+    lengthening: Annotated[Number, Field(gt=0)] = 1.0
+    dead_band: Annotated[Ratio, Field(gt=0)] = 0.7
     lag: Annotated[Ratio, Field(gt=0)] = 1.0
     dead_time: Annotated[Duration, Field(gt=0)] = 0.3
     share: Annotated[Ratio, Field(gt=0)] = 0.2

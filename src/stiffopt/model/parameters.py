@@ -64,6 +64,9 @@ _KINDS = {
     "compensation.inertia": _Kind("", True, "factor on the second moment of area"),
     "compensation.stiffness": _Kind("", True, "factor on the stiffness"),
     "compensation.softening": _Kind("", False, "share of softening"),
+    "compensation.bending_radius": _Kind("m", True, "least bending radius"),
+    "compensation.lengthening": _Kind("", False, "lengthening by bending"),
+    "corrections.dead_band": _Kind("Pa", True, "dead band"),
     "corrections.gain": _Kind("", True, "gain"),
     "corrections.offset": _Kind("Pa", False, "offset"),
     "corrections.azimuth": _Kind("rad", False, "azimuth"),
@@ -184,6 +187,7 @@ def explicit(description: RobotDescription) -> RobotDescription:
         corrections = Corrections(
             gain=given.gain or (1.0,) * count,
             offset=given.offset or (0.0,) * count,
+            dead_band=given.dead_band,
             azimuth=given.azimuth or (0.0,) * count,
         )
         update: dict[str, Any] = {
