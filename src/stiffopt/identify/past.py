@@ -145,12 +145,12 @@ class Past:
             kept[inside] = found[wanted[inside] - begin]
             state = found[-1]
         shares = np.array([part.share for part in history.parts])
-        c = self._channels
+        c, last = self._channels, history.stages - 1
         values, by_lag, by_dead, by_side = (kept[:, :, k * c : (k + 1) * c] for k in range(4))
 
         def mixed(states: Array) -> Array:
-            slow: Array = np.einsum("j,mjc->mc", shares, states[:, 1:])
-            return (1 - float(shares.sum())) * states[:, 0] + slow
+            slow: Array = np.einsum("j,mjc->mc", shares, states[:, last + 1 :])
+            return (1 - float(shares.sum())) * states[:, last] + slow
 
         end = Start(state[:, :c], state[:, 3 * c :], pressures[-1])
         return Effective(
@@ -158,7 +158,7 @@ class Past:
             per_lag=mixed(by_lag),
             per_dead_time=mixed(by_dead),
             per_side=mixed(by_side),
-            per_share=np.swapaxes(values[:, 1:] - values[:, :1], 1, 2),
+            per_share=np.swapaxes(values[:, last + 1 :] - values[:, last : last + 1], 1, 2),
             end=self._rested(end, history),
         )
 

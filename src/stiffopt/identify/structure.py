@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stiffopt.model.description import RobotDescription, Segment
+from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.history import History, Play
 
 __all__ = ["STRUCTURES", "Structure"]
 
 _LAG = 0.3  # s, where the robot file does not say
 _DEAD_TIME = 0.1  # s
-_WIDTHS = (0.05, 0.13, 0.27, 0.53)  # of plays, as shares of the range of pressures that was seen
+_WIDTHS = (0.05, 0.13, 0.27, 0.53)  # of plays, as shares of the highest pressure that was seen
 _SHARE = 0.05  # of each play, to begin with
+_BENDS_TO = 0.6  # least bending radius over the length of a segment
+_DEAD_BAND = 0.05  # of the highest pressure that was seen
 
 
 @dataclass(frozen=True)
@@ -22,23 +24,25 @@ class Structure:
     Attributes
     ----------
     name : for people and the command line.
+    words : what it has, in words.
     shape : names of the parameters of each segment's equilibrium that are fitted.
-    lag, dead_time, play : whether its history has them.
+    lag, play, dead_time : whether its history has them.
     """
 
     name: str
+    words: str
     shape: tuple[str, ...]
     lag: bool = False
-    dead_time: bool = False
     play: bool = False
+    dead_time: bool = False
 
     def applied(self, description: RobotDescription, seen: float) -> RobotDescription:
-        """The robot with the history of this structure.
+        """The robot from which the fit of this structure begins.
 
         Parameters
         ----------
         description : RobotDescription
-            What its own histories say is where the fit begins.
+            Where it already has what the structure has, that is where the fit begins.
         seen : float
             Highest pressure that was recorded, in Pa.
         """
@@ -46,29 +50,66 @@ class Structure:
         return description.model_copy(update={"segments": segments, "calibration": None})
 
     def _segment(self, segment: Segment, seen: float) -> Segment:
-        given = segment.history or History()
+        update: dict[str, object] = {"history": self._history(segment.history or History(), seen)}
+        if segment.strain_law == "paper":
+            given = segment.compensation or Compensation()
+            update["compensation"] = given.model_copy(
+                update={
+                    "bending_radius": (given.bending_radius or _BENDS_TO * segment.length)
+                    if "compensation.bending_radius" in self.shape
+                    else given.bending_radius
+                }
+            )
+        corrections = segment.corrections or Corrections()
+        update["corrections"] = corrections.model_copy(
+            update={
+                "dead_band": (corrections.dead_band or _DEAD_BAND * seen)
+                if "corrections.dead_band" in self.shape
+                else corrections.dead_band
+            }
+        )
+        return segment.model_copy(update=update)
+
+    def _history(self, given: History, seen: float) -> History | None:
+        if not (self.lag or self.play):
+            return None
         plays = given.play or tuple(Play(width=w * seen, share=_SHARE) for w in _WIDTHS)
-        history = History(
+        return History(
             dead_time=(given.dead_time or _DEAD_TIME) if self.dead_time else 0.0,
             lag=(given.lag or _LAG) if self.lag else 0.0,
             play=plays if self.play else (),
         )
-        return segment.model_copy(update={"history": history if self.lag or self.play else None})
 
 
 _BASIC = (
     "length",
     "material.youngs_modulus",
     "compensation.area",
+    "compensation.stiffness",
     "corrections.gain",
     "corrections.azimuth",
+    "compensation.modulus_per_pressure",
 )
-_FULL = (*_BASIC, "compensation.modulus_per_pressure")
+_PROGRESSIVE = (
+    *_BASIC,
+    "corrections.dead_band",
+    "compensation.bending_radius",
+    "compensation.lengthening",
+)
 
 STRUCTURES = (
-    Structure("static", _BASIC),
-    Structure("lag", _BASIC, lag=True),
-    Structure("dead-time", _BASIC, lag=True, dead_time=True),
-    Structure("hysteresis", _FULL, lag=True, dead_time=True, play=True),
+    Structure("static", "no history", _BASIC),
+    Structure("lag", "a first-order lag", _BASIC, lag=True),
+    Structure("hysteresis", "lag and play", _BASIC, lag=True, play=True),
+    Structure(
+        "delayed-hysteresis", "dead time, lag and play", _BASIC, lag=True, play=True, dead_time=True
+    ),
+    Structure(
+        "progressive",
+        "lag and play; a dead band, and bending that stiffens and lengthens",
+        _PROGRESSIVE,
+        lag=True,
+        play=True,
+    ),
 )
 """The simplest first."""

@@ -78,12 +78,15 @@ class History(Schema):
     ----------
     dead_time : until a pressure has any effect, in s.
     lag : time constant with which it then has its effect, in s.
+    stages : how many such lags there are in a row: 1, or 2 for a regulator and a chamber that
+        fills through its tube, which are taken for equally slow.
     play : hysteresis.
     creep : slow effects.
     """
 
     dead_time: Annotated[Duration, Field(ge=0)] = 0.0
     lag: Annotated[Duration, Field(ge=0)] = 0.0
+    stages: Annotated[int, Field(ge=1, le=2)] = 1
     play: Items[Play] = ()
     creep: Items[Creep] = ()
 
@@ -109,8 +112,8 @@ class History(Schema):
 
     @property
     def n_states(self) -> int:
-        """Number of states of one channel: x, each y and each z."""
-        return 1 + len(self.parts)
+        """Number of states of one channel: what each lag lets through, each y and each z."""
+        return self.stages + len(self.parts)
 
     def next_state(self, state: ca.SX, before: ca.SX, now: ca.SX, step: ca.SX) -> ca.SX:
         """State (m,) of a channel after a step, through which the (delayed) pressure runs evenly.
@@ -121,35 +124,46 @@ class History(Schema):
         Parameters
         ----------
         state : (m,)
-            Before the step: x, every y_j, every z_k.
+            Before the step: every x, the last of which counts, every y_j, every z_k.
         before, now : scalar
             Delayed pressure before and after the step, in Pa.
         step : scalar
             In s, positive.
         """
         ramp = (now - before) / step
-        if ca.SX(self.lag).is_zero():
-            start, transient, following = before, None, now
-        else:  # x(t) = start + ramp t + transient exp(-t / lag)
-            start = before - ramp * self.lag
-            transient = state[0] - start
-            following = now - ramp * self.lag + transient * ca.exp(-step / self.lag)
-        end: list[ca.SX] = [following]
-        for index, play in enumerate(self.play, start=1):
+        lag: ca.SX | float = self.lag
+        instant = ca.SX(lag).is_zero()
+        # stage i: x_i(t) = before - i lag ramp + ramp t + transients[i] exp(-t / lag), in which
+        # what the stage before still lets through makes the transient a polynomial in t / lag
+        transients: list[ca.SX] = []
+        end: list[ca.SX] = []
+        for i in range(self.stages):
+            if instant:
+                end.append(now)
+                continue
+            transients.append(state[i] - before + (i + 1) * lag * ramp)
+            left = transients[i] + (step / lag * transients[i - 1] if i else 0)
+            end.append(now - (i + 1) * lag * ramp + left * ca.exp(-step / lag))
+        following = end[-1]
+        for index, play in enumerate(self.play, start=self.stages):
             y = state[index]
             end.append(ca.fmax(following - play.width, ca.fmin(following + play.width, y)))
-        for index, creep in enumerate(self.creep, start=1 + len(self.play)):
+        for index, creep in enumerate(self.creep, start=self.stages + len(self.play)):
             decay = ca.exp(-step / creep.time)
-            late = (1 - decay) * start + ramp * (step - creep.time * (1 - decay))
-            if transient is not None:
-                late += transient * _convolution(step / creep.time, step / self.lag)
+            late = (1 - decay) * before + ramp * (step - creep.time * (1 - decay))
+            if not instant:
+                late -= (1 - decay) * self.stages * lag * ramp
+                for transient, weight in zip(
+                    reversed(transients), _convolutions(step / creep.time, step / lag), strict=False
+                ):
+                    late += transient * weight
             end.append(decay * state[index] + late)
         return ca.vertcat(*end)
 
     def effective(self, state: ca.SX) -> ca.SX:
         """Pressure u that in equilibrium would give the shape which belongs to a state (m,)."""
-        x = u = state[0]
-        for index, part in enumerate(self.parts, start=1):
+        x = u = state[self.stages - 1]
+        for index, part in enumerate(self.parts, start=self.stages):
             u = u + part.share * (state[index] - x)
         return u
 
@@ -165,16 +179,25 @@ class History(Schema):
             middle.
         """
         plays = [pressure + side * play.width for play in self.play]
-        return np.array([pressure, *plays, *[pressure] * len(self.creep)])
+        return np.array([*[pressure] * self.stages, *plays, *[pressure] * len(self.creep)])
 
     def from_rest(self, pressure: float) -> Array:
         """State (m,) long after a rise from no pressure, on an arm that knew none before."""
         widths = [play.width for play in self.play]
         plays = [float(np.clip(0.0, pressure - w, pressure + w)) for w in widths]
-        return np.array([pressure, *plays, *[pressure] * len(self.creep)])
+        return np.array([*[pressure] * self.stages, *plays, *[pressure] * len(self.creep)])
 
 
 NO_HISTORY = History()
+
+
+def _convolutions(a: ca.SX, b: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """``int_0^1 a exp(-a (1 - t)) (b t)^k exp(-b t) dt`` for k = 0 and 1."""
+    rates = ca.SX.sym("a"), ca.SX.sym("b")
+    first = _convolution(*rates)
+    both = ca.Function("both", rates, [first, -rates[1] * ca.jacobian(first, rates[1])])
+    found: tuple[ca.SX, ca.SX] = both.call([a, b])
+    return found
 
 
 def _convolution(a: ca.SX, b: ca.SX) -> ca.SX:
