@@ -16,34 +16,17 @@ __all__ = ["begins", "chosen_rows", "sample", "thinned"]
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-_ON_THE_WAY = 0.5  # of the rows are spread over the way of the pressures, the rest over time
 _STRAIGHT = 1e-3  # of the range of pressures: commands this near to a line are on it
 _LONGEST_GAP = 64  # rows that are left out at once
 _REST = 0.02  # of the range of pressures: below, an arm is at rest
 
 
-def chosen_rows(recording: Recording, span: Array, most: int) -> Rows:
-    """Rows (M,) to compare: spread over time and over the way that the pressures went.
-
-    Parameters
-    ----------
-    recording : Recording
-    span : (n,)
-        Range of each channel's pressure, in Pa.
-    most : int
-        Not more rows than this.
-    """
+def chosen_rows(recording: Recording, most: int) -> Rows:
+    """Rows (M,) to compare: at most so many of those in which the tip was seen, evenly spread."""
     usable = np.flatnonzero(np.isfinite(recording.tracks[0].position).all(axis=1))
     if len(usable) <= most:
         return usable
-    way = np.abs(np.diff(recording.pressures[usable] / span, axis=0)).sum(axis=1)
-    time = np.diff(recording.time[usable])
-    total = way.sum()
-    share = _ON_THE_WAY if total > 0 else 0.0
-    pace = (1 - share) * time / time.sum() + (share * way / total if total > 0 else 0.0)
-    mark = np.concatenate([[0.0], np.cumsum(pace)])
-    places = np.searchsorted(mark, np.linspace(0, mark[-1], most)).clip(max=len(usable) - 1)
-    chosen: Rows = usable[np.unique(places)]
+    chosen: Rows = usable[np.linspace(0, len(usable) - 1, most).round().astype(np.intp)]
     return chosen
 
 
@@ -98,7 +81,7 @@ def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording,
 
 def sample(recording: Recording, span: Array, most: int, begin: Begin) -> Sample:
     """Sample of at most so many rows of a recording."""
-    rows = chosen_rows(recording, span, most)
+    rows = chosen_rows(recording, most)
     smaller, places = thinned(recording, rows, span)
     return Sample(smaller, places, np.ones(len(places)), begin)
 

@@ -59,7 +59,7 @@ def compare(
     samples, kept = [], []
     for recording, begin in zip(recordings, states, strict=True):
         every = np.arange(len(recording.time))
-        rows = every if len(every) <= most else chosen_rows(recording, span, most)
+        rows = every if len(every) <= most else chosen_rows(recording, most)
         smaller, places = thinned(recording, rows, span)
         samples.append(Sample(smaller, places, np.ones(len(places)), begin))
         kept.append(rows)

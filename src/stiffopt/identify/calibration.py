@@ -1,0 +1,360 @@
+"""Calibrate: from recordings of an arm to a robot file that predicts it, with its uncertainty."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.errors import InputError
+from stiffopt.identify.choice import Candidate, best, held_back_errors
+from stiffopt.identify.comparison import Comparison, Errors
+from stiffopt.identify.estimates import Estimate, doubts, estimates
+from stiffopt.identify.fit import Fit, fit
+from stiffopt.identify.recording import Recording, prepare
+from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.setup import Setup, named, started
+from stiffopt.identify.structure import STRUCTURES, Structure
+from stiffopt.identify.unknowns import BASE
+from stiffopt.identify.validation import compare, placements
+from stiffopt.logs import Log, StiffnessTable
+from stiffopt.model.calibration import Calibration, FittedParameter
+from stiffopt.model.description import Recordings, RobotDescription
+from stiffopt.model.parameters import Parameter, with_values
+from stiffopt.registration import Placement, Registration
+
+__all__ = ["CalibrationResult", "calibrate", "recordings_of"]
+
+Array = NDArray[np.float64]
+Progress = Callable[[float, float, str], None]
+
+_SCREENING_ROWS = 150
+_TURNS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)  # rad; starts where the turn is not known
+_UNKNOWN_TURN = 0.5  # rad; a base that may be turned further has several starts
+_UNKNOWN_MODULUS = 0.5  # relative; a modulus that may be further off has several starts
+_FINEST_DEAD_TIME = 0.1  # s between rows; of slower logs dead time and lag are one
+_DIGITS = 4  # of correlations in the file
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """What a calibration found.
+
+    Attributes
+    ----------
+    before, robot : RobotDescription
+        The robot file as it was, and calibrated.
+    structure : Structure
+        That was chosen.
+    candidates : tuple of Candidate
+        That it was chosen from, the simplest first.
+    estimates : tuple of Estimate
+        Every number that was fitted.
+    nominal, calibrated : tuple of Comparison
+        The logs beside what the robot predicts before and after.
+    held_back : dict of str to Errors
+        Errors in logs (or parts of a log) when the others are fitted.
+    tables : tuple of StiffnessTable
+    remarks : tuple of str
+        What was found in the logs, and what to make of the result, one sentence each.
+    """
+
+    before: RobotDescription
+    robot: RobotDescription
+    structure: Structure
+    candidates: tuple[Candidate, ...]
+    estimates: tuple[Estimate, ...]
+    nominal: tuple[Comparison, ...]
+    calibrated: tuple[Comparison, ...]
+    held_back: dict[str, Errors]
+    tables: tuple[StiffnessTable, ...]
+    remarks: tuple[str, ...]
+
+
+def calibrate(
+    description: RobotDescription,
+    logs: Sequence[tuple[str, Log]],
+    tables: Sequence[StiffnessTable] = (),
+    settings: CalibrationSettings | None = None,
+    progress: Progress | None = None,
+) -> CalibrationResult:
+    """Fit a robot to recordings.
+
+    Parameters
+    ----------
+    description : RobotDescription
+        Where the fit begins; its tolerances say how far it may be expected to go.
+    logs : sequence of (name, Log)
+        In the order in which they were recorded.
+    tables : sequence of StiffnessTable
+        Fitted together with the logs.
+    settings : CalibrationSettings, optional
+    progress : callable, optional
+        Is told what is done, of how much, and in words.
+
+    Raises
+    ------
+    InputError
+        There is nothing to fit, or a log is not usable; it names the log.
+    EquilibriumError
+        An arm under gravity buckles on the way.
+    """
+    settings = settings or CalibrationSettings()
+    if not logs and not tables:
+        raise InputError("there is nothing to fit to; expected a log or a table of stiffness")
+    structures = _structures(settings)
+    teller = _Teller(progress, len(structures))
+    recordings = recordings_of(description, logs, settings)
+    setup = Setup.of(description, recordings, tables, settings)
+    if not recordings:  # poses are taken to be as the robot file has them
+        teller.begin("fitting the stiffness")
+        alone = Structure("stiffness", "stiffness alone", ("compensation.stiffness",))
+        return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
+    near = _screened(setup, teller)
+    candidates = []
+    for structure in structures:
+        if structure.dead_time and len(structures) > 1 and _is_slow(recordings):
+            continue
+        teller.begin(f"fitting {structure.words}")
+        problem = setup.problem(structure, settings.trial_rows)
+        found = fit(problem, [started(problem, near)], teller)
+        near = {**near, **named(found.problem, found.x)}
+        teller.begin(f"predicting held-back logs: {structure.words}")
+        folds = held_back_errors(found, settings.settle, teller)
+        candidates.append(Candidate(structure, found, folds))
+    chosen = best(candidates)
+    teller.begin(f"final fit: {chosen.structure.words}")
+    near = named(chosen.fit.problem, chosen.fit.x)
+    final = _final(setup, chosen.structure, near, teller)
+    return _result(setup, final, chosen.structure, candidates, teller)
+
+
+def recordings_of(
+    description: RobotDescription,
+    logs: Sequence[tuple[str, Log]],
+    settings: CalibrationSettings,
+) -> list[Recording]:
+    """Return logs as a fit and a validation use them."""
+    given = placements(description)
+    return [
+        prepare(
+            log,
+            name,
+            description,
+            channels=given.channels or None,
+            frame=given.frame,
+            bodies=tuple(given.bodies),
+            pressures=settings.pressures,
+        )
+        for name, log in logs
+    ]
+
+
+class _Teller:
+    """Tells progress as evaluations go by, of which nobody knows how many there will be."""
+
+    def __init__(self, progress: Progress | None, structures: int) -> None:
+        self._progress = progress
+        self._phases = 2.0 * structures + 2.0
+        self._phase = 0
+        self._evaluations = 0
+        self._words = ""
+
+    def begin(self, words: str) -> None:
+        self._phase += 1
+        self._evaluations = 0
+        self._words = words
+        self()
+
+    def __call__(self) -> None:
+        if self._progress is not None:
+            # nears the end of the phase, however many there are
+            share = 1 - 1 / (1 + self._evaluations / 60)
+            done = min(self._phase - 1 + share, self._phases)
+            self._progress(done, self._phases, self._words)
+        self._evaluations += 1
+
+
+def _structures(settings: CalibrationSettings) -> list[Structure]:
+    known = {structure.name: structure for structure in STRUCTURES}
+    for name in settings.structures:
+        if name not in known:
+            raise InputError(f"there is no model '{name}'; choose one of auto, {', '.join(known)}")
+    return [known[name] for name in settings.structures]
+
+
+def _is_slow(recordings: Sequence[Recording]) -> bool:
+    steps = [float(np.median(np.diff(recording.time))) for recording in recordings]
+    return max(steps) > _FINEST_DEAD_TIME
+
+
+def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
+    """Coordinates by name near the best of several starts, from few rows."""
+    teller.begin("looking for a start")
+    problem = setup.problem(STRUCTURES[1], _SCREENING_ROWS)
+    tolerances = setup.tolerances
+    turns = _TURNS if tolerances.base_turn > _UNKNOWN_TURN else (0.0,)
+    moduli = (0.0, -1.0, 1.0) if tolerances.youngs_modulus > _UNKNOWN_MODULUS else (0.0,)
+    starts = []
+    for turn, modulus in itertools.product(turns, moduli):
+        start = started(problem, {})
+        for i, unknown in enumerate(problem.unknowns.all):
+            if unknown.name == f"{BASE}, about z":
+                start[i] = turn / unknown.deviation
+            if unknown.parameter is not None and unknown.parameter.key.endswith("youngs_modulus"):
+                start[i] = modulus
+        starts.append(start)
+    return named(problem, fit(problem, starts, teller, rounds=1).x)
+
+
+def _final(setup: Setup, structure: Structure, near: Mapping[str, float], teller: _Teller) -> Fit:
+    """Fit all that counts; with tables, both as soft as poses say and not softened by pressure.
+
+    Poses alone do not tell whether pressure softens the arm or acts ever more strongly on it;
+    stiffness does, and the better of the two extremes is taken.
+    """
+    found = []
+    for description in _softenings(setup):
+        own = replace(setup, description=description)
+        problem = own.problem(structure, setup.settings.rows)
+        found.append(fit(problem, [started(problem, near)], teller))
+    return min(found, key=lambda each: each.cost)
+
+
+def _softenings(setup: Setup) -> list[RobotDescription]:
+    """The robot as it is and, if there are tables, with the other extreme of softening."""
+    description = setup.description
+    slopes = [
+        segment.compensation and segment.compensation.modulus_per_pressure
+        for segment in description.segments
+    ]
+    if not setup.tables or not any(slopes):
+        return [description]
+    values = {
+        Parameter(f"segments[{s}].compensation.softening"): 0.0
+        for s, segment in enumerate(description.segments)
+    }
+    return [description, with_values(description, values)]
+
+
+def _result(
+    setup: Setup,
+    found: Fit,
+    structure: Structure,
+    candidates: Sequence[Candidate],
+    teller: _Teller,
+) -> CalibrationResult:
+    listed = estimates(found)
+    settings = setup.settings
+    robot = _robot(setup, found)
+    teller.begin("comparing")
+
+    def compared(description: RobotDescription) -> tuple[Comparison, ...]:
+        return compare(
+            description,
+            setup.recordings,
+            sequence=settings.sequence,
+            rezero=settings.rezero,
+            settle=settings.settle,
+            tell=teller,
+        )
+
+    remarks = [
+        f"{recording.name}: {remark}"
+        for recording in setup.recordings
+        for remark in recording.remarks
+    ]
+    folds = [each.folds for each in candidates if each.structure is structure]
+    return CalibrationResult(
+        before=setup.description,
+        robot=robot,
+        structure=structure,
+        candidates=tuple(candidates),
+        estimates=listed,
+        nominal=compared(setup.description) if setup.recordings else (),
+        calibrated=compared(robot) if setup.recordings else (),
+        held_back=folds[0] if folds else {},
+        tables=setup.tables,
+        remarks=(*remarks, *doubts(found, listed)),
+    )
+
+
+def _robot(setup: Setup, found: Fit) -> RobotDescription:
+    """The calibrated robot, with where the tracker is and how well all is known."""
+    problem, x = found.problem, found.x
+    given = placements(setup.description)
+    recordings = setup.description.recordings
+    if setup.recordings:
+        base, sensors, _, _ = problem.unknowns.slices()
+        moves = x * problem.scale
+        base_in_tracker = problem.base_in_tracker @ _motion(moves[base])
+        places = {
+            point.name: Placement.of(_inverse(_motion(moves[own]) @ point.sensor))
+            for point, own in zip(problem.points, sensors, strict=True)
+        }
+        recordings = Recordings(
+            channels=given.channels,
+            frame=given.frame,
+            registration=Registration(
+                tracker_in_base=Placement.of(_inverse(base_in_tracker)),
+                tip_in_sensor=places["tip"],
+            ),
+            bodies={
+                name: body.model_copy(update={"point_in_sensor": places[name]})
+                for name, body in given.bodies.items()
+            },
+        )
+    robot = found.robot
+    return robot.model_copy(update={"recordings": recordings, "calibration": _record(setup, found)})
+
+
+def _record(setup: Setup, found: Fit) -> Calibration:
+    """What the robot file says of how well it is known."""
+    shape = [
+        i
+        for i, unknown in enumerate(found.problem.unknowns.parameters)
+        if unknown.parameter is not None and not unknown.parameter.is_history
+    ]
+    unknowns = [found.problem.unknowns.all[i] for i in shape]
+    covariance = found.covariance[np.ix_(shape, shape)]
+    deviation = np.sqrt(np.diag(covariance))
+    correlation = np.round(covariance / np.outer(deviation, deviation), _DIGITS)
+    pressures = [recording.pressures for recording in setup.recordings]
+    pressures += [table.pressures for table in setup.tables]
+    seen = np.concatenate(pressures)
+    ends = np.cumsum([0, *(segment.n_channels for segment in setup.description.segments)])
+    norms = [float(np.linalg.norm(seen[:, a:b], axis=1).max()) for a, b in itertools.pairwise(ends)]
+    turns = any(point.turns for point in found.problem.points)
+    return Calibration(
+        logs=tuple(recording.name for recording in setup.recordings),
+        parameters=tuple(
+            FittedParameter(
+                key=unknown.parameter.key,
+                deviation=float(f"{d * unknown.deviation:.6g}"),
+                prior=unknown.deviation,
+            )
+            for unknown, d in zip(unknowns, deviation, strict=True)
+            if unknown.parameter is not None
+        ),
+        correlation=tuple(tuple(row) for row in correlation.tolist()),
+        position_residual=found.problem.noise.position if setup.recordings else 0.0,
+        angle_residual=found.problem.noise.angle if turns else None,
+        pressure_min=tuple(seen.min(axis=0).tolist()),
+        pressure_max=tuple(seen.max(axis=0).tolist()),
+        pressure_norm=tuple(norms),
+    )
+
+
+def _motion(twist: Array) -> Array:
+    """Transform (4, 4) of a twist (6,), (3,) without a turn, or of nothing."""
+    full = np.zeros(6)
+    full[: len(twist)] = twist
+    return np.asarray(lie.exp(full))
+
+
+def _inverse(transform: Array) -> Array:
+    return np.asarray(np.linalg.inv(transform))

@@ -1,0 +1,131 @@
+"""What was learnt of each number, and what was not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stiffopt.identify.fit import Fit
+from stiffopt.identify.unknowns import BASE, SENSOR
+
+__all__ = ["Estimate", "doubts", "estimates"]
+
+_LEARNT = 0.5  # share of the prior's variance that must be gone
+_TIED = 0.95  # correlation from which two numbers cannot be told apart
+_FAR = 3.0  # deviations from the robot file
+_TILT = np.radians(8.0)  # of base or sensor, that is doubted whatever the tolerance
+_NORMAL = 1.959963984540054
+
+_EXPERIMENTS = (
+    ("compensation.stiffness", "'stiffopt experiment stiffness', whose table is fitted too"),
+    ("material.youngs_modulus", "'stiffopt experiment stiffness', whose table is fitted too"),
+    ("compensation.area", "all channels of the segment at the same pressure, in steps"),
+    ("corrections.gain", "each channel alone, to its highest pressure"),
+    ("corrections.azimuth", "each channel alone, with the tip's orientation recorded"),
+    ("corrections.offset", "small pressures, near zero"),
+    ("corrections.dead_band", "small pressures, near zero, in slow ramps"),
+    ("compensation.modulus_per_pressure", "several channels at once, to high pressures"),
+    ("compensation.bending_radius", "each channel alone, to its highest pressure"),
+    ("compensation.lengthening", "each channel alone, to its highest pressure"),
+    ("length", "a calliper, or the tip's orientation recorded while it bends far"),
+    ("history.lag", "steps of pressure, logged at 10 Hz or more"),
+    ("history.dead_time", "steps of pressure, logged at 10 Hz or more"),
+    ("history.play", "the same pressures reached from below and from above"),
+    (BASE, "the base tracked too, or touched with a pointer"),
+    (SENSOR, "the tip's orientation recorded while it bends in all directions"),
+)
+"""For the beginning of a key (or of a name) what would tell."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number that was fitted.
+
+    Attributes
+    ----------
+    name : for people.
+    key : in the robot file, or empty.
+    unit : SI unit; empty for a plain number.
+    before, value : in SI; of a frame's move, zero before.
+    low, high : 95 % interval.
+    learnt : share of the prior's variance that the data removed, from 0 to 1.
+    far : how many prior deviations from the robot file it ended.
+    """
+
+    name: str
+    key: str
+    unit: str
+    before: float
+    value: float
+    low: float
+    high: float
+    learnt: float
+    far: float
+
+
+def estimates(found: Fit) -> tuple[Estimate, ...]:
+    """Every number of a fit with its interval."""
+    variance = np.diag(found.covariance)
+    listed = []
+    for unknown, x, v in zip(found.problem.unknowns.all, found.x, variance, strict=True):
+        middle, half = x * unknown.deviation, _NORMAL * math.sqrt(v) * unknown.deviation
+        ends = [max(middle - half, unknown.low), middle, min(middle + half, unknown.high)]
+        before, unit, key = 0.0, unknown.unit, ""
+        if unknown.parameter is not None:
+            key, unit = unknown.parameter.key, unknown.parameter.unit
+            before = unknown.parameter.value(found.problem.description)
+            ends = [float(unknown.parameter.at(before, end)) for end in ends]
+        listed.append(
+            Estimate(
+                unknown.name,
+                key,
+                unit,
+                before,
+                ends[1],
+                ends[0],
+                ends[2],
+                learnt=float(np.clip(1 - v, 0, 1)),
+                far=float(x),
+            )  # fmt: skip
+        )
+    return tuple(listed)
+
+
+def doubts(found: Fit, listed: Sequence[Estimate]) -> list[str]:
+    """What to make of the numbers: not learnt, not told apart, or far from the robot file."""
+    remarks = []
+    unlearnt: dict[str, list[str]] = {}
+    for estimate in listed:
+        if estimate.learnt < _LEARNT:
+            unlearnt.setdefault(_experiment(estimate), []).append(estimate.name)
+    for experiment, names in unlearnt.items():
+        tell = f"; what would tell: {experiment}" if experiment else ""
+        remarks.append(f"not learnt from these data: {'; '.join(names)}{tell}")
+    deviation = np.sqrt(np.diag(found.covariance))
+    correlation = found.covariance / np.outer(deviation, deviation)
+    for i, one in enumerate(listed):
+        for j in range(i):
+            if abs(correlation[i, j]) > _TIED:
+                remarks.append(
+                    f"hardly told apart: {listed[j].name} and {one.name} "
+                    f"(correlation {correlation[i, j]:.2f})"
+                )
+    for estimate in listed:
+        turned = estimate.unit == "rad" and not estimate.key and not estimate.name.endswith("z")
+        if abs(estimate.far) > _FAR or (turned and abs(estimate.value) > _TILT):
+            remarks.append(
+                f"far from the robot file: {estimate.name}, by {abs(estimate.far):.1f} of its "
+                "tolerances; look for a reason before you trust it"
+            )
+    return remarks
+
+
+def _experiment(estimate: Estimate) -> str:
+    key = estimate.key.partition("].")[2]
+    for beginning, experiment in _EXPERIMENTS:
+        if (key and key.startswith(beginning)) or estimate.name.startswith(beginning):
+            return experiment
+    return ""
