@@ -1,9 +1,10 @@
-"""From pressures to strains: sections, the paper's law, the neo-Hookean law, the registry."""
+"""From pressures to strains: sections, strain laws with compensation, corrections, the registry."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -18,46 +19,87 @@ from independent import (
     LOPSIDED,
     PAIR,
     SIX,
+    Arm,
+    RodSection,
     Tube,
     derivative,
     eq_9,
     neo_hookean,
+    paper_section,
     rod_section,
     section,
+    shift,
+    wrench_map,
 )
+from stiffopt.errors import InputError
 from stiffopt.model.actuation import (
     NORM_SMOOTHING,
     STRAIN_LAWS,
     SectionGeometry,
     neo_hookean_stretch,
+    onset,
     smooth_norm,
     strain_law,
 )
-from stiffopt.model.description import Segment
+from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.robot_files import load_description
 
 Vector = NDArray[np.float64]
 
 TUBES = {"flop": FLOP, "cross": CROSS, "pair": PAIR, "lopsided": LOPSIDED, "six": SIX}
-LAWS = {"paper": lambda tube: tube, "neo-hookean": neo_hookean}
+LAWS = {
+    "paper": lambda tube: tube,
+    "rest-length": lambda tube: replace(tube, law="rest-length"),
+    "neo-hookean": neo_hookean,
+}
 
 
-def segment_of(tube: Tube) -> Segment:
-    return Segment(**tube.mapping())
+def segment_of(tube: Tube, **compensation: float) -> Segment:
+    """Segment of a tube, with some of its compensation replaced."""
+    mapping = tube.mapping()
+    if compensation:
+        mapping["compensation"] = (mapping["compensation"] or {}) | compensation
+    return Segment(**mapping)
 
 
 @cache
-def law_of(tube: Tube) -> ca.Function:
+def function_of(segment: Segment) -> ca.Function:
     """Strain (6,), compliance (6, 6) and margin of a segment as a function of its pressures."""
-    law = strain_law(segment_of(tube))
-    p = ca.SX.sym("p", len(tube.channels))
+    law = strain_law(segment)
+    p = ca.SX.sym("p", segment.n_channels)
     part = law.section(p)
     outputs = [part.strain, ca.densify(part.compliance), law.margin(p)]
     return ca.Function("law", [p], outputs)
 
 
-def strain_and_compliance(tube: Tube, p: Vector) -> tuple[Vector, Vector]:
-    strain, compliance, _ = law_of(tube)(p)
+def law_of(tube: Tube) -> ca.Function:
+    return function_of(segment_of(tube))
+
+
+def evaluated(segment: Segment, p: Vector) -> tuple[Vector, Vector]:
+    """Strain (6,) and compliance (6, 6) of a segment."""
+    strain, compliance, _ = function_of(segment)(p)
     return strain.full()[:, 0], compliance.full()
+
+
+def strain_and_compliance(tube: Tube, p: Vector) -> tuple[Vector, Vector]:
+    return evaluated(segment_of(tube), p)
+
+
+def expected_section(tube: Tube, p: Vector) -> RodSection:
+    """Strain and compliance about the axis by formulas that know nothing of stiffopt."""
+    if tube.law != "rest-length":
+        return rod_section(tube, p, (0, 0, 0))
+    found = paper_section(tube, p)  # the same numbers, but none is multiplied by the stretch
+    (x, y), (kx, ky) = found.centroid, found.curvature
+    inverse = np.linalg.inv(wrench_map(shift(x, y, 0)))
+    return RodSection(
+        strain=np.array([0, 0, found.stretch + ky * x - kx * y, kx, ky, 0]),
+        compliance=inverse.T @ found.flexibility @ inverse,
+        weight=np.zeros(3),
+        centroid=np.append(found.centroid, 0.0),
+    )
 
 
 def some_pressures(tube: Tube, seed: int = 0, highest: float = 1e5) -> Vector:
@@ -123,7 +165,7 @@ def test_sections_against_independent_formulas(name: str, law: str) -> None:
     for seed in range(3):
         p = some_pressures(tube, seed)
         strain, C = strain_and_compliance(tube, p)
-        expected = rod_section(tube, p, (0, 0, 0))
+        expected = expected_section(tube, p)
         # the cone's rounding of 0.01 Pa shows in the eighth digit of the modulus
         assert strain == pytest.approx(expected.strain, rel=2e-7, abs=1e-12)
         size = np.sqrt(np.outer(np.diag(expected.compliance), np.diag(expected.compliance)))
@@ -272,6 +314,361 @@ def test_neo_hookean_strain_balances_the_pressure_to_first_order_in_curvature(na
         errors.append(np.abs((resultant(tube, shrink, strain) - applied) / size).max())
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     assert errors[1] < 1e-3
+
+
+# -- compensation ---------------------------------------------------------------------------
+
+
+def scaled(matrix: Vector, size: Vector) -> Vector:
+    """A compliance in units of the diagonal of another."""
+    return matrix / np.sqrt(np.outer(np.diag(size), np.diag(size)))
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", TUBES)
+def test_a_compensation_that_says_nothing_changes_nothing(name: str, law: str) -> None:
+    tube = LAWS[law](replace(TUBES[name], factors=None))
+    p = some_pressures(tube)
+    for plain, spelled in zip(
+        evaluated(segment_of(tube), p),
+        evaluated(Segment(**tube.mapping() | {"compensation": Compensation()}), p),
+        strict=True,
+    ):
+        assert np.array_equal(plain, spelled)
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", ["flop", "lopsided"])
+def test_free_shapes_know_nothing_of_stiffness_and_softening(name: str, law: str) -> None:
+    """Loads meet ``stiffness (E + softening slope |p|)``; every flexibility is one over that."""
+    tube = LAWS[law](TUBES[name])
+    given = {"modulus_per_pressure": -0.3, "area": 1.1, "inertia": 0.9}
+    for seed, softening in enumerate((0.0, 0.25, 1.0)):
+        p = some_pressures(tube, seed)
+        free, C = evaluated(segment_of(tube, **given), p)
+        strain, loaded = evaluated(segment_of(tube, **given, stiffness=1.4, softening=softening), p)
+        assert strain == pytest.approx(free, rel=1e-14, abs=1e-16)
+        E, slope = tube.youngs_modulus, -0.3 * np.linalg.norm(p)
+        ratio = (E + slope) / (1.4 * (E + softening * slope))
+        assert scaled(loaded, C) == pytest.approx(ratio * scaled(C, C), abs=1e-6)
+
+
+def test_stiffness_of_a_segment_that_pressure_does_not_soften() -> None:
+    """Values of another implementation, in N/m."""
+    mapping = load_description("stiff-flop-1").model_dump()
+    mapping["segments"][0]["compensation"] |= {"stiffness": 1.396, "softening": 0.0}
+    robot = Manipulator(RobotDescription(**mapping))
+    for pressures, expected in {
+        (0.4, 0, 0): (19.22, 18.40, 337.43),
+        (0.8, 0, 0): (21.27, 17.03, 91.84),
+        (1.0, 0, 0): (24.27, 16.28, 55.64),
+        (1.5, 0, 0): (56.29, 14.44, 23.19),
+        (0.5, 1.0, 0.2): (14.531, 18.047, 77.863),
+    }.items():
+        found = [robot.stiffness(1e5 * np.array(pressures), axis) for axis in np.eye(3)]
+        assert found == pytest.approx(expected, rel=3e-4)
+
+
+def moment_pressures(tube: Tube, p: Vector, moment: Vector) -> Vector:
+    """Pressures that add a moment (M_x, M_y) to that of p, and no force."""
+    geometry = SectionGeometry.of(segment_of(tube))
+    first = np.array([moment[1], moment[0]]) * [-1, 1]  # int r P dA
+    wanted = np.array([*first, 0.0])
+    effect = np.vstack([geometry.channel_moment.T, geometry.channel_force])
+    return p + np.linalg.pinv(effect) @ wanted
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("name", ["flop", "cross", "six"])
+def test_loads_bend_by_the_derivative_of_the_limited_curvature(name: str, law: str) -> None:
+    """A moment by added pressures without a force bends like one by a load; isotropic section."""
+    tube = LAWS[law](replace(TUBES[name], factors=None))
+    p = 0.8e5 * np.linspace(1, 0, len(tube.channels))
+    free, _ = evaluated(segment_of(tube), p)
+    segment = segment_of(tube, bending_radius=0.5 / float(np.linalg.norm(free[3:5])))
+    strain, C = evaluated(segment, p)
+    assert np.linalg.norm(strain[3:5]) < 0.97 * np.linalg.norm(free[3:5])
+
+    def curvature(moment: Vector) -> Vector:
+        return evaluated(segment, moment_pressures(tube, p, moment))[0][3:5]
+
+    slope = derivative(curvature, np.zeros(2), 1e-5)
+    # of chambers that shrink with the section, see the neo-Hookean law
+    lever = section(tube, p).stretch ** -0.5 if law == "neo-hookean" else 1.0
+    assert C[3:5, 3:5] == pytest.approx(slope / lever, rel=1e-7, abs=1e-7 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("name", ["pair", "lopsided"])
+def test_a_bending_radius_keeps_the_compliance_symmetric(name: str) -> None:
+    """Where the section has a weak axis, the determinant is still that of the derivative."""
+    tube = replace(TUBES[name], factors=None)
+    radius = 0.4 * tube.length
+    p = some_pressures(tube, 1)
+    free, C = evaluated(segment_of(tube), p)
+    strain, less = evaluated(segment_of(tube, bending_radius=radius), p)
+    assert np.allclose(less, less.T, rtol=1e-12, atol=1e-15)
+    stretch = section(tube, p).stretch
+    kappa = free[3:5] / stretch
+    limited = kappa / np.hypot(1, radius * np.linalg.norm(kappa))
+    assert strain[3:5] == pytest.approx(stretch * limited, rel=1e-12)
+    slope = derivative(lambda k: k / np.hypot(1, radius * np.linalg.norm(k)), kappa, 1e-3 / radius)
+    parts = [np.linalg.det(matrix[3:5, 3:5]) for matrix in (less, C)]
+    assert parts[0] == pytest.approx(np.linalg.det(slope) * parts[1], rel=1e-9)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_pressure_bends_ever_more_but_no_further_than_the_radius(law: str) -> None:
+    tube = LAWS[law](replace(FLOP, factors=None))
+    segment = segment_of(tube, bending_radius=0.03, area=1e7)  # hardly stretches
+    curvatures = [
+        float(np.linalg.norm(evaluated(segment, q * np.array([1, 0, 0.3]))[0][3:5]))
+        for q in np.geomspace(1e2, 1e9, 50)
+    ]
+    assert (np.diff(curvatures) > 0).all()
+    little = evaluated(segment_of(tube, area=1e7), np.array([1e2, 0, 30]))[0][3:5]
+    assert curvatures[0] == pytest.approx(np.linalg.norm(little), rel=1e-4)
+    assert curvatures[-1] * 0.03 == pytest.approx(1, rel=1e-4)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_bending_lengthens_the_axis_by_the_squared_strain_of_the_wall(law: str) -> None:
+    tube = LAWS[law](FLOP)
+    p = np.array([1.2e5, 0.1e5, 0.4e5])
+    free, C = evaluated(segment_of(tube, bending_radius=0.07), p)
+    strain, longer = evaluated(segment_of(tube, bending_radius=0.07, lengthening=0.6), p)
+    if law == "paper":  # curvature and compliance are per deformed length
+        curvature = free[3:5] / free[2]
+        assert strain[3:5] == pytest.approx(free[3:5] * strain[2] / free[2], rel=1e-12)
+        assert longer == pytest.approx(C * strain[2] / free[2], rel=1e-12)
+    else:
+        curvature = free[3:5]
+        assert strain[3:5] == pytest.approx(free[3:5], rel=1e-14)
+        assert longer == pytest.approx(C, rel=1e-14)
+    wall = 0.015 * np.linalg.norm(curvature)
+    assert strain[2] - free[2] == pytest.approx(0.6 * wall**2, rel=1e-10)
+    assert wall > 0.05
+
+
+@pytest.mark.parametrize("name", TUBES)
+def test_compensated_neo_hookean_section_by_integrated_stresses(name: str) -> None:
+    """The stretch by a root, stiffnesses by differences of stresses over a scaled section."""
+    tube = neo_hookean(TUBES[name])
+    given = {"modulus_per_pressure": -0.25, "area": 1.2, "inertia": 1.05}
+    segment = segment_of(tube, **given, stiffness=1.3, softening=0.4)
+    geometry = SectionGeometry.of(segment)
+    p = np.full(len(tube.channels), 0.6e5)
+    norm = np.linalg.norm(p)
+    pushed = replace(tube, youngs_modulus=tube.youngs_modulus - 0.25 * norm)
+    met = replace(tube, youngs_modulus=1.3 * (tube.youngs_modulus - 0.25 * 0.4 * norm))
+
+    def stress(of: Tube, shrink: float, xi: Vector) -> Vector:
+        return compensated_resultant(of, shrink, xi, 1.2, 1.05)
+
+    force = float(geometry.channel_force @ p)
+    stretch = brentq(
+        lambda L: stress(pushed, L**-0.5, np.array([0, 0, L, 0, 0, 0]))[2] - force, 1, 5
+    )
+    shrink = stretch**-0.5
+    straight = np.array([0, 0, stretch, 0, 0, 0])
+    strain, C = evaluated(segment, p)
+    expected = np.linalg.inv(derivative(lambda xi: stress(met, shrink, xi), straight, 1e-3))
+    assert scaled(C, expected) == pytest.approx(scaled(expected, expected), abs=1e-7)
+    # the strain balances the pressures, linearised in curvature
+    x, y = shrink * (geometry.channel_moment.T @ p)
+    applied = np.array([0, 0, force, y, -x, 0])
+    K = derivative(lambda xi: stress(pushed, shrink, xi), straight, 1e-3)
+    balanced = straight + np.linalg.solve(K, applied - stress(pushed, shrink, straight))
+    assert strain == pytest.approx(balanced, rel=1e-7, abs=1e-7)
+
+
+def compensated_resultant(
+    tube: Tube, shrink: float, xi: Vector, area: float, inertia: float
+) -> Vector:
+    """`resultant` of a section with more area, and spread about its centroid to more inertia."""
+    mu = tube.youngs_modulus / 3
+    points, weights = solid_points(tube)
+    centre = (points @ weights / weights.sum())[:, np.newaxis]
+    x, y = shrink * (centre + np.sqrt(inertia / area) * (points - centre))
+    gx, gy, L = xi[0] - xi[5] * y, xi[1] + xi[5] * x, xi[2] + xi[3] * y - xi[4] * x
+    sx, sy, sz = mu * gx, mu * gy, mu * (L - L**-2)
+    return area * np.array([sx, sy, sz, y * sz, -x * sz, x * sy - y * sx]) @ weights
+
+
+def test_the_neo_hookean_margin_ends_where_the_modulus_does() -> None:
+    segment = segment_of(neo_hookean(FLOP), modulus_per_pressure=-0.5)  # 100 kPa, gone at 2 bar
+    for share, sign in ((0.0, 1), (0.998, 1), (0.9995, -1), (1.2, -1)):
+        *_, margin = function_of(segment)(share * 2e5 * np.array([2, 2, 1]) / 3)
+        assert np.sign(float(margin)) == sign
+
+
+# -- corrections ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("band", [1.0, 2e3, 3e4])
+def test_the_onset_is_smooth_and_monotone(band: float) -> None:
+    p = ca.SX.sym("p")
+    value = onset(p, band)
+    slope = ca.jacobian(value, p)
+    f = ca.Function("onset", [p], [value, slope, ca.jacobian(slope, p)])
+    w = band / 2
+    places = [0.0, 1e-9, band / 3, band, band * (1 + 1e-12), 16 * band, 16.5 * band, 21 * band, 1e7]
+    for place in places:
+        z = (place - band) / w
+        found = [float(part) for part in f(place)]
+        rise = 1 / (1 + np.exp(-z))
+        assert found[0] == pytest.approx(
+            w * (np.logaddexp(0, z) - np.logaddexp(0, -2)), rel=1e-12, abs=1e-12 * band
+        )
+        assert found[1] == pytest.approx(rise, rel=1e-12)
+        assert found[2] * w == pytest.approx(rise * (1 - rise), rel=1e-9, abs=1e-12)
+    many = f(np.linspace(0, 30 * band, 4001)[np.newaxis])[0].full()[0]
+    assert (np.diff(many) > 0).all()
+    assert many[0] == 0
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_corrections_are_dead_band_then_gain_then_offset(law: str) -> None:
+    tube = LAWS[law](FLOP)
+    gain, offset = np.array([1.1, 0.9, 1.0]), np.array([2e3, -1e3, 0.0])
+    corrections = Corrections(gain=gain, offset=offset, dead_band=8e3)
+    corrected = Segment(**tube.mapping() | {"corrections": corrections})
+    for seed in range(3):
+        p = some_pressures(tube, seed)
+        z = (p - 8e3) / 4e3
+        acting = gain * 4e3 * (np.logaddexp(0, z) - np.logaddexp(0, -2)) + offset
+        for found, expected in zip(
+            evaluated(corrected, p), evaluated(segment_of(tube), acting), strict=True
+        ):
+            assert found == pytest.approx(expected, rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_an_azimuth_turns_the_moment_of_its_channel(law: str) -> None:
+    """In a law that is linear in the moment, those of channels add up."""
+    tube = LAWS[law](replace(FLOP, factors=None))
+    azimuth = np.array([0.1, -0.2, 0.3])
+    segment = Segment(**tube.mapping() | {"corrections": Corrections(azimuth=azimuth)})
+    p = some_pressures(tube)
+    stretched = np.full(3, p.mean())  # the same force, and no moment
+    rest, C = evaluated(segment_of(tube), stretched)
+    expected = rest[3:5].copy()
+    for channel, turn in enumerate(azimuth):
+        alone = stretched + np.where(np.arange(3) == channel, p[channel], 0) - p[channel] / 3
+        c, s = np.cos(turn), np.sin(turn)
+        expected += np.array([[c, -s], [s, c]]) @ evaluated(segment_of(tube), alone)[0][3:5]
+    strain, turned = evaluated(segment, p)
+    assert strain[3:5] == pytest.approx(expected, rel=1e-10)
+    assert strain[2] == pytest.approx(rest[2], rel=1e-12)
+    assert turned == pytest.approx(C, rel=1e-12, abs=1e-15)
+
+
+def test_a_dead_band_needs_pressures_that_are_never_negative() -> None:
+    mapping = Arm((FLOP, FLOP)).mapping()
+    mapping["segments"][1]["corrections"] = {"dead_band": 8e3}
+    robot = RobotDescription(**mapping)
+    assert robot.segments[1].corrections == Corrections(dead_band=8e3)
+    lowest = [-1e3, -1e3, -1e3, 0.0, 0.0, 0.0]
+    RobotDescription(**mapping | {"pressure": {"min": lowest, "max": 1e5}})
+    lowest[4] = -1e3
+    with pytest.raises(InputError, match=r"segments\[1\]\.corrections\.dead_band.*-0\.01 bar"):
+        RobotDescription(**mapping | {"pressure": {"min": lowest, "max": 1e5}})
+
+
+# -- the simulated arm ----------------------------------------------------------------------
+
+
+def plant_of(description: RobotDescription, law: str = "linear") -> Any:
+    """The simulated arm without creep and hysteresis."""
+    pytest.importorskip("numba")
+    from stiffopt.rig.simulated.plant import Plant
+    from stiffopt.rig.simulated.settings import PlantSettings, Silicone
+
+    silicone = Silicone(law=law, damping=0.0, creep=(), hysteresis=())
+    return Plant(description, PlantSettings(silicone=silicone, dynamics="quasi-static"))
+
+
+def described(arm: Arm, law: str = "rest-length", **compensation: float) -> RobotDescription:
+    """An arm all of whose segments have a law, and some of their compensation replaced."""
+    mapping = arm.mapping()
+    for segment in mapping["segments"]:
+        segment["strain_law"] = law
+        segment["compensation"] = (segment["compensation"] or {}) | compensation
+    return RobotDescription(**mapping)
+
+
+def stiffness_of(plant: Any, p: Vector) -> Vector:
+    """Stiffness (3,) of a simulated tip in the base axes, free, by forces of 0.2 mN."""
+    from stiffopt.rig.simulated.settings import Load
+
+    found = []
+    for axis in np.eye(3):
+        moved = []
+        for force in (2e-4, -2e-4):
+            plant.settle(p, Load(force=force * axis))
+            moved.append(axis @ plant.tip_pose()[:3, 3])
+        found.append(4e-4 / (moved[0] - moved[1]))
+    return np.array(found)
+
+
+@pytest.mark.filterwarnings("ignore:the simulator is compiled")
+@pytest.mark.parametrize("name", ["1 segment", "3 segments, mixed"])
+def test_the_rest_length_law_is_the_simulated_arm_of_linear_silicone(name: str) -> None:
+    description = described(ARMS[name])
+    plant, model = plant_of(description), Manipulator(description)
+    rng = np.random.default_rng(5)
+    for p in rng.uniform(0, 1e5, (6, description.n_pressures)):
+        plant.settle(p)
+        assert plant.tip_pose()[:3, 3] == pytest.approx(model.tip_pose(p)[:3, 3], abs=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:the simulator is compiled")
+@pytest.mark.parametrize("law", ["linear", "yeoh"])
+def test_the_simulated_arm_is_stiff_without_bending_less(law: str) -> None:
+    """Its free shapes are those of E and slope; what loads meet is what the model says."""
+    p = np.array([1.1e5, 0.2e5, 0.5e5])
+    plain, stiff = (
+        described(ARMS["1 segment"]),
+        described(ARMS["1 segment"], stiffness=1.4, softening=0.3),
+    )
+    plants = [plant_of(description, law) for description in (plain, stiff)]
+    for plant in plants:
+        plant.settle(p)
+    assert plants[1].tip_pose() == pytest.approx(plants[0].tip_pose(), abs=1e-7)
+    if law == "linear":
+        expected = [Manipulator(stiff).stiffness(p, axis) for axis in np.eye(3)]
+        assert stiffness_of(plants[1], p) == pytest.approx(expected, rel=1e-3)
+    E, slope = 100e3, -0.2 * np.linalg.norm(p)
+    ratio = 1.4 * (E + 0.3 * slope) / (E + slope)
+    found = stiffness_of(plants[1], p) / stiffness_of(plants[0], p)
+    assert found == pytest.approx(np.full(3, ratio), rel=2e-4)
+
+
+@pytest.mark.filterwarnings("ignore:the simulator is compiled")
+def test_a_simulated_arm_that_is_stiffer_takes_as_much_more_work() -> None:
+    """The same shapes at the same pressures, which act more strongly."""
+    trace = np.random.default_rng(7).uniform(0, 1e5, (50, 3))
+    energies = []
+    for stiffness in (1.0, 1.4):
+        plant = plant_of(
+            described(ARMS["1 segment"], modulus_per_pressure=0.0, stiffness=stiffness)
+        )
+        plant.follow(trace)
+        energies.append(plant.energies())
+    assert energies[0].elastic > 1e-4
+    for name in ("elastic", "work"):
+        plain, stiff = (getattr(energy, name) for energy in energies)
+        assert stiff == pytest.approx(1.4 * plain, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "key", ["compensation.bending_radius", "compensation.lengthening", "corrections.dead_band"]
+)
+def test_the_simulated_arm_says_what_it_cannot_do(key: str) -> None:
+    mapping = Arm((FLOP, FLOP)).mapping()
+    group, name = key.split(".")
+    mapping["segments"][1][group] = {name: 0.05}
+    with pytest.raises(InputError, match=rf"knows no segments\[1\]\.{group}\.{name}"):
+        plant_of(RobotDescription(**mapping))
 
 
 # -- every law ------------------------------------------------------------------------------

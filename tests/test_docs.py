@@ -14,14 +14,20 @@ from pydantic import BaseModel
 import stiffopt
 from examples import run_examples
 from stiffopt.logs import read_log
+from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.description import (
     Chambers,
     Compensation,
+    Corrections,
     Material,
     PressureLimits,
+    Recordings,
     RobotDescription,
     Segment,
+    Tolerances,
+    TrackedBody,
 )
+from stiffopt.model.history import Creep, History, Play
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task
@@ -49,6 +55,8 @@ PAGES = [
 ]
 SCHEMAS: list[type[BaseModel]] = [
     *(RobotDescription, Segment, Chambers, Material, Compensation, PressureLimits),
+    *(Corrections, History, Play, Creep, Recordings, TrackedBody, Tolerances),
+    *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
     *(RigDescription, Safety, LogSettings, LabSettings, Registration, Placement),
     *(simulated.PlantSettings, simulated.Silicone, simulated.Creep, simulated.Hysteresis),
@@ -69,6 +77,7 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.rig.drivers.openigtlink": "Drivers aurora and openigtlink",
     "stiffopt.rig.drivers": "Driver probe",
     "stiffopt.rig": "Rig file",
+    "stiffopt.registration": "Rig file",
     "stiffopt.model": "Robot file",
     "stiffopt.optimise": "Task file",
 }

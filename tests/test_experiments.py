@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import signal
 import subprocess
@@ -27,17 +28,20 @@ from stiffopt.experiments import (
     KinematicsSettings,
     PressureSequence,
     StiffnessSettings,
+    evaluate_coverage,
     evaluate_kinematics,
     evaluate_stiffness,
     run_kinematics,
     run_stiffness,
 )
-from stiffopt.experiments.conductor import STEEPEST, Conductor, steepest
+from stiffopt.experiments.conductor import GENTLE, STEEPEST, Conductor, steepest
+from stiffopt.experiments.coverage import coverage_for, spread_pressures
+from stiffopt.experiments.coverage_result import read_rounds
 from stiffopt.experiments.folder import alone_in, create_folder
 from stiffopt.experiments.kinematics_result import read_recordings
 from stiffopt.experiments.points import PointsFile
 from stiffopt.experiments.slope import Line, combine, fit_line, fit_lines, student_t
-from stiffopt.logs import read_log, read_mcap_log, read_stiffness_table
+from stiffopt.logs import Log, read_log, read_mcap_log, read_stiffness_table
 from stiffopt.rig.config import load_rig_description, make_rig
 from stiffopt.rig.interface import PressureLimits, Rig
 
@@ -64,7 +68,9 @@ def golden(p: np.ndarray, direction: np.ndarray) -> float:
 
 
 def short(**given: object) -> KinematicsSettings:
-    values = {"channels": 3, "pressures": (0.5e5,), "period": 1.0, "repetitions": 2, **given}
+    values = {
+        "channels": 3, "pressures": (0.5e5,), "period": 1.0, "repetitions": 2, "poses": 0, **given,
+    }  # fmt: skip
     return KinematicsSettings(**values)
 
 
@@ -238,6 +244,266 @@ def test_what_was_complete_is_not_repeated(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.glob("*.csv")} == {
         f"kinematics_{k}.csv" for k in (1, 2, 3)
     }
+
+
+# -- combined poses -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", [1, 3, 6, 9])
+@pytest.mark.parametrize("count", [2, 7, 24, 48])
+def test_combined_poses_reach_all_ends_of_all_channels(channels: int, count: int) -> None:
+    low, high = np.linspace(-0.2e5, 0.1e5, channels), np.linspace(1e5, 1.5e5, channels)
+    poses = spread_pressures(count, low, high)
+    assert poses.shape == (count, channels)
+    even = low + (high - low) * np.linspace(0, 1, count)[:, np.newaxis]
+    np.testing.assert_allclose(np.sort(poses, axis=0), even, atol=1e-6)
+    assert (poses >= low).all()
+    assert (poses <= high).all()
+    np.testing.assert_array_equal(poses, spread_pressures(count, low, high))
+
+
+@pytest.mark.parametrize("channels", [2, 3, 6])
+def test_combined_poses_are_spread_better_than_by_chance(channels: int) -> None:
+    poses = spread_pressures(24, np.zeros(channels), np.ones(channels))
+    random = np.random.default_rng(0)
+    chance = [stats.qmc.discrepancy(random.uniform(size=(24, channels))) for _ in range(200)]
+    assert stats.qmc.discrepancy(poses) < min(chance)
+    related = np.abs(np.corrcoef(poses.T) - np.eye(channels))
+    assert related.max() < 0.35
+    for one in range(channels):
+        for other in range(one):
+            pair = poses[:, [one, other]] > 0.5
+            assert {tuple(row) for row in pair.tolist()} == {
+                (False, False), (False, True), (True, False), (True, True)
+            }  # fmt: skip
+    rises = (np.diff(poses, axis=0) > 0).mean(axis=0)
+    assert ((rises > 0.35) & (rises < 0.65)).all()  # loaded and unloaded about as often
+
+
+def test_many_channels_do_not_rise_together() -> None:
+    related = np.corrcoef(spread_pressures(24, np.zeros(9), np.ones(9)).T) - np.eye(9)
+    assert np.abs(related).max() < 0.45
+
+
+def test_few_poses_and_none() -> None:
+    assert spread_pressures(1, [0, -1e4], [1e5, 2e5]).tolist() == [[1e5, 2e5]]
+    assert spread_pressures(0, [0, 0], [1, 1]).shape == (0, 2)
+    assert coverage_for(fake_rig(), 0, 1.0).rounds == []
+
+
+@pytest.mark.parametrize("count", [1, 6, 7, 13, 24])
+def test_rounds_are_short_and_hold_all_poses(count: int) -> None:
+    coverage = coverage_for(fake_rig(), count, 1.0)
+    sizes = [len(poses) for poses in coverage.rounds]
+    assert len(sizes) == math.ceil(count / 6)
+    assert max(sizes) - min(sizes) <= 1
+    assert max(sizes) <= 6
+    np.testing.assert_array_equal(np.vstack(coverage.rounds), coverage.poses)
+
+
+def plateaus(log: Log, least: float = 0.9) -> list[list[float]]:
+    """Commands that stay the same for so many seconds, one after the other."""
+    found, begin = [], 0
+    for row in range(1, len(log) + 1):
+        if row == len(log) or (log.commanded[row] != log.commanded[begin]).any():
+            if log.time[row - 1] - log.time[begin] >= least:
+                found.append(log.commanded[begin].tolist())
+            begin = row
+    return found
+
+
+@pytest.mark.parametrize(
+    ("robot", "slew", "low", "high", "highest"),
+    [
+        ("stiff-flop-1", 3e5, 0.0, 1.5e5, None),
+        ("stiff-flop-1", 0.3e5, 0.0, 0.7e5, 2e5),
+        ("stiff-flop-1", None, 0.0, 1.5e5, 0.6e5),
+        ("stiff-flop-2", 3e5, 0.0, 1.5e5, None),
+    ],
+)
+def test_every_combined_pose_is_held_and_gently_reached(
+    tmp_path: Path, robot: str, slew: float | None, low: float, high: float, highest: float | None
+) -> None:
+    rig = fake_rig(robot=robot, slew=slew, low=low, high=high)
+    n = rig.supply.n
+    settings = short(channels=n, repetitions=1, period=4.0, poses=8, max=highest)
+    with rig:
+        assert run_kinematics(rig, tmp_path, settings, rate=50.0) == []
+    most = high if highest is None else min(high, highest)
+    rate = GENTLE if slew is None else min(slew, GENTLE)
+    assert_gentle(rig, rate, high)  # the teeth are slower than that
+    logs = read_rounds(tmp_path, 2)
+    assert len(logs) == 2
+    held = []
+    for log in logs:
+        assert log.commanded.max() <= most
+        assert np.abs(log.commanded[0]).max() <= rate * 0.1  # from nothing
+        found = plateaus(log)
+        assert found[-1] == [0.0] * n  # and back, which is held too
+        held += found[:-1]
+        assert log.measured is not None
+        assert not np.abs(log.measured[-1]).max() > 10
+    np.testing.assert_allclose(held, spread_pressures(8, np.zeros(n), np.full(n, most)), atol=0.1)
+    assert np.max(held, axis=0) == pytest.approx(most)
+    assert [path.name for path in sorted(tmp_path.glob("*.csv"))] == [
+        "kinematics_1.csv", "kinematics_poses_1.csv", "kinematics_poses_2.csv",
+    ]  # fmt: skip
+    others = read_mcap_log(tmp_path / "kinematics_poses_2.mcap")
+    np.testing.assert_allclose(others.tip_position, logs[1].tip_position, atol=1e-7)
+
+
+def test_combined_poses_of_channels_that_cannot_be_low(tmp_path: Path) -> None:
+    rig = fake_rig(slew=1e5)
+    rig.supply.limits = PressureLimits(np.array([0.1e5, -0.5e5, 0.0]), np.array([1e5, 0.5e5, 1e5]))
+    with rig:
+        run_kinematics(rig, tmp_path, short(repetitions=1, poses=3), rate=50.0)
+        with pytest.raises(InputError, match=r"at most 0.05 bar: channel 1 has 0.1 to 1 bar"):
+            run_kinematics(rig, tmp_path, short(repetitions=1, poses=3, max=0.05e5), rate=50.0)
+    (log,) = read_rounds(tmp_path, 1)
+    assert log.commanded.min(axis=0).tolist() == [0.1e5, -0.5e5, 0]
+    assert log.commanded.max(axis=0).tolist() == [1e5, 0.5e5, 1e5]
+    assert log.commanded[-1].tolist() == [0.1e5, 0, 0]
+
+
+def test_without_combined_poses_all_is_as_in_the_paper(tmp_path: Path) -> None:
+    written = []
+    for poses in (0, 2):
+        folder = tmp_path / str(poses)
+        folder.mkdir()
+        rig = fake_rig(slew=3e5)
+        with rig:
+            run_kinematics(rig, folder, short(poses=poses), rate=50.0)
+        written.append(world_of(rig).writes[:-1])  # the last one vents
+    alone, more = written
+    assert len(alone) < len(more)
+    for (time_then, then), (time_now, now) in zip(alone, more, strict=False):
+        assert time_then == time_now
+        assert then.tolist() == now.tolist()
+    assert {path.name for path in (tmp_path / "0").glob("*.csv")} == {
+        "kinematics_1.csv", "kinematics_2.csv"
+    }  # fmt: skip
+    for name in ("kinematics_1.csv", "kinematics_2.csv"):
+        assert (tmp_path / "0" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
+def test_rounds_that_were_complete_are_not_repeated(tmp_path: Path) -> None:
+    settings = short(repetitions=1, poses=8)
+    told: list[tuple[float, float, str]] = []
+
+    def check() -> None:
+        if told and told[-1][2] == "combined pose 6 of 8":
+            raise KeyboardInterrupt
+
+    rig = fake_rig(slew=3e5)
+    with rig, pytest.raises(KeyboardInterrupt):
+        run_kinematics(
+            rig, tmp_path, settings, rate=50.0, check=check,
+            progress=lambda *what: told.append(what),
+        )  # fmt: skip
+    assert not world_of(rig).commanded.any()
+    assert {path.name for path in tmp_path.glob("*.csv")} == {
+        "kinematics_1.csv", "kinematics_poses_1.csv", "kinematics_poses_2.part.csv"
+    }  # fmt: skip
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*_1.csv")}
+    told.clear()
+    rig = fake_rig(slew=3e5)
+    with rig:
+        run_kinematics(rig, tmp_path, settings, rate=50.0, progress=lambda *what: told.append(what))
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert not list(tmp_path.glob("*.part.*"))
+    done, totals, texts = zip(*told, strict=True)
+    assert list(done) == sorted(done)
+    assert len(set(totals)) == 1
+    assert done[-1] < totals[0]
+    assert [text for text in dict.fromkeys(texts) if text.startswith("combined")] == [
+        f"combined pose {number} of 8" for number in (5, 6, 7, 8)
+    ]
+    held = [pose for log in read_rounds(tmp_path, 2) for pose in plateaus(log)[:-1]]
+    np.testing.assert_allclose(held, spread_pressures(8, np.zeros(3), np.full(3, 1.5e5)), atol=0.1)
+    (tmp_path / "kinematics_poses_1.mcap").unlink()  # it is torn: once more
+    rig = fake_rig(slew=3e5)
+    with rig:
+        run_kinematics(rig, tmp_path, settings, rate=50.0)
+    assert (tmp_path / "kinematics_poses_1.mcap").exists()
+
+
+def test_an_arm_that_does_not_come_to_rest_is_not_waited_for(tmp_path: Path) -> None:
+    world: list[FakeWorld] = []
+
+    def creeping(p: np.ndarray) -> np.ndarray:
+        return straight(p) + np.array([2e-4 * (world[0].t - 100), 0, 0])
+
+    rig = fake_rig(creeping, slew=3e5)
+    world.append(world_of(rig))
+    settings = short(repetitions=1, poses=3, settle=2.0)
+    with rig:
+        notes = run_kinematics(rig, tmp_path, settings, rate=50.0)
+    assert notes[-1] == "in 3 combined poses the arm was not at rest within 2 s"
+    (log,) = read_rounds(tmp_path, 1)
+    assert len(plateaus(log, 1.9)) == 4
+    assert len(plateaus(log, 2.1)) == 0
+    foreseen = coverage_for(rig, 3, 2.0).duration(1) - 3  # s for the rest before it
+    assert log.time[-1] - log.time[0] == pytest.approx(foreseen, rel=0.05)
+    found = evaluate_coverage([log], model())
+    assert found is not None
+    np.testing.assert_allclose(found.speed, 2e-4, rtol=0.02)
+
+
+def test_the_error_of_combined_poses_is_that_at_their_end(tmp_path: Path) -> None:
+    """Ramps do not count, and neither do regulators that are off."""
+    arm, shift = model(), np.array([0.0, 0.002, 0.0])
+    rig = fake_rig(lambda p: arm.tip_pose(p)[:3, 3] + shift * p.max() / 1.5e5, slew=3e5)
+    with rig:
+        run_kinematics(rig, tmp_path, short(repetitions=1, poses=9), rate=100.0)
+    result = evaluate_coverage(read_rounds(tmp_path, 2), arm)
+    assert result is not None
+    poses = spread_pressures(9, np.zeros(3), np.full(3, 1.5e5))
+    np.testing.assert_allclose(result.pressures, poses, atol=20)
+    np.testing.assert_allclose(result.errors, 0.002 * poses.max(axis=1) / 1.5e5, rtol=1e-3)
+    assert result.mean == pytest.approx(np.mean(0.002 * poses.max(axis=1) / 1.5e5), rel=1e-3)
+    assert result.worst == pytest.approx(0.002, rel=1e-3)
+    assert result.mean < result.p95 <= result.worst
+    assert result.doubts == ()
+    with pytest.raises(InputError, match="has 6 channels, the recordings have 3"):
+        evaluate_coverage(read_rounds(tmp_path, 2), stiffopt.load_robot("stiff-flop-2"))
+    assert evaluate_coverage([], arm) is None
+
+
+def test_a_command_that_was_held_for_a_moment_is_no_pose() -> None:
+    """A supply that has vented by itself comes back up: what it passes does not count."""
+    time = np.arange(0, 10, 0.05)
+    commanded = np.zeros((200, 3))
+    commanded[20:34] = 0.5e5  # 0.65 s
+    commanded[40:100] = 1e5
+    commanded[110:150, 1] = 0.3e5  # the tip is out of sight
+    tip = np.full((200, 3), 0.05)
+    tip[60:80] = 0.01
+    tip[80:100] = [0.0, 0.0, 0.1]
+    tip[110:150] = np.nan
+    found = evaluate_coverage([Log(time, commanded, tip)], model())
+    assert found is not None
+    assert found.pressures.tolist() == [[1e5] * 3]
+    np.testing.assert_allclose(found.tip, [[0.0, 0.0, 0.1]], atol=1e-12)
+    assert found.speed == pytest.approx(0, abs=1e-9)
+    expected = model().tip_pose(np.full(3, 1e5))[2, 3] - 0.1
+    assert found.errors == pytest.approx(abs(expected), abs=1e-9)
+    assert found.doubts  # of the gap
+
+
+def test_the_figure_of_combined_poses_shows_pressures_and_errors(tmp_path: Path) -> None:
+    from stiffopt.experiments import CoverageResult
+    from stiffopt.plots.experiments import plot_coverage
+
+    random = np.random.default_rng(0)
+    pressures, tip = random.uniform(0, 1.5e5, (5, 6)), random.normal(size=(5, 3)) * 1e-3
+    result = CoverageResult(pressures, tip, np.zeros((5, 3)), np.zeros(5), 0.18)
+    figure = plot_coverage(result, title="a $rig$")
+    shades, bars = figure.axes[0].collections[0], figure.axes[1].patches
+    np.testing.assert_allclose(shades.get_array(), pressures.T * 1e-5)
+    np.testing.assert_allclose(
+        [bar.get_height() for bar in bars], np.linalg.norm(tip, axis=1) * 1e3
+    )
+    figure.savefig(tmp_path / "poses.png")
 
 
 # -- stiffness ------------------------------------------------------------------------------------
@@ -569,7 +835,7 @@ def test_on_the_simulated_rig(tmp_path: Path) -> None:
     from stiffopt.rig.config import open_rig
 
     path = Path(__file__).resolve().parent.parent / "rig" / "sim.yaml"
-    kinematics = KinematicsSettings(channels=3, repetitions=2)
+    kinematics = KinematicsSettings(channels=3, repetitions=2, poses=6)
     stiffness = StiffnessSettings(channels=3, repetitions=2, pressures=(0.0, 0.75e5))
     for name in "ks":
         (tmp_path / name).mkdir()
@@ -580,6 +846,10 @@ def test_on_the_simulated_rig(tmp_path: Path) -> None:
     result = evaluate_kinematics(read_recordings(tmp_path / "k", kinematics), model())
     assert result.mean < 0.005
     assert result.repeatability < 0.001
+    combined = evaluate_coverage(read_rounds(tmp_path / "k", 1), model())
+    assert combined is not None
+    assert len(combined.errors) == 6
+    assert combined.worst < 0.015  # higher pressures, and it creeps
     for cell in evaluate_stiffness(tmp_path / "s", stiffness, model()).cells:
         assert cell.estimate is not None
         assert cell.estimate.value == pytest.approx(cell.model, rel=0.3)
@@ -601,7 +871,7 @@ def use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Rig], Rig]
 
 
 KINEMATICS = ["experiment", "kinematics", "rig.yaml", "--pressures", "0.5 bar", "--period", "1 s",
-              "--repetitions", "2"]  # fmt: skip
+              "--repetitions", "2", "--poses", "2"]  # fmt: skip
 STIFFNESS = ["experiment", "stiffness", "rig.yaml", "--pressures", "0:1:1 bar", "--directions",
              "x,-z", "--repetitions", "1", "--steps", "3"]  # fmt: skip
 
@@ -614,19 +884,69 @@ def test_kinematics_from_the_rig_to_the_figure(
     (folder,) = (tmp_path / "runs").iterdir()
     assert folder.name.startswith("kinematics_a-rig_20")
     assert {path.name for path in folder.iterdir()} == {
-        "experiment.yaml", "figure.png", "report.md", "kinematics_1.csv", "kinematics_1.mcap",
-        "kinematics_2.csv", "kinematics_2.mcap",
+        "experiment.yaml", "figure.png", "poses.png", "report.md", "kinematics_1.csv",
+        "kinematics_1.mcap", "kinematics_2.csv", "kinematics_2.mcap", "kinematics_poses_1.csv",
+        "kinematics_poses_1.mcap",
     }  # fmt: skip
-    assert (folder / "figure.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("figure.png", "poses.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
     said = capsys.readouterr()
     assert "95th percentile" in said.out
-    assert "% of length" in (folder / "report.md").read_text()
+    report = (folder / "report.md").read_text()
+    assert "| tip error | mm | % of length | combined: mm | % of length |" in report
+    assert "combined poses: 2 of 2, all channels, 0 to 1.5 bar" in report
     assert not said.err
     assert not world_of(rig).commanded.any()
     # complete: nothing moves, the report is made again
     rig = use(fake_rig())
     assert main(["experiment", "kinematics", "rig.yaml", "--resume", str(folder)]) == 0
     assert "nothing was left to do" in capsys.readouterr().err
+    assert not world_of(rig).writes
+
+
+def test_kinematics_as_json(
+    use: Callable[[Rig], Rig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arm, shift = model(), np.array([0.0, 0.0, 0.003])
+    use(fake_rig(lambda p: arm.tip_pose(p)[:3, 3] + shift, slew=3e5))
+    assert main([*KINEMATICS, "--json", "--no-plot", "--out", "run", "--max", "1.2 bar"]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    found = json.loads(line)
+    assert (found["model"], found["length_m"], found["folder"]) == ("stiff-flop-1", 0.09, "run")
+    assert found["repetitions"] == 2
+    assert found["mean_error_m"] == pytest.approx(0.003, rel=0.03)
+    combined = found["combined"]
+    assert combined["poses"] == 2
+    for key in ("mean_error_m", "p95_error_m", "max_error_m", "errors_m"):
+        assert combined[key] == pytest.approx([0.003] * 2 if key == "errors_m" else 0.003, rel=1e-3)
+    assert np.max(combined["pressures_pa"], axis=0) == pytest.approx(1.2e5, abs=20)
+    (tmp_path / "run" / "kinematics_poses_1.csv").write_text(
+        "time_s,p1_pa,p2_pa,p3_pa,tip_x_m,tip_y_m,tip_z_m\n"
+        + "".join(f"{0.1 * k:.1f},{k < 20},0,0,,,\n".replace("True", "1e5").replace("False", "0")
+                  for k in range(30))
+    )  # fmt: skip
+    resume = ["experiment", "kinematics", "rig.yaml", "--resume", "run", "--no-plot"]
+    assert main([*resume, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["combined"] is None
+    assert main(resume) == 0
+    assert "no combined pose was held with the tip in sight" in " ".join(
+        capsys.readouterr().out.split()
+    )
+
+
+def test_a_folder_from_before_there_were_combined_poses_is_complete(
+    use: Callable[[Rig], Rig], tmp_path: Path
+) -> None:
+    use(fake_rig(slew=3e5))
+    assert main([*KINEMATICS, "--poses", "0", "--no-plot", "-q", "--out", "run"]) == 0
+    path = tmp_path / "run" / "experiment.yaml"
+    lines = path.read_text().splitlines()
+    kept = [line for line in lines if not line.startswith(("poses", "settle"))]
+    assert len(kept) == len(lines) - 2
+    path.write_text("\n".join(kept) + "\n")
+    rig = use(fake_rig())
+    command = ["experiment", "kinematics", "rig.yaml", "--resume", "run", "--no-plot", "-q"]
+    assert main(command) == 0
     assert not world_of(rig).writes
 
 
@@ -725,6 +1045,10 @@ def test_no_device_leaves_no_folder(
         ([*KINEMATICS, "--pressures", "1 mm"], "--pressures: '1 mm'"),
         ([*KINEMATICS, "--pressures", "0 bar"], "must be greater than 0"),
         ([*KINEMATICS, "--period", "5"], "--period: '5' has no unit"),
+        ([*KINEMATICS, "--poses", "-1"], "'--poses'"),
+        ([*KINEMATICS, "--max", "0 bar"], "max: must be greater than 0"),
+        ([*KINEMATICS, "--max", "1 s"], "--max: '1 s'"),
+        ([*KINEMATICS, "--settle", "0 s"], "settle: must be greater than 0"),
         ([*KINEMATICS, "--model", "stiff-flop-2"], "has 6 channels, the rig has 3"),
         ([*KINEMATICS, "--resume", "none"], "--pressures cannot be changed"),
         (["experiment", "kinematics", "rig.yaml", "--resume", "none"], "holds no experiment"),

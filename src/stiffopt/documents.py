@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from stiffopt.errors import FileError, InputError, Loc, dotted, shown
+from stiffopt.errors import FileError, InputError, Loc, dotted, printable, shown
 
 __all__ = ["Document", "read_document", "to_yaml", "write_file"]
 
@@ -52,7 +52,9 @@ def to_yaml(data: Mapping[str, Any]) -> str:
     )
 
 
-def write_file(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
+def write_file(
+    path: str | os.PathLike[str], data: Mapping[str, Any], comment: Sequence[str] = ()
+) -> None:
     """Write data as YAML that `read_document` reads back as they were.
 
     The file appears whole or not at all: it is written beside its place and then moved there.
@@ -63,8 +65,10 @@ def write_file(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
         The file; its folder must exist.
     data :
         Text, numbers, booleans, None, lists, tuples, arrays and mappings with text as keys.
+    comment :
+        Lines that stand above the data, for people.
     """
-    text = to_yaml(data)
+    text = "".join(f"# {printable(line)}\n" for line in comment) + to_yaml(data)
     target = Path(path)
     try:
         if target.exists() and not target.is_file():

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any, TypeVar
 
@@ -66,12 +66,15 @@ def line_of(path: str | os.PathLike[str], *loc: str | int) -> int | None:
     return None
 
 
-def save_file(path: str | os.PathLike[str], kind: str, schema: Schema) -> None:
+def save_file(
+    path: str | os.PathLike[str], kind: str, schema: Schema, comment: Sequence[str] = ()
+) -> None:
     """Write a description as a file of its kind, which `read_file` reads back as its equal.
 
-    Quantities are written with units; what is None or an empty list is left out.
+    Quantities are written with units; what is None or an empty list is left out. The lines of
+    `comment` stand above it, for people.
     """
-    write_file(path, _as_file(kind, schema))
+    write_file(path, _as_file(kind, schema), comment)
 
 
 def file_text(kind: str, schema: Schema) -> str:

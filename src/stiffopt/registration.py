@@ -86,6 +86,17 @@ class Registration(Schema):
         tip = T @ sensor @ self.tip_in_sensor.transform()
         return tip[:3, 3], lie.quaternion_from_rotation(tip[:3, :3])
 
+    def then(self, correction: Registration) -> Registration:
+        """Return the registration that is this one, its poses then registered by a correction."""
+        return Registration(
+            tracker_in_base=Placement.of(
+                correction.tracker_in_base.transform() @ self.tracker_in_base.transform()
+            ),
+            tip_in_sensor=Placement.of(
+                self.tip_in_sensor.transform() @ correction.tip_in_sensor.transform()
+            ),
+        )
+
     def sensor_in_tracker(self, tip: Array) -> Array:
         """Return what a perfect tracker reads (4, 4) where the tip (4, 4) is in the base frame."""
         return self.tracker_in_base.inverse() @ tip @ self.tip_in_sensor.inverse()

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from stiffopt.errors import EquilibriumError, FileError, InputError
 from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.uncertainty import TipUncertainty
 from stiffopt.optimise.pareto import pareto_front
 from stiffopt.optimise.solution import PressureSolution, judge
 from stiffopt.optimise.solver import PressureSolver, stiffness_blind
@@ -21,6 +22,8 @@ class Answer:
     robot : the arm under the task's load.
     solution : of the task.
     plain : the task's stiffnesses at the stiffness-blind solution; empty where there is none.
+    uncertainty : how well the tip is known there, or None if the robot was not calibrated.
+    intervals : of the task's stiffnesses, 95 %; empty where there is no `uncertainty`.
     front : the trade-off, or None if it was not asked for or cannot be had.
     complaint : why there is no trade-off although it was asked for.
     """
@@ -29,6 +32,8 @@ class Answer:
     robot: Manipulator
     solution: PressureSolution
     plain: tuple[float, ...] = ()
+    uncertainty: TipUncertainty | None = None
+    intervals: tuple[tuple[float, float], ...] = ()
     front: tuple[PressureSolution, ...] | None = None
     complaint: str = ""
 
@@ -79,7 +84,24 @@ def _solved(file: str, solver: PressureSolver) -> Answer:
         solution = solver.solve()
     except EquilibriumError as error:
         solution = PressureSolution("failed", str(error), solver.task)
-    return Answer(file, solver.robot, solution, _plain(solver, solution))
+    answer = Answer(file, solver.robot, solution, _plain(solver, solution))
+    return _with_uncertainty(answer)
+
+
+def _with_uncertainty(answer: Answer) -> Answer:
+    pressures = answer.solution.pressures
+    if answer.robot.description.calibration is None or pressures is None:
+        return answer
+    try:
+        uncertainty = answer.robot.tip_uncertainty(pressures)
+        measures = answer.task.measures[: len(answer.solution.stiffnesses)]
+        intervals = tuple(
+            uncertainty.stiffness_interval(m.direction, m.kind, m.boundary, m.frame)
+            for m in measures
+        )
+    except EquilibriumError:  # no equilibrium there, or hardly: nothing is known of its errors
+        return answer
+    return replace(answer, uncertainty=uncertainty, intervals=intervals)
 
 
 def _plain(solver: PressureSolver, solution: PressureSolution) -> tuple[float, ...]:

@@ -23,8 +23,9 @@ Exit codes:
 KINEMATICS_HELP = """\
 Ramp each channel in turn up and down and record the tip, as in Experiment 1 of the paper.
 
-Each channel has a tooth for each pressure; the whole sequence is repeated. Recordings (log v1 as
-CSV, and MCAP), a report and a figure against the model go into a folder. RIG is a rig file.
+Each channel has a tooth for each pressure; the whole sequence is repeated. Then come poses in which
+all channels are pressurised together, for a calibration. Recordings (log v1 as CSV, and MCAP), a
+report and figures against the model go into a folder. RIG is a rig file.
 """
 
 _KINEMATICS_EPILOG = f"""\
@@ -32,6 +33,7 @@ _KINEMATICS_EPILOG = f"""\
 Examples:
   stiffopt experiment kinematics rig/sim.yaml
   stiffopt experiment kinematics rig/sim.yaml --pressures '0.5,1 bar' --repetitions 2 --out first
+  stiffopt experiment kinematics rig/sim.yaml --poses 48 --max '1.2 bar'
   stiffopt experiment kinematics rig/sim.yaml --resume first
 {_CODES}"""
 
@@ -98,16 +100,46 @@ def kinematics(
         typer.Option(metavar="TIME", help="Of a tooth, up and down; by default 40 s / 9."),
     ] = None,
     repetitions: Repetitions = None,
+    poses: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            min=0,
+            max=1000,
+            help="Poses of all channels together after that; by default 24, 0 for none.",
+        ),
+    ] = None,
+    settle: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="How long the arm may take to rest in each of these poses; by default 7 s.",
+        ),
+    ] = None,
+    most: Annotated[
+        str | None,
+        typer.Option(
+            "--max",
+            metavar="PRESSURE",
+            help="No channel goes higher in these poses; by default the rig's limits.",
+        ),
+    ] = None,
     resume: Resume = None,
     model: Model = None,
     no_plot: NoPlot = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object in SI units instead of a report.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Do Experiment 1."""
     from stiffopt.cli import experiment_run  # here, so that --help waits for no numerics
 
-    given = {"pressures": pressures, "period": period, "repetitions": repetitions}
-    options = experiment_run.Options(rig, out, resume, model, not no_plot, quiet, given)
+    given = {
+        "pressures": pressures, "period": period, "repetitions": repetitions, "poses": poses,
+        "settle": settle, "max": most,
+    }  # fmt: skip
+    options = experiment_run.Options(rig, out, resume, model, not no_plot, quiet, given, as_json)
     raise typer.Exit(experiment_run.run("kinematics", options))
 
 

@@ -1,13 +1,20 @@
 """What an experiment has found, for people: on the terminal and as Markdown."""
 
 from dataclasses import dataclass
+from math import isfinite
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from stiffopt.errors import printable
-from stiffopt.experiments import KinematicsResult, KinematicsSettings, StiffnessResult
+from stiffopt.experiments import (
+    CoverageResult,
+    KinematicsResult,
+    KinematicsSettings,
+    StiffnessResult,
+)
 from stiffopt.experiments.slope import Estimate
 from stiffopt.experiments.stiffness import direction_name
 from stiffopt.model.manipulator import Manipulator
@@ -29,14 +36,25 @@ class Facts:
 
 
 def kinematics_facts(
-    result: KinematicsResult, settings: KinematicsSettings, model: Manipulator
+    result: KinematicsResult,
+    coverage: CoverageResult | None,
+    settings: KinematicsSettings,
+    model: Manipulator,
 ) -> Facts:
-    """Return what a kinematics experiment has found."""
+    """Return what a kinematics experiment has found, in the combined poses too if there are any."""
+    found: list[KinematicsResult | CoverageResult] = [result]
 
-    def row(label: str, error: float) -> tuple[str, ...]:
-        return label, f"{error * _MM:.2f}", f"{error / result.length * 100:.1f}"
+    def row(label: str, errors: list[float]) -> tuple[str, ...]:
+        cells = [(f"{e * _MM:.2f}", f"{e / result.length * 100:.1f}") for e in errors]
+        return label, *(text for cell in cells for text in cell)
 
     peaks = ", ".join(f"{p * _BAR:g}" for p in settings.pressures)
+    heading: tuple[str, ...] = ("tip error", "mm", "% of length")
+    remark = "distance of the model's tip from the measured one, at the measured pressures"
+    if coverage is not None:
+        found.append(coverage)
+        heading += ("combined: mm", "% of length")
+        remark += "; combined: at the end of each pose"
     return Facts(
         title=f"{settings.rig}: kinematics",
         lines=(
@@ -46,17 +64,85 @@ def kinematics_facts(
                 f"each of {settings.channels} channels to {peaks} bar, {result.time[-1]:.0f} s",
             ),
             ("recordings", f"{result.repetitions}, {len(result.errors):,} samples compared"),
+            *_combined(coverage, settings),
             *_spread(result),
             *(("DOUBT", doubt) for doubt in result.doubts),
+            *_combined_doubts(coverage, settings),
         ),
-        heading=("tip error", "mm", "% of length"),
+        heading=heading,
         rows=(
-            row("mean", result.mean),
-            row("95th percentile", result.p95),
-            row("largest", result.worst),
+            row("mean", [each.mean for each in found]),
+            row("95th percentile", [each.p95 for each in found]),
+            row("largest", [each.worst for each in found]),
         ),
-        remark="distance of the model's tip from the measured one, at the measured pressures",
+        remark=remark,
     )
+
+
+def kinematics_record(
+    result: KinematicsResult,
+    coverage: CoverageResult | None,
+    settings: KinematicsSettings,
+    model: Manipulator,
+) -> dict[str, Any]:
+    """Return what a kinematics experiment has found, for JSON, in SI units."""
+
+    def errors(found: KinematicsResult | CoverageResult) -> dict[str, float]:
+        return {
+            "mean_error_m": found.mean,
+            "p95_error_m": found.p95,
+            "max_error_m": found.worst,
+        }
+
+    combined: dict[str, Any] | None = None
+    if coverage is not None:
+        combined = {
+            "poses": len(coverage.errors), **errors(coverage),
+            "pressures_pa": coverage.pressures.tolist(), "errors_m": coverage.errors.tolist(),
+            "speeds_m_per_s": coverage.speed.tolist(), "doubts": list(coverage.doubts),
+        }  # fmt: skip
+    spread = result.repeatability
+    return {
+        "rig": settings.rig,
+        "model": model.description.name,
+        "length_m": model.length,
+        "repetitions": result.repetitions,
+        "samples": len(result.errors),
+        **errors(result),
+        "repeatability_m": spread if result.repetitions > 1 and isfinite(spread) else None,
+        "doubts": list(result.doubts),
+        "combined": combined,
+    }
+
+
+def _combined(
+    coverage: CoverageResult | None, settings: KinematicsSettings
+) -> tuple[tuple[str, str], ...]:
+    if coverage is None:
+        return ()
+    low, high = coverage.pressures.min() * _BAR, coverage.pressures.max() * _BAR
+    return (
+        (
+            "combined poses",
+            f"{len(coverage.errors)} of {settings.poses}, all channels, {_bar(low)} to "
+            f"{_bar(high)} bar; the tip moved by {coverage.speed.mean() * _MM:.2f} mm in the last "
+            "second",
+        ),
+    )
+
+
+def _bar(value: float) -> str:
+    return f"{round(value, 2) + 0.0:g}"
+
+
+def _combined_doubts(
+    coverage: CoverageResult | None, settings: KinematicsSettings
+) -> tuple[tuple[str, str], ...]:
+    if coverage is not None:
+        return tuple(("DOUBT", f"combined poses: {doubt}") for doubt in coverage.doubts)
+    if settings.poses:
+        return (("DOUBT", "no combined pose was held with the tip in sight"),)
+    return ()
 
 
 def _spread(result: KinematicsResult) -> tuple[tuple[str, str], ...]:

@@ -1,5 +1,6 @@
 """What `stiffopt experiment` does with its arguments."""
 
+import json
 import re
 import sys
 from collections.abc import Callable, Mapping
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stiffopt.cli import experiment_report, quantities
-from stiffopt.cli.console import report_error, report_note, show, warnings_as_notes
+from stiffopt.cli.console import report_error, report_note, show, warnings_as_notes, write_line
 from stiffopt.cli.exits import BAD_INPUT, FAULT, INTERRUPTED, SOLVED
 from stiffopt.cli.experiment_display import Display
 from stiffopt.cli.interrupts import Interruptible
@@ -18,11 +19,14 @@ from stiffopt.errors import DeviceError, FileError, InputError, StiffoptError
 from stiffopt.experiments import (
     KinematicsSettings,
     StiffnessSettings,
+    evaluate_coverage,
     evaluate_kinematics,
     evaluate_stiffness,
     run_kinematics,
     run_stiffness,
 )
+from stiffopt.experiments.coverage import round_count
+from stiffopt.experiments.coverage_result import read_rounds
 from stiffopt.experiments.folder import (
     alone_in,
     check_same,
@@ -30,7 +34,12 @@ from stiffopt.experiments.folder import (
     open_folder,
     remove_folder,
 )
-from stiffopt.experiments.kinematics import missing_repetitions, sequence_for
+from stiffopt.experiments.kinematics import (
+    missing_repetitions,
+    missing_rounds,
+    poses_for,
+    sequence_for,
+)
 from stiffopt.experiments.kinematics_result import read_recordings
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
 from stiffopt.logs import require_mcap, write_stiffness_table
@@ -38,6 +47,7 @@ from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
 
 REPORT, FIGURE, TABLE = "report.md", "figure.png", "stiffness.csv"
+POSES_FIGURE = "poses.png"
 
 Settings = KinematicsSettings | StiffnessSettings
 
@@ -53,6 +63,7 @@ class Options:
     plot: bool
     quiet: bool
     given: Mapping[str, str | int | None]
+    as_json: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,7 +81,10 @@ class _Plan:
     def is_complete(self) -> bool:
         """Whether nothing is left to do."""
         if isinstance(self.settings, KinematicsSettings):
-            return not missing_repetitions(self.folder, self.settings)
+            return not (
+                missing_repetitions(self.folder, self.settings)
+                or missing_rounds(self.folder, self.settings)
+            )
         return not missing_series(self.folder, self.settings)
 
 
@@ -136,6 +150,7 @@ def _planned(experiment: str, options: Options) -> _Plan:
         raise InputError("this rig has no tracker; the experiments need one")
     if isinstance(settings, KinematicsSettings):
         sequence_for(rig, settings)
+        poses_for(rig, settings)
     else:
         check_stiffness(rig, settings)
         _check_that_somebody_is_there(rig)
@@ -174,7 +189,7 @@ def _settings(
             )
         folder = Path(options.resume)
         settings: Settings = (
-            open_folder(folder, KinematicsSettings)
+            _kinematics_settings(folder)
             if experiment == "kinematics"
             else open_folder(folder, StiffnessSettings)
         )
@@ -190,7 +205,15 @@ def _settings(
     return settings, Path(log_folder) / f"{experiment}_{safe}_{stamp}"
 
 
+def _kinematics_settings(folder: Path) -> KinematicsSettings:
+    """Settings of a folder; one that does not speak of combined poses was begun without them."""
+    settings = open_folder(folder, KinematicsSettings)
+    begun_with = settings.poses if "poses" in settings.model_fields_set else 0
+    return settings.model_copy(update={"poses": begun_with})
+
+
 _QUANTITIES = {
+    "max": ("Pa", "pressure"),
     "period": ("s", "duration"),
     "settle": ("s", "duration"),
     "displacement": ("m", "length"),
@@ -287,26 +310,44 @@ def _say_where(experiment: str, plan: _Plan, options: Options) -> None:
 
 def _tell(plan: _Plan, options: Options) -> None:
     """Evaluate, report, draw."""
-    settings, folder, model = plan.settings, plan.folder, plan.model
-    if isinstance(settings, KinematicsSettings):
-        kinematics = evaluate_kinematics(read_recordings(folder, settings), model)
-        facts = experiment_report.kinematics_facts(kinematics, settings, model)
+    if isinstance(plan.settings, KinematicsSettings):
+        _tell_kinematics(plan, plan.settings, options)
     else:
-        stiffness = evaluate_stiffness(folder, settings, model)
-        write_stiffness_table(folder / TABLE, stiffness.table())
-        facts = experiment_report.stiffness_facts(stiffness, model)
+        _tell_stiffness(plan, plan.settings, options)
+
+
+def _tell_kinematics(plan: _Plan, settings: KinematicsSettings, options: Options) -> None:
+    folder, model = plan.folder, plan.model
+    result = evaluate_kinematics(read_recordings(folder, settings), model)
+    coverage = evaluate_coverage(read_rounds(folder, round_count(settings.poses)), model)
+    facts = experiment_report.kinematics_facts(result, coverage, settings, model)
     _write(folder / REPORT, experiment_report.markdown(facts))
     if options.plot:
         from stiffopt.plots import save_figure
-        from stiffopt.plots.experiments import plot_kinematics, plot_stiffness
+        from stiffopt.plots.experiments import plot_coverage, plot_kinematics
 
-        title = facts.title
-        figure = (
-            plot_kinematics(kinematics, title=title)
-            if isinstance(settings, KinematicsSettings)
-            else plot_stiffness(stiffness, title=title)
-        )
-        save_figure(figure, folder / FIGURE)
+        save_figure(plot_kinematics(result, title=facts.title), folder / FIGURE)
+        if coverage is not None:
+            title = f"{facts.title}, combined poses"
+            save_figure(plot_coverage(coverage, title=title), folder / POSES_FIGURE)
+    if options.as_json:
+        record = experiment_report.kinematics_record(result, coverage, settings, model)
+        write_line(json.dumps({**record, "folder": str(folder)}, allow_nan=False))
+    elif not options.quiet:
+        show(experiment_report.renderable(facts, str(folder)))
+
+
+def _tell_stiffness(plan: _Plan, settings: StiffnessSettings, options: Options) -> None:
+    folder, model = plan.folder, plan.model
+    result = evaluate_stiffness(folder, settings, model)
+    write_stiffness_table(folder / TABLE, result.table())
+    facts = experiment_report.stiffness_facts(result, model)
+    _write(folder / REPORT, experiment_report.markdown(facts))
+    if options.plot:
+        from stiffopt.plots import save_figure
+        from stiffopt.plots.experiments import plot_stiffness
+
+        save_figure(plot_stiffness(result, title=facts.title), folder / FIGURE)
     if not options.quiet:
         show(experiment_report.renderable(facts, str(folder)))
 

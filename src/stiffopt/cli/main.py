@@ -8,6 +8,14 @@ from typing import Annotated
 
 import typer
 
+from stiffopt.cli.calibrate import (
+    CALIBRATE_EPILOG,
+    CALIBRATE_HELP,
+    VALIDATE_EPILOG,
+    VALIDATE_HELP,
+    calibrate,
+    validate,
+)
 from stiffopt.cli.console import Closed, report_error
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
 from stiffopt.cli.experiment import experiment_app
@@ -37,6 +45,8 @@ app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
 app.command("robots")(robots)
 app.add_typer(map_app, name="map")
 app.add_typer(experiment_app, name="experiment")
+app.command("calibrate", help=CALIBRATE_HELP, epilog=CALIBRATE_EPILOG)(calibrate)
+app.command("validate", help=VALIDATE_HELP, epilog=VALIDATE_EPILOG)(validate)
 app.command("lab", help=LAB_HELP, epilog=LAB_EPILOG)(lab)
 
 solve_pressure_app = _application()

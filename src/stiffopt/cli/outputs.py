@@ -1,7 +1,9 @@
 """The files that are written: checked before the long work, written whole or not at all."""
 
 import os
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,6 +52,60 @@ def check(out: str | None, plot: str | None, tasks: Sequence[str]) -> FilesToWri
     for path in plots:
         _check_writable(path)
     return FilesToWrite(out, plots)
+
+
+def check_new_file(path: str, endings: tuple[str, ...]) -> None:
+    """Check the path of a file that is written only where there is none.
+
+    Raises
+    ------
+    FileError
+        It is there, cannot be written, or has the wrong ending.
+    """
+    _check_writable(path)
+    _check_ending(path, endings)
+    if os.path.lexists(path):
+        raise FileError(path, "exists; give another name, or remove it")
+
+
+def check_new_folder(path: str) -> None:
+    """Check the path of a folder that is made only where there is nothing.
+
+    Raises
+    ------
+    FileError
+        It is there, or cannot be made.
+    """
+    if os.path.lexists(path):
+        raise FileError(path, "exists; give another folder, or remove it")
+    parent = os.path.dirname(os.path.abspath(path))
+    if not os.path.isdir(parent):
+        raise FileError(path, f"cannot be made: there is no folder '{parent}'")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise FileError(path, "cannot be made: permission denied")
+
+
+@contextmanager
+def new_folder(path: str | None) -> Iterator[Path | None]:
+    """Context with a folder that gets its name at the end, and is removed if something fails.
+
+    Raises
+    ------
+    FileError
+        It cannot be made.
+    """
+    if path is None:
+        yield None
+        return
+    target = Path(os.path.abspath(path))
+    try:
+        with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as beside:
+            part = Path(beside) / "part"
+            part.mkdir()
+            yield part
+            part.rename(target)
+    except OSError as error:
+        raise FileError(path, f"cannot be made: {(error.strerror or '').lower()}") from None
 
 
 def write_results(path: str, answers: Sequence[Answer]) -> None:

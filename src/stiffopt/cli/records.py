@@ -35,7 +35,10 @@ def _json_record(answer: Answer) -> Record:
         "stiffness_unit": solution.stiffness_unit,
         "stiffnesses": solution.stiffnesses,
         "stiffnesses_plain": answer.plain,
+        "stiffness_interval": _interval(answer),
         "matrix_distance": solution.matrix_distance,
+        "tip_uncertainty_m": None if answer.uncertainty is None else answer.uncertainty.semi_axes,
+        "inside_recorded_range": None if answer.uncertainty is None else answer.uncertainty.inside,
         "compliance": solution.compliance,
         "active_bounds": solution.active_bounds,
         "freedom": solution.freedom,
@@ -47,6 +50,11 @@ def _json_record(answer: Answer) -> Record:
     if answer.front is not None:
         record["pareto"] = [_json_point(point) for point in answer.front]
     return record
+
+
+def _interval(answer: Answer) -> tuple[float, float] | None:
+    """95 % interval of the task's first stiffness, or None where nothing is known of it."""
+    return answer.intervals[0] if answer.intervals else None
 
 
 def _json_sensitivities(solution: PressureSolution) -> Record | None:
@@ -110,6 +118,7 @@ def result_record(answer: Answer) -> Record:
         "message": solution.message or None,
         "pressures": _quantities(solution.pressures, "Pa", "bar"),
         "tip": _tip(solution),
+        "uncertainty": _uncertainty(answer),
         "position_error": _quantity(solution.position_error, "m", "mm"),
         "angle_error": _quantity(solution.angle_error, "rad", "deg"),
         "stiffness": _stiffnesses(answer),
@@ -134,20 +143,33 @@ def _tip(solution: PressureSolution) -> Record | None:
     }
 
 
+def _uncertainty(answer: Answer) -> Record | None:
+    known = answer.uncertainty
+    if known is None:
+        return None
+    return {
+        "tip_semi_axes": _quantities(known.semi_axes, "m", "mm"),
+        "tip_axes": _strict(known.axes.T),
+        "inside_recorded_range": known.inside,
+    }
+
+
 def _stiffnesses(answer: Answer) -> list[Record] | None:
     solution = answer.solution
     plain = answer.plain or (None,) * len(solution.stiffnesses)
+    intervals = answer.intervals or (None,) * len(solution.stiffnesses)
     return [
         {
             "value": _quantity(value, measure.unit),
+            "interval": None if ends is None else [_quantity(end, measure.unit) for end in ends],
             "plain": _quantity(blind, measure.unit),
             "direction": list(measure.direction),
             "frame": measure.frame,
             "kind": measure.kind,
             "boundary": measure.boundary,
         }
-        for measure, value, blind in zip(
-            solution.task.measures, solution.stiffnesses, plain, strict=False
+        for measure, value, blind, ends in zip(
+            solution.task.measures, solution.stiffnesses, plain, intervals, strict=False
         )
     ] or None
 

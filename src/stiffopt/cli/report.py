@@ -27,6 +27,11 @@ from stiffopt.plots.wording import (
 
 _COLOURS = {"solved": "green", "unreachable": "yellow", "failed": "red", "bad input": "red"}
 _BAR = 1e-5  # per Pa
+_PARTS = {
+    "parameters": "the errors of the calibrated parameters",
+    "hysteresis": "hysteresis: it matters where the arm was before",
+    "residual": "what no parameter explained in the recordings",
+}
 
 Vector = NDArray[Any]
 Line = tuple[str, RenderableType]
@@ -59,6 +64,7 @@ def _lines(answer: Answer) -> Iterable[Line]:
         return
     yield "pressures", _pressures(answer, solution.pressures)
     yield from _tip(solution, solution.tip_pose)
+    yield from _uncertainty(answer)
     yield from _stiffnesses(answer)
     yield from _worth(solution)
     if solution.confidence is not None and solution.confidence.reached:
@@ -125,14 +131,39 @@ def _error(value: float, tolerance: float, unit: str, what: str) -> Text:
     )
 
 
+def _uncertainty(answer: Answer) -> Iterable[Line]:
+    """How well the calibration knows the tip there."""
+    known = answer.uncertainty
+    if known is None:
+        return
+    axes = " x ".join(f"{value * 1e3:.2f}" for value in known.semi_axes)
+    yield (
+        "known to",
+        Text.assemble(
+            (f"{axes} mm", "bold"),
+            f", semi-axes of the tip's 95 % ellipsoid\nmostly for {_PARTS[known.largest_part]}",
+        ),
+    )
+    if not known.inside:
+        yield (
+            "warning",
+            Text(
+                "the calibration saw no such pressures: the model extrapolates, and real errors\n"
+                "may be larger than this",
+                style="yellow",
+            ),
+        )
+
+
 def _stiffnesses(answer: Answer) -> Iterable[Line]:
     solution = answer.solution
     goal = solution.task.stiffness
     plain = answer.plain or (None,) * len(solution.stiffnesses)
-    for number, (measure, value, blind) in enumerate(
-        zip(solution.task.measures, solution.stiffnesses, plain, strict=False)
+    intervals = answer.intervals or (None,) * len(solution.stiffnesses)
+    for number, (measure, value, blind, ends) in enumerate(
+        zip(solution.task.measures, solution.stiffnesses, plain, intervals, strict=False)
     ):
-        yield "" if number else "stiffness", _stiffness(measure, value, blind)
+        yield "" if number else "stiffness", _stiffness(measure, value, blind, ends)
     if (
         goal is not None
         and isinstance(goal.match, MatchMatrix)
@@ -148,8 +179,15 @@ def _stiffnesses(answer: Answer) -> Iterable[Line]:
         )
 
 
-def _stiffness(measure: StiffnessMeasure, value: float, plain: float | None) -> Text:
+def _stiffness(
+    measure: StiffnessMeasure,
+    value: float,
+    plain: float | None,
+    interval: tuple[float, float] | None,
+) -> Text:
     remarks = [_demand(measure)]
+    if interval is not None:
+        remarks.append("95 %: {} to {}".format(*map(figures, interval)))
     if plain is not None:
         remarks.append(f"plain: {figures(plain)}, {gain_text(value, plain)}")
     remark = ", ".join(filter(None, remarks))

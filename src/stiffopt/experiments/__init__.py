@@ -1,6 +1,7 @@
 """The paper's experiments: protocols that run on any rig, and what they find."""
 
 from stiffopt.experiments.arm_map import ArmMap, TipMap, map_arm, map_tip
+from stiffopt.experiments.coverage_result import CoverageResult, evaluate_coverage
 from stiffopt.experiments.kinematics import (
     KinematicsSettings,
     PressureSequence,
@@ -12,12 +13,14 @@ from stiffopt.experiments.stiffness_result import StiffnessResult, evaluate_stif
 
 __all__ = [
     "ArmMap",
+    "CoverageResult",
     "KinematicsResult",
     "KinematicsSettings",
     "PressureSequence",
     "StiffnessResult",
     "StiffnessSettings",
     "TipMap",
+    "evaluate_coverage",
     "evaluate_kinematics",
     "evaluate_stiffness",
     "map_arm",

@@ -1,7 +1,8 @@
 """Experiment 1 of the paper: the tip while each channel in turn is ramped up and down.
 
 The pressure sequence is that of figure 5a: pair after pair, three sawteeth each, to 0.4, 0.8 and
-1.0 bar, nine teeth in 40 s for one segment. The arm is at rest before each repetition.
+1.0 bar, nine teeth in 40 s for one segment. The arm is at rest before each repetition. After all
+repetitions follow combined poses (`stiffopt.experiments.coverage`), which the paper does not have.
 """
 
 from __future__ import annotations
@@ -23,6 +24,12 @@ from stiffopt.experiments.conductor import (
     at_rest,
     check_pressures,
     steepest,
+)
+from stiffopt.experiments.coverage import (
+    Coverage,
+    coverage_for,
+    round_count,
+    round_name,
 )
 from stiffopt.experiments.folder import Recording
 from stiffopt.experiments.settings import ExperimentSettings, Progress
@@ -47,6 +54,9 @@ class KinematicsSettings(ExperimentSettings):
     experiment : says which.
     pressures : peaks of the teeth of each channel, in Pa.
     period : of a tooth, up and down, in s.
+    poses : combined ones that follow; 0 for the paper's sequence alone.
+    settle : how long the arm may take to come to rest in each of them, in s.
+    max : pressure that no channel exceeds in them, in Pa, beside the limits of the rig.
     """
 
     experiment: Literal["kinematics"] = "kinematics"
@@ -56,6 +66,9 @@ class KinematicsSettings(ExperimentSettings):
         1.0e5,
     )
     period: Annotated[Duration, Field(gt=0)] = 40.0 / 9.0
+    poses: Annotated[int, Field(ge=0, le=1000)] = 24
+    settle: Annotated[Duration, Field(gt=0)] = 7.0
+    max: Annotated[Pressure, Field(gt=0)] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +141,17 @@ def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
     return PressureSequence.sawtooth(base, settings.pressures, settings.period, steepest(rig))
 
 
+def poses_for(rig: Rig, settings: KinematicsSettings) -> Coverage:
+    """Return the combined poses as this rig can take them.
+
+    Raises
+    ------
+    InputError
+        A channel cannot be as low as the settings want it.
+    """
+    return coverage_for(rig, settings.poses, settings.settle, settings.max)
+
+
 def recording_name(repetition: int) -> str:
     """Return the name of a recording, without ending; repetitions count from 1."""
     return f"kinematics_{repetition}"
@@ -135,12 +159,18 @@ def recording_name(repetition: int) -> str:
 
 def missing_repetitions(folder: Path, settings: KinematicsSettings) -> list[int]:
     """Repetitions that are not complete in a folder, counted from 1."""
-    return [k for k in range(1, settings.repetitions + 1) if not _is_whole(folder, k)]
+    numbers = range(1, settings.repetitions + 1)
+    return [k for k in numbers if not _is_whole(folder, recording_name(k))]
 
 
-def _is_whole(folder: Path, repetition: int) -> bool:
-    """Whether both recordings of a repetition are there and the table can be read."""
-    name = recording_name(repetition)
+def missing_rounds(folder: Path, settings: KinematicsSettings) -> list[int]:
+    """Rounds of combined poses that are not complete in a folder, counted from 1."""
+    numbers = range(1, round_count(settings.poses) + 1)
+    return [k for k in numbers if not _is_whole(folder, round_name(k))]
+
+
+def _is_whole(folder: Path, name: str) -> bool:
+    """Whether both files of a recording are there and the table can be read."""
     try:
         return (folder / f"{name}.mcap").exists() and len(read_log(folder / f"{name}.csv").time) > 1
     except FileError:  # damaged or not there: it is done again
@@ -156,15 +186,16 @@ def run_kinematics(
     progress: Progress = lambda done, total, text: None,
     check: Callable[[], None] = lambda: None,
 ) -> list[str]:
-    """Record the repetitions that a folder lacks.
+    """Record the repetitions and the rounds of combined poses that a folder lacks.
 
     Parameters
     ----------
     rig : Rig
         Open.
     folder : Path
-        Gets ``kinematics_1.csv`` (log v1), ``kinematics_1.mcap`` and so on; one that is not
-        complete is called ``kinematics_1.part.csv``.
+        Gets ``kinematics_1.csv`` (log v1), ``kinematics_1.mcap`` and so on, and then
+        ``kinematics_poses_1.csv`` and so on; one that is not complete is called
+        ``kinematics_1.part.csv``.
     settings : KinematicsSettings
     rate : float
         Of the commands, in Hz.
@@ -185,27 +216,46 @@ def run_kinematics(
     DeviceError
         A device fails; what was recorded is kept.
     """
-    sequence = sequence_for(rig, settings)
+    sequence, coverage = sequence_for(rig, settings), poses_for(rig, settings)
     conductor = Conductor(rig, rate, check)
-    todo = missing_repetitions(folder, settings)
+    todo, rounds = missing_repetitions(folder, settings), missing_rounds(folder, settings)
+    total = sequence.duration * len(todo) + sum(map(coverage.duration, rounds))
     notes: list[str] = []
-    if todo:
+    if todo or rounds:
         conductor.start()
-    for count, repetition in enumerate(todo):
-        text = f"repetition {repetition} of {settings.repetitions}"
-        total = sequence.duration * len(todo)
 
-        def tell(t: float, done: float = sequence.duration * count, text: str = text) -> None:
-            progress(done + t, total, text)  # noqa: B023 - the same for all
+    def rest(base: Array, what: str) -> None:
+        conductor.ramp(base)
+        if not conductor.settle(base, at_rest, SETTLE):
+            notes.append(f"before {what} the arm was not at rest within {SETTLE:g} s")
+
+    done = 0.0
+    for repetition in todo:
+        text = f"repetition {repetition} of {settings.repetitions}"
+
+        def tell(t: float, done: float = done, text: str = text) -> None:
+            progress(done + t, total, text)
 
         tell(0.0)
-        conductor.ramp(sequence.at(0.0))
-        if not conductor.settle(sequence.at(0.0), at_rest, SETTLE):
-            notes.append(
-                f"before repetition {repetition} the arm was not at rest within {SETTLE:g} s"
-            )
+        rest(sequence.at(0.0), f"repetition {repetition}")
         about = {"experiment": "kinematics", "repetition": str(repetition), "rig": settings.rig}
         _record(conductor, sequence, folder, recording_name(repetition), about, tell)
+        done += sequence.duration
+    restless = 0
+    for number in rounds:
+
+        def say(t: float, text: str, done: float = done) -> None:
+            progress(done + t, total, text)
+
+        say(0.0, f"round {number} of combined poses")
+        rest(coverage.base, f"round {number} of combined poses")
+        about = {"experiment": "kinematics", "poses": str(number), "rig": settings.rig}
+        restless += coverage.record(conductor, folder, number, about, say)
+        done += coverage.duration(number)
+    if restless:
+        notes.append(
+            f"in {restless} combined poses the arm was not at rest within {settings.settle:g} s"
+        )
     return notes
 
 

@@ -15,19 +15,19 @@ from stiffopt.identify.choice import Candidate, best, held_back_errors
 from stiffopt.identify.comparison import Comparison, Errors
 from stiffopt.identify.estimates import Estimate, doubts, estimates
 from stiffopt.identify.fit import Fit, fit
-from stiffopt.identify.recording import Recording, prepare
+from stiffopt.identify.recording import Recording
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.setup import Setup, named, started
 from stiffopt.identify.structure import STRUCTURES, Structure
 from stiffopt.identify.unknowns import BASE
-from stiffopt.identify.validation import compare, placements
+from stiffopt.identify.validation import compare, placements, recordings_of
 from stiffopt.logs import Log, StiffnessTable
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.description import Recordings, RobotDescription
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.registration import Placement, Registration
 
-__all__ = ["CalibrationResult", "calibrate", "recordings_of"]
+__all__ = ["CalibrationResult", "calibrate"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
@@ -131,27 +131,6 @@ def calibrate(
     near = named(chosen.fit.problem, chosen.fit.x)
     final = _final(setup, chosen.structure, near, teller)
     return _result(setup, final, chosen.structure, candidates, teller)
-
-
-def recordings_of(
-    description: RobotDescription,
-    logs: Sequence[tuple[str, Log]],
-    settings: CalibrationSettings,
-) -> list[Recording]:
-    """Return logs as a fit and a validation use them."""
-    given = placements(description)
-    return [
-        prepare(
-            log,
-            name,
-            description,
-            channels=given.channels or None,
-            frame=given.frame,
-            bodies=tuple(given.bodies),
-            pressures=settings.pressures,
-        )
-        for name, log in logs
-    ]
 
 
 class _Teller:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Comparison", "Errors"]
+__all__ = ["Comparison", "Errors", "together"]
 
 Array = NDArray[np.float64]
 
@@ -91,8 +91,20 @@ class Comparison:
     @property
     def outside(self) -> Errors:
         """Errors of the rows whose pressures the calibration had not seen."""
-        beyond = ~self.inside
-        return Errors.of(self.distance[beyond], None if self.angle is None else self.angle[beyond])
+        return self.rows(~self.inside).errors
+
+    def rows(self, wanted: NDArray[np.bool_]) -> Comparison:
+        """Some rows (N,) of it."""
+        return replace(
+            self,
+            time=self.time[wanted],
+            pressures=self.pressures[wanted],
+            effective=self.effective[wanted],
+            measured=self.measured[wanted],
+            predicted=self.predicted[wanted],
+            angle=None if self.angle is None else self.angle[wanted],
+            inside=self.inside[wanted],
+        )
 
 
 def together(comparisons: Sequence[Comparison]) -> Errors:

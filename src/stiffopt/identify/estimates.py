@@ -89,7 +89,7 @@ def estimates(found: Fit) -> tuple[Estimate, ...]:
                 ends[2],
                 learnt=float(np.clip(1 - v, 0, 1)),
                 far=float(x),
-            )  # fmt: skip
+            )
         )
     return tuple(listed)
 

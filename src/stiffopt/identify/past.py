@@ -18,7 +18,8 @@ __all__ = ["Effective", "Past", "Start"]
 
 Array = NDArray[np.float64]
 
-_CHUNK = 2000  # rows that are run at once; only the wanted ones are kept
+_CHUNKS = (1, 32, 128, 512, 2048)  # rows that may be run at once; fewer are filled up
+_CARRIED = 5  # values and four derivatives
 _BETWEEN_LOGS = 60.0  # s at the last pressures, between two logs of a sequence
 
 
@@ -64,8 +65,8 @@ class Effective:
     ----------
     pressures : ndarray
         (M, c), in Pa.
-    per_lag, per_dead_time, per_side : ndarray
-        (M, c); by lag and dead time in s, and by the side of the same channel.
+    per_lag, per_lag_falling, per_dead_time, per_side, per_memory : ndarray
+        (M, c); by lags and dead time in s, and by side and memory of the same channel.
     per_share : ndarray
         (M, c, parts).
     end : Start
@@ -74,8 +75,10 @@ class Effective:
 
     pressures: Array
     per_lag: Array
+    per_lag_falling: Array
     per_dead_time: Array
     per_side: Array
+    per_memory: Array
     per_share: Array
     end: Start
 
@@ -94,7 +97,7 @@ class Past:
     def __init__(self, history: History | None, channels: int) -> None:
         self.history = history or NO_HISTORY
         self._channels = channels
-        self._runs = {lagging: self._run_function(lagging) for lagging in (False, True)}
+        self._runs: dict[tuple[bool, bool], _Run] = {}
 
     def effective(
         self,
@@ -124,70 +127,77 @@ class Past:
         before = np.vstack([start.before, delayed[:-1]])
         # a later command acts: d p(t - dead) / d dead = -p'
         changes = np.vstack([np.zeros(self._channels), -slope[:-1]]), -slope
-        run = self._runs[history.lag > 0]
-        state = np.concatenate(
-            [
-                start.states,
-                np.zeros_like(start.states),
-                np.zeros_like(start.states),
-                start.per_side,
-            ],
-            axis=1,
-        )
+        run, lags = self._run(history), (history.lag, history.lag_falling)
+        state = _carried(start)
         kept = np.empty((len(wanted), *state.shape))
-        for begin in range(0, len(time), _CHUNK):
-            block = slice(begin, min(begin + _CHUNK, len(time)))
+        for begin in range(0, len(time), _CHUNKS[-1]):
+            block = slice(begin, min(begin + _CHUNKS[-1], len(time)))
             found = run(
                 state, before[block], delayed[block], changes[0][block], changes[1][block],
-                steps[block], max(history.lag, 1e-12),
+                steps[block], lags,
             )  # fmt: skip
             inside = (wanted >= block.start) & (wanted < block.stop)
             kept[inside] = found[wanted[inside] - begin]
             state = found[-1]
         shares = np.array([part.share for part in history.parts])
-        c, last = self._channels, history.stages - 1
-        values, by_lag, by_dead, by_side = (kept[:, :, k * c : (k + 1) * c] for k in range(4))
+        memory = np.array([history.memory_of(channel) for channel in range(self._channels)])
+        c = self._channels
+        values, by_lag, by_falling, by_dead, by_side = (
+            kept[:, :, k * c : (k + 1) * c] for k in range(_CARRIED)
+        )
+
+        def slow(states: Array) -> Array:
+            remembered: Array = np.einsum("j,mjc->mc", shares, states[:, 1:])
+            return remembered - float(shares.sum()) * states[:, 0]
 
         def mixed(states: Array) -> Array:
-            slow: Array = np.einsum("j,mjc->mc", shares, states[:, last + 1 :])
-            return (1 - float(shares.sum())) * states[:, last] + slow
+            return np.asarray(states[:, 0] + memory * slow(states))
 
-        end = Start(state[:, :c], state[:, 3 * c :], pressures[-1])
+        end = Start(state[:, :c], state[:, -c:], pressures[-1])
         return Effective(
             pressures=mixed(values),
             per_lag=mixed(by_lag),
+            per_lag_falling=mixed(by_falling),
             per_dead_time=mixed(by_dead),
             per_side=mixed(by_side),
-            per_share=np.swapaxes(values[:, last + 1 :] - values[:, last : last + 1], 1, 2),
+            per_memory=slow(values),
+            per_share=np.swapaxes(values[:, 1:] - values[:, :1], 1, 2) * memory[:, np.newaxis],
             end=self._rested(end, history),
         )
 
     def _rested(self, end: Start, history: History) -> Start:
         """State a while later, at the last pressures."""
-        c = self._channels
-        state = np.concatenate(
-            [end.states, np.zeros_like(end.states), np.zeros_like(end.states), end.per_side], axis=1
-        )
-        same, none = end.before[np.newaxis], np.zeros((1, c))
-        (state,) = self._runs[history.lag > 0](
-            state, same, same, none, none, np.array([_BETWEEN_LOGS]), max(history.lag, 1e-12)
-        )
-        return Start(state[:, :c], state[:, 3 * c :], end.before)
+        same, none = end.before[np.newaxis], np.zeros((1, self._channels))
+        (state,) = self._run(history)(
+            _carried(end), same, same, none, none, np.array([_BETWEEN_LOGS]),
+            (history.lag, history.lag_falling),
+        )  # fmt: skip
+        return Start(state[:, : self._channels], state[:, -self._channels :], end.before)
 
-    def _run_function(self, lagging: bool) -> _Run:
-        return _Run(self.history, self._channels, lagging)
+    def _run(self, history: History) -> _Run:
+        kind = (history.lag > 0, history.lag_falling > 0)
+        if kind not in self._runs:
+            self._runs[kind] = _Run(self.history, self._channels, *kind)
+        return self._runs[kind]
+
+
+def _carried(start: Start) -> Array:
+    """State of `_Run` (m, 5 c) in which only the side has an effect yet."""
+    none = np.zeros_like(start.states)
+    return np.concatenate([start.states, none, none, none, start.per_side], axis=1)
 
 
 class _Run:
     """The operators of several channels over many rows, with their derivatives carried along.
 
-    A state is (m, 4 c): the operators of each channel, then their derivatives by lag, dead time
-    and side.
+    A state is (m, 5 c): the operators of each channel, then their derivatives by lag, falling
+    lag, dead time and side.
     """
 
-    def __init__(self, history: History, channels: int, lagging: bool) -> None:
-        self._shape = (history.n_states, 4 * channels)
-        self._function = _steps(history, channels, lagging).mapaccum("run", _CHUNK)
+    def __init__(self, history: History, channels: int, lags: bool, falls: bool) -> None:
+        self._shape = (history.n_states, _CARRIED * channels)
+        step = _steps(history, channels, lags, falls)
+        self._functions = {rows: step.mapaccum("run", rows) for rows in _CHUNKS}
 
     def __call__(
         self,
@@ -197,51 +207,47 @@ class _Run:
         before_change: Array,
         now_change: Array,
         steps: Array,
-        lag: float,
+        lags: tuple[float, float],
     ) -> Array:
-        """States (N, m, 4 c) after each of N steps; the pressures and their changes are (N, c)."""
+        """States (N, m, 5 c) after each of N steps; the pressures and their changes are (N, c)."""
         count = len(steps)
-        fill = _CHUNK - count
+        size = next(rows for rows in _CHUNKS if rows >= count)
+        fill = size - count
 
         def columns(values: Array) -> Array:
             return np.pad(values.reshape(count, -1), ((0, fill), (0, 0)), mode="edge").T
 
-        found = self._function(
+        found = self._functions[size](
             state,
             *(columns(each) for each in (before, now, before_change, now_change, steps)),
-            ca.repmat(ca.DM(lag), 1, _CHUNK),
+            ca.repmat(ca.DM(lags), 1, size),
         )
         rows, width = self._shape
-        states = np.asarray(found.full()).reshape(rows, _CHUNK, width)
+        states = np.asarray(found.full()).reshape(rows, size, width)
         return np.asarray(np.swapaxes(states[:, :count], 0, 1))
 
 
-def _steps(history: History, channels: int, lagging: bool) -> ca.Function:
-    """One step of `_Run`: state, pressures, their changes, length in s, lag in s -> state."""
+def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Function:
+    """One step of `_Run`: state, pressures, their changes, length and lags in s -> state."""
     m = history.n_states
-    value, by_lag, by_dead, by_side = (ca.SX.sym(name, m) for name in ("y", "l", "d", "s"))
+    value, *slopes = (ca.SX.sym(name, m) for name in ("y", "l", "f", "d", "s"))
     before, now, before_change, now_change = (ca.SX.sym(name) for name in ("a", "b", "da", "db"))
-    step, lag = ca.SX.sym("step"), ca.SX.sym("lag")
-    end = history.model_copy(update={"lag": lag if lagging else 0.0}).next_state(
-        value, before, now, step
-    )
+    step, lag = ca.SX.sym("step"), ca.SX.sym("lag", 2)
+    update = {"lag": lag[0] if lags else 0.0, "lag_falling": lag[1] if falls else 0.0}
+    end = history.model_copy(update=update).next_state(value, before, now, step)
+    by_lag, by_falling, by_dead, by_side = (ca.jtimes(end, value, slope) for slope in slopes)
+    direct = ca.jacobian(end, lag)
     moved = ca.jtimes(end, ca.vertcat(before, now), ca.vertcat(before_change, now_change))
-    ends = [
-        end,
-        ca.jtimes(end, value, by_lag) + ca.jacobian(end, lag),
-        ca.jtimes(end, value, by_dead) + moved,
-        ca.jtimes(end, value, by_side),
-    ]
     one = ca.Function(
         "one",
-        [value, by_lag, by_dead, by_side, before, now, before_change, now_change, step, lag],
-        ends,
+        [value, *slopes, before, now, before_change, now_change, step, lag],
+        [end, by_lag + direct[:, 0], by_falling + direct[:, 1], by_dead + moved, by_side],
     )
-    state = ca.SX.sym("state", m, 4 * channels)
+    state = ca.SX.sym("state", m, _CARRIED * channels)
     pressures = [ca.SX.sym("p", channels) for _ in range(4)]
-    blocks: list[list[ca.SX]] = [[], [], [], []]
+    blocks: list[list[ca.SX]] = [[] for _ in range(_CARRIED)]
     for c in range(channels):
-        parts = [state[:, k * channels + c] for k in range(4)]
+        parts = [state[:, k * channels + c] for k in range(_CARRIED)]
         found = one.call([*parts, *(p[c] for p in pressures), step, lag])
         for block, part in zip(blocks, found, strict=True):
             block.append(part)

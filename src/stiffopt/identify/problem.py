@@ -32,6 +32,9 @@ __all__ = ["Begin", "Noise", "Point", "Predicted", "Problem", "Sample", "Unknown
 Array = NDArray[np.float64]
 
 
+_MOST_MEMORY = 0.9  # sum of the shares of a channel, beyond which a penalty grows
+_MEMORY_SLACK = 0.01
+
 Begin = Literal["rest", "previous", "unknown"]
 """How a log begins: after a rise from no pressure, as the previous one ended, or nobody knows."""
 
@@ -236,7 +239,31 @@ class Problem:
             value, jacobian = self._stiffness_residuals(table, x)
             values.append(value)
             jacobians.append(jacobian)
+        value, jacobian = self._too_much_memory(x)
+        values.append(value)
+        jacobians.append(jacobian)
         return np.concatenate(values), np.concatenate(jacobians) * self.scale
+
+    def _too_much_memory(self, x: Array) -> tuple[Array, Array]:
+        """By how much the shares of each channel's history exceed what is sensible, (n,)."""
+        n = self.description.n_pressures
+        value, slope = np.zeros(n), np.zeros((n, self.size))
+        row = 0
+        for s, segment in enumerate(self.description.segments):
+            history = self._history(s, x * self.scale)
+            prefix = f"segments[{s}].history"
+            total = sum(part.share for part in history.parts)
+            for c in range(segment.n_channels):
+                memory = history.memory_of(c)
+                if memory * total > _MOST_MEMORY:
+                    value[row] = (memory * total - _MOST_MEMORY) / _MEMORY_SLACK
+                    for key, i in self._index.items():
+                        if key.startswith(prefix) and key.endswith("share"):
+                            slope[row, i] = memory / _MEMORY_SLACK
+                        elif key == f"{prefix}.memory[{c}]":
+                            slope[row, i] = memory * total / _MEMORY_SLACK
+                row += 1
+        return value, slope
 
     def predict(self, x: Array) -> Predicted:
         """What the model says at scaled coordinates (d,)."""
@@ -247,9 +274,10 @@ class Problem:
     ) -> None:
         """Add weighted residuals (M, 3) and their slopes (M, 3, d) by unscaled coordinates."""
         known = ~np.isnan(error.sum(axis=1))
-        weight = np.where(known, self._weights, 0.0) / scale
-        values.append((np.where(known[:, np.newaxis], error, 0.0) * weight[:, np.newaxis]).ravel())
-        jacobians.append((slope * weight[:, np.newaxis, np.newaxis]).reshape(-1, self.size))
+        weight = (np.where(known, self._weights, 0.0) / scale)[:, np.newaxis]
+        values.append((np.where(known[:, np.newaxis], error, 0.0) * weight).ravel())
+        slope = np.where(known[:, np.newaxis, np.newaxis], slope, 0.0)
+        jacobians.append((slope * weight[..., np.newaxis]).reshape(-1, self.size))
 
     def _predict(self, x: Array) -> tuple[Predicted, list[tuple[Array, Array | None]]]:
         """Prediction, and the slopes (M, 3, d) of each point's position and turn."""
@@ -309,13 +337,14 @@ class Problem:
             end: Start | None = None
             for i, sample in enumerate(self.samples):
                 pressures = sample.recording.pressures[:, channels]
+                before = sample.recording.before[channels]
                 if sample.begin == "previous" and end is not None:
                     start = end
                 elif sample.begin == "unknown" and sides[i].stop > sides[i].start:
                     own = coordinates[sides[i]][channels]
-                    start = Start.settled(history, pressures[0], own)
+                    start = Start.settled(history, before, own)
                 else:
-                    start = Start.from_rest(history, pressures[0])
+                    start = Start.from_rest(history, before)
                 found = past.effective(
                     sample.recording.time, pressures, sample.rows, start, history
                 )
@@ -335,6 +364,13 @@ class Problem:
         lag = self._index.get(f"{prefix}.lag")
         if lag is not None:
             slopes[:, :, lag] = found.per_lag * history.lag
+        falling = self._index.get(f"{prefix}.lag_falling")
+        if falling is not None:
+            slopes[:, :, falling] = found.per_lag_falling * history.lag_falling
+        for c in range(slopes.shape[1]):
+            memory = self._index.get(f"{prefix}.memory[{c}]")
+            if memory is not None:
+                slopes[:, c, memory] = found.per_memory[:, c] * history.memory_of(c)
         dead_time = self._index.get(f"{prefix}.dead_time")
         if dead_time is not None:
             slopes[:, :, dead_time] = found.per_dead_time
@@ -360,6 +396,10 @@ class Problem:
             update={
                 "dead_time": value("dead_time", history.dead_time),
                 "lag": value("lag", history.lag),
+                "lag_falling": value("lag_falling", history.lag_falling),
+                "memory": tuple(
+                    value(f"memory[{c}]", factor) for c, factor in enumerate(history.memory)
+                ),
                 "play": tuple(
                     play.model_copy(update={"share": value(f"play[{j}].share", play.share)})
                     for j, play in enumerate(history.play)

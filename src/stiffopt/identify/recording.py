@@ -36,6 +36,7 @@ Rows = NDArray[np.bool_]
 _MOST = 0.95  # share of the rows in which a frame must not have moved ...
 _MOVED = 2e-3  # ... by this, in m
 _TURNED = np.radians(2.0)  # ... or by this
+_LATE = 0.15  # of the range; gauges are off by less, regulators in the first row by more
 _TIP = "tip"
 _UNUSED = "these are not used"
 
@@ -65,6 +66,8 @@ class Recording:
     name : of the file.
     time : (N,), in s.
     pressures : (N, n), in Pa, in the order of the robot's channels; all finite.
+    before : (n,), pressures in the arm when the log begins, in Pa. A log may begin with a step:
+        commanded in its first row, where the measured pressure is still the old one.
     tracks : the tip first.
     remarks : what was found and what was done about it, one sentence each.
     """
@@ -72,6 +75,7 @@ class Recording:
     name: str
     time: Array
     pressures: Array
+    before: Array
     tracks: tuple[Track, ...]
     remarks: tuple[str, ...]
 
@@ -156,7 +160,8 @@ def prepare(
         remarks += found
     kept = tuple(tracks[body] for body in (_TIP, *bodies))
     check_excitation(name, log.time, p, kept[0].position, description)
-    return Recording(name, log.time, p, kept, remarks)
+    before = _before(log, columns, p, description)
+    return Recording(name, log.time, p, before, kept, remarks)
 
 
 def _columns(there: int, channels: Sequence[int] | None, wanted: int) -> list[int]:
@@ -219,6 +224,18 @@ def _pressures(
     how = "from the rows before and after" if which == "measured" else "as in the last row with one"
     missing = ~whole(p)
     return filled, counted(missing, log.time, f"a {which} pressure is missing", f"taken {how}")
+
+
+def _before(log: Log, columns: list[int], pressures: Array, description: RobotDescription) -> Array:
+    """Return pressures (n,) in the arm at the first row: measured, where they are far from it."""
+    first: Array = pressures[0].copy()
+    if log.measured is None:
+        return first
+    measured = log.measured[0, columns]
+    span = np.subtract(description.pressure_max, description.pressure_min)
+    late = np.abs(measured - first) > _LATE * span  # not where it is missing
+    first[late] = measured[late]
+    return first
 
 
 def _stale(log: Log) -> Rows:

@@ -90,7 +90,7 @@ def begins(recordings: Sequence[Recording], span: Array, sequence: bool) -> list
     """How each recording begins; in a sequence, each as the one before it ended."""
     found: list[Begin] = []
     for index, recording in enumerate(recordings):
-        at_rest = bool((np.abs(recording.pressures[0]) <= _REST * span).all())
+        at_rest = bool((np.abs(recording.before) <= _REST * span).all())
         if sequence and index:
             found.append("previous")
         else:

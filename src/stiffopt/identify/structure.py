@@ -11,7 +11,7 @@ __all__ = ["STRUCTURES", "Structure"]
 
 _LAG = 0.3  # s, where the robot file does not say
 _DEAD_TIME = 0.1  # s
-_WIDTHS = (0.05, 0.13, 0.27, 0.53)  # of plays, as shares of the highest pressure that was seen
+_WIDTHS = (0.05, 0.12, 0.24, 0.46)  # of plays, as shares of the highest pressure that was seen
 _SHARE = 0.05  # of each play, to begin with
 _BENDS_TO = 0.6  # least bending radius over the length of a segment
 _DEAD_BAND = 0.05  # of the highest pressure that was seen
@@ -26,14 +26,16 @@ class Structure:
     name : for people and the command line.
     words : what it has, in words.
     shape : names of the parameters of each segment's equilibrium that are fitted.
-    lag, play, dead_time : whether its history has them.
+    lag, falling, play, memory, dead_time : whether its history has them.
     """
 
     name: str
     words: str
     shape: tuple[str, ...]
     lag: bool = False
+    falling: bool = False
     play: bool = False
+    memory: bool = False
     dead_time: bool = False
 
     def applied(self, description: RobotDescription, seen: float) -> RobotDescription:
@@ -50,7 +52,7 @@ class Structure:
         return description.model_copy(update={"segments": segments, "calibration": None})
 
     def _segment(self, segment: Segment, seen: float) -> Segment:
-        update: dict[str, object] = {"history": self._history(segment.history or History(), seen)}
+        update: dict[str, object] = {"history": self._history(segment, seen)}
         if segment.strain_law == "paper":
             given = segment.compensation or Compensation()
             update["compensation"] = given.model_copy(
@@ -70,13 +72,16 @@ class Structure:
         )
         return segment.model_copy(update=update)
 
-    def _history(self, given: History, seen: float) -> History | None:
+    def _history(self, segment: Segment, seen: float) -> History | None:
+        given = segment.history or History()
         if not (self.lag or self.play):
             return None
         plays = given.play or tuple(Play(width=w * seen, share=_SHARE) for w in _WIDTHS)
         return History(
             dead_time=(given.dead_time or _DEAD_TIME) if self.dead_time else 0.0,
             lag=(given.lag or _LAG) if self.lag else 0.0,
+            lag_falling=(given.lag_falling or given.lag or _LAG) if self.falling else 0.0,
+            memory=(given.memory or (1.0,) * segment.n_channels) if self.memory else (),
             play=plays if self.play else (),
         )
 
@@ -102,7 +107,23 @@ STRUCTURES = (
     Structure("lag", "a first-order lag", _BASIC, lag=True),
     Structure("hysteresis", "lag and play", _BASIC, lag=True, play=True),
     Structure(
-        "delayed-hysteresis", "dead time, lag and play", _BASIC, lag=True, play=True, dead_time=True
+        "channel-hysteresis",
+        "lags when rising and falling, and play of each channel's own",
+        _BASIC,
+        lag=True,
+        falling=True,
+        play=True,
+        memory=True,
+    ),
+    Structure(
+        "delayed-hysteresis",
+        "dead time, lags when rising and falling, and play of each channel's own",
+        _BASIC,
+        lag=True,
+        falling=True,
+        play=True,
+        memory=True,
+        dead_time=True,
     ),
     Structure(
         "progressive",

@@ -92,6 +92,8 @@ def history_unknowns(description: RobotDescription, tolerances: Tolerances) -> l
         if history is None:
             continue
         names = ["dead_time"] * (history.dead_time > 0) + ["lag"] * (history.lag > 0)
+        names += ["lag_falling"] * (history.lag_falling > 0)
+        names += [f"memory[{c}]" for c in range(len(history.memory))]
         names += [f"play[{j}].share" for j in range(len(history.play))]
         names += [f"creep[{j}].share" for j in range(len(history.creep))]
         for name in names:
@@ -100,8 +102,10 @@ def history_unknowns(description: RobotDescription, tolerances: Tolerances) -> l
             low, high = -math.inf, math.inf
             if name == "dead_time":
                 deviation, low = tolerances.dead_time, -value
-            elif name == "lag":
+            elif name.startswith("lag"):
                 deviation = tolerances.lag
+            elif name.startswith("memory"):
+                deviation = tolerances.memory
             else:
                 deviation, (low, high) = tolerances.share, _between(value, 0.0, _LARGEST_SHARE)
             unit = "" if parameter.is_positive else parameter.unit

@@ -11,19 +11,79 @@ from numpy.typing import NDArray
 from stiffopt.identify.comparison import Comparison
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import Noise, Point, Predicted, Problem, Sample, Unknowns
-from stiffopt.identify.recording import Recording, Track, aligned
+from stiffopt.identify.recording import Recording, Track, aligned, prepare
 from stiffopt.identify.samples import begins, chosen_rows, thinned
+from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.unknowns import Unknown, side_unknowns, zero_unknowns
+from stiffopt.logs import Log
 from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.registration import Placement
 
-__all__ = ["compare", "points_of"]
+__all__ = ["compare", "recordings_of", "validate"]
 
 Array = NDArray[np.float64]
 
 MOST_ROWS = 50_000  # of a log that are compared; more say nothing more
-SETTLE = 2.0  # s, in which the state of an arm that does not begin at rest is estimated
-_NOISE = Noise(1e-3, np.radians(2.0))  # of that estimate
+_NOISE = Noise(1e-3, np.radians(2.0))  # of readings, for a robot that was not calibrated
+
+
+def validate(
+    description: RobotDescription,
+    logs: Sequence[tuple[str, Log]],
+    settings: CalibrationSettings | None = None,
+    progress: Callable[[float, float, str], None] | None = None,
+) -> tuple[Comparison, ...]:
+    """Run a robot along logs and compare; nothing of the robot is fitted.
+
+    Parameters
+    ----------
+    description : RobotDescription
+    logs : sequence of (name, Log)
+        In the order in which they were recorded.
+    settings : CalibrationSettings, optional
+        How logs are read; what is fitted has no effect here.
+    progress : callable, optional
+        Is told what is done, of how much, and in words.
+
+    Raises
+    ------
+    InputError
+        A log is not usable; it names the log.
+    """
+    settings = settings or CalibrationSettings()
+    if progress is not None:
+        progress(0, 2, "reading logs")
+    recordings = recordings_of(description, logs, settings)
+    if progress is not None:
+        progress(1, 2, "comparing")
+    return compare(
+        description,
+        recordings,
+        sequence=settings.sequence,
+        rezero=settings.rezero,
+        settle=settings.settle,
+    )
+
+
+def recordings_of(
+    description: RobotDescription,
+    logs: Sequence[tuple[str, Log]],
+    settings: CalibrationSettings,
+) -> list[Recording]:
+    """Return logs as a fit and a validation use them."""
+    given = placements(description)
+    return [
+        prepare(
+            log,
+            name,
+            description,
+            channels=given.channels or None,
+            frame=given.frame,
+            bodies=tuple(given.bodies),
+            pressures=settings.pressures,
+        )
+        for name, log in logs
+    ]
 
 
 def compare(
@@ -32,7 +92,7 @@ def compare(
     *,
     sequence: bool = False,
     rezero: bool = False,
-    settle: float = SETTLE,
+    settle: float = 2.0,
     most: int = MOST_ROWS,
     tell: Callable[[], None] = lambda: None,
 ) -> tuple[Comparison, ...]:
@@ -172,7 +232,7 @@ def _beginnings(
             if begun.begin == "previous":
                 begun = replace(begun, begin="rest")
             own = replace(_none([begun], points), zeros=(zeros,), sides=(sides,))
-            problem = Problem(description, own, [begun], points, base, _NOISE)
+            problem = Problem(description, own, [begun], points, base, _noise(description))
             x = fit(problem, [x], tell, rounds=0).x
         found.append(x)
     unknowns = replace(_none(samples, points), zeros=tuple(all_zeros), sides=tuple(all_sides))
@@ -180,6 +240,14 @@ def _beginnings(
     zeros_first = [x[: len(zeros)] for x, zeros in zip(found, all_zeros, strict=True)]
     sides_last = [x[len(zeros) :] for x, zeros in zip(found, all_zeros, strict=True)]
     return unknowns, np.concatenate([np.zeros(0), *zeros_first, *sides_last])
+
+
+def _noise(description: RobotDescription) -> Noise:
+    """What a prediction may be expected to miss: nothing finer can be told from it."""
+    known = description.calibration
+    if known is None or not known.position_residual:
+        return _NOISE
+    return Noise(known.position_residual, known.angle_residual or _NOISE.angle)
 
 
 def _comparison(

@@ -8,14 +8,14 @@ model need not know.  To add a law, subclass `StrainLaw` and enter it in `STRAIN
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.model.description import Segment
+from stiffopt.model.description import Compensation, Segment
 
 NORM_SMOOTHING = 0.01
 """Rounding of the cone sqrt(p.p) at zero pressure, in Pa (see `smooth_norm`)."""
@@ -97,12 +97,15 @@ def smooth_norm(p: ca.SX) -> ca.SX:
 def onset(p: ca.SX, dead_band: ca.SX | float) -> ca.SX:
     """Pressure less a dead band: ``w ln((1 + e^((p - b) / w)) / (1 + e^(-b / w)))``.
 
-    Monotone, zero at p = 0, and its slope rises from 0.12 to 1; the width w is half the band b.
+    Smooth, monotone, zero at p = 0, and its slope rises from 0.12 to 1; the width w is half the
+    band b.  Far above the band it is ``p - 1.06 b``.  It is meant for positive pressures: below
+    zero hardly anything comes through.
     """
     w = dead_band / 2
     z = (p - dead_band) / w
-    # ln(1 + e^z) without overflow
-    return w * (ca.fmax(z, 0) + ca.log1p(ca.exp(-ca.fabs(z))) - np.log1p(np.exp(-2.0)))
+    # ln(1 + e^z) without overflow, in which the exponential is lost to rounding from 30 on
+    logarithm = ca.if_else(z > 30, z, ca.log1p(ca.exp(ca.fmin(z, 40))))
+    return w * (logarithm - np.log1p(np.exp(-2.0)))
 
 
 def _bending(second_moment: ca.SX) -> ca.SX:
@@ -135,6 +138,7 @@ class StrainLaw(ABC):
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
         self.geometry = SectionGeometry.of(segment)
+        self.compensation = segment.compensation or Compensation()
 
     @abstractmethod
     def section(self, p: ca.SX) -> Section:
@@ -156,6 +160,35 @@ class StrainLaw(ABC):
         if len(corrections.offset):
             p = p + ca.vertcat(*corrections.offset)
         return p
+
+    def _modulus(self, acting: ca.SX, softening: Any = 1.0) -> ca.SX:
+        """Compensated modulus ``E + softening slope |p|``, in Pa."""
+        modulus = self.segment.material.youngs_modulus
+        slope = ca.SX(softening * self.compensation.modulus_per_pressure)
+        return ca.SX(modulus) if slope.is_zero() else modulus + slope * smooth_norm(acting)
+
+    def _loaded_modulus(self, acting: ca.SX) -> ca.SX:
+        """Modulus with which the section gives way to loads, in Pa."""
+        return self.compensation.stiffness * self._modulus(acting, self.compensation.softening)
+
+    def _modulus_margin(self, p: ca.SX) -> ca.SX:
+        """Compensated modulus over a thousandth of the nominal one, less one."""
+        return self._modulus(self._acting(p)) / (1e-3 * self.segment.material.youngs_modulus) - 1
+
+    def _bent(self, omega: ca.SX, flexibility: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Curvature (2,) and flexibility (2, 2) by which the least bending radius lets it bend."""
+        radius = self.compensation.bending_radius
+        if ca.SX(radius).is_zero():
+            return omega, flexibility
+        omega, less = _limited(omega, radius)
+        return omega, less @ flexibility @ less
+
+    def _lengthened(self, stretch: ca.SX, omega: ca.SX) -> ca.SX:
+        """Stretch of the line of centroids with what bending by omega (2,) adds to it."""
+        lengthening = self.compensation.lengthening
+        if ca.SX(lengthening).is_zero():
+            return stretch
+        return stretch + lengthening * self.segment.outer_radius**2 * ca.sumsqr(omega)
 
     def _axial_force(self, acting: ca.SX) -> ca.SX:
         """Force of the acting pressures on the section, ``f_z = sum P A_c``, in N."""
@@ -188,14 +221,13 @@ class StrainLaw(ABC):
         return ca.sparsify(A @ compliance @ A.T)
 
 
-class PaperLaw(StrainLaw):
-    """The paper's law: linear, per deformed length, with compensation coefficients lambda.
+class LinearLaw(StrainLaw):
+    """Linear fibres with compensation coefficients lambda (eqs 8-10).
 
     ``lambda_E = E + slope |p|``, ``lambda_A = a A``, ``lambda_I = i I``; elongation
-    ``f_z l / (E A)``; curvature ``M / (E I)`` per *deformed* length, and the compliance of
-    eq. 17 integrated over deformed length (slip 8 of the notes).  Where the centroid is off the
-    axis, which the paper does not treat, all this holds for the line of centroids, and the
-    compensated second moment is that about the centroid.
+    ``f_z l / (E A)``; curvature ``M / (E I)`` and compliance per the length that the subclass
+    names.  Where the centroid is off the axis, which the paper does not treat, all this holds for
+    the line of centroids, and the compensated second moment is that about the centroid.
 
     Loads meet the modulus ``stiffness (E + softening slope |p|)``, the paper's own where both
     factors are 1.  Where there is a least bending radius R, the curvature is
@@ -204,47 +236,27 @@ class PaperLaw(StrainLaw):
     """
 
     limit = "the pressure drives the compensated modulus of this segment to zero"
-
-    def _modulus(self, acting: ca.SX, softening: Any = 1.0) -> ca.SX:
-        modulus = self.segment.material.youngs_modulus
-        compensation = self.segment.compensation
-        if compensation is None:
-            return ca.SX(modulus)
-        slope = ca.SX(softening * compensation.modulus_per_pressure)
-        return ca.SX(modulus) if slope.is_zero() else modulus + slope * smooth_norm(acting)
-
-    def _loaded_modulus(self, acting: ca.SX) -> ca.SX:
-        """Modulus with which the section gives way to loads."""
-        compensation = self.segment.compensation
-        if compensation is None:
-            return self._modulus(acting)
-        return compensation.stiffness * self._modulus(acting, compensation.softening)
+    _per_deformed_length: ClassVar[bool]
 
     def margin(self, p: ca.SX) -> ca.SX:
         """Compensated modulus over a thousandth of the nominal one, less one."""
-        return self._modulus(self._acting(p)) / (1e-3 * self.segment.material.youngs_modulus) - 1
+        return self._modulus_margin(p)
 
     def section(self, p: ca.SX) -> Section:
         """Section of eqs 8-10; see `StrainLaw.section`."""
-        compensation = self.segment.compensation
-        scale_area = compensation.area if compensation else 1.0
-        scale_inertia = compensation.inertia if compensation else 1.0
-        radius = compensation.bending_radius if compensation else 0.0
-        lengthening = compensation.lengthening if compensation else 0.0
         geometry = self.geometry
-        area = scale_area * geometry.area
-        inertia = scale_inertia * ca.DM(geometry.second_moment)
+        area = self.compensation.area * geometry.area
+        inertia = self.compensation.inertia * ca.DM(geometry.second_moment)
         acting = self._acting(p)
         E = self._modulus(acting)
         loaded = self._loaded_modulus(acting)
         G = loaded / (2 * (1 + self.segment.material.poisson_ratio))
         force, moment = self._axial_force(acting), self._moment_about_centroid(acting)
-        kappa = ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E
-        flexibility = ca.inv_minor(loaded * _bending(inertia))
-        if not ca.SX(radius).is_zero():
-            kappa, less = _limited(kappa, radius)
-            flexibility = less @ flexibility @ less
-        per_deformed_length = self._about_axis(
+        kappa, flexibility = self._bent(
+            ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E,
+            ca.inv_minor(loaded * _bending(inertia)),
+        )
+        compliance = self._about_axis(
             self._compliance_about_centroid(
                 shear=G * area,
                 axial=loaded * area,
@@ -254,11 +266,32 @@ class PaperLaw(StrainLaw):
             ca.SX(geometry.centroid),
         )
         c = geometry.centroid
-        stretch = 1 + force / (E * area)  # of the line of centroids
-        if not ca.SX(lengthening).is_zero():
-            stretch += lengthening * self.segment.outer_radius**2 * ca.sumsqr(kappa)
-        strain = stretch * ca.vertcat(0, 0, 1 + kappa[1] * c[0] - kappa[0] * c[1], kappa, 0)
-        return Section(strain, stretch * per_deformed_length)
+        stretch = self._lengthened(1 + force / (E * area), kappa)  # of the line of centroids
+        if self._per_deformed_length:
+            strain = stretch * ca.vertcat(0, 0, 1 + kappa[1] * c[0] - kappa[0] * c[1], kappa, 0)
+            return Section(strain, stretch * compliance)
+        along = stretch + kappa[1] * c[0] - kappa[0] * c[1]
+        return Section(ca.vertcat(0, 0, along, kappa, 0), compliance)
+
+
+class PaperLaw(LinearLaw):
+    """The paper's law: linear, per *deformed* length.
+
+    So are its curvature and, integrated over deformed length, the compliance of eq. 17 (slip 8 of
+    the notes); per length at rest both gain the stretch as a factor.
+    """
+
+    _per_deformed_length = True
+
+
+class RestLengthLaw(LinearLaw):
+    """The paper's formulas per length at *rest*, as linear fibres have it.
+
+    A fibre's stress follows its length over that at rest, whatever the others do; so stretch and
+    bending do not mix.
+    """
+
+    _per_deformed_length = False
 
 
 class NeoHookeanLaw(StrainLaw):
@@ -275,42 +308,54 @@ class NeoHookeanLaw(StrainLaw):
 
     exact for the strain to first order in curvature, and for the compliance where the segment
     is straight; the coupling of stretch and bending that grows with curvature is left out.
+
+    Compensation coefficients mean what they mean in `LinearLaw`: E, A and I are the compensated
+    ones, loads meet the stiffnesses above with mu of the loaded modulus, the bending radius limits
+    the curvature per reference length, and lengthening adds to the stretch of the shape alone.
     """
 
-    limit = "the pressure compresses this segment beyond the neo-Hookean law's range"
+    limit = "the pressure brings this segment beyond the neo-Hookean law's range"
     _lowest_load = -1.8  # the closed-form root below is real down to -3 / 2^(2/3) = -1.89
 
-    def _shear_modulus(self) -> float:
-        return self.segment.material.youngs_modulus / 3
+    def _load(self, acting: ca.SX) -> ca.SX:
+        """Axial load N / (mu A) of the acting pressures."""
+        mu = self._modulus(acting) / 3
+        return self._axial_force(acting) / (mu * (self.compensation.area * self.geometry.area))
 
     def margin(self, p: ca.SX) -> ca.SX:
-        """Distance of the axial load N / (mu A) from the largest compression."""
-        load = self._axial_force(self._acting(p)) / (self._shear_modulus() * self.geometry.area)
-        return load - self._lowest_load
+        """Distance of the axial load from the largest compression, or that of `LinearLaw`."""
+        margin = self._load(self._acting(p)) - self._lowest_load
+        if ca.SX(self.compensation.modulus_per_pressure).is_zero():
+            return margin
+        return ca.fmin(margin, self._modulus_margin(p))
 
     def section(self, p: ca.SX) -> Section:
         """Section about the stretched state; see `StrainLaw.section`."""
         geometry = self.geometry
-        mu = self._shear_modulus()
+        area = self.compensation.area * geometry.area
+        inertia = self.compensation.inertia * ca.DM(geometry.second_moment)
         acting = self._acting(p)
-        load = self._axial_force(acting) / (mu * geometry.area)
-        stretch = neo_hookean_stretch(load)
-        tangent_modulus = mu * (1 + 2 * stretch**-3)
+        stretch = neo_hookean_stretch(self._load(acting))
+        rise = 1 + 2 * stretch**-3  # E_t / mu
         shrink = 1 / ca.sqrt(stretch)
-        bending = tangent_modulus * _bending(ca.DM(geometry.second_moment)) / stretch
+        mu, loaded = self._modulus(acting) / 3, self._loaded_modulus(acting) / 3
+        omega, flexibility = self._bent(
+            ca.inv_minor(mu * rise * _bending(inertia) / stretch)
+            @ (shrink * self._moment_about_centroid(acting)),
+            ca.inv_minor(loaded * rise * _bending(inertia) / stretch),
+        )
         centroid = shrink * ca.SX(geometry.centroid)
         compliance = self._about_axis(
             self._compliance_about_centroid(
-                shear=mu * geometry.area,
-                axial=tangent_modulus * geometry.area,
-                flexibility=ca.inv_minor(bending),
-                torsion=mu * np.trace(geometry.second_moment) / stretch,
+                shear=loaded * area,
+                axial=loaded * rise * area,
+                flexibility=flexibility,
+                torsion=loaded * ca.trace(inertia) / stretch,
             ),
             centroid,
         )
-        omega = ca.inv_minor(bending) @ (shrink * self._moment_about_centroid(acting))
-        axis_stretch = stretch + omega[1] * centroid[0] - omega[0] * centroid[1]
-        return Section(ca.vertcat(0, 0, axis_stretch, omega, 0), compliance)
+        along = self._lengthened(stretch, omega) + omega[1] * centroid[0] - omega[0] * centroid[1]
+        return Section(ca.vertcat(0, 0, along, omega, 0), compliance)
 
 
 def neo_hookean_stretch(load: ca.SX) -> ca.SX:
@@ -326,7 +371,11 @@ def neo_hookean_stretch(load: ca.SX) -> ca.SX:
     return third + u + third**2 / u
 
 
-STRAIN_LAWS: dict[str, type[StrainLaw]] = {"paper": PaperLaw, "neo-hookean": NeoHookeanLaw}
+STRAIN_LAWS: dict[str, type[StrainLaw]] = {
+    "paper": PaperLaw,
+    "rest-length": RestLengthLaw,
+    "neo-hookean": NeoHookeanLaw,
+}
 
 
 def strain_law(segment: Segment) -> StrainLaw:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from stiffopt.errors import shown
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Angle, Length, Number, Pressure
 
@@ -48,6 +49,7 @@ class Calibration(Schema):
         positions (each axis) and angles.
     pressure_min, pressure_max : between which each channel was recorded, in Pa.
     pressure_norm : largest norm that was recorded of each segment's pressures, in Pa.
+        Where nothing is said of what was recorded, everything counts as recorded.
     """
 
     logs: Items[str] = ()
@@ -61,10 +63,13 @@ class Calibration(Schema):
 
     @property
     def covariance(self) -> Array:
-        """Covariance (k, k) of the parameters' coordinates."""
+        """Covariance (k, k) of the parameters' coordinates, without negative variances."""
         deviations = np.array([parameter.deviation for parameter in self.parameters])
         matrix = np.array(self.correlation, dtype=float).reshape(len(deviations), len(deviations))
-        return matrix * np.outer(deviations, deviations)
+        # the file's few digits may leave what is as good as known slightly below zero
+        values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+        root = deviations[:, np.newaxis] * vectors * np.sqrt(np.maximum(values, 0.0))
+        return np.asarray(root @ root.T)
 
     def covers(self, channels: Sequence[int], pressures: Array) -> NDArray[np.bool_]:
         """Say which pressures (N, n) lie within what was recorded.
@@ -76,17 +81,27 @@ class Calibration(Schema):
         pressures : (N, n)
             In Pa.
         """
-        low, high = np.array(self.pressure_min), np.array(self.pressure_max)
-        slack = _SLACK * np.max(np.abs([low, high]), initial=0.0)
+        everything = (np.inf,) * pressures.shape[1]
+        low = np.array(self.pressure_min or np.negative(everything))
+        high = np.array(self.pressure_max or everything)
+        norms = self.pressure_norm or (np.inf,) * len(channels)
+        recorded = [*self.pressure_min, *self.pressure_max]
+        slack = _SLACK * np.max(np.abs(recorded), initial=0.0)
         inside = ((pressures >= low - slack) & (pressures <= high + slack)).all(axis=1)
         ends = np.cumsum([0, *channels])
-        for begin, end, norm in zip(ends, ends[1:], self.pressure_norm, strict=False):
+        for begin, end, norm in zip(ends, ends[1:], norms, strict=False):
             inside &= np.linalg.norm(pressures[:, begin:end], axis=1) <= norm + slack
         return np.asarray(inside)
 
     @model_validator(mode="after")
     def _check(self) -> Calibration:
         k = len(self.parameters)
+        keys = [parameter.key for parameter in self.parameters]
+        for index, key in enumerate(keys):
+            if key in keys[:index]:
+                raise BadKeyError(
+                    f"parameters.{index}.key", f"{shown(key)} is there twice; expected once"
+                )
         rows = [len(row) for row in self.correlation]
         if rows != [k] * k:
             raise BadKeyError("correlation", f"expected {k} rows of {k} numbers, one per parameter")

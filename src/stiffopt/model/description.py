@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -46,6 +47,7 @@ __all__ = [
 ]
 
 _SLACK = 1e-9  # m; two circles that touch may overlap by rounding
+_INDEX = re.compile(r"\[(\d{1,4})\]")
 
 
 def _index(value: Any) -> Any:
@@ -129,10 +131,10 @@ class Compensation(Schema):
     softening : share of `modulus_per_pressure` by which the arm gives way to loads more easily;
         the rest is pressure that acts ever more strongly, as in chambers that swell. 1 in the
         paper.
-    bending_radius : that pressure bends to at the most, in m: the silicone stiffens towards it.
-        0 in the paper, which knows no limit.
+    bending_radius : least radius that pressure bends to, in m, of the axis per length as the strain
+        law counts it: the silicone stiffens towards it. 0 in the paper, which knows no limit.
     lengthening : stretch of the axis per squared strain ``(outer_radius / bending radius)^2`` of
-        the wall that bending stretches most. 0 in the paper.
+        the wall that bending stretches most. Loads do not lengthen. 0 in the paper.
     """
 
     modulus_per_pressure: Number = 0.0
@@ -151,7 +153,8 @@ class Corrections(Schema):
     ----------
     gain : pressure that acts per pressure.
     offset : pressure that acts in addition, in Pa.
-    dead_band : of all channels: pressure up to which hardly anything moves, in Pa.
+    dead_band : of all channels: pressure up to which hardly anything moves, in Pa. It comes before
+        gain and offset, and is for pressures that are never negative.
     azimuth : turns the channel's chambers about the axis, from x towards y, in rad.
     """
 
@@ -174,7 +177,8 @@ class Segment(Schema):
     corrections : of the channels, or None for none.
     history : how the shape lags behind the pressures, or None if it does not.
     connector : rigid length after the segment, in m.
-    strain_law : how pressures strain the segment.
+    strain_law : how pressures strain the segment: ``paper``, linear per deformed length;
+        ``rest-length``, the same per length at rest; or ``neo-hookean``.
     """
 
     length: PositiveLength
@@ -189,7 +193,7 @@ class Segment(Schema):
     corrections: Corrections | None = None
     history: History | None = None
     connector: Annotated[Length, Field(ge=0)] = 0.0
-    strain_law: Literal["paper", "neo-hookean"] = "paper"
+    strain_law: Literal["paper", "rest-length", "neo-hookean"] = "paper"
 
     @property
     def n_channels(self) -> int:
@@ -200,24 +204,25 @@ class Segment(Schema):
     def _check(self) -> Segment:
         self._check_walls()
         self._check_channels()
+        if self.history is not None and self.history.memory:
+            if len(self.history.memory) != self.n_channels:
+                raise BadKeyError(
+                    "history.memory",
+                    f"has {len(self.history.memory)} values; expected {self.n_channels}, one for "
+                    "each channel",
+                )
         for name, values in self.corrections or ():
             if isinstance(values, tuple) and values and len(values) != self.n_channels:
                 raise BadKeyError(
                     f"corrections.{name}",
                     f"has {len(values)} values; expected {self.n_channels}, one for each channel",
                 )
-        if self.strain_law == "neo-hookean":
-            if self.material.poisson_ratio != 0.5:
-                raise BadKeyError(
-                    "material.poisson_ratio",
-                    "the neo-hookean law is incompressible; expected 0.5, "
-                    f"not {self.material.poisson_ratio:g}",
-                )
-            if self.compensation is not None:
-                raise BadKeyError(
-                    "compensation",
-                    "the neo-hookean law takes no compensation; remove it or use the paper's law",
-                )
+        if self.strain_law == "neo-hookean" and self.material.poisson_ratio != 0.5:
+            raise BadKeyError(
+                "material.poisson_ratio",
+                "the neo-hookean law is incompressible; expected 0.5, "
+                f"not {self.material.poisson_ratio:g}",
+            )
         return self
 
     def _check_walls(self) -> None:
@@ -311,6 +316,16 @@ class Recordings(Schema):
     registration: Registration = Registration()
     bodies: dict[str, TrackedBody] = Field(default={})
 
+    @model_validator(mode="after")
+    def _check(self) -> Recordings:
+        for index, column in enumerate(self.channels):
+            if column in self.channels[:index]:
+                raise BadKeyError(
+                    f"channels.{index}",
+                    f"column {column} is there twice; expected another for each channel",
+                )
+        return self
+
 
 class Tolerances(Schema):
     """How well a robot file knows the arm: what a calibration takes for one standard deviation.
@@ -329,7 +344,8 @@ class Tolerances(Schema):
     sensor_position, sensor_angle : of the tracked sensor on the tip.
     body_position, body_angle : of other tracked bodies.
     zero : of the position from log to log, where logs are zeroed anew, in m.
-    lag : of a segment, relative; dead_time : in s; share : of an operator of its history.
+    lag : of a segment, relative; dead_time : in s; share : of an operator of its history;
+        memory : of a channel, relative.
     """
 
     length: Annotated[Ratio, Field(gt=0)] = 0.03
@@ -347,6 +363,7 @@ class Tolerances(Schema):
     lag: Annotated[Ratio, Field(gt=0)] = 1.0
     dead_time: Annotated[Duration, Field(gt=0)] = 0.3
     share: Annotated[Ratio, Field(gt=0)] = 0.2
+    memory: Annotated[Ratio, Field(gt=0)] = 0.3
     base_position: Annotated[Length, Field(gt=0)] = 0.005
     base_tilt: Annotated[Angle, Field(gt=0)] = 0.05
     base_turn: Annotated[Angle, Field(gt=0)] = 0.1
@@ -443,6 +460,9 @@ class RobotDescription(Schema):
                     f"{high * 1e-5:g} bar must be greater than the min of {low * 1e-5:g} bar "
                     f"({self.channel_name(index)})",
                 )
+        self._check_dead_bands()
+        self._check_recordings()
+        self._check_calibration()
         if any(self.gravity):
             for index, segment in enumerate(self.segments):
                 if segment.material.density is None:
@@ -452,3 +472,66 @@ class RobotDescription(Schema):
                         "add one such as 'density: 1070 kg/m^3' or remove gravity",
                     )
         return self
+
+    def _check_dead_bands(self) -> None:
+        """Refuse a dead band where a pressure may be negative: it would hardly act there at all."""
+        lowest = iter(self.pressure_min)
+        for index, segment in enumerate(self.segments):
+            low = min(itertools.islice(lowest, segment.n_channels))
+            if low < 0 and segment.corrections is not None and segment.corrections.dead_band > 0:
+                raise BadKeyError(
+                    f"segments.{index}.corrections.dead_band",
+                    "a dead band is for pressures from 0 on, but those of this segment may be down "
+                    f"to {low * 1e-5:g} bar; remove it or raise pressure.min",
+                )
+
+    def _check_recordings(self) -> None:
+        given = self.recordings or Recordings()
+        if given.channels and len(given.channels) != self.n_pressures:
+            raise BadKeyError(
+                "recordings.channels",
+                f"has {len(given.channels)} columns; expected {self.n_pressures}, one for each "
+                "channel of the robot, proximal segment first",
+            )
+        for name, body in given.bodies.items():
+            if body.at > self.length + _SLACK:
+                raise BadKeyError(
+                    f"recordings.bodies.{name}.at",
+                    f"{body.at * 1e3:g} mm is beyond the tip; expected at most the length at rest "
+                    f"with the connectors, {self.length * 1e3:g} mm",
+                )
+
+    def _check_calibration(self) -> None:
+        if self.calibration is None:
+            return
+        for index, parameter in enumerate(self.calibration.parameters):
+            if not self._has_number(parameter.key):
+                raise BadKeyError(
+                    f"calibration.parameters.{index}.key",
+                    f"{shown(parameter.key)} is no number of a segment of this robot; expected a "
+                    "key such as 'segments[0].material.youngs_modulus'",
+                )
+        for key, n, what in (
+            ("pressure_min", self.n_pressures, "channel"),
+            ("pressure_max", self.n_pressures, "channel"),
+            ("pressure_norm", self.n_segments, "segment"),
+        ):
+            values = getattr(self.calibration, key)
+            if values and len(values) != n:
+                raise BadKeyError(
+                    f"calibration.{key}",
+                    f"has {len(values)} values; expected {n}, one for each {what} of the robot",
+                )
+
+    def _has_number(self, key: str) -> bool:
+        """Whether a key such as ``segments[0].corrections.gain[2]`` names a number of a segment."""
+        found: Any = self
+        for step in key.replace("[", ".[").split("."):
+            index = _INDEX.fullmatch(step)
+            if index is not None and isinstance(found, tuple) and int(index[1]) < len(found):
+                found = found[int(index[1])]
+            elif isinstance(found, Schema) and step in type(found).model_fields:
+                found = getattr(found, step)
+            else:
+                return False
+        return key.startswith("segments[") and isinstance(found, float)

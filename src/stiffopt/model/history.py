@@ -78,21 +78,23 @@ class History(Schema):
     ----------
     dead_time : until a pressure has any effect, in s.
     lag : time constant with which it then has its effect, in s.
-    stages : how many such lags there are in a row: 1, or 2 for a regulator and a chamber that
-        fills through its tube, which are taken for equally slow.
+    lag_falling : the same while the pressure falls, in s, as chambers empty otherwise than they
+        fill; 0: the same.
+    memory : of each channel, factor on the shares of play and creep; one for all if empty.
     play : hysteresis.
     creep : slow effects.
     """
 
     dead_time: Annotated[Duration, Field(ge=0)] = 0.0
     lag: Annotated[Duration, Field(ge=0)] = 0.0
-    stages: Annotated[int, Field(ge=1, le=2)] = 1
+    lag_falling: Annotated[Duration, Field(ge=0)] = 0.0
+    memory: Items[Annotated[Ratio, Field(ge=0)]] = ()
     play: Items[Play] = ()
     creep: Items[Creep] = ()
 
     @model_validator(mode="after")
     def _check(self) -> History:
-        total = sum(part.share for part in self.parts)
+        total = sum(part.share for part in self.parts) * max(self.memory, default=1.0)
         if total >= 1:
             raise BadKeyError(
                 "play" if self.play else "creep",
@@ -107,13 +109,16 @@ class History(Schema):
 
     @property
     def largest_memory(self) -> float:
-        """How far hysteresis can take the shape from equilibrium, as a pressure, in Pa."""
+        """How far hysteresis can take the shape from equilibrium, as a pressure, in Pa.
+
+        Of a channel with another `memory` it is that many times as far.
+        """
         return sum(part.share * part.width for part in self.play)
 
     @property
     def n_states(self) -> int:
-        """Number of states of one channel: what each lag lets through, each y and each z."""
-        return self.stages + len(self.parts)
+        """Number of states of one channel: x, each y and each z."""
+        return 1 + len(self.parts)
 
     def next_state(self, state: ca.SX, before: ca.SX, now: ca.SX, step: ca.SX) -> ca.SX:
         """State (m,) of a channel after a step, through which the (delayed) pressure runs evenly.
@@ -124,48 +129,44 @@ class History(Schema):
         Parameters
         ----------
         state : (m,)
-            Before the step: every x, the last of which counts, every y_j, every z_k.
+            Before the step: x, every y_j, every z_k.
         before, now : scalar
             Delayed pressure before and after the step, in Pa.
         step : scalar
             In s, positive.
         """
         ramp = (now - before) / step
-        lag: ca.SX | float = self.lag
-        instant = ca.SX(lag).is_zero()
-        # stage i: x_i(t) = before - i lag ramp + ramp t + transients[i] exp(-t / lag), in which
-        # what the stage before still lets through makes the transient a polynomial in t / lag
-        transients: list[ca.SX] = []
-        end: list[ca.SX] = []
-        for i in range(self.stages):
-            if instant:
-                end.append(now)
-                continue
-            transients.append(state[i] - before + (i + 1) * lag * ramp)
-            left = transients[i] + (step / lag * transients[i - 1] if i else 0)
-            end.append(now - (i + 1) * lag * ramp + left * ca.exp(-step / lag))
-        following = end[-1]
-        for index, play in enumerate(self.play, start=self.stages):
+        if ca.SX(self.lag).is_zero():
+            start, transient, following = before, None, now
+        else:  # x(t) = start + ramp t + transient exp(-t / lag)
+            lag = self.lag
+            if not ca.SX(self.lag_falling).is_zero():
+                lag = ca.if_else(now < state[0], self.lag_falling, self.lag)
+            start = before - ramp * lag
+            transient = state[0] - start
+            following = now - ramp * lag + transient * ca.exp(-step / lag)
+        end: list[ca.SX] = [following]
+        for index, play in enumerate(self.play, start=1):
             y = state[index]
             end.append(ca.fmax(following - play.width, ca.fmin(following + play.width, y)))
-        for index, creep in enumerate(self.creep, start=self.stages + len(self.play)):
+        for index, creep in enumerate(self.creep, start=1 + len(self.play)):
             decay = ca.exp(-step / creep.time)
-            late = (1 - decay) * before + ramp * (step - creep.time * (1 - decay))
-            if not instant:
-                late -= (1 - decay) * self.stages * lag * ramp
-                for transient, weight in zip(
-                    reversed(transients), _convolutions(step / creep.time, step / lag), strict=False
-                ):
-                    late += transient * weight
+            late = (1 - decay) * start + ramp * (step - creep.time * (1 - decay))
+            if transient is not None:
+                late += transient * _convolution(step / creep.time, step / lag)
             end.append(decay * state[index] + late)
         return ca.vertcat(*end)
 
-    def effective(self, state: ca.SX) -> ca.SX:
-        """Pressure u that in equilibrium would give the shape which belongs to a state (m,)."""
-        x = u = state[self.stages - 1]
-        for index, part in enumerate(self.parts, start=self.stages):
-            u = u + part.share * (state[index] - x)
+    def effective(self, state: ca.SX, channel: int = 0) -> ca.SX:
+        """Pressure u that in equilibrium gives the shape of a state (m,) of a channel, from 0."""
+        x = u = state[0]
+        for index, part in enumerate(self.parts, start=1):
+            u = u + self.memory_of(channel) * part.share * (state[index] - x)
         return u
+
+    def memory_of(self, channel: int) -> float:
+        """Factor on the shares of a channel of the segment, from 0."""
+        return self.memory[channel] if len(self.memory) else 1.0
 
     def settled(self, pressure: float, side: float) -> Array:
         """State (m,) long after a pressure was reached.
@@ -179,25 +180,16 @@ class History(Schema):
             middle.
         """
         plays = [pressure + side * play.width for play in self.play]
-        return np.array([*[pressure] * self.stages, *plays, *[pressure] * len(self.creep)])
+        return np.array([pressure, *plays, *[pressure] * len(self.creep)])
 
     def from_rest(self, pressure: float) -> Array:
         """State (m,) long after a rise from no pressure, on an arm that knew none before."""
         widths = [play.width for play in self.play]
         plays = [float(np.clip(0.0, pressure - w, pressure + w)) for w in widths]
-        return np.array([*[pressure] * self.stages, *plays, *[pressure] * len(self.creep)])
+        return np.array([pressure, *plays, *[pressure] * len(self.creep)])
 
 
 NO_HISTORY = History()
-
-
-def _convolutions(a: ca.SX, b: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """``int_0^1 a exp(-a (1 - t)) (b t)^k exp(-b t) dt`` for k = 0 and 1."""
-    rates = ca.SX.sym("a"), ca.SX.sym("b")
-    first = _convolution(*rates)
-    both = ca.Function("both", rates, [first, -rates[1] * ca.jacobian(first, rates[1])])
-    found: tuple[ca.SX, ca.SX] = both.call([a, b])
-    return found
 
 
 def _convolution(a: ca.SX, b: ca.SX) -> ca.SX:
@@ -218,6 +210,8 @@ class Memory:
     ----------
     histories : sequence
         One per channel; None for a channel whose shape follows at once.
+    places : sequence of int, optional
+        Which channel of its segment each one is, from 0; matters where memories differ.
 
     Attributes
     ----------
@@ -225,9 +219,12 @@ class Memory:
         Effective pressures (n,) now, in Pa.
     """
 
-    def __init__(self, histories: Sequence[History | None]) -> None:
+    def __init__(
+        self, histories: Sequence[History | None], places: Sequence[int] | None = None
+    ) -> None:
         if not histories:
             raise InputError("expected the history of at least one channel")
+        self._places = list(places or [0] * len(histories))
         self._histories = [history or NO_HISTORY for history in histories]
         self._ends = np.cumsum([history.n_states for history in self._histories])
         self._dead_times = np.array([history.dead_time for history in self._histories])
@@ -293,7 +290,10 @@ class Memory:
         self._times = np.array([-np.inf])  # from when on each of the commands (k, n) was given
         self._commands = pressures[None, :]
         self.effective = np.array(
-            [float(h.effective(ca.DM(x))) for h, x in zip(self._histories, states, strict=True)]
+            [
+                float(h.effective(ca.DM(x), c))
+                for h, x, c in zip(self._histories, states, self._places, strict=True)
+            ]
         )
 
     def _follow_late(self, step: float, pressures: Array) -> Array:
@@ -350,7 +350,9 @@ class Memory:
             h.next_state(x, delayed[c], delayed[c], step)
             for c, (h, x) in enumerate(zip(self._histories, parts, strict=True))
         ]
-        effective = [h.effective(x) for h, x in zip(self._histories, ends, strict=True)]
+        effective = [
+            h.effective(x, c) for h, x, c in zip(self._histories, ends, self._places, strict=True)
+        ]
         outputs = [ca.densify(ca.vertcat(*ends)), ca.densify(ca.vertcat(*effective))]
         return ca.Function("advance", [state, delayed, step], outputs)
 

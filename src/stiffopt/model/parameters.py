@@ -72,6 +72,8 @@ _KINDS = {
     "corrections.azimuth": _Kind("rad", False, "azimuth"),
     "history.dead_time": _Kind("s", False, "dead time"),
     "history.lag": _Kind("s", True, "lag"),
+    "history.lag_falling": _Kind("s", True, "lag when falling"),
+    "history.memory": _Kind("", True, "memory"),
     "history.play.share": _Kind("", False, "share of play"),
     "history.creep.share": _Kind("", False, "share of creep"),
 }
@@ -179,7 +181,7 @@ class Parameter:
 
 
 def explicit(description: RobotDescription) -> RobotDescription:
-    """The same robot with every default of a correction written out."""
+    """The same robot with every default that can be a parameter written out."""
 
     def spelled(segment: Segment) -> Segment:
         count = segment.n_channels
@@ -191,11 +193,10 @@ def explicit(description: RobotDescription) -> RobotDescription:
             azimuth=given.azimuth or (0.0,) * count,
         )
         update: dict[str, Any] = {
+            "compensation": segment.compensation or Compensation(),
             "corrections": corrections,
             "history": segment.history or History(),
         }
-        if segment.strain_law == "paper":
-            update["compensation"] = segment.compensation or Compensation()
         return segment.model_copy(update=update)
 
     segments = tuple(spelled(segment) for segment in description.segments)

@@ -3,7 +3,14 @@
 Three things leave the tip uncertain, and are independent of each other: the parameters, whose
 covariance the calibration found; the hysteresis, because the same pressures hold the arm anywhere
 between where loading and unloading take it; and what no parameter explained in the recordings.
-Each is carried to the tip by its Jacobian, to first order.
+The first two are carried to the tip by their Jacobians, to first order.
+
+Hysteresis is what it can be long after the pressures were reached, when lag and creep are over.  A
+play operator was never dragged beyond what the robot's pressure limits allow, so that far less of
+it is possible near the limits than between them: an arm that came to rest is where loading from
+rest would leave it, or pressed further.  Each channel's effective pressure is taken to lie anywhere
+between the two ends, evenly, and its mean square is taken about the equilibrium, which `tip_pose`
+returns and which is not in the middle near the limits.
 """
 
 from __future__ import annotations
@@ -11,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,9 +32,10 @@ from stiffopt.model.history import NO_HISTORY, History
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 
-__all__ = ["TipUncertainty", "Uncertainty"]
+__all__ = ["Part", "TipUncertainty", "Uncertainty", "settled_range"]
 
 Vector = NDArray[np.float64]
+Part = Literal["parameters", "hysteresis", "residual"]
 
 _CHI_SQUARED = 7.814727903251179  # 95 % quantile, three degrees of freedom
 _NORMAL = 1.959963984540054  # 97.5 % quantile
@@ -39,8 +48,9 @@ class TipUncertainty:
     Attributes
     ----------
     parameters, hysteresis, residual : ndarray
-        Covariances (3, 3) of the position in base axes, in m^2, that come from the parameters'
-        errors, from hysteresis, and from what the calibration left unexplained.
+        Mean squares (3, 3) of the error of `Manipulator.tip_pose`'s position in base axes, in m^2,
+        that come from the parameters' errors, from hysteresis, and from what the calibration left
+        unexplained.
     inside : bool
         Whether the calibration saw such pressures; outside, the model extrapolates and the real
         errors may be larger.
@@ -55,12 +65,12 @@ class TipUncertainty:
 
     @property
     def covariance(self) -> Vector:
-        """Covariance (3, 3) of the position in base axes, in m^2."""
+        """Mean square (3, 3) of the position's error in base axes, in m^2."""
         return np.asarray(self.parameters + self.hysteresis + self.residual)
 
     @cached_property
     def semi_axes(self) -> Vector:
-        """Half lengths (3,) of the 95 % ellipsoid in m, the longest first."""
+        """Half lengths (3,) of the 95 % ellipsoid about `tip_pose` in m, the longest first."""
         values = np.linalg.eigvalsh(self.covariance)[::-1]
         return np.asarray(np.sqrt(_CHI_SQUARED * np.maximum(values, 0.0)))
 
@@ -68,6 +78,16 @@ class TipUncertainty:
     def axes(self) -> Vector:
         """Unit vectors (3, 3) of the ellipsoid as columns, in base axes, as in `semi_axes`."""
         return np.asarray(np.linalg.eigh(self.covariance)[1][:, ::-1])
+
+    @property
+    def largest_part(self) -> Part:
+        """What most of the error's mean square comes from."""
+        parts: dict[Part, float] = {
+            "parameters": float(np.trace(self.parameters)),
+            "hysteresis": float(np.trace(self.hysteresis)),
+            "residual": float(np.trace(self.residual)),
+        }
+        return max(parts, key=lambda part: parts[part])
 
     def stiffness_interval(
         self,
@@ -78,7 +98,8 @@ class TipUncertainty:
     ) -> tuple[float, float]:
         """95 % interval of a directional stiffness, in N/m or N m/rad; see `Manipulator.stiffness`.
 
-        From the parameters' errors and hysteresis, on a logarithmic scale.
+        From the parameters' errors and hysteresis, on a logarithmic scale, to first order. It
+        contains `Manipulator.stiffness`.
         """
         return self._source.stiffness_interval(self._pressures, direction, kind, boundary, frame)
 
@@ -105,14 +126,12 @@ class Uncertainty:
                 f"robot '{description.name}' was not calibrated, so that nothing is known of its "
                 "errors; fit it to recordings with 'stiffopt calibrate'"
             )
+        self._description = description
         self._channels = [segment.n_channels for segment in description.segments]
         self._calibration: Calibration = description.calibration
         parameters = [Parameter(fitted.key) for fitted in self._calibration.parameters]
         self._arm = ParametricArm(description, parameters, tip_load)
         self._covariance = self._calibration.covariance
-        self._hysteresis = np.concatenate(
-            [_hysteresis(segment.history, segment.n_channels) for segment in description.segments]
-        )
 
     def at(self, pressures: Vector) -> TipUncertainty:
         """Uncertainty at pressures (n,)."""
@@ -122,7 +141,7 @@ class Uncertainty:
         per_pressure = rotation @ found.per_pressure[0, :3]
         return TipUncertainty(
             parameters=per_coordinate @ self._covariance @ per_coordinate.T,
-            hysteresis=(per_pressure * self._hysteresis**2) @ per_pressure.T,
+            hysteresis=(per_pressure * self._hysteresis(pressures)) @ per_pressure.T,
             residual=np.eye(3) * self._calibration.position_residual**2,
             inside=bool(self._calibration.covers(self._channels, pressures[np.newaxis])[0]),
             _source=self,
@@ -138,14 +157,54 @@ class Uncertainty:
             pressures[np.newaxis], self._rest, measure
         )
         g, h = per_coordinate[0] / k[0], per_pressure[0] / k[0]
-        deviation = float(np.sqrt(g @ self._covariance @ g + ((h * self._hysteresis) ** 2).sum()))
+        deviation = float(np.sqrt(g @ self._covariance @ g + h**2 @ self._hysteresis(pressures)))
         return float(k[0] * np.exp(-_NORMAL * deviation)), float(k[0] * np.exp(_NORMAL * deviation))
+
+    def _hysteresis(self, pressures: Vector) -> Vector:
+        """Mean squares (n,) of effective minus commanded pressures (n,), in Pa^2."""
+        robot = self._description
+        places = [
+            (segment.history or NO_HISTORY, channel)
+            for segment in robot.segments
+            for channel in range(segment.n_channels)
+        ]
+        found = []
+        for (history, channel), *values in zip(
+            places, pressures.tolist(), robot.pressure_min, robot.pressure_max, strict=True
+        ):
+            least, most = np.subtract(settled_range(history, channel, *values), values[0])
+            found.append((least**2 + least * most + most**2) / 3)
+        return np.array(found)
 
     @property
     def _rest(self) -> Vector:
         return np.zeros(len(self._calibration.parameters))
 
 
-def _hysteresis(history: History | None, channels: int) -> Vector:
-    """Standard deviations (c,) of the effective pressures, each anywhere between its ends."""
-    return np.full(channels, (history or NO_HISTORY).largest_memory / np.sqrt(3))
+def settled_range(
+    history: History, channel: int, pressure: float, low: float, high: float
+) -> tuple[float, float]:
+    """Least and largest effective pressure of a channel that settled at a pressure, in Pa.
+
+    The arm began at rest without pressure; of what was commanded since then only the limits are
+    known.
+
+    Parameters
+    ----------
+    history :
+        Of the channel's segment.
+    channel :
+        Of the segment, from 0.
+    pressure :
+        In Pa.
+    low, high :
+        Limits, in Pa.
+    """
+    low, high = min(low, 0.0, pressure), max(high, 0.0, pressure)
+    ends = np.array([pressure, pressure])
+    for play in history.play:
+        # the operator is dragged down to low + width and up to high - width; it began at zero
+        least = max(pressure - play.width, min(low + play.width, 0.0))
+        most = min(pressure + play.width, max(high - play.width, 0.0))
+        ends += history.memory_of(channel) * play.share * (np.array([least, most]) - pressure)
+    return float(ends[0]), float(ends[1])

@@ -1,9 +1,10 @@
-"""Figures of the paper's experiments: the tip against the model (5), stiffness (7)."""
+"""Figures of the experiments: the tip against the model (5), combined poses, stiffness (7)."""
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stiffopt.experiments.coverage_result import CoverageResult
 from stiffopt.experiments.kinematics_result import KinematicsResult
 from stiffopt.experiments.stiffness import direction_name
 from stiffopt.experiments.stiffness_result import StiffnessResult
@@ -97,6 +98,63 @@ def _draw_error(axes: Any, result: KinematicsResult) -> None:
     axes.set_ylabel("model - measured (mm)")
     _legend(axes)
     _plain(axes)
+
+
+def plot_coverage(result: CoverageResult, *, title: str = "combined poses") -> "Figure":
+    """Draw the pressures of each combined pose, and how far the model's tip is off there.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    count, n = result.pressures.shape
+    height = 4.6 + 0.32 * n
+    figure = Figure(figsize=(11, height))
+    grid = figure.add_gridspec(
+        2, 2, height_ratios=(0.32 * n, 3.0), width_ratios=(1, 0.018), left=0.085, right=0.92,
+        top=1 - 1.1 / height, bottom=0.62 / height, hspace=0.12, wspace=0.03,
+    )  # fmt: skip
+    top = figure.add_subplot(grid[0, 0])
+    below = figure.add_subplot(grid[1, 0], sharex=top)
+    edges = np.arange(count + 1) + 0.5
+    shades = top.pcolormesh(
+        edges, np.arange(n + 1) + 0.5, result.pressures.T * BAR, cmap="viridis",
+        edgecolors="white", linewidth=0.6,
+    )  # fmt: skip
+    top.set_yticks(range(1, n + 1), [f"p{channel}" for channel in range(1, n + 1)])
+    top.invert_yaxis()
+    top.tick_params(labelbottom=False, labelsize=9)
+    top.spines[:].set_visible(False)
+    scale = figure.colorbar(shades, cax=figure.add_subplot(grid[0, 1]))
+    scale.set_label("bar")
+    scale.ax.tick_params(labelsize=9)
+    below.bar(np.arange(1, count + 1), result.errors * MM, width=0.7, color=MEASURED)
+    for value, style, label in ((result.mean, "-", "mean"), (result.p95, "--", "95 %")):
+        below.axhline(value * MM, color=MODEL, linewidth=1.2, linestyle=style, label=label)
+    below.set_xlim(edges[0], edges[-1])
+    below.set_ylim(bottom=0)
+    below.set_xlabel("pose, in the order in which they were taken")
+    below.set_ylabel("error of the model's tip (mm)")
+    below.xaxis.set_major_locator(MaxNLocator(integer=True))
+    below.legend(
+        loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=9, frameon=False, borderaxespad=0.0,
+        handlelength=1.6,
+    )  # fmt: skip
+    _plain(below)
+    percent = 100 / result.length
+    _head(
+        figure, title,
+        f"error of the model's tip at the end of a pose: mean {result.mean * MM:.2f} mm "
+        f"({result.mean * percent:.1f} % of length), 95 % below {result.p95 * MM:.2f} mm "
+        f"({result.p95 * percent:.1f} %), at most {result.worst * MM:.2f} mm "
+        f"({result.worst * percent:.1f} %)      {count} pose{'s' * (count != 1)}",
+    )  # fmt: skip
+    return figure
 
 
 def plot_stiffness(result: StiffnessResult, *, title: str = "stiffness") -> "Figure":

@@ -15,6 +15,7 @@ from stiffopt.errors import FileError, InputError, dotted, shown
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import PerChannelPressure, PerChannelRate, RobotDescription
 from stiffopt.model.robot_files import load_description
+from stiffopt.registration import Registration
 from stiffopt.rig.drivers.aurora import AuroraSettings
 from stiffopt.rig.drivers.modbus import ModbusSettings
 from stiffopt.rig.drivers.nidaq import NidaqSettings
@@ -251,6 +252,11 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
                     "max_pressure",
                 )
     plant, tracker = description.plant or PlantSettings(), description.tracker
+    if tracker is not None:
+        try:
+            _registration(tracker, robot)
+        except InputError as error:
+            raise _MisfitError(str(error), "tracker", "calibrated") from None
     if isinstance(tracker, SimulatedTrackerSettings):
         fastest = 1 / plant.discretisation.step
         if tracker.rate > fastest * (1 + 1e-9):
@@ -329,20 +335,52 @@ def make_rig(
     """Return the rig of a description; see `open_rig`."""
     limits, slew = limits_of(description, robot), slew_of(description, robot)
     supply, tracker, probe = description.supply, description.tracker, description.probe
+    registration = None if tracker is None else _registration(tracker, robot)
     if isinstance(supply, SimulatedSupplySettings):
         from stiffopt.rig.simulated.rig import simulated_rig  # here: numba takes its time
 
-        return simulated_rig(description, robot, limits, slew, real_time=real_time)
-    clock = SystemClock()
-    return Rig(
-        robot,
-        supply.device(limits, clock),
-        None if tracker is None else _real(tracker).device(clock),
-        None if probe is None else _real(probe).device(clock),
-        clock=clock,
-        slew=slew,
-        settings=description,
-    )
+        rig: Rig = simulated_rig(description, robot, limits, slew, real_time=real_time)
+    else:
+        clock = SystemClock()
+        rig = Rig(
+            robot,
+            supply.device(limits, clock),
+            None if tracker is None else _real(tracker).device(clock),
+            None if probe is None else _real(probe).device(clock),
+            clock=clock,
+            slew=slew,
+            settings=description,
+        )
+    if rig.tracker is not None and registration is not None:
+        rig.tracker.registration = registration
+    return rig
+
+
+def _registration(tracker: Any, robot: RobotDescription) -> Registration:
+    """What makes a tracker's readings poses of the tip in the base frame.
+
+    Raises
+    ------
+    InputError
+        The robot file shall correct the poses, and cannot.
+    """
+    given: Registration = tracker.registration
+    if not tracker.calibrated:
+        return given
+    recordings = robot.recordings
+    if recordings is None:
+        raise InputError(
+            f"the robot '{robot.name}' has no 'recordings', which would say how to correct the "
+            "tracker's poses; expected a robot file of 'stiffopt calibrate'"
+        )
+    straight = tuple(range(1, robot.n_pressures + 1))
+    if recordings.frame is not None or (recordings.channels or straight) != straight:
+        raise InputError(
+            f"the 'recordings' of the robot '{robot.name}' are not of a rig, whose channels are "
+            "in the robot's order and whose tracker sees the tip alone; calibrate it with logs "
+            "of this rig"
+        )
+    return given.then(recordings.registration)
 
 
 def _real(settings: Any) -> Any:

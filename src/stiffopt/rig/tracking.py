@@ -80,6 +80,11 @@ class PoseTracker(Device):
     A driver calls `_deliver` with what the device sends, from whatever thread; registration, signs
     and sense are seen to here. `read` never waits for the device: a silent device delivers
     nothing, and only the age of the latest sample tells.
+
+    Attributes
+    ----------
+    registration : Registration
+        What makes the device's readings poses of the tip in the base frame.
     """
 
     def __init__(

@@ -28,12 +28,14 @@ class StreamedSettings(Schema):
     range : what is farther from the tracker than this is not believed, in m.
     connect_timeout : what does not answer for this long when it is opened is not there, in s.
     registration : where tracker and sensor are.
+    calibrated : whether the robot file's own registration then corrects the poses.
     """
 
     latency: Annotated[Duration, Field(ge=0, le=1)] = 0.025
     range: Annotated[Length, Field(gt=0, le=100)] = 2.0
     connect_timeout: Annotated[Duration, Field(gt=0, le=60)] = 10.0
     registration: Registration = Registration()
+    calibrated: bool = False
 
 
 class StreamedTracker(PoseTracker):

@@ -10,7 +10,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
-from stiffopt.model.description import Corrections, RobotDescription, Segment
+from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.history import NO_HISTORY, Memory
 from stiffopt.rig.simulated.material import LINEAR, YEOH, Material
 from stiffopt.rig.simulated.rod import Rod
@@ -40,7 +40,16 @@ class Channels(NamedTuple):
 
 
 def make_channels(robot: RobotDescription, mismatch: Mismatch) -> Channels:
-    """Return how the channels of an arm act that differs from its robot file by a mismatch."""
+    """Return how the channels of an arm act that differs from its robot file by a mismatch.
+
+    Raises
+    ------
+    InputError
+        The robot file corrects them as the simulated arm cannot.
+    """
+    for index, segment in enumerate(robot.segments):
+        if segment.corrections is not None:
+            _refuse(segment.corrections, index, "corrections", ("dead_band",))
     parts = [(s.corrections or Corrections(), s.n_channels) for s in robot.segments]
     gain = np.concatenate([corrections.gain or (1.0,) * n for corrections, n in parts])
     offset = np.concatenate([corrections.offset or (0.0,) * n for corrections, n in parts])
@@ -53,10 +62,24 @@ def make_channels(robot: RobotDescription, mismatch: Mismatch) -> Channels:
     )
 
 
+def _refuse(
+    given: Compensation | Corrections, index: int, key: str, names: tuple[str, ...]
+) -> None:
+    """Raise `InputError` if a segment has one of some keys, which the simulated arm cannot do."""
+    for name in names:
+        if getattr(given, name) != 0:
+            raise InputError(
+                f"the simulated arm knows no segments[{index}].{key}.{name}; simulate a robot "
+                "without it, which the optimiser's model may still have"
+            )
+
+
 def make_memory(robot: RobotDescription) -> Memory | None:
     """Return the histories of the channels, or None if shapes follow the pressures at once."""
     histories = [s.history or NO_HISTORY for s in robot.segments for _ in range(s.n_channels)]
-    return None if all(history == NO_HISTORY for history in histories) else Memory(histories)
+    if all(history == NO_HISTORY for history in histories):
+        return None
+    return Memory(histories, [c for s in robot.segments for c in range(s.n_channels)])
 
 
 def make_rod(
@@ -204,19 +227,28 @@ def make_material(
     channels: Channels,
     viscosity: float,
 ) -> Material:
-    """Return the sections of the arm; `viscosity` is that of the dashpot over E, in s."""
+    """Return the sections of the arm; `viscosity` is that of the dashpot over E, in s.
+
+    Raises
+    ------
+    InputError
+        The robot file has a compensation that the simulated arm cannot have.
+    """
     silicone = settings.silicone
     n = robot.n_segments
     factors = mismatch.modulus or (1.0,) * n
     modulus, slope, shear, torsion = np.empty(n), np.empty(n), np.empty(n), np.empty(n)
+    actuation, actuation_slope = np.empty(n), np.empty(n)
     centroid = np.empty((n, 2))
     fibres, area = np.empty((n, 2 * _ON_RING, 2)), np.empty((n, 2 * _ON_RING))
     for s, segment in enumerate(robot.segments):
-        lamb = segment.compensation
-        modulus[s] = segment.material.youngs_modulus * factors[s]
-        slope[s] = (lamb.modulus_per_pressure if lamb else 0.0) * factors[s]
-        scale_area, scale_inertia = (lamb.area, lamb.inertia) if lamb else (1.0, 1.0)
-        fibres[s], area[s] = _fibres(segment, scale_area, scale_inertia)
+        lamb = segment.compensation or Compensation()
+        _refuse(lamb, s, "compensation", ("bending_radius", "lengthening"))
+        actuation[s] = lamb.stiffness
+        modulus[s] = segment.material.youngs_modulus * factors[s] * lamb.stiffness
+        actuation_slope[s] = lamb.modulus_per_pressure * factors[s] * lamb.stiffness
+        slope[s] = actuation_slope[s] * lamb.softening
+        fibres[s], area[s] = _fibres(segment, lamb.area, lamb.inertia)
         centroid[s] = area[s] @ fibres[s] / area[s].sum()
         in_shear = 1 / (2 * (1 + segment.material.poisson_ratio))  # G / E
         shear[s] = in_shear * area[s].sum()
@@ -232,6 +264,8 @@ def make_material(
         slip_strain=np.array([h.strain for h in silicone.hysteresis], dtype=float),
         modulus=modulus,
         modulus_slope=slope,
+        actuation=actuation,
+        actuation_slope=actuation_slope,
         shear=shear,
         torsion=torsion,
         centroid=centroid,

@@ -35,6 +35,8 @@ class Material(NamedTuple):
     slip_share, slip_strain : of the Jenkin elements (j,).
     modulus, modulus_slope : of the segments (S,): E at rest in Pa, and its change per norm of the
         segment's pressures.
+    actuation, actuation_slope : of the segments (S,): how much more pressure acts than drawn, at
+        rest, and the slope of the modulus, in place of `modulus_slope`, that free shapes show.
     shear, torsion : G A / E and G J / E of the segments (S,).
     centroid : of the sections (S, 2), m.
     fibre_x, fibre_y, fibre_area : of the fibres (S, f), m and m^2.
@@ -51,6 +53,8 @@ class Material(NamedTuple):
     slip_strain: Array
     modulus: Array
     modulus_slope: Array
+    actuation: Array
+    actuation_slope: Array
     shear: Array
     torsion: Array
     centroid: Array
@@ -120,14 +124,20 @@ def energy(material: Material, strain: float) -> float:
 
 
 @jit
-def pressed_modulus(material: Material, segment: int, pressures: Array) -> float:
-    """Young's modulus at these pressures (n,), over that at rest."""
+def pressed_modulus(material: Material, segment: int, pressures: Array) -> tuple[float, float]:
+    """Young's modulus at these pressures (n,), over that at rest; and what acts per pressure.
+
+    The latter is such that the arm's free shapes are those of a modulus with the slope
+    `Material.actuation_slope`, and not affected by `Material.actuation`.
+    """
     total = 0.0
     for channel in range(material.first_channel[segment], material.first_channel[segment + 1]):
         total += pressures[channel] * pressures[channel]
-    modulus = material.modulus[segment] + material.modulus_slope[segment] * total**0.5
-    pressed: float = modulus / material.modulus[segment]
-    return max(pressed, _SOFTEST)
+    norm = total**0.5
+    modulus = material.modulus[segment]
+    pressed = max((modulus + material.modulus_slope[segment] * norm) / modulus, _SOFTEST)
+    free = max((modulus + material.actuation_slope[segment] * norm) / modulus, _SOFTEST)
+    return pressed, material.actuation[segment] * pressed / free
 
 
 @jit
@@ -181,14 +191,14 @@ def internal_forces(
         stiff += material.creep_share[k] * (1 - share * dashpot[k, 1]) if history else 0.0
         pull[k] = material.creep_share[k] * (share * dashpot[k, 0] + rest)
     for s in range(len(rod.length)):
-        pressed = pressed_modulus(material, s, pressures)
+        pressed, acting = pressed_modulus(material, s, pressures)
         E = material.modulus[s]
         cx, cy = material.centroid[s, 0], material.centroid[s, 1]
         push, push_x, push_y = 0.0, 0.0, 0.0
         for c in range(material.first_channel[s], material.first_channel[s + 1]):
-            push += pressures[c] * material.channel_force[c]
-            push_x += pressures[c] * material.channel_x[c]
-            push_y += pressures[c] * material.channel_y[c]
+            push += acting * pressures[c] * material.channel_force[c]
+            push_x += acting * pressures[c] * material.channel_x[c]
+            push_y += acting * pressures[c] * material.channel_y[c]
         for g in range(len(rod.weight)):
             strain_at(rod, s, rod.basis[g], before, e0)
             strain_at(rod, s, rod.basis[g], after, e1)
@@ -248,6 +258,7 @@ def remember(
     lost, work = 0.0, 0.0
     for s in range(len(rod.length)):
         E = material.modulus[s]
+        _, acting = pressed_modulus(material, s, pressures)
         cx, cy = material.centroid[s, 0], material.centroid[s, 1]
         for g in range(len(rod.weight)):
             weight = rod.weight[g] * rod.length[s]
@@ -258,7 +269,7 @@ def remember(
             for c in range(material.first_channel[s], material.first_channel[s + 1]):
                 swept = e0[2] * material.channel_force[c]
                 swept += e0[3] * material.channel_y[c] - e0[4] * material.channel_x[c]
-                work += weight * pressures[c] * swept
+                work += weight * acting * pressures[c] * swept
             gx, gy = e0[0] - e0[5] * cy, e0[1] + e0[5] * cx
             sheared = material.shear[s] * (gx * gx + gy * gy) + material.torsion[s] * e0[5] ** 2
             lost += weight * E * material.viscosity / scheme.step * sheared
@@ -293,7 +304,7 @@ def stored(rod: Rod, material: Material, memory: Memory, pressures: Array, q: Ar
     e = np.empty(6)
     total = 0.0
     for s in range(len(rod.length)):
-        pressed = pressed_modulus(material, s, pressures)
+        pressed, _ = pressed_modulus(material, s, pressures)
         cx, cy = material.centroid[s, 0], material.centroid[s, 1]
         for g in range(len(rod.weight)):
             strain_at(rod, s, rod.basis[g], q, e)

@@ -250,6 +250,7 @@ class SimulatedTrackerSettings(Schema):
     missing : share of the frames that never arrive.
     flips : share of the frames with the other sign of the quaternion.
     registration : where tracker and sensor are.
+    calibrated : whether the robot file's own registration then corrects the poses.
     """
 
     driver: Literal["simulated"] = "simulated"
@@ -261,6 +262,7 @@ class SimulatedTrackerSettings(Schema):
     missing: Share = 0.0
     flips: Share = 0.0
     registration: Registration = Registration()
+    calibrated: bool = False
 
 
 class SimulatedProbeSettings(Schema):

@@ -1,0 +1,168 @@
+"""The commands `stiffopt calibrate` and `stiffopt validate`."""
+
+from typing import Annotated
+
+import typer
+
+CALIBRATE_HELP = """\
+Fit a robot file to recordings of the arm, and write how well all of it is then known.
+
+The values of the robot file and its tolerances are where the fit begins and how far it is expected
+to go. Several models are fitted and the one is taken that predicts held-back logs best; of those
+that are as good, the simplest. A LOG is a recording, log v1 (.csv) or MCAP (.mcap), in the order in
+which they were made.
+"""
+
+VALIDATE_HELP = """\
+Say how well a robot file predicts recordings that it was not fitted to.
+
+The model is run along the commanded pressures of each LOG, a recording, log v1 (.csv) or MCAP
+(.mcap), and compared with the measured tip. Nothing of the robot is fitted.
+"""
+
+_CODES = """
+\b
+Exit codes:
+  0    done
+  2    bad input, or a file cannot be written; nothing is written
+  130  interrupted (Ctrl-C); nothing is written
+"""
+
+CALIBRATE_EPILOG = f"""\
+\b
+Examples:
+  stiffopt calibrate --robot my-arm.yaml run/*.csv --out my-arm-calibrated.yaml
+  stiffopt calibrate --robot my-arm.yaml monday.csv --stiffness run/stiffness.csv --out fitted.yaml
+  stiffopt calibrate --robot asu-two-segment apr4_*.csv --sequence --out asu.yaml --report fit
+{_CODES}"""
+
+VALIDATE_EPILOG = f"""\
+\b
+Examples:
+  stiffopt validate --robot my-arm-calibrated.yaml tuesday.csv
+  stiffopt validate --robot my-arm-calibrated.yaml tuesday_*.csv --sequence --report tuesday
+{_CODES}"""
+
+Robot = Annotated[
+    str,
+    typer.Option(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml)."),
+]
+Sequence = Annotated[
+    bool,
+    typer.Option(
+        "--sequence",
+        help="The logs follow each other: each begins in the state in which the one before ended. "
+        "Without it, how a log begins is estimated.",
+    ),
+]
+Rezero = Annotated[
+    bool, typer.Option("--rezero", help="Positions are counted anew in each log: fit the shift.")
+]
+Pressures = Annotated[
+    str,
+    typer.Option(metavar="WHICH", help="commanded or measured: the pressures that lead."),
+]
+Channels = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LIST",
+        help="For each channel of the robot its pressure column in the logs, such as 4,5,6,1,2,3; "
+        "by default as the robot file says, else in order.",
+    ),
+]
+Frame = Annotated[
+    str | None,
+    typer.Option(
+        metavar="BODY",
+        help="The tracked body that carries the base, in whose frame all is meant; by default as "
+        "the robot file says, else the tracker.",
+    ),
+]
+Report = Annotated[
+    str | None,
+    typer.Option(metavar="DIR", help="Write a page (report.md) with figures into this new folder."),
+]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print no tables, notes and progress; errors only.")
+]
+
+
+def calibrate(
+    robot: Robot,
+    out: Annotated[
+        str, typer.Option(metavar="FILE.yaml", help="Write the calibrated robot file; a new one.")
+    ],
+    logs: Annotated[
+        list[str] | None, typer.Argument(metavar="[LOG]...", show_default=False)
+    ] = None,
+    stiffness: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TABLE.csv",
+            help="A table of measured stiffness, fitted too; may be repeated. LOGs may then be "
+            "absent.",
+        ),
+    ] = None,
+    model: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="auto, or one of static, lag, hysteresis, delayed-hysteresis, progressive.",
+        ),
+    ] = "auto",
+    fix: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="KEY",
+            help="Do not fit this: a key of the robot file, such as segments[0].length, or its end "
+            "alone, such as corrections.gain, for all segments and channels; may be repeated.",
+        ),
+    ] = None,
+    sequence: Sequence = False,
+    rezero: Rezero = False,
+    pressures: Pressures = "commanded",
+    channels: Channels = None,
+    frame: Frame = None,
+    rows: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=50, max=100_000, help="Of all logs that are fitted; by default 2000."
+        ),
+    ] = None,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Fit a robot file."""
+    from stiffopt.cli import calibrate_run  # here, so that --help waits for no numerics
+
+    reading = calibrate_run.Reading(
+        robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame
+    )
+    options = calibrate_run.CalibrateOptions(
+        reading, out, tuple(stiffness or ()), model, tuple(fix or ()), rows, report, as_json, quiet
+    )
+    raise typer.Exit(calibrate_run.run_calibrate(options))
+
+
+def validate(
+    robot: Robot,
+    logs: Annotated[list[str], typer.Argument(metavar="LOG...", show_default=False)],
+    sequence: Sequence = False,
+    rezero: Rezero = False,
+    pressures: Pressures = "commanded",
+    channels: Channels = None,
+    frame: Frame = None,
+    report: Report = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Compare a robot file with recordings."""
+    from stiffopt.cli import calibrate_run
+
+    reading = calibrate_run.Reading(
+        robot, tuple(logs), sequence, rezero, pressures, channels, frame
+    )
+    options = calibrate_run.ValidateOptions(reading, report, as_json, quiet)
+    raise typer.Exit(calibrate_run.run_validate(options))

@@ -1,0 +1,250 @@
+"""What a calibration and a validation read: the robot, logs and tables, as options say."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from stiffopt.cli import quantities
+from stiffopt.errors import FileError, InputError, shown
+from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.structure import STRUCTURES
+from stiffopt.logs import (
+    Log,
+    StiffnessTable,
+    read_log,
+    read_mcap_log,
+    read_stiffness_table,
+    require_mcap,
+)
+from stiffopt.model.description import Recordings, RobotDescription
+from stiffopt.model.parameters import Parameter
+from stiffopt.model.robot_files import load_description
+
+_PRESSURES = ("commanded", "measured")
+_MCAP = ".mcap"
+_HISTORY = ("dead_time", "lag")
+_PLAYS = 4  # of a history that the fit brings along
+_SEGMENT = re.compile(r"segments\[\d+\]\.")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Options of both commands: which robot, which logs, and how these are read."""
+
+    robot: str
+    logs: tuple[str, ...]
+    sequence: bool
+    rezero: bool
+    pressures: str
+    channels: str | None
+    frame: str | None
+
+    def settings(self, **others: Any) -> CalibrationSettings:
+        """Return settings that say so, and others.
+
+        Raises
+        ------
+        InputError
+            There is no such kind of pressures.
+        """
+        if self.pressures not in _PRESSURES:
+            raise InputError(
+                f"--pressures: expected {' or '.join(_PRESSURES)}, not {shown(self.pressures)}"
+            )
+        given = {"sequence": self.sequence, "rezero": self.rezero, "pressures": self.pressures}
+        return CalibrationSettings(**given, **others)
+
+    def description(self) -> RobotDescription:
+        """Return the robot, which reads logs as the options say.
+
+        Raises
+        ------
+        InputError
+            There is no such robot, or its file or --channels is wrong.
+        """
+        robot = load_description(self.robot)
+        change: dict[str, Any] = {}
+        if self.channels is not None:
+            change["channels"] = quantities.channels("--channels", self.channels)
+            if len(change["channels"]) != robot.n_pressures:
+                raise InputError(
+                    f"--channels: {shown(self.channels)} names {len(change['channels'])} columns, "
+                    f"the robot '{robot.name}' has {robot.n_pressures} channels; expected one for "
+                    "each"
+                )
+        if self.frame is not None:
+            change["frame"] = self.frame
+        if not change:
+            return robot
+        recordings = (robot.recordings or Recordings()).model_copy(update=change)
+        return robot.model_copy(update={"recordings": recordings})
+
+    def read(
+        self, robot: RobotDescription, progress: Callable[[float, float, str], None]
+    ) -> list[tuple[str, Log]]:
+        """Return the logs and their names: those of the files, with folders where they need them.
+
+        Raises
+        ------
+        InputError
+            A log cannot be read, or has other channels than the robot.
+        """
+        names = log_names(self.logs)
+        if any(_is_mcap(path) for path in self.logs):
+            require_mcap()
+        found = []
+        for i, (name, path) in enumerate(zip(names, self.logs, strict=True)):
+            progress(i, len(names), f"reading {name}")
+            log = _read(path)
+            _check_channels(path, log, robot)
+            found.append((name, log))
+        return found
+
+
+def log_names(paths: Sequence[str]) -> list[str]:
+    """Return a name for each file: its own, with so many folders before it that none is twice.
+
+    Raises
+    ------
+    FileError
+        A file is there twice.
+    """
+    parts = [Path(path).resolve().parts for path in paths]
+    for i, each in enumerate(parts):
+        if each in parts[:i]:
+            raise FileError(paths[i], "is given twice; expected each log once")
+    depth = [1] * len(parts)
+    while True:
+        names = ["/".join(each[-n:]) for each, n in zip(parts, depth, strict=True)]
+        same = [i for i, name in enumerate(names) if names.count(name) > 1]
+        if not same:
+            return names
+        for i in same:
+            depth[i] += 1
+
+
+def read_tables(paths: Sequence[str], robot: RobotDescription) -> list[StiffnessTable]:
+    """Return tables of stiffness.
+
+    Raises
+    ------
+    FileError
+        One cannot be read, or is of another robot.
+    """
+    tables = []
+    for path in paths:
+        table = read_stiffness_table(path)
+        if table.pressures.shape[1] != robot.n_pressures:
+            raise FileError(
+                path,
+                f"has {table.pressures.shape[1]} pressures, the robot '{robot.name}' has "
+                f"{robot.n_pressures} channels",
+            )
+        tables.append(table)
+    return tables
+
+
+def check_model(name: str) -> None:
+    """Refuse a model that is not there.
+
+    Raises
+    ------
+    InputError
+        There is none of this name.
+    """
+    names = ["auto", *(structure.name for structure in STRUCTURES)]
+    if name not in names:
+        raise InputError(
+            f"--model: there is no model {shown(name)}; expected one of {', '.join(names)}"
+        )
+
+
+def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]:
+    """Return the keys that are meant by whole keys, keys without an index, or their ends.
+
+    Raises
+    ------
+    InputError
+        None is meant by one of them.
+    """
+    known = _fitted_keys(robot)
+    found: list[str] = []
+    for text in given:
+        wanted = text.strip()
+        meant = [
+            key
+            for key in known
+            for candidate in (key, _SEGMENT.sub("", key))
+            if candidate == wanted or candidate.startswith((f"{wanted}[", f"{wanted}."))
+        ]
+        if not meant:
+            ends = dict.fromkeys(re.sub(r"\[\d+\]", "", _SEGMENT.sub("", key)) for key in known)
+            raise InputError(
+                f"--fix: {shown(text)} is nothing that is fitted to the robot '{robot.name}'; "
+                f"expected a key such as {known[0]}, or one of {', '.join(ends)} for all of them"
+            )
+        found += meant
+    return tuple(dict.fromkeys(found))
+
+
+def _fitted_keys(robot: RobotDescription) -> list[str]:
+    """Keys of all that some model fits."""
+    names = dict.fromkeys(name for structure in STRUCTURES for name in structure.shape)
+    keys = []
+    for s, segment in enumerate(robot.segments):
+        for name in names:
+            key = f"segments[{s}].{name}"
+            try:
+                Parameter(key).value(robot)
+            except TypeError:  # one for each channel
+                keys += [f"{key}[{c}]" for c in range(segment.n_channels)]
+            else:
+                keys.append(key)
+        history = segment.history
+        plays = len(history.play) if history is not None and history.play else _PLAYS
+        creeps = len(history.creep) if history is not None else 0
+        keys += [f"segments[{s}].history.{name}" for name in _HISTORY]
+        keys += [f"segments[{s}].history.play[{j}].share" for j in range(plays)]
+        keys += [f"segments[{s}].history.creep[{j}].share" for j in range(creeps)]
+    return keys
+
+
+def _is_mcap(path: str) -> bool:
+    return path.lower().endswith(_MCAP)
+
+
+def _read(path: str) -> Log:
+    if _is_mcap(path):
+        return read_mcap_log(path)
+    try:
+        return read_log(path)
+    except FileError as error:
+        try:
+            read_stiffness_table(path)
+        except FileError:
+            raise error from None
+        raise FileError(
+            path, f"is a table of stiffness, not a log; give it as --stiffness {path}"
+        ) from None
+
+
+def _check_channels(path: str, log: Log, robot: RobotDescription) -> None:
+    columns = robot.recordings.channels if robot.recordings is not None else ()
+    if columns:
+        if max(columns) > log.n:
+            raise FileError(
+                path,
+                f"has no column p{max(columns)}_pa, which --channels or the robot file names; "
+                f"there are {log.n} pressures",
+            )
+    elif log.n != robot.n_pressures:
+        example = ",".join(str(c + 1) for c in range(robot.n_pressures))
+        raise FileError(
+            path,
+            f"has {log.n} pressures, the robot '{robot.name}' has {robot.n_pressures} channels; "
+            f"say with --channels which column each channel has, such as --channels {example}",
+        )

@@ -1,0 +1,211 @@
+"""Combined poses: all channels at once, spread over everything that a rig may be commanded.
+
+The paper's sequence moves one channel at a time. What it cannot show, a model that is fitted to it
+has to guess: how channels act together, and what happens above its peaks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stiffopt.errors import InputError
+from stiffopt.experiments.conductor import GENTLE, Array, Conductor, Row, at_rest, steepest
+from stiffopt.experiments.folder import Recording
+from stiffopt.logs import LogLayout
+from stiffopt.rig.interface import Rig
+
+__all__ = ["Coverage", "coverage_for", "round_count", "round_name", "spread_pressures"]
+
+ROUND = 6
+"""Poses after which the arm goes back to nothing, at most."""
+_BEFORE = 3.0  # s that the arm usually takes to come to rest before a round
+_SKIPPED = 12  # of the sequence: what begins it rises together in all large bases
+
+
+def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
+    """Return pressures (count, n) that fill a box evenly, in Pa.
+
+    In each channel they have equal distances, from one end to the other, in the order of a Halton
+    sequence: all ends are reached with any number of poses, and the channels are combined evenly.
+    From one to the next, about half of the channels rise and half fall. The same arguments give
+    the same pressures.
+
+    Parameters
+    ----------
+    count :
+        How many.
+    low, high : (n,)
+        Ends of each channel, in Pa.
+    """
+    low, high = np.array(low, dtype=float), np.array(high, dtype=float)
+    if count == 1:
+        return high[np.newaxis]
+    numbers = range(_SKIPPED + 1, _SKIPPED + 1 + count)
+    sequence = np.array(
+        [[_mirrored(k, base) for base, _ in zip(_primes(), low, strict=False)] for k in numbers]
+    ).reshape(count, len(low))
+    share = np.argsort(np.argsort(sequence, axis=0), axis=0) / max(count - 1, 1)
+    mixed = np.argsort(np.array(numbers) ** 2 * np.sqrt(2.0) % 1.0)  # the sequence rises in steps
+    found: Array = np.clip(low + share[mixed] * (high - low), low, high)
+    return found
+
+
+def _mirrored(number: int, base: int) -> float:
+    """The digits of a number behind the point, in reverse order."""
+    value, digit = 0.0, 1.0
+    while number:
+        digit /= base
+        number, rest = divmod(number, base)
+        value += digit * rest
+    return value
+
+
+def _primes() -> Iterator[int]:
+    found: list[int] = []
+    number = 2
+    while True:
+        if all(number % prime for prime in found):
+            found.append(number)
+            yield number
+        number += 1
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Combined poses as a rig can take them.
+
+    Attributes
+    ----------
+    base : pressures (n,) between rounds, in Pa: nothing, or what is nearest to it.
+    poses : pressures (N, n), in Pa.
+    speed : rates (n,) at which pressures change, in Pa/s.
+    settle : seconds that the arm may take to come to rest in a pose.
+    """
+
+    base: Array
+    poses: Array
+    speed: Array
+    settle: float
+
+    @property
+    def rounds(self) -> list[Array]:
+        """The poses (m, n) between two returns to `base`, of about equal number."""
+        count = round_count(len(self.poses))
+        return np.array_split(self.poses, count) if count else []
+
+    def duration(self, number: int) -> float:
+        """Seconds that a round, counted from 1, takes at most."""
+        return _BEFORE + sum(self._durations(self.rounds[number - 1]))
+
+    def _durations(self, poses: Array) -> list[float]:
+        """Of each way to a pose of a round and the time there; the last is the way back."""
+        knots = np.vstack([self.base, poses, self.base])
+        ways = np.abs(np.diff(knots, axis=0)) / self.speed
+        return [float(way) + self.settle for way in ways.max(axis=1)]
+
+    def record(
+        self,
+        conductor: Conductor,
+        folder: Path,
+        number: int,
+        about: dict[str, str],
+        tell: Callable[[float, str], None],
+    ) -> int:
+        """Record a round, from `base` through its poses and back.
+
+        Parameters
+        ----------
+        conductor : Conductor
+            Has seen the tip; the arm is at `base`.
+        folder : Path
+            Gets the files `round_name`, with ``.part`` in their names until they are complete.
+        number : int
+            Which round, counted from 1.
+        about : dict of str to str
+            Kept in the MCAP file.
+        tell : callable
+            Is told seconds done and what goes on.
+
+        Returns
+        -------
+        int
+            In how many poses the arm was not at rest in time.
+        """
+        turns = any(row.quaternion is not None for row in conductor.rows)
+        layout = LogLayout(n=conductor.n, measured=True, tip_quaternion=turns)
+        poses, before = self.rounds[number - 1], sum(map(len, self.rounds[: number - 1]))
+        durations = self._durations(poses)
+        restless = 0
+        begin = conductor.clock.now()
+        with Recording(folder, round_name(number), layout, begin, about) as recording:
+
+            def keep(row: Row) -> None:
+                if row.time >= begin:
+                    recording.append(row.logged(begin))
+
+            conductor.sink = keep
+            try:
+                for index, pose in enumerate([*poses, self.base]):
+                    count = min(before + index + 1, before + len(poses))
+                    tell(
+                        _BEFORE + sum(durations[:index]),
+                        f"combined pose {count} of {len(self.poses)}",
+                    )
+                    conductor.ramp(pose)
+                    rested = conductor.settle(pose, at_rest, self.settle)
+                    restless += not rested and index < len(poses)
+            finally:
+                conductor.sink = None
+            recording.complete()
+        return restless
+
+
+def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = None) -> Coverage:
+    """Return combined poses over all that a rig may be commanded.
+
+    Parameters
+    ----------
+    rig : Rig
+    count : int
+        How many poses.
+    settle : float
+        Seconds that the arm may take to come to rest in each.
+    highest : float, optional
+        No channel goes higher, in Pa.
+
+    Raises
+    ------
+    InputError
+        A channel cannot be as low as `highest`.
+    """
+    limits = rig.supply.limits
+    high = limits.high if highest is None else np.minimum(limits.high, highest)
+    for channel in np.flatnonzero(high < limits.low):
+        raise InputError(
+            f"combined poses of at most {high[channel] * 1e-5:g} bar: channel {channel + 1} has "
+            f"{limits.low[channel] * 1e-5:g} to {limits.high[channel] * 1e-5:g} bar"
+        )
+    return Coverage(
+        base=limits.clamp(np.clip(0.0, limits.low, limits.high)),
+        poses=spread_pressures(count, limits.low, high),
+        speed=np.minimum(steepest(rig), GENTLE),
+        settle=settle,
+    )
+
+
+def round_count(poses: int) -> int:
+    """Return in how many rounds so many poses are taken."""
+    return -(-poses // ROUND)
+
+
+def round_name(number: int) -> str:
+    """Return the name of a round's recording, without ending; rounds count from 1.
+
+    Sorted by name they come after the paper's sequence, as they were recorded.
+    """
+    return f"kinematics_poses_{number}"

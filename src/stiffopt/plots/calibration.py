@@ -1,0 +1,450 @@
+"""Figures of a calibration and of a validation: errors, paths, models, stiffness."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.identify.choice import Candidate
+from stiffopt.identify.comparison import Comparison
+from stiffopt.model.description import RobotDescription
+from stiffopt.plots.experiments import AXES, CHANNELS, MEASURED, MODEL, _head, _plain
+from stiffopt.plots.figures import _literal, require_matplotlib
+from stiffopt.plots.scales import make_logarithmic
+from stiffopt.plots.style import BAR, MM, RANGE
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "MeasuredStiffness",
+    "plot_errors_over_pressure",
+    "plot_errors_over_time",
+    "plot_models",
+    "plot_paths",
+    "plot_stiffnesses",
+    "plot_tip_over_time",
+]
+
+Array = NDArray[np.float64]
+
+_MOST = 8  # logs in a figure; of more, those with the largest errors
+_DRAWN = 3000  # points of a line
+_SCATTERED = 1200  # points of a log in a cloud
+_BEFORE = "#9aa3ab"
+_OUTSIDE = "#f2a541"
+_WIDE = 11.0  # inches
+_ROW = 1.35
+_GAP = 5.0  # median steps of time that are a pause in a recording
+
+
+@dataclass(frozen=True)
+class MeasuredStiffness:
+    """A measured stiffness with its standard uncertainty and what the robot says of it, in N/m."""
+
+    label: str
+    measured: float
+    sigma: float
+    before: float | None
+    after: float | None
+
+
+# -- over time ------------------------------------------------------------------------------------
+
+
+def plot_errors_over_time(
+    found: Sequence[Comparison], before: Sequence[Comparison] = (), *, title: str = "errors"
+) -> Figure:
+    """Draw the error of the tip over time, a panel for each log.
+
+    Parameters
+    ----------
+    found : sequence of Comparison
+    before : sequence of Comparison
+        The same logs beside the robot as it was; may be empty.
+    title : str
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    shown = _worst(found)
+    figure, panels, height = _stacked(len(shown), 1, _ROW if len(shown) > 2 else 2 * _ROW)
+    logarithmic = bool(before)
+    for axes, i in zip(panels[:, 0], shown, strict=True):
+        each = found[i]
+        _shade_outside(axes, each)
+        if before:
+            _line(axes, each.time, before[i].distance * MM, _BEFORE, 0.9, "robot file before")
+        _line(axes, each.time, each.distance * MM, MEASURED, 1.0, "this robot file")
+        _panel_title(axes, each)
+        axes.set_xlim(each.time[0], each.time[-1])
+        if logarithmic:
+            axes.set_yscale("log")
+            _limit_decades(axes, found, before)
+            make_logarithmic(axes)
+        else:
+            axes.set_ylim(bottom=0)
+        axes.set_ylabel("error (mm)")
+    panels[-1, 0].set_xlabel("time (s)")
+    _key(figure, panels[0, 0], height, found)
+    _head(figure, title, _facts("distance of the predicted from the measured tip", found, shown))
+    return figure
+
+
+def plot_tip_over_time(
+    found: Sequence[Comparison], *, title: str = "tip", frame: str = "the tracker's frame"
+) -> Figure:
+    """Draw the measured and the predicted tip over time: x, y and z of each log.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    shown = _worst(found)
+    alone = len(shown) == 1
+    rows, columns = (3, 1) if alone else (len(shown), 3)
+    figure, panels, height = _stacked(rows, columns, 1.7)
+    for row, i in enumerate(shown):
+        each = found[i]
+        for axis in range(3):
+            axes = panels[axis, 0] if alone else panels[row, axis]
+            _shade_outside(axes, each)
+            _line(axes, each.time, each.measured[:, axis] * MM, MEASURED, 1.6, "measured")
+            _line(axes, each.time, each.predicted[:, axis] * MM, MODEL, 0.9, "predicted")
+            axes.set_xlim(each.time[0], each.time[-1])
+            axes.set_ylabel(f"{'xyz'[axis]} (mm)")
+            if axis == 0:
+                _panel_title(axes, each)
+            _room(axes, np.concatenate([each.measured[:, axis], each.predicted[:, axis]]) * MM)
+    for axes in panels[-1]:
+        axes.set_xlabel("time (s)")
+    _key(figure, panels[0, 0], height, found)
+    _head(figure, title, _facts(f"position in {frame}", found, shown))
+    return figure
+
+
+def plot_paths(
+    found: Sequence[Comparison], *, title: str = "paths", frame: str = "the tracker's frame"
+) -> Figure:
+    """Draw the measured and the predicted path of the tip in three views, a row for each log.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    shown = _worst(found)
+    figure, panels, height = _stacked(len(shown), 3, 3.3)
+    for row, i in enumerate(shown):
+        each = found[i]
+        rows = _evenly(len(each.time), _DRAWN)
+        measured, predicted = each.measured[rows] * MM, each.predicted[rows] * MM
+        for axes, (a, b) in zip(panels[row], ((0, 1), (0, 2), (1, 2)), strict=True):
+            axes.plot(
+                measured[:, a], measured[:, b], "-", color=MEASURED, linewidth=0.9, alpha=0.75,
+                label="measured",
+            )  # fmt: skip
+            axes.plot(
+                predicted[:, a], predicted[:, b], "-", color=MODEL, linewidth=0.7, alpha=0.75,
+                label="predicted",
+            )  # fmt: skip
+            axes.set_xlabel(f"{'xyz'[a]} (mm)", labelpad=1)
+            axes.set_ylabel(f"{'xyz'[b]} (mm)", labelpad=1)
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.grid(alpha=0.2)
+        _panel_title(panels[row, 0], each)
+    _key(figure, panels[0, 0], height, ())
+    _head(figure, title, _facts(f"path in {frame}", found, shown))
+    return figure
+
+
+# -- over pressure --------------------------------------------------------------------------------
+
+
+def plot_errors_over_pressure(
+    found: Sequence[Comparison], robot: RobotDescription, *, title: str = "errors"
+) -> Figure:
+    """Draw the error of the tip over the pressure of each channel, a row for each segment.
+
+    Last in a row is the norm of the segment's pressures; what the calibration has seen is shaded.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    counts = [segment.n_channels for segment in robot.segments]
+    columns = max(counts) + 1
+    figure, panels, height = _stacked(len(counts), columns, 2.5, shared=True)
+    ends = np.cumsum([0, *counts])
+    for s, (begin, end) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+        for k in range(columns):
+            axes = panels[s, k]
+            if k < end - begin:
+                channel = int(begin) + k
+                pressures = [each.pressures[:, channel] for each in found]
+                label = f"{robot.channel_name(channel)} (bar)"
+            elif k == columns - 1:
+                channel = -1
+                pressures = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in found]
+                label = f"norm of segment {s + 1} (bar)"
+            else:
+                axes.set_visible(False)
+                continue
+            _shade_seen(axes, robot, s, channel)
+            for number, (each, p) in enumerate(zip(found, pressures, strict=True)):
+                rows = _evenly(len(p), _SCATTERED)
+                axes.plot(
+                    p[rows] * BAR, each.distance[rows] * MM, ".", markersize=2.5, alpha=0.5,
+                    markeredgewidth=0, color=CHANNELS[number % len(CHANNELS)], label=each.name,
+                )  # fmt: skip
+            axes.set_xlabel(label)
+            if k == 0:
+                axes.set_ylabel("error (mm)")
+            _plain(axes)
+    highest = max((float(np.nanmax(each.distance, initial=0.0)) for each in found), default=1.0)
+    for axes in panels.flat:
+        axes.set_ylim(0, 1.05 * highest * MM)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    if robot.calibration is not None and robot.calibration.pressure_max:
+        from matplotlib.patches import Patch
+
+        handles, labels = [*handles, Patch(color=RANGE)], [*labels, "what the calibration has seen"]
+    figure.legend(
+        handles, [_literal(each) for each in labels], loc="upper right",
+        bbox_to_anchor=(0.985, 1 - 0.1 / height), ncols=min(len(labels), 4), fontsize=8.5,
+        frameon=False, markerscale=4, columnspacing=1.2, handletextpad=0.4,
+    )  # fmt: skip
+    _head(figure, title, "error of the tip over the pressure of each channel")
+    return figure
+
+
+def _shade_seen(axes: Any, robot: RobotDescription, segment: int, channel: int) -> None:
+    calibration = robot.calibration
+    if calibration is None or not calibration.pressure_max:
+        return
+    if channel < 0:
+        low, high = 0.0, calibration.pressure_norm[segment]
+    else:
+        low, high = calibration.pressure_min[channel], calibration.pressure_max[channel]
+    axes.axvspan(low * BAR, high * BAR, color=RANGE, zorder=0)
+
+
+# -- models and stiffness -------------------------------------------------------------------------
+
+
+def plot_models(
+    candidates: Sequence[Candidate], chosen: str, *, title: str = "models"
+) -> Figure:
+    """Draw the error of each model in what was held back.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    height = 1.75 + 0.5 * len(candidates)
+    figure = Figure(figsize=(_WIDE, height))
+    axes = figure.add_axes((0.16, 0.62 / height, 0.58, 1 - 1.75 / height))
+    folds = list(candidates[0].folds)
+    for row, each in enumerate(candidates):
+        is_chosen = each.structure.name == chosen
+        axes.barh(
+            row, each.score * MM, height=0.62, zorder=1,
+            color="#b9cfe6" if is_chosen else "#e3e6e9",
+        )  # fmt: skip
+        for number, fold in enumerate(folds):
+            axes.plot(
+                each.folds[fold].mean * MM, row, "o", markersize=5,
+                color=CHANNELS[number % len(CHANNELS)], markeredgewidth=0,
+                label=_literal(fold) if row == 0 else None,
+            )  # fmt: skip
+    axes.set_yticks(range(len(candidates)), [each.structure.name for each in candidates])
+    for tick, each in zip(axes.get_yticklabels(), candidates, strict=True):
+        tick.set_weight("bold" if each.structure.name == chosen else "normal")
+    axes.invert_yaxis()
+    axes.set_xlim(left=0)
+    axes.set_xlabel("mean error of the tip (mm)")
+    axes.legend(
+        loc="upper left", bbox_to_anchor=(1.01, 1.05), fontsize=9, frameon=False, title="held back",
+        alignment="left",
+    )  # fmt: skip
+    _plain(axes)
+    _head(figure, title, f"bars: mean over what was held back      chosen: {chosen}")
+    return figure
+
+
+def plot_stiffnesses(
+    rows: Sequence[MeasuredStiffness], *, title: str = "stiffness"
+) -> Figure:
+    """Draw each measured stiffness with its 95 % interval, and what the robot says before and after.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    height = 1.75 + 0.27 * len(rows)
+    figure = Figure(figsize=(_WIDE, height))
+    axes = figure.add_axes((0.24, 0.62 / height, 0.56, 1 - 1.75 / height))
+    places = np.arange(len(rows))
+    measured = np.array([row.measured for row in rows])
+    axes.errorbar(
+        measured, places, xerr=[1.96 * row.sigma for row in rows], fmt="s", markersize=5, capsize=3,
+        color=MEASURED, label="measured, 95 %",
+    )  # fmt: skip
+    shown = [measured]
+    for values, colour, mark, label in (
+        ([row.before for row in rows], _BEFORE, "D", "robot file before"),
+        ([row.after for row in rows], MODEL, "o", "this robot file"),
+    ):
+        x = np.array([np.nan if value is None else value for value in values])
+        shown.append(x)
+        axes.plot(
+            x, places, mark, markersize=5.5, markerfacecolor="none", markeredgewidth=1.4,
+            color=colour, label=label,
+        )  # fmt: skip
+    axes.set_yticks(places, [row.label for row in rows], fontsize=8.5)
+    axes.invert_yaxis()
+    axes.set_xlabel("stiffness (N/m)")
+    known = np.concatenate(shown)
+    known = known[np.isfinite(known) & (known > 0)]
+    if len(known) and known.max() > 8 * known.min():
+        axes.set_xscale("log")
+    else:
+        axes.set_xlim(left=0)
+    axes.grid(axis="x", alpha=0.25, which="both")
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), fontsize=9, frameon=False)
+    _plain(axes)
+    _head(figure, title, "measured, and at the same pressures predicted")
+    return figure
+
+
+# -- parts ----------------------------------------------------------------------------------------
+
+
+def _stacked(
+    rows: int, columns: int, row: float, *, shared: bool = False
+) -> tuple[Figure, Any, float]:
+    """Figure with rows of panels below a head, the panels (rows, columns), and its height."""
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    height = 1.75 + rows * (row + 0.42)
+    figure = Figure(figsize=(_WIDE, height))
+    panels = figure.subplots(
+        rows, columns, squeeze=False, sharey=shared,
+        gridspec_kw={
+            "left": 0.07, "right": 0.985, "top": 1 - 1.3 / height, "bottom": 0.58 / height,
+            "hspace": 0.45 / row * (1.0 if columns == 1 or shared else 1.25),
+            "wspace": 0.08 if shared else 0.24,
+        },
+    )  # fmt: skip
+    for axes in panels.flat:
+        _plain(axes)
+    return figure, panels, height
+
+
+def _worst(found: Sequence[Comparison]) -> list[int]:
+    """Indices of the logs that are drawn, in their order."""
+    if len(found) <= _MOST:
+        return list(range(len(found)))
+    errors = np.nan_to_num(np.array([each.errors.p95 for each in found]))
+    return sorted(np.argsort(errors)[::-1][:_MOST].tolist())
+
+
+def _facts(what: str, found: Sequence[Comparison], shown: Sequence[int]) -> str:
+    if len(shown) == len(found):
+        return what
+    return f"{what}      of {len(found)} logs the {len(shown)} with the largest errors"
+
+
+def _panel_title(axes: Any, found: Comparison) -> None:
+    errors = found.errors
+    text = f"{found.name}"
+    if errors.n:
+        text += f"   mean {errors.mean * MM:.2f} mm, 95 % below {errors.p95 * MM:.2f} mm"
+    axes.set_title(_literal(text), loc="left", fontsize=9.5, pad=3)
+
+
+def _line(axes: Any, time: Array, values: Array, colour: str, width: float, label: str) -> None:
+    """Draw a line that breaks at pauses, and whose peaks stay however long it is."""
+    rows = _peaks(values, _DRAWN)
+    t, y = time[rows], values[rows]
+    if len(t) > 2:
+        steps = np.diff(t)
+        pauses = np.flatnonzero(steps > max(_GAP * np.median(steps), 2.0)) + 1
+        t, y = np.insert(t, pauses, np.nan), np.insert(y, pauses, np.nan)
+    axes.plot(t, y, color=colour, linewidth=width, label=label)
+
+
+def _peaks(values: Array, most: int) -> NDArray[np.intp]:
+    """Rows with the least and the greatest value of each of many stretches."""
+    count = len(values)
+    if count <= most:
+        return np.arange(count)
+    edges = np.linspace(0, count, most // 2 + 1).astype(int)
+    kept = []
+    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+        part = values[begin:end]
+        known = np.flatnonzero(np.isfinite(part))
+        if len(known):
+            kept += [begin + known[part[known].argmin()], begin + known[part[known].argmax()]]
+    return np.unique(np.array(kept, dtype=np.intp))
+
+
+def _evenly(count: int, most: int) -> NDArray[np.intp]:
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
+
+
+def _shade_outside(axes: Any, found: Comparison) -> None:
+    """Mark the times at which pressures were outside what the calibration has seen."""
+    if found.inside.all():
+        return
+    axes.fill_between(
+        found.time, 0, 1, where=~found.inside, step="post", transform=axes.get_xaxis_transform(),
+        color=_OUTSIDE, alpha=0.3, linewidth=0, zorder=0,
+    )  # fmt: skip
+
+
+def _limit_decades(axes: Any, found: Sequence[Comparison], before: Sequence[Comparison]) -> None:
+    distances = np.concatenate([each.distance for each in (*found, *before)]) * MM
+    known = distances[np.isfinite(distances) & (distances > 0)]
+    if len(known):
+        axes.set_ylim(np.quantile(known, 0.002) * 0.8, known.max() * 1.2)
+
+
+def _room(axes: Any, values: Array) -> None:
+    """Leave some room about values, and at least a millimetre."""
+    known = values[np.isfinite(values)]
+    if len(known):
+        middle, half = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
+        half = max(1.08 * half, 1.0)
+        axes.set_ylim(middle - half, middle + half)
+
+
+def _key(figure: Figure, axes: Any, height: float, found: Sequence[Comparison]) -> None:
+    """Legend of the lines, and of the shade where there is some, at the top."""
+    handles, labels = axes.get_legend_handles_labels()
+    if any(not each.inside.all() for each in found):
+        from matplotlib.patches import Patch
+
+        handles.append(Patch(color=_OUTSIDE, alpha=0.3))
+        labels.append("outside what the calibration has seen")
+    figure.legend(
+        handles, labels, loc="upper right", bbox_to_anchor=(0.985, 1 - 0.16 / height),
+        ncols=len(labels), fontsize=9, frameon=False, handlelength=1.6, columnspacing=1.4,
+    )  # fmt: skip
