@@ -24,6 +24,9 @@ from stiffopt.cli.inputs import find_tasks
 from stiffopt.cli.records import json_line
 from stiffopt.documents import read_document
 from stiffopt.errors import EquilibriumError
+from stiffopt.model.calibration import Calibration, FittedParameter
+from stiffopt.model.history import History, Play
+from stiffopt.model.robot_files import load_description, save_robot
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.units import parse_quantity
 
@@ -168,6 +171,101 @@ stiffness: {match: {matrix: [[10, 0, 0], [0, 10, 0], [0, 0, 500]], unit: N/m, to
     assert "from the matrix to match, tolerance 0.99" in " ".join(run(path).stdout.split())
     (record,) = lines(run("--json", path).stdout)
     assert record["matrix_distance"] > 0
+
+
+def calibrated(tmp_path: Path, *, recorded: float) -> str:
+    """Write a calibrated robot that was recorded up to a pressure in Pa, and return a task."""
+    keys = ("segments[0].material.youngs_modulus", "segments[0].compensation.stiffness")
+    robot = load_description("stiff-flop-1")
+    segment = robot.segments[0].model_copy(
+        update={"history": History(play=[Play(width=1e4, share=0.1)])}
+    )
+    calibration = Calibration(
+        logs=["day.csv"],
+        parameters=[FittedParameter(key=key, deviation=0.05, prior=0.3) for key in keys],
+        correlation=[[1, 0], [0, 1]],
+        position_residual=3e-4,
+        pressure_min=[0, 0, 0],
+        pressure_max=[recorded] * 3,
+        pressure_norm=[2 * recorded],
+    )
+    update = {"segments": (segment,), "calibration": calibration, "name": "mine"}
+    save_robot(tmp_path / "mine.yaml", robot.model_copy(update=update))
+    goal = ONE.replace("stiff-flop-1", "mine.yaml")
+    goal = goal.replace("0]}}", "0]}, at_least: {direction: [0, 1, 0], value: 0.1 N/m}}")
+    (tmp_path / "calibrated.yaml").write_text(goal)
+    return str(tmp_path / "calibrated.yaml")
+
+
+def test_a_calibrated_robot_says_how_well_it_is_known(tmp_path: Path) -> None:
+    path = calibrated(tmp_path, recorded=1.5e5)
+    result = run("--json", path)
+    (record,) = lines(result.stdout)
+    assert result.exit_code == 0
+    p = record["pressures_pa"]
+    known = stiffopt.load_robot(tmp_path / "mine.yaml").tip_uncertainty(p)
+    assert record["tip_uncertainty_m"] == pytest.approx(known.semi_axes.tolist())
+    assert record["inside_recorded_range"] is True
+    low, high = record["stiffness_interval"]
+    assert (low, high) == pytest.approx(known.stiffness_interval((1, 0, 0)))
+    assert low < record["stiffness"] < high
+    text = run(path).stdout
+    axes = " x ".join(f"{value * 1e3:.2f}" for value in known.semi_axes)
+    assert f"known to   {axes} mm, semi-axes of the tip's 95 % ellipsoid\n" in text
+    assert "mostly for the errors of the calibrated parameters\n" in text
+    assert f"(95 %: {low:.4g}" in text
+    assert "(asked: at least 0.1000, 95 %: " in text
+    assert "warning" not in text
+    assert max(map(len, text.splitlines()[1:])) <= 80
+
+
+def test_pressures_that_no_calibration_saw_are_told(tmp_path: Path) -> None:
+    path = calibrated(tmp_path, recorded=0.4e5)
+    (record,) = lines(run("--json", path).stdout)
+    assert record["inside_recorded_range"] is False
+    text = " ".join(run(path).stdout.split())
+    assert "warning the calibration saw no such pressures: the model extrapolates" in text
+
+
+def test_a_result_file_has_the_uncertainty(tmp_path: Path) -> None:
+    path = calibrated(tmp_path, recorded=1.5e5)
+    assert run(path, "--quiet", "--out", str(tmp_path / "out.yaml")).exit_code == 0
+    (entry,) = read_document(tmp_path / "out.yaml").data["results"]
+    (record,) = lines(run("--json", path).stdout)
+    axes = [parse_quantity(text, "m") for text in entry["uncertainty"]["tip_semi_axes"]]
+    assert axes == pytest.approx(record["tip_uncertainty_m"])
+    assert entry["uncertainty"]["inside_recorded_range"] is True
+    interval = [parse_quantity(text, "N/m") for text in entry["stiffness"][0]["interval"]]
+    assert interval == pytest.approx(record["stiffness_interval"])
+
+
+def test_without_a_stiffness_there_is_no_interval(tmp_path: Path) -> None:
+    path = Path(calibrated(tmp_path, recorded=1.5e5))
+    path.write_text(path.read_text()[: path.read_text().index("stiffness")])
+    (record,) = lines(run("--json", str(path)).stdout)
+    assert record["stiffness_interval"] is None
+    assert len(record["tip_uncertainty_m"]) == 3
+
+
+def test_nothing_is_told_of_a_robot_that_was_not_calibrated(write: Write) -> None:
+    path = write("one.yaml", ONE)
+    (record,) = lines(run("--json", path).stdout)
+    for key in ("tip_uncertainty_m", "stiffness_interval", "inside_recorded_range"):
+        assert record[key] is None
+    text = run(path).stdout
+    assert not [word for word in ("known to", "95 %", "warning") if word in text]
+
+
+def test_a_key_that_cannot_be_calibrated_is_bad_input(tmp_path: Path) -> None:
+    path = calibrated(tmp_path, recorded=1.5e5)
+    robot = tmp_path / "mine.yaml"
+    text = robot.read_text()
+    robot.write_text(
+        text.replace("key: segments[0].compensation.stiffness", "key: segments[0].connector")
+    )
+    result = run(path)
+    assert result.exit_code == 2
+    assert "'segments[0].connector' cannot be a parameter" in " ".join(result.stderr.split())
 
 
 def test_unreachable_is_3_and_reports_the_closest(write: Write) -> None:

@@ -8,10 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stiffopt.errors import DeviceError, FileError, InputError, MissingExtraError
 from stiffopt.files import read_file, save_file
-from stiffopt.model.robot_files import load_description
+from stiffopt.model.description import Recordings
+from stiffopt.model.robot_files import load_description, save_robot
+from stiffopt.registration import Placement, Registration
 from stiffopt.rig.config import (
     RigDescription,
     limits_of,
@@ -20,6 +23,8 @@ from stiffopt.rig.config import (
     open_rig,
     slew_of,
 )
+from stiffopt.rig.interface import Rig
+from stiffopt.rig.simulated.rig import SimulatedRig
 
 RIGS = sorted((Path(__file__).parent.parent / "rig").glob("*.yaml"))
 EXPECTED = {
@@ -66,6 +71,109 @@ def test_every_simulated_rig_runs(path: Path) -> None:
         rig.vent()
         rig.clock.sleep(1.0)
         assert rig.supply.read().pressures.max() < 1e3
+
+
+# A rig with a calibrated robot --------------------------------------------------------------------
+
+OFF = Placement(position=(0.003, -0.002, 0.001), orientation=(0.99875, 0.03, 0.04, 0.0))
+TURNED = {"position": (0.1, -0.2, 0.3), "orientation": (0.5, -0.5, 0.5, 0.5)}
+SENSOR = {"position": (0.0, 0.002, -0.005), "orientation": (0.6, 0.0, 0.8, 0.0)}
+
+
+def displaced_rig(recordings: Recordings | None, *, calibrated: bool = True) -> Rig:
+    """Return a rig whose tracker is not where its registration says."""
+    robot = load_description("stiff-flop-1").model_copy(update={"recordings": recordings})
+    description = RigDescription(
+        robot="stiff-flop-1",
+        supply={"driver": "simulated", "ripple": 0.0},
+        tracker={
+            "driver": "simulated",
+            "noise": 0.0,
+            "angular_noise": 0.0,
+            "registration": {"tracker_in_base": TURNED, "tip_in_sensor": SENSOR},
+            "calibrated": calibrated,
+        },
+        plant={
+            "dynamics": "quasi-static",
+            "silicone": {"law": "linear", "creep": (), "hysteresis": ()},
+            "mismatch": {"registration": OFF},
+        },
+    )
+    return make_rig(description, robot)
+
+
+def seen_and_true(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (4, 4) of the tip: as the rig sees it, and as it is."""
+    assert isinstance(rig, SimulatedRig)
+    assert rig.tracker is not None
+    with rig:
+        rig.supply.arm()
+        rig.command([1e5, 0.5e5, 0.0])
+        rig.clock.sleep(6.0)
+        sample = rig.tracker.latest
+        assert sample is not None
+        assert sample.quaternion is not None
+        turn = Rotation.from_quat(sample.quaternion, scalar_first=True).as_matrix()
+        seen = np.block([[turn, sample.position[:, np.newaxis]], [np.eye(4)[3:]]])
+        return seen, rig.world.plant.tip_pose()
+
+
+def test_the_registration_of_a_calibrated_robot_corrects_what_a_tracker_sees() -> None:
+    correction = Recordings(channels=(1, 2, 3), registration=Registration(tracker_in_base=OFF))
+    seen, true = seen_and_true(displaced_rig(correction))
+    np.testing.assert_allclose(seen, true, atol=2e-6)  # the arm hardly moves any more
+    for rig in (displaced_rig(correction, calibrated=False), displaced_rig(None, calibrated=False)):
+        seen, true = seen_and_true(rig)
+        assert np.linalg.norm(seen[:3, 3] - true[:3, 3]) > 3e-3
+        np.testing.assert_allclose(OFF.transform() @ seen, true, atol=2e-6)
+
+
+def test_so_does_where_a_calibrated_robot_has_the_sensor() -> None:
+    there = Placement(position=(0.001, 0.0, 0.004), orientation=(0.8, 0.0, 0.6, 0.0))
+    registration = Registration(tracker_in_base=OFF, tip_in_sensor=there)
+    seen, true = seen_and_true(displaced_rig(Recordings(registration=registration)))
+    np.testing.assert_allclose(seen, true @ there.transform(), atol=2e-6)
+
+
+def test_real_trackers_are_corrected_too() -> None:
+    description = load_rig_description(Path(__file__).parent.parent / "rig" / "openigtlink.yaml")
+    assert description.tracker is not None
+    tracker = description.tracker.model_copy(update={"calibrated": True})
+    robot = load_description(description.robot).model_copy(
+        update={"recordings": Recordings(registration=Registration(tracker_in_base=OFF))}
+    )
+    rig = make_rig(description.model_copy(update={"tracker": tracker}), robot)
+    assert rig.tracker is not None
+    np.testing.assert_allclose(
+        rig.tracker.registration.tracker_in_base.transform(),
+        OFF.transform() @ tracker.registration.tracker_in_base.transform(),
+        atol=1e-12,
+    )
+
+
+@pytest.mark.parametrize(
+    ("recordings", "message"),
+    [
+        (None, "the robot 'stiff-flop-1' has no 'recordings', which would say how to correct"),
+        (Recordings(frame="base"), "'stiff-flop-1' are not of a rig"),
+        (Recordings(channels=(2, 1, 3)), "'stiff-flop-1' are not of a rig"),
+    ],
+)
+def test_a_robot_that_cannot_correct_a_tracker_says_so(
+    recordings: Recordings | None, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message):
+        displaced_rig(recordings)
+    robot = load_description("stiff-flop-1").model_copy(update={"recordings": recordings})
+    save_robot(tmp_path / "arm.yaml", robot)
+    rig = (
+        "format: stiffopt-rig/1\nrobot: arm.yaml\nsupply: {driver: simulated}\n"
+        "tracker:\n  driver: simulated\n  calibrated: true\n"
+    )
+    (tmp_path / "rig.yaml").write_text(rig)
+    with pytest.raises(FileError, match=message) as caught:
+        open_rig(tmp_path / "rig.yaml")
+    assert (caught.value.key, caught.value.line) == ("tracker.calibrated", 6)
 
 
 @pytest.mark.parametrize(

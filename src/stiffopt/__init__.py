@@ -1,6 +1,7 @@
 """Run a fluidic soft arm stiff where it matters.
 
-The model (`load_robot`), the task (`load_task`) and the optimiser (`solve_pressure`) in SI units.
+The model (`load_robot`), the task (`load_task`) and the optimiser (`solve_pressure`) in SI units;
+and the model of an arm from its recordings (`calibrate`).
 """
 
 from importlib import import_module
@@ -18,10 +19,17 @@ if TYPE_CHECKING:
         SlowWarning,
         StiffoptError,
     )
+    from stiffopt.identify.api import calibrate, validate
+    from stiffopt.identify.calibration import CalibrationResult
+    from stiffopt.identify.comparison import Comparison
+    from stiffopt.identify.settings import CalibrationSettings
+    from stiffopt.logs import Log, StiffnessTable, read_log, read_mcap_log, read_stiffness_table
     from stiffopt.model.description import RobotDescription
+    from stiffopt.model.history import History, Memory
     from stiffopt.model.manipulator import Manipulator, load_robot
-    from stiffopt.model.robot_files import builtin_robots
+    from stiffopt.model.robot_files import builtin_robots, save_robot
     from stiffopt.model.screws import Twist, Wrench
+    from stiffopt.model.uncertainty import TipUncertainty
     from stiffopt.optimise.goal import (
         AtLeast,
         MatchMatrix,
@@ -42,15 +50,21 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AtLeast",
+    "CalibrationResult",
+    "CalibrationSettings",
     "CommandError",
+    "Comparison",
     "DeviceError",
     "EquilibriumError",
     "FileError",
+    "History",
     "InputError",
     "Load",
+    "Log",
     "Manipulator",
     "MatchMatrix",
     "MatchValue",
+    "Memory",
     "MissingExtraError",
     "Observation",
     "PoseSample",
@@ -63,23 +77,31 @@ __all__ = [
     "SlowWarning",
     "StiffnessGoal",
     "StiffnessMeasure",
+    "StiffnessTable",
     "StiffoptError",
     "Target",
     "Task",
+    "TipUncertainty",
     "Tolerance",
     "Twist",
     "WorkspaceMap",
     "Wrench",
     "__version__",
     "builtin_robots",
+    "calibrate",
     "load_robot",
     "load_task",
     "map_workspace",
     "open_rig",
     "open_workspace_map",
     "pareto_front",
+    "read_log",
+    "read_mcap_log",
+    "read_stiffness_table",
+    "save_robot",
     "solve_batch",
     "solve_pressure",
+    "validate",
 ]
 
 # Names are imported when they are first asked for: NumPy, CasADi and pydantic take a quarter of a
@@ -89,10 +111,19 @@ _NAMES = {
         *("CommandError", "DeviceError", "EquilibriumError", "FileError"),
         *("InputError", "MissingExtraError", "PressureError", "SlowWarning", "StiffoptError"),
     ),
+    "stiffopt.identify.api": ("calibrate", "validate"),
+    "stiffopt.identify.calibration": ("CalibrationResult",),
+    "stiffopt.identify.comparison": ("Comparison",),
+    "stiffopt.identify.settings": ("CalibrationSettings",),
+    "stiffopt.logs": (
+        *("Log", "StiffnessTable", "read_log", "read_mcap_log", "read_stiffness_table"),
+    ),
     "stiffopt.model.description": ("RobotDescription",),
+    "stiffopt.model.history": ("History", "Memory"),
     "stiffopt.model.manipulator": ("Manipulator", "load_robot"),
-    "stiffopt.model.robot_files": ("builtin_robots",),
+    "stiffopt.model.robot_files": ("builtin_robots", "save_robot"),
     "stiffopt.model.screws": ("Twist", "Wrench"),
+    "stiffopt.model.uncertainty": ("TipUncertainty",),
     "stiffopt.optimise.goal": (
         *("AtLeast", "MatchMatrix", "MatchValue", "StiffnessGoal", "StiffnessMeasure"),
     ),
@@ -112,6 +143,7 @@ _MODULES = (
     "errors",
     "experiments",
     "files",
+    "identify",
     "lie",
     "logs",
     "model",

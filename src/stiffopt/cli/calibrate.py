@@ -108,7 +108,16 @@ def calibrate(
         str,
         typer.Option(
             metavar="NAME",
-            help="auto, or one of static, lag, hysteresis, delayed-hysteresis, progressive.",
+            help="auto, or one of static, lag, hysteresis, channel-hysteresis, delayed-hysteresis, "
+            "creep, progressive, progressive-creep.",
+        ),
+    ] = "auto",
+    strain_law: Annotated[
+        str,
+        typer.Option(
+            metavar="WHICH",
+            help="auto: another strain law than the robot file's, if that predicts clearly better; "
+            "or keep.",
         ),
     ] = "auto",
     fix: Annotated[
@@ -141,7 +150,16 @@ def calibrate(
         robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame
     )
     options = calibrate_run.CalibrateOptions(
-        reading, out, tuple(stiffness or ()), model, tuple(fix or ()), rows, report, as_json, quiet
+        reading,
+        out,
+        tuple(stiffness or ()),
+        model,
+        strain_law,
+        tuple(fix or ()),
+        rows,
+        report,
+        as_json,
+        quiet,
     )
     raise typer.Exit(calibrate_run.run_calibrate(options))
 

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING
 
 import stiffopt
 from stiffopt.cli import calibration_records as records
-from stiffopt.cli.calibration_inputs import Reading, check_model, fixed_keys, read_tables
+from stiffopt.cli.calibration_inputs import (
+    Reading,
+    check_model,
+    check_strain_law,
+    fixed_keys,
+    read_tables,
+)
 from stiffopt.cli.console import report_error, show, warnings_as_notes, write_line
 from stiffopt.cli.exits import BAD_INPUT, INTERRUPTED, SOLVED
 from stiffopt.cli.experiment_display import Display
@@ -44,6 +50,7 @@ class CalibrateOptions:
     out: str
     tables: tuple[str, ...]
     model: str
+    strain_law: str
     fix: tuple[str, ...]
     rows: int | None
     report: str | None
@@ -126,12 +133,16 @@ def _calibrated(options: CalibrateOptions, progress: Progress) -> CalibrationRes
             "there is nothing to fit to; expected a LOG or a table of stiffness (--stiffness)"
         )
     check_model(options.model)
+    check_strain_law(options.strain_law)
     rows = {}
     if options.rows is not None:
         rows = {"rows": options.rows, "trial_rows": min(options.rows, _FEW_ROWS)}
     robot = options.reading.description()
     settings = options.reading.settings(
-        structure=options.model, fixed=fixed_keys(options.fix, robot), **rows
+        structure=options.model,
+        strain_law=options.strain_law,
+        fixed=fixed_keys(options.fix, robot),
+        **rows,
     )
     tables = read_tables(options.tables, robot)
     logs = options.reading.read(robot, progress)

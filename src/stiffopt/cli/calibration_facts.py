@@ -85,7 +85,7 @@ def after_only(robot: RobotDescription, found: Sequence[Comparison]) -> TextTabl
     turns = any(each.angle is not None for each in found)
     known = robot.calibration is not None
     heading = ("log", "rows", "mean", "median", "95 %", "max", "%")
-    heading += ("axis",) * turns + ("outside",) * known
+    further = ("axis",) * turns + ("outside",) * known
 
     def row(name: str, e: Errors, inside: float) -> tuple[str, ...]:
         numbers = [_millimetres(each) for each in (e.mean, e.median, e.p95, e.max)]
@@ -103,7 +103,7 @@ def after_only(robot: RobotDescription, found: Sequence[Comparison]) -> TextTabl
     remark += "; axis: mean angle in deg" * turns
     if known:
         remark += "; outside: rows with pressures that the calibration had not seen"
-    return TextTable("Error of the tip in mm", heading, tuple(rows), remark)
+    return TextTable("Error of the tip in mm", (*heading, *further), tuple(rows), remark)
 
 
 def ranges(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
@@ -266,7 +266,7 @@ def stiffness_rows(
             rows.append(
                 StiffnessRow(
                     f"({bars})",
-                    direction_name(tuple(float(c) for c in d)),
+                    direction_name((float(d[0]), float(d[1]), float(d[2]))),
                     boundary,
                     float(table.stiffness[i]),
                     float(table.sigma[i]),
@@ -298,7 +298,7 @@ def stiffnesses(rows: Sequence[StiffnessRow]) -> TextTable:
             (
                 row.pressures,
                 f"{row.direction}, {row.boundary}",
-                f"{figures(row.measured)} +- {_NORMAL * row.sigma:.2g}",
+                f"{figures(row.measured)} +- {_two(_NORMAL * row.sigma)}",
                 text(row.before),
                 text(row.after),
                 "-" if row.after is None else f"{(row.after / row.measured - 1) * 100:+.0f} %",
@@ -319,6 +319,11 @@ def _millimetres(value: float) -> str:
 def _decimals(value: float, places: int) -> str:
     """A number with so many decimals; a dash where there is none, and no minus before zero."""
     return f"{round(value, places) + 0.0:.{places}f}" if isfinite(value) else "-"
+
+
+def _two(value: float) -> str:
+    """A number with two significant figures, and no power of ten before a million."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def _angle(errors: Errors) -> str:

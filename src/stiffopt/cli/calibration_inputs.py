@@ -163,6 +163,18 @@ def check_model(name: str) -> None:
         )
 
 
+def check_strain_law(which: str) -> None:
+    """Refuse what is neither ``auto`` nor ``keep``.
+
+    Raises
+    ------
+    InputError
+        It is neither.
+    """
+    if which not in ("auto", "keep"):
+        raise InputError(f"--strain-law: expected auto or keep, not {shown(which)}")
+
+
 def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]:
     """Return the keys that are meant by whole keys, keys without an index, or their ends.
 

@@ -189,8 +189,12 @@ def _remarks(page: _Page, remarks: Sequence[str]) -> None:
 
 
 def _plain(text: str) -> str:
-    """Text that Markdown leaves as it is."""
-    return text.replace("*", r"\*").replace("_", r"\_").replace("<", "&lt;")
+    """Text that Markdown leaves as it is; what is between backticks, it does anyway."""
+    parts = text.split("`")
+    parts[::2] = [
+        part.replace("*", r"\*").replace("_", r"\_").replace("<", "&lt;") for part in parts[::2]
+    ]
+    return "`".join(parts)
 
 
 def _cell(text: str) -> str:

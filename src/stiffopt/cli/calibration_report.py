@@ -13,10 +13,12 @@ from stiffopt.cli.calibration_facts import TextTable
 from stiffopt.errors import printable
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.comparison import Comparison
+from stiffopt.identify.estimates import TIED
 from stiffopt.model.description import RobotDescription
 
 _MOST_REMARKS = 8  # of the logs; the report has all
 _MOST_STIFFNESSES = 30
+_MOST_PAIRS = 3
 
 
 def calibration(result: CalibrationResult, out: str, report: str | None) -> RenderableType:
@@ -32,13 +34,17 @@ def calibration(result: CalibrationResult, out: str, report: str | None) -> Rend
     if result.tables:
         rows = facts.stiffness_rows(result.tables, result.before, result.robot)
         blocks += _block(facts.stiffnesses(rows[:_MOST_STIFFNESSES]))
-        blocks += _more(len(rows) - _MOST_STIFFNESSES, "stiffnesses", report)
+        blocks += _more(len(rows) - _MOST_STIFFNESSES, "of these", report)
     for table in facts.numbers(result, beginnings=False):
         blocks += _block(table)
     found = [f"{each.name}: {remark}" for each in result.calibrated for remark in each.remarks]
     blocks += _remarks("What was found in the logs", found, report)
     own = [remark for remark in result.remarks if remark not in found]
-    blocks += _remarks("What to make of it", own, report, most=None)
+    pairs = [remark for remark in own if remark.startswith(TIED)]
+    hidden = pairs[_MOST_PAIRS:]
+    kept = [remark for remark in own if remark not in hidden]
+    blocks += _remarks("What to make of it", kept, report, most=None)
+    blocks += _more(len(hidden), f"of '{TIED}'", report)
     blocks += [Text(""), Text(f"  robot file  {printable(out)}")]
     if report is not None:
         blocks.append(Text(f"  report      {printable(report)}/report.md"))
@@ -92,7 +98,7 @@ def _remarks(
         grid.add_row("  -", printable(remark))
     return [
         Text(""), Text(f"  {title}", "bold"), grid,
-        *_more(len(remarks) - len(shown), "remarks", report),
+        *_more(len(remarks) - len(shown), "of these", report),
     ]  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from stiffopt.errors import InputError
 from stiffopt.identify import calibration, validation
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.comparison import Comparison
@@ -64,7 +65,7 @@ def calibrate(
     """
     read = [
         table if isinstance(table, StiffnessTable) else read_stiffness_table(table)
-        for table in _listed(tables)
+        for table in tables
     ]
     return calibration.calibrate(_description(robot), _named(logs), read, settings, progress)
 
@@ -105,7 +106,8 @@ def _description(robot: RobotSource) -> RobotDescription:
 
 def _named(logs: Sequence[LogSource]) -> list[tuple[str, Log]]:
     """Logs with their names: those of the files, with their folders where files share a name."""
-    logs = _listed(logs)
+    if isinstance(logs, str):
+        raise InputError("expected a list of logs, not one path")
     files = Counter(Path(log).name for log in logs if isinstance(log, str | os.PathLike))
     found = []
     for number, log in enumerate(logs, start=1):
@@ -118,9 +120,3 @@ def _named(logs: Sequence[LogSource]) -> list[tuple[str, Log]]:
             read = read_mcap_log if path.suffix == ".mcap" else read_log
             found.append((path.name if files[path.name] == 1 else str(path), read(path)))
     return found
-
-
-def _listed(sources: Sequence[_SourceT]) -> Sequence[_SourceT]:
-    """Let one source stand for a sequence of one."""
-    single = isinstance(sources, str | os.PathLike | Log | StiffnessTable)
-    return [sources] if single else sources  # type: ignore[list-item]

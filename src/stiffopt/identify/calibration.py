@@ -18,7 +18,7 @@ from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.setup import Setup, named, started
-from stiffopt.identify.structure import STRUCTURES, Structure
+from stiffopt.identify.structure import STRAIN_LAWS, STRUCTURES, Structure
 from stiffopt.identify.unknowns import BASE
 from stiffopt.identify.validation import compare, placements, recordings_of
 from stiffopt.logs import Log, StiffnessTable
@@ -37,6 +37,9 @@ _TURNS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)  # rad; starts where the tu
 _UNKNOWN_TURN = 0.5  # rad; a base that may be turned further has several starts
 _UNKNOWN_MODULUS = 0.5  # relative; a modulus that may be further off has several starts
 _FINEST_DEAD_TIME = 0.1  # s between rows; of slower logs dead time and lag are one
+_STILL = 1e-3  # of the range of pressures; smaller changes are none
+_A_WHILE = 1.0  # s
+_HELD = 0.2  # share of the time that pressures must be held for creep to be told
 _DIGITS = 4  # of correlations in the file
 
 
@@ -117,20 +120,50 @@ def calibrate(
     near = _screened(setup, teller)
     candidates = []
     for structure in structures:
-        if structure.dead_time and len(structures) > 1 and _is_slow(recordings):
+        if len(structures) > 1 and not _can_be_told(structure, recordings):
             continue
-        teller.begin(f"fitting {structure.words}")
-        problem = setup.problem(structure, settings.trial_rows)
-        found = fit(problem, [started(problem, near)], teller)
-        near = {**near, **named(found.problem, found.x)}
-        teller.begin(f"predicting held-back logs: {structure.words}")
-        folds = held_back_errors(found, settings.settle, teller)
-        candidates.append(Candidate(structure, found, folds))
+        candidates.append(_candidate(setup, structure, near, teller))
+        near = {**near, **named(candidates[-1].fit.problem, candidates[-1].fit.x)}
     chosen = best(candidates)
+    if settings.strain_law == "auto":
+        # the robot file's law, unless another predicts clearly better
+        near = named(chosen.fit.problem, chosen.fit.x)
+        laws = [chosen]
+        for law in _other_laws(description):
+            structure = replace(
+                chosen.structure, strain_law=law, name=f"{chosen.structure.name}, {law}"
+            )
+            laws.append(_candidate(setup, structure, near, teller))
+        candidates += laws[1:]
+        chosen = best(laws)
     teller.begin(f"final fit: {chosen.structure.words}")
     near = named(chosen.fit.problem, chosen.fit.x)
     final = _final(setup, chosen.structure, near, teller)
     return _result(setup, final, chosen.structure, candidates, teller)
+
+
+def _candidate(
+    setup: Setup, structure: Structure, near: Mapping[str, float], teller: _Teller
+) -> Candidate:
+    """Fit a structure to few rows, and to what is left of them when parts are held back."""
+    settings = setup.settings
+    teller.begin(f"fitting {structure.words}")
+    problem = setup.problem(structure, settings.trial_rows)
+    found = fit(problem, [started(problem, near)], teller)
+    teller.begin(f"predicting held-back logs: {structure.words}")
+    return Candidate(structure, found, held_back_errors(found, settings.settle, teller))
+
+
+def _other_laws(description: RobotDescription) -> list[str]:
+    """Strain laws that the robot could have instead of its own."""
+    segments = description.segments
+    own = {segment.strain_law for segment in segments}
+    soft = all(segment.material.poisson_ratio == 0.5 for segment in segments)
+    return (
+        [law for law in STRAIN_LAWS if law not in own and (soft or law != "neo-hookean")]
+        if len(own) == 1
+        else []
+    )
 
 
 class _Teller:
@@ -166,9 +199,30 @@ def _structures(settings: CalibrationSettings) -> list[Structure]:
     return [known[name] for name in settings.structures]
 
 
-def _is_slow(recordings: Sequence[Recording]) -> bool:
+def _can_be_told(structure: Structure, recordings: Sequence[Recording]) -> bool:
+    """Whether recordings can tell what a structure has, whatever its error on them.
+
+    A dead time shorter than a few rows is taken for lag, and creep on a path of even speed for
+    amplitude; both then predict other runs worse than nothing.
+    """
     steps = [float(np.median(np.diff(recording.time))) for recording in recordings]
-    return max(steps) > _FINEST_DEAD_TIME
+    if structure.dead_time and max(steps) > _FINEST_DEAD_TIME:
+        return False
+    return not structure.creep or _held(recordings) > _HELD
+
+
+def _held(recordings: Sequence[Recording]) -> float:
+    """Share of the time in which no pressure had changed for a while."""
+    held = total = 0.0
+    for recording in recordings:
+        range_of = np.ptp(recording.pressures, axis=0).max() or 1.0
+        change = np.abs(np.diff(recording.pressures, axis=0)).max(axis=1) > _STILL * range_of
+        moves = np.concatenate([[recording.time[0]], recording.time[1:][change]])
+        last = moves[np.searchsorted(moves, recording.time, side="right") - 1]
+        steps = np.diff(recording.time, append=recording.time[-1])
+        held += float(steps[recording.time - last > _A_WHILE].sum())
+        total += float(steps.sum())
+    return held / total if total else 0.0
 
 
 def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:

@@ -11,8 +11,10 @@ import numpy as np
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.unknowns import BASE, SENSOR
 
-__all__ = ["Estimate", "doubts", "estimates"]
+__all__ = ["TIED", "Estimate", "doubts", "estimates"]
 
+TIED = "hardly told apart"
+"""How the remark on two numbers begins that these data do not tell apart."""
 _LEARNT = 0.5  # share of the prior's variance that must be gone
 _TIED = 0.95  # correlation from which two numbers cannot be told apart
 _FAR = 3.0  # deviations from the robot file
@@ -110,8 +112,7 @@ def doubts(found: Fit, listed: Sequence[Estimate]) -> list[str]:
         for j in range(i):
             if abs(correlation[i, j]) > _TIED:
                 remarks.append(
-                    f"hardly told apart: {listed[j].name} and {one.name} "
-                    f"(correlation {correlation[i, j]:.2f})"
+                    f"{TIED}: {listed[j].name} and {one.name} (correlation {correlation[i, j]:.2f})"
                 )
     for estimate in listed:
         turned = estimate.unit == "rad" and not estimate.key and not estimate.name.endswith("z")

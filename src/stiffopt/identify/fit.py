@@ -143,12 +143,12 @@ def _loss(n_prior: int) -> Callable[[Array], Array]:
 
 def _reweighted(problem: Problem, x: Array, independent: float) -> tuple[Problem, float]:
     """The problem with the noise and weights that fit its residuals, and rows per independent."""
+    if not problem.samples:
+        return problem, 1.0
     predicted = problem.predict(x)
     position = _spread(np.concatenate(predicted.errors), _LEAST_POSITION)
     turns = [read.turn for read in predicted.read if read.turn is not None]
     angle = _spread(np.concatenate(turns), _LEAST_ANGLE) if turns else problem.noise.angle
-    if not problem.samples:
-        return problem, 1.0
     found = _rows_per_independent(problem, predicted)
     factor = np.sqrt(independent / found)
     samples = [replace(sample, weight=sample.weight * factor) for sample in problem.samples]

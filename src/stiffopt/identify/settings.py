@@ -20,6 +20,8 @@ class CalibrationSettings(Schema):
     ----------
     structure : name of a model of `STRUCTURES`, or ``auto``: the one that predicts held-back
         logs (of a single log, held-back parts) best; of those that are as good, the simplest.
+    strain_law : ``auto``: the robot file's, unless another of `STRAIN_LAWS` predicts what is held
+        back clearly better; or ``keep``.
     sequence : whether the logs follow each other, so that each begins in the state in which the
         one before it ended.
     rezero : whether positions are counted anew in each log.
@@ -32,6 +34,7 @@ class CalibrationSettings(Schema):
     """
 
     structure: str = "auto"
+    strain_law: Literal["auto", "keep"] = "auto"
     sequence: bool = False
     rezero: bool = False
     pressures: Literal["commanded", "measured"] = "commanded"

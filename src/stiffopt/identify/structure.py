@@ -5,14 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
-from stiffopt.model.history import History, Play
+from stiffopt.model.history import Creep, History, Play
 
 __all__ = ["STRUCTURES", "Structure"]
+
+STRAIN_LAWS = ("paper", "rest-length", "neo-hookean")
 
 _LAG = 0.3  # s, where the robot file does not say
 _DEAD_TIME = 0.1  # s
 _WIDTHS = (0.05, 0.12, 0.24, 0.46)  # of plays, as shares of the highest pressure that was seen
 _SHARE = 0.05  # of each play, to begin with
+_CREEP_TIMES = (2.0, 20.0)  # s
+_CREEP_SHARE = 0.02  # to begin with
 _BENDS_TO = 0.6  # least bending radius over the length of a segment
 _DEAD_BAND = 0.05  # of the highest pressure that was seen
 
@@ -26,7 +30,8 @@ class Structure:
     name : for people and the command line.
     words : what it has, in words.
     shape : names of the parameters of each segment's equilibrium that are fitted.
-    lag, falling, play, memory, dead_time : whether its history has them.
+    lag, falling, play, memory, dead_time, creep : whether its history has them.
+    strain_law : of all segments; empty for the robot file's.
     """
 
     name: str
@@ -37,6 +42,8 @@ class Structure:
     play: bool = False
     memory: bool = False
     dead_time: bool = False
+    creep: bool = False
+    strain_law: str = ""
 
     def applied(self, description: RobotDescription, seen: float) -> RobotDescription:
         """The robot from which the fit of this structure begins.
@@ -53,23 +60,18 @@ class Structure:
 
     def _segment(self, segment: Segment, seen: float) -> Segment:
         update: dict[str, object] = {"history": self._history(segment, seen)}
-        if segment.strain_law == "paper":
-            given = segment.compensation or Compensation()
-            update["compensation"] = given.model_copy(
-                update={
-                    "bending_radius": (given.bending_radius or _BENDS_TO * segment.length)
-                    if "compensation.bending_radius" in self.shape
-                    else given.bending_radius
-                }
-            )
+        if self.strain_law:
+            update["strain_law"] = self.strain_law
+        given = segment.compensation or Compensation()
+        if "compensation.bending_radius" in self.shape:
+            radius = given.bending_radius or _BENDS_TO * segment.length
+            given = given.model_copy(update={"bending_radius": radius})
+        update["compensation"] = given
         corrections = segment.corrections or Corrections()
-        update["corrections"] = corrections.model_copy(
-            update={
-                "dead_band": (corrections.dead_band or _DEAD_BAND * seen)
-                if "corrections.dead_band" in self.shape
-                else corrections.dead_band
-            }
-        )
+        if "corrections.dead_band" in self.shape:
+            band = corrections.dead_band or _DEAD_BAND * seen
+            corrections = corrections.model_copy(update={"dead_band": band})
+        update["corrections"] = corrections
         return segment.model_copy(update=update)
 
     def _history(self, segment: Segment, seen: float) -> History | None:
@@ -77,12 +79,14 @@ class Structure:
         if not (self.lag or self.play):
             return None
         plays = given.play or tuple(Play(width=w * seen, share=_SHARE) for w in _WIDTHS)
+        creeps = given.creep or tuple(Creep(time=time, share=_CREEP_SHARE) for time in _CREEP_TIMES)
         return History(
             dead_time=(given.dead_time or _DEAD_TIME) if self.dead_time else 0.0,
             lag=(given.lag or _LAG) if self.lag else 0.0,
             lag_falling=(given.lag_falling or given.lag or _LAG) if self.falling else 0.0,
             memory=(given.memory or (1.0,) * segment.n_channels) if self.memory else (),
             play=plays if self.play else (),
+            creep=creeps if self.creep else (),
         )
 
 
@@ -92,6 +96,7 @@ _BASIC = (
     "compensation.area",
     "compensation.stiffness",
     "corrections.gain",
+    "corrections.offset",
     "corrections.azimuth",
     "compensation.modulus_per_pressure",
 )
@@ -106,6 +111,7 @@ STRUCTURES = (
     Structure("static", "no history", _BASIC),
     Structure("lag", "a first-order lag", _BASIC, lag=True),
     Structure("hysteresis", "lag and play", _BASIC, lag=True, play=True),
+    Structure("creep", "lag, play and creep", _BASIC, lag=True, play=True, creep=True),
     Structure(
         "channel-hysteresis",
         "lags when rising and falling, and play of each channel's own",
@@ -131,6 +137,14 @@ STRUCTURES = (
         _PROGRESSIVE,
         lag=True,
         play=True,
+    ),
+    Structure(
+        "progressive-creep",
+        "lag, play and creep; a dead band, and bending that stiffens and lengthens",
+        _PROGRESSIVE,
+        lag=True,
+        play=True,
+        creep=True,
     ),
 )
 """The simplest first."""

@@ -64,8 +64,6 @@ def shape_unknowns(
             keys = [f"segments[{s}].{name}"]
             if name.startswith("corrections.") and field != "dead_band":
                 keys = [f"{keys[0]}[{c}]" for c in range(segment.n_channels)]
-            if name.startswith("compensation.") and segment.strain_law == "neo-hookean":
-                continue
             for key in keys:
                 parameter = Parameter(key)
                 low, high = -math.inf, math.inf
@@ -106,6 +104,9 @@ def history_unknowns(description: RobotDescription, tolerances: Tolerances) -> l
                 deviation = tolerances.lag
             elif name.startswith("memory"):
                 deviation = tolerances.memory
+            elif name.startswith("creep"):
+                deviation = tolerances.creep_share
+                low, high = _between(value, 0.0, _LARGEST_SHARE)
             else:
                 deviation, (low, high) = tolerances.share, _between(value, 0.0, _LARGEST_SHARE)
             unit = "" if parameter.is_positive else parameter.unit

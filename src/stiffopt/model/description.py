@@ -344,7 +344,7 @@ class Tolerances(Schema):
     sensor_position, sensor_angle : of the tracked sensor on the tip.
     body_position, body_angle : of other tracked bodies.
     zero : of the position from log to log, where logs are zeroed anew, in m.
-    lag : of a segment, relative; dead_time : in s; share : of an operator of its history;
+    lag : of a segment, relative; dead_time : in s; share, creep_share : of an operator of its history;
         memory : of a channel, relative.
     """
 
@@ -363,6 +363,7 @@ class Tolerances(Schema):
     lag: Annotated[Ratio, Field(gt=0)] = 1.0
     dead_time: Annotated[Duration, Field(gt=0)] = 0.3
     share: Annotated[Ratio, Field(gt=0)] = 0.2
+    creep_share: Annotated[Ratio, Field(gt=0)] = 0.03
     memory: Annotated[Ratio, Field(gt=0)] = 0.3
     base_position: Annotated[Length, Field(gt=0)] = 0.005
     base_tilt: Annotated[Angle, Field(gt=0)] = 0.05

@@ -9,10 +9,10 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 from stiffopt.errors import InputError, shown
-from stiffopt.files import read_file
+from stiffopt.files import read_file, save_file
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["builtin_robots", "load_description", "robot_path"]
+__all__ = ["builtin_robots", "load_description", "robot_path", "save_robot"]
 
 
 @cache
@@ -57,6 +57,17 @@ def load_description(
         )
     with as_file(files("stiffopt").joinpath("robots", f"{text}.yaml")) as path:
         return read_file(path, "robot", RobotDescription)
+
+
+def save_robot(path: str | os.PathLike[str], robot: RobotDescription) -> None:
+    """Write a robot file, in the place of what is there; it reads back as its equal.
+
+    Raises
+    ------
+    FileError
+        The file cannot be written.
+    """
+    save_file(path, "robot", robot)
 
 
 def robot_path(name_or_path: str, base: str | os.PathLike[str]) -> str:

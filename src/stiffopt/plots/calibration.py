@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,9 +13,9 @@ from numpy.typing import NDArray
 from stiffopt.identify.choice import Candidate
 from stiffopt.identify.comparison import Comparison
 from stiffopt.model.description import RobotDescription
-from stiffopt.plots.experiments import AXES, CHANNELS, MEASURED, MODEL, _head, _plain
+from stiffopt.plots.experiments import CHANNELS, MEASURED, MODEL, _head, _plain
 from stiffopt.plots.figures import _literal, require_matplotlib
-from stiffopt.plots.scales import make_logarithmic
+from stiffopt.plots.scales import make_logarithmic, round_steps
 from stiffopt.plots.style import BAR, MM, RANGE
 
 if TYPE_CHECKING:
@@ -33,13 +34,21 @@ __all__ = [
 Array = NDArray[np.float64]
 
 _MOST = 8  # logs in a figure; of more, those with the largest errors
+_MOST_PATHS = 4  # where each takes much room
 _DRAWN = 3000  # points of a line
 _SCATTERED = 1200  # points of a log in a cloud
 _BEFORE = "#9aa3ab"
 _OUTSIDE = "#f2a541"
 _WIDE = 11.0  # inches
+_HEAD = 1.08
 _ROW = 1.35
-_GAP = 5.0  # median steps of time that are a pause in a recording
+_FEW = 30  # different pressures
+_ASIDE = 0.015  # of their range
+_GAP = 5.0  # median steps of time that are a pause in a recording, if they are ...
+_PAUSE = 1.0  # s
+_FLAT = 0.25  # an axis shows at least this share of what the widest of x, y and z does
+_LINE = 0.2  # inches, of a legend
+_LEGEND = 75  # characters beside each other in a legend
 
 
 @dataclass(frozen=True)
@@ -113,6 +122,8 @@ def plot_tip_over_time(
     figure, panels, height = _stacked(rows, columns, 1.7)
     for row, i in enumerate(shown):
         each = found[i]
+        both = np.concatenate([each.measured, each.predicted]) * MM
+        widest = float(np.nanmax(np.nanmax(both, axis=0) - np.nanmin(both, axis=0)))
         for axis in range(3):
             axes = panels[axis, 0] if alone else panels[row, axis]
             _shade_outside(axes, each)
@@ -122,7 +133,7 @@ def plot_tip_over_time(
             axes.set_ylabel(f"{'xyz'[axis]} (mm)")
             if axis == 0:
                 _panel_title(axes, each)
-            _room(axes, np.concatenate([each.measured[:, axis], each.predicted[:, axis]]) * MM)
+            _room(axes, both[:, axis], _FLAT * widest)
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
     _key(figure, panels[0, 0], height, found)
@@ -140,12 +151,13 @@ def plot_paths(
     MissingExtraError
         If matplotlib is not installed.
     """
-    shown = _worst(found)
-    figure, panels, height = _stacked(len(shown), 3, 3.3)
+    shown = _worst(found, _MOST_PATHS)
+    figure, panels, height = _stacked(len(shown), 3, 3.3 if len(shown) == 1 else 2.6)
     for row, i in enumerate(shown):
         each = found[i]
         rows = _evenly(len(each.time), _DRAWN)
-        measured, predicted = each.measured[rows] * MM, each.predicted[rows] * MM
+        measured = _path(each.time[rows], each.measured[rows] * MM)
+        predicted = _path(each.time[rows], each.predicted[rows] * MM)
         for axes, (a, b) in zip(panels[row], ((0, 1), (0, 2), (1, 2)), strict=True):
             axes.plot(
                 measured[:, a], measured[:, b], "-", color=MEASURED, linewidth=0.9, alpha=0.75,
@@ -182,48 +194,61 @@ def plot_errors_over_pressure(
     """
     counts = [segment.n_channels for segment in robot.segments]
     columns = max(counts) + 1
-    figure, panels, height = _stacked(len(counts), columns, 2.5, shared=True)
+    shown = [found[i] for i in _worst(found)]
+    known = robot.calibration is not None and len(robot.calibration.pressure_max) > 0
+    labels = [_literal(each.name) for each in shown] + ["what the calibration has seen"] * known
+    beside = max(1, min(len(labels), _LEGEND // (max(map(len, labels)) + 4)))
+    head = max(_HEAD, 0.35 + _LINE * -(-len(labels) // beside))
+    figure, panels, height = _stacked(len(counts), columns, 2.5, shared=True, head=head)
     ends = np.cumsum([0, *counts])
-    for s, (begin, end) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+    for s, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
         for k in range(columns):
             axes = panels[s, k]
             if k < end - begin:
-                channel = int(begin) + k
-                pressures = [each.pressures[:, channel] for each in found]
+                channel = begin + k
+                pressures = [each.pressures[:, channel] for each in shown]
                 label = f"{robot.channel_name(channel)} (bar)"
             elif k == columns - 1:
                 channel = -1
-                pressures = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in found]
+                pressures = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in shown]
                 label = f"norm of segment {s + 1} (bar)"
             else:
                 axes.set_visible(False)
                 continue
             _shade_seen(axes, robot, s, channel)
-            for number, (each, p) in enumerate(zip(found, pressures, strict=True)):
+            aside = _side_by_side(pressures)
+            for number, (each, p) in enumerate(zip(shown, pressures, strict=True)):
                 rows = _evenly(len(p), _SCATTERED)
                 axes.plot(
-                    p[rows] * BAR, each.distance[rows] * MM, ".", markersize=2.5, alpha=0.5,
+                    (p[rows] + aside[number]) * BAR, each.distance[rows] * MM, ".", markersize=3.0, alpha=0.5,
                     markeredgewidth=0, color=CHANNELS[number % len(CHANNELS)], label=each.name,
                 )  # fmt: skip
             axes.set_xlabel(label)
             if k == 0:
                 axes.set_ylabel("error (mm)")
             _plain(axes)
-    highest = max((float(np.nanmax(each.distance, initial=0.0)) for each in found), default=1.0)
+    highest = max((float(np.nanmax(each.distance, initial=0.0)) for each in shown), default=1.0)
     for axes in panels.flat:
         axes.set_ylim(0, 1.05 * highest * MM)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    if robot.calibration is not None and robot.calibration.pressure_max:
+    handles, _ = panels[0, 0].get_legend_handles_labels()
+    if known:
         from matplotlib.patches import Patch
 
-        handles, labels = [*handles, Patch(color=RANGE)], [*labels, "what the calibration has seen"]
+        handles.append(Patch(color=RANGE))
     figure.legend(
-        handles, [_literal(each) for each in labels], loc="upper right",
-        bbox_to_anchor=(0.985, 1 - 0.1 / height), ncols=min(len(labels), 4), fontsize=8.5,
-        frameon=False, markerscale=4, columnspacing=1.2, handletextpad=0.4,
+        handles, labels, loc="upper right", bbox_to_anchor=(0.985, 1 - 0.1 / height), ncols=beside,
+        fontsize=8.5, frameon=False, markerscale=4, columnspacing=1.2, handletextpad=0.4,
     )  # fmt: skip
-    _head(figure, title, "error of the tip over the pressure of each channel")
+    _head(figure, title, _facts("error of the tip over pressure", found, _worst(found)))
     return figure
+
+
+def _side_by_side(pressures: Sequence[Array]) -> Array:
+    """How far each log is moved aside, so that logs of few pressures do not hide each other."""
+    every = np.concatenate(pressures)
+    if len(np.unique(every)) > _FEW:
+        return np.zeros(len(pressures))
+    return (np.arange(len(pressures)) - (len(pressures) - 1) / 2) * _ASIDE * float(np.ptp(every))
 
 
 def _shade_seen(axes: Any, robot: RobotDescription, segment: int, channel: int) -> None:
@@ -240,9 +265,7 @@ def _shade_seen(axes: Any, robot: RobotDescription, segment: int, channel: int) 
 # -- models and stiffness -------------------------------------------------------------------------
 
 
-def plot_models(
-    candidates: Sequence[Candidate], chosen: str, *, title: str = "models"
-) -> Figure:
+def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "models") -> Figure:
     """Draw the error of each model in what was held back.
 
     Raises
@@ -271,7 +294,7 @@ def plot_models(
             )  # fmt: skip
     axes.set_yticks(range(len(candidates)), [each.structure.name for each in candidates])
     for tick, each in zip(axes.get_yticklabels(), candidates, strict=True):
-        tick.set_weight("bold" if each.structure.name == chosen else "normal")
+        tick.set_fontweight("bold" if each.structure.name == chosen else "normal")
     axes.invert_yaxis()
     axes.set_xlim(left=0)
     axes.set_xlabel("mean error of the tip (mm)")
@@ -284,10 +307,8 @@ def plot_models(
     return figure
 
 
-def plot_stiffnesses(
-    rows: Sequence[MeasuredStiffness], *, title: str = "stiffness"
-) -> Figure:
-    """Draw each measured stiffness with its 95 % interval, and what the robot says before and after.
+def plot_stiffnesses(rows: Sequence[MeasuredStiffness], *, title: str = "stiffness") -> Figure:
+    """Draw measured stiffnesses with their 95 % intervals, and what the robot says of them.
 
     Raises
     ------
@@ -324,6 +345,8 @@ def plot_stiffnesses(
     known = known[np.isfinite(known) & (known > 0)]
     if len(known) and known.max() > 8 * known.min():
         axes.set_xscale("log")
+        axes.set_xticks(steps := round_steps(known.min(), known.max()), [f"{x:g}" for x in steps])
+        axes.minorticks_off()
     else:
         axes.set_xlim(left=0)
     axes.grid(axis="x", alpha=0.25, which="both")
@@ -337,18 +360,18 @@ def plot_stiffnesses(
 
 
 def _stacked(
-    rows: int, columns: int, row: float, *, shared: bool = False
+    rows: int, columns: int, row: float, *, shared: bool = False, head: float = _HEAD
 ) -> tuple[Figure, Any, float]:
     """Figure with rows of panels below a head, the panels (rows, columns), and its height."""
     require_matplotlib()
     from matplotlib.figure import Figure
 
-    height = 1.75 + rows * (row + 0.42)
+    height = head + 0.45 + rows * (row + 0.42)
     figure = Figure(figsize=(_WIDE, height))
     panels = figure.subplots(
         rows, columns, squeeze=False, sharey=shared,
         gridspec_kw={
-            "left": 0.07, "right": 0.985, "top": 1 - 1.3 / height, "bottom": 0.58 / height,
+            "left": 0.07, "right": 0.985, "top": 1 - head / height, "bottom": 0.58 / height,
             "hspace": 0.45 / row * (1.0 if columns == 1 or shared else 1.25),
             "wspace": 0.08 if shared else 0.24,
         },
@@ -358,12 +381,12 @@ def _stacked(
     return figure, panels, height
 
 
-def _worst(found: Sequence[Comparison]) -> list[int]:
+def _worst(found: Sequence[Comparison], most: int = _MOST) -> list[int]:
     """Indices of the logs that are drawn, in their order."""
-    if len(found) <= _MOST:
+    if len(found) <= most:
         return list(range(len(found)))
     errors = np.nan_to_num(np.array([each.errors.p95 for each in found]))
-    return sorted(np.argsort(errors)[::-1][:_MOST].tolist())
+    return sorted(np.argsort(errors)[::-1][:most].tolist())
 
 
 def _facts(what: str, found: Sequence[Comparison], shown: Sequence[int]) -> str:
@@ -383,12 +406,19 @@ def _panel_title(axes: Any, found: Comparison) -> None:
 def _line(axes: Any, time: Array, values: Array, colour: str, width: float, label: str) -> None:
     """Draw a line that breaks at pauses, and whose peaks stay however long it is."""
     rows = _peaks(values, _DRAWN)
-    t, y = time[rows], values[rows]
-    if len(t) > 2:
-        steps = np.diff(t)
-        pauses = np.flatnonzero(steps > max(_GAP * np.median(steps), 2.0)) + 1
-        t, y = np.insert(t, pauses, np.nan), np.insert(y, pauses, np.nan)
-    axes.plot(t, y, color=colour, linewidth=width, label=label)
+    line = _path(time[rows], np.stack([time[rows], values[rows]], axis=1))
+    axes.plot(line[:, 0], line[:, 1], color=colour, linewidth=width, label=label)
+
+
+def _path(time: Array, values: Array) -> Array:
+    """Points (N, k) of a line without missing ones; NaN where they are missing for long."""
+    known = np.isfinite(values).all(axis=1)
+    t, points = time[known], values[known]
+    if len(t) < 3:
+        return points
+    steps = np.diff(t)
+    pauses = np.flatnonzero(steps > max(_GAP * float(np.median(steps)), _PAUSE)) + 1
+    return np.asarray(np.insert(points, pauses, np.nan, axis=0))
 
 
 def _peaks(values: Array, most: int) -> NDArray[np.intp]:
@@ -398,7 +428,7 @@ def _peaks(values: Array, most: int) -> NDArray[np.intp]:
         return np.arange(count)
     edges = np.linspace(0, count, most // 2 + 1).astype(int)
     kept = []
-    for begin, end in zip(edges[:-1], edges[1:], strict=True):
+    for begin, end in itertools.pairwise(edges):
         part = values[begin:end]
         known = np.flatnonzero(np.isfinite(part))
         if len(known):
@@ -427,12 +457,12 @@ def _limit_decades(axes: Any, found: Sequence[Comparison], before: Sequence[Comp
         axes.set_ylim(np.quantile(known, 0.002) * 0.8, known.max() * 1.2)
 
 
-def _room(axes: Any, values: Array) -> None:
-    """Leave some room about values, and at least a millimetre."""
+def _room(axes: Any, values: Array, least: float) -> None:
+    """Leave some room about values, and show at least so much of the axis."""
     known = values[np.isfinite(values)]
     if len(known):
         middle, half = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
-        half = max(1.08 * half, 1.0)
+        half = max(1.08 * half, least / 2, 0.5)
         axes.set_ylim(middle - half, middle + half)
 
 
