@@ -660,14 +660,27 @@ def test_a_simulated_arm_that_is_stiffer_takes_as_much_more_work() -> None:
         assert stiff == pytest.approx(1.4 * plain, rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    "key", ["compensation.bending_radius", "compensation.lengthening", "corrections.dead_band"]
-)
-def test_the_simulated_arm_says_what_it_cannot_do(key: str) -> None:
+@pytest.mark.filterwarnings("ignore:the simulator is compiled")
+def test_the_simulated_arm_has_the_dead_band_of_the_model() -> None:
+    """In one segment only, before gain and offset."""
+    mapping = described(ARMS["2 segments"]).model_dump()
+    mapping["segments"][1]["corrections"] = {
+        "gain": (1.1, 0.9, 1.0),
+        "offset": (1e3, 0.0, -500.0),
+        "dead_band": 9e3,
+    }
+    description = RobotDescription(**mapping)
+    plant, model = plant_of(description), Manipulator(description)
+    for p in np.random.default_rng(8).uniform(0, 1e5, (4, 6)):
+        plant.settle(p)
+        assert plant.tip_pose() == pytest.approx(model.tip_pose(p), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["bending_radius", "lengthening"])
+def test_the_simulated_arm_says_what_it_cannot_do(name: str) -> None:
     mapping = Arm((FLOP, FLOP)).mapping()
-    group, name = key.split(".")
-    mapping["segments"][1][group] = {name: 0.05}
-    with pytest.raises(InputError, match=rf"knows no segments\[1\]\.{group}\.{name}"):
+    mapping["segments"][1]["compensation"] = {name: 0.05}
+    with pytest.raises(InputError, match=rf"knows no segments\[1\]\.compensation\.{name}"):
         plant_of(RobotDescription(**mapping))
 
 

@@ -252,11 +252,27 @@ def test_what_is_no_parameter(key: str) -> None:
         "segments[0].corrections.gain[3]",
         "segments[0].history.play[0].share",
         "segments[0].length[0]",
+        "segments[0].corrections.gain",
     ],
 )
 def test_what_a_robot_does_not_have(key: str) -> None:
     with pytest.raises(InputError, match="has no parameter"):
         Parameter(key).value(load_description("stiff-flop-1"))
+
+
+@pytest.mark.parametrize(
+    "key", ["compensation.bending_radius", "corrections.dead_band", "history.lag"]
+)
+def test_what_is_zero_cannot_be_varied_by_a_factor(key: str) -> None:
+    description = load_description("stiff-flop-1")
+    parameter = Parameter(f"segments[0].{key}")
+    assert parameter.value(description) == 0
+    with pytest.raises(InputError, match=rf"{key} is 0; only from a positive value"):
+        parametric(description, [parameter])
+    with pytest.raises(InputError, match=rf"{key} is 0; only from a positive value"):
+        parameter.coordinate(0.0, 1.0)
+    with pytest.raises(InputError, match=rf"{key} is -1; only from a positive value"):
+        parameter.coordinate(1.0, -1.0)
 
 
 def test_values_are_checked_as_in_a_file() -> None:
@@ -266,5 +282,5 @@ def test_values_are_checked_as_in_a_file() -> None:
         ("compensation.softening", 1.1, "softening"),
         ("material.youngs_modulus", math.nan, "youngs_modulus"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(InputError, match=told):
             with_values(description, {Parameter(f"segments[0].{key}"): value})

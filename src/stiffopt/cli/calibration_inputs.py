@@ -12,6 +12,7 @@ from stiffopt.cli import quantities
 from stiffopt.errors import FileError, InputError, shown
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.structure import STRUCTURES
+from stiffopt.identify.unknowns import history_unknowns, shape_unknowns
 from stiffopt.logs import (
     Log,
     StiffnessTable,
@@ -20,14 +21,11 @@ from stiffopt.logs import (
     read_stiffness_table,
     require_mcap,
 )
-from stiffopt.model.description import Recordings, RobotDescription
-from stiffopt.model.parameters import Parameter
+from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
 
 _PRESSURES = ("commanded", "measured")
 _MCAP = ".mcap"
-_HISTORY = ("dead_time", "lag")
-_PLAYS = 4  # of a history that the fit brings along
 _SEGMENT = re.compile(r"segments\[\d+\]\.")
 
 
@@ -205,24 +203,15 @@ def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]
 
 def _fitted_keys(robot: RobotDescription) -> list[str]:
     """Keys of all that some model fits."""
-    names = dict.fromkeys(name for structure in STRUCTURES for name in structure.shape)
-    keys = []
-    for s, segment in enumerate(robot.segments):
-        for name in names:
-            key = f"segments[{s}].{name}"
-            try:
-                Parameter(key).value(robot)
-            except TypeError:  # one for each channel
-                keys += [f"{key}[{c}]" for c in range(segment.n_channels)]
-            else:
-                keys.append(key)
-        history = segment.history
-        plays = len(history.play) if history is not None and history.play else _PLAYS
-        creeps = len(history.creep) if history is not None else 0
-        keys += [f"segments[{s}].history.{name}" for name in _HISTORY]
-        keys += [f"segments[{s}].history.play[{j}].share" for j in range(plays)]
-        keys += [f"segments[{s}].history.creep[{j}].share" for j in range(creeps)]
-    return keys
+    tolerances = robot.tolerances or Tolerances()
+    keys: dict[str, None] = {}
+    for structure in STRUCTURES:
+        begun = structure.applied(robot, float(max(robot.pressure_max)))
+        unknowns = shape_unknowns(begun, structure.shape, tolerances)
+        for each in (*unknowns, *history_unknowns(begun, tolerances)):
+            if each.parameter is not None:
+                keys[each.parameter.key] = None
+    return list(keys)
 
 
 def _is_mcap(path: str) -> bool:

@@ -326,14 +326,14 @@ def _robot(setup: Setup, found: Fit) -> RobotDescription:
         moves = x * problem.scale
         base_in_tracker = problem.base_in_tracker @ _motion(moves[base])
         places = {
-            point.name: Placement.of(_inverse(_motion(moves[own]) @ point.sensor))
+            point.name: _placement(_inverse(_motion(moves[own]) @ point.sensor))
             for point, own in zip(problem.points, sensors, strict=True)
         }
         recordings = Recordings(
             channels=given.channels,
             frame=given.frame,
             registration=Registration(
-                tracker_in_base=Placement.of(_inverse(base_in_tracker)),
+                tracker_in_base=_placement(_inverse(base_in_tracker)),
                 tip_in_sensor=places["tip"],
             ),
             bodies={
@@ -387,6 +387,15 @@ def _motion(twist: Array) -> Array:
     full = np.zeros(6)
     full[: len(twist)] = twist
     return np.asarray(lie.exp(full))
+
+
+def _placement(transform: Array) -> Placement:
+    """Placement of a transform (4, 4), with as many digits as a robot file needs."""
+    found = Placement.of(transform)
+    return Placement(
+        position=tuple(round(x, 8) for x in found.position),
+        orientation=tuple(round(q, 8) for q in found.orientation),
+    )
 
 
 def _inverse(transform: Array) -> Array:

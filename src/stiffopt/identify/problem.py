@@ -210,12 +210,12 @@ class Problem:
         return other
 
     def robot(self, x: Array) -> RobotDescription:
-        """Robot with the parameters of scaled coordinates x (d,)."""
+        """Robot with the parameters of scaled coordinates x (d,), to seven digits."""
         coordinates = x * self.scale
         return with_values(
             self.description,
             {
-                parameter: float(parameter.at(parameter.value(self.description), coordinates[i]))
+                parameter: _rounded(parameter.at(parameter.value(self.description), coordinates[i]))
                 for i, parameter in enumerate(self._parameters)
             },
         )
@@ -438,3 +438,8 @@ class Problem:
             value[rows] = (table.stiffness[rows] - k) / table.sigma[rows]
             slope[rows, : len(coordinates)] = -per_coordinate / table.sigma[rows, np.newaxis]
         return value, slope
+
+
+def _rounded(value: float) -> float:
+    """A value with as many digits as a robot file needs."""
+    return float(f"{value:.7g}")

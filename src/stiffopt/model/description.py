@@ -204,13 +204,12 @@ class Segment(Schema):
     def _check(self) -> Segment:
         self._check_walls()
         self._check_channels()
-        if self.history is not None and self.history.memory:
-            if len(self.history.memory) != self.n_channels:
-                raise BadKeyError(
-                    "history.memory",
-                    f"has {len(self.history.memory)} values; expected {self.n_channels}, one for "
-                    "each channel",
-                )
+        memory = self.history.memory if self.history is not None else ()
+        if memory and len(memory) != self.n_channels:
+            raise BadKeyError(
+                "history.memory",
+                f"has {len(memory)} values; expected {self.n_channels}, one for each channel",
+            )
         for name, values in self.corrections or ():
             if isinstance(values, tuple) and values and len(values) != self.n_channels:
                 raise BadKeyError(
@@ -344,8 +343,7 @@ class Tolerances(Schema):
     sensor_position, sensor_angle : of the tracked sensor on the tip.
     body_position, body_angle : of other tracked bodies.
     zero : of the position from log to log, where logs are zeroed anew, in m.
-    lag : of a segment, relative; dead_time : in s; share, creep_share : of an operator of its history;
-        memory : of a channel, relative.
+    lag, memory : of a history, relative; dead_time : in s; share, creep_share : of its operators.
     """
 
     length: Annotated[Ratio, Field(gt=0)] = 0.03

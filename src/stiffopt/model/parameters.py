@@ -159,9 +159,9 @@ class Parameter:
             try:
                 found = found[step] if isinstance(step, int) else getattr(found, step)
             except (AttributeError, IndexError, TypeError):
-                raise InputError(
-                    f"robot '{description.name}' has no parameter {shown(self.key)}"
-                ) from None
+                found = None
+        if not isinstance(found, int | float):
+            raise InputError(f"robot '{description.name}' has no parameter {shown(self.key)}")
         return float(found)
 
     def at(self, nominal: float, coordinate: Any) -> Any:
@@ -172,8 +172,24 @@ class Parameter:
         return nominal + coordinate
 
     def coordinate(self, nominal: float, value: float) -> float:
-        """Coordinate of a value."""
-        return math.log(value / nominal) if self.is_positive else value - nominal
+        """Coordinate of a value.
+
+        Raises
+        ------
+        InputError
+            Only what is positive has a logarithm.
+        """
+        if not self.is_positive:
+            return value - nominal
+        return math.log(self._checked(value) / self._checked(nominal))
+
+    def _checked(self, value: float) -> float:
+        if not 0 < value < math.inf:
+            raise InputError(
+                f"{self.key} is {value:g}; only from a positive value can it be varied, "
+                "since that is done by a factor"
+            )
+        return value
 
     def per_coordinate(self, value: float) -> float:
         """Change of the value per change of the coordinate."""
@@ -206,9 +222,15 @@ def explicit(description: RobotDescription) -> RobotDescription:
 def with_values(
     description: RobotDescription, values: Mapping[Parameter, float]
 ) -> RobotDescription:
-    """Robot with other values of some parameters, checked as if read from a file."""
+    """Robot with other values of some parameters, checked as if read from a file.
+
+    Raises
+    ------
+    InputError
+        The robot has no such number, or it may not have such a value.
+    """
     changed = _replaced(explicit(description), {p._path: value for p, value in values.items()})
-    return RobotDescription.model_validate(changed.model_dump())
+    return RobotDescription(**changed.model_dump())
 
 
 def parametric(
@@ -217,13 +239,20 @@ def parametric(
     """Actuation of a robot whose parameters may vary, and their coordinates (k,).
 
     Rest lengths act by stretching the section, which is the same: all stays per length at rest
-    *in the description*.
+    *in the description*, and so does the segment's mass.
+
+    Raises
+    ------
+    InputError
+        The robot has no such number, or one that is zero where it must be positive to be varied.
     """
     coordinates = ca.SX.sym("coordinates", len(parameters))
     changes: dict[_Path, Any] = {}
     stretch: dict[int, Any] = {}
     for index, parameter in enumerate(parameters):
         nominal = parameter.value(description)
+        if parameter.is_positive:
+            parameter._checked(nominal)
         value = parameter.at(nominal, coordinates[index])
         if parameter._path[2:] == ("length",):
             stretch[parameter.segment] = value / nominal

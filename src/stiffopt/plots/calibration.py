@@ -15,7 +15,7 @@ from stiffopt.identify.comparison import Comparison
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots.experiments import CHANNELS, MEASURED, MODEL, _head, _plain
 from stiffopt.plots.figures import _literal, require_matplotlib
-from stiffopt.plots.scales import make_logarithmic, round_steps
+from stiffopt.plots.scales import label_logarithmic, make_logarithmic
 from stiffopt.plots.style import BAR, MM, RANGE
 
 if TYPE_CHECKING:
@@ -220,8 +220,9 @@ def plot_errors_over_pressure(
             for number, (each, p) in enumerate(zip(shown, pressures, strict=True)):
                 rows = _evenly(len(p), _SCATTERED)
                 axes.plot(
-                    (p[rows] + aside[number]) * BAR, each.distance[rows] * MM, ".", markersize=3.0, alpha=0.5,
-                    markeredgewidth=0, color=CHANNELS[number % len(CHANNELS)], label=each.name,
+                    (p[rows] + aside[number]) * BAR, each.distance[rows] * MM, ".",
+                    markersize=3.0, alpha=0.5, markeredgewidth=0, label=each.name,
+                    color=CHANNELS[number % len(CHANNELS)],
                 )  # fmt: skip
             axes.set_xlabel(label)
             if k == 0:
@@ -345,8 +346,7 @@ def plot_stiffnesses(rows: Sequence[MeasuredStiffness], *, title: str = "stiffne
     known = known[np.isfinite(known) & (known > 0)]
     if len(known) and known.max() > 8 * known.min():
         axes.set_xscale("log")
-        axes.set_xticks(steps := round_steps(known.min(), known.max()), [f"{x:g}" for x in steps])
-        axes.minorticks_off()
+        label_logarithmic(axes.xaxis, *axes.get_xlim())
     else:
         axes.set_xlim(left=0)
     axes.grid(axis="x", alpha=0.25, which="both")

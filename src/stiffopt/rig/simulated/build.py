@@ -30,47 +30,47 @@ class Channels(NamedTuple):
 
     Attributes
     ----------
-    gain, offset : (n,); ``gain p + offset`` acts where the shape is that of the pressure p, Pa.
+    dead_band, gain, offset : (n,); ``gain onset(p) + offset`` acts where the shape is that of the
+        pressure p, Pa; see `stiffopt.model.description.Corrections`.
     angle : by which the channel's chambers are turned about the axis (n,), rad.
     """
 
+    dead_band: Array
     gain: Array
     offset: Array
     angle: Array
 
+    def acting(self, effective: Array) -> Array:
+        """Pressures (m, n) that act where the shape is that of effective ones (m, n), in Pa."""
+        if self.dead_band.any():
+            w = np.where(self.dead_band > 0, self.dead_band / 2, 1.0)
+            begun = w * (np.logaddexp(0, (effective - self.dead_band) / w) - np.logaddexp(0, -2))
+            effective = np.where(self.dead_band > 0, begun, effective)
+        return np.ascontiguousarray(effective * self.gain + self.offset)
+
 
 def make_channels(robot: RobotDescription, mismatch: Mismatch) -> Channels:
-    """Return how the channels of an arm act that differs from its robot file by a mismatch.
-
-    Raises
-    ------
-    InputError
-        The robot file corrects them as the simulated arm cannot.
-    """
-    for index, segment in enumerate(robot.segments):
-        if segment.corrections is not None:
-            _refuse(segment.corrections, index, "corrections", ("dead_band",))
+    """Return how the channels of an arm act that differs from its robot file by a mismatch."""
     parts = [(s.corrections or Corrections(), s.n_channels) for s in robot.segments]
     gain = np.concatenate([corrections.gain or (1.0,) * n for corrections, n in parts])
     offset = np.concatenate([corrections.offset or (0.0,) * n for corrections, n in parts])
     angle = np.concatenate([corrections.azimuth or (0.0,) * n for corrections, n in parts])
     further = np.array(mismatch.gain or (1.0,) * robot.n_pressures)
     return Channels(
+        dead_band=np.concatenate([np.full(n, corrections.dead_band) for corrections, n in parts]),
         gain=further * gain,
         offset=further * offset + np.array(mismatch.offset or (0.0,) * robot.n_pressures),
         angle=angle + np.array(mismatch.angle or (0.0,) * robot.n_pressures),
     )
 
 
-def _refuse(
-    given: Compensation | Corrections, index: int, key: str, names: tuple[str, ...]
-) -> None:
-    """Raise `InputError` if a segment has one of some keys, which the simulated arm cannot do."""
-    for name in names:
+def _check_compensation(given: Compensation, index: int) -> None:
+    """Raise `InputError` if a segment has a compensation that the simulated arm cannot have."""
+    for name in ("bending_radius", "lengthening"):
         if getattr(given, name) != 0:
             raise InputError(
-                f"the simulated arm knows no segments[{index}].{key}.{name}; simulate a robot "
-                "without it, which the optimiser's model may still have"
+                f"the simulated arm knows no segments[{index}].compensation.{name}; simulate a "
+                "robot without it, which the optimiser's model may still have"
             )
 
 
@@ -243,7 +243,7 @@ def make_material(
     fibres, area = np.empty((n, 2 * _ON_RING, 2)), np.empty((n, 2 * _ON_RING))
     for s, segment in enumerate(robot.segments):
         lamb = segment.compensation or Compensation()
-        _refuse(lamb, s, "compensation", ("bending_radius", "lengthening"))
+        _check_compensation(lamb, s)
         actuation[s] = lamb.stiffness
         modulus[s] = segment.material.youngs_modulus * factors[s] * lamb.stiffness
         actuation_slope[s] = lamb.modulus_per_pressure * factors[s] * lamb.stiffness

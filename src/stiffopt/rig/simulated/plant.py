@@ -402,7 +402,7 @@ class Plant:
         return p
 
     def _acting(self, effective: Array) -> Array:
-        acting = np.ascontiguousarray(effective * self._channels.gain + self._channels.offset)
+        acting = self._channels.acting(effective)
         if len(acting):
             self._last_acting = acting[-1]
         return acting
