@@ -32,6 +32,7 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.robot_files import load_description
 
+ROOT = Path(__file__).resolve().parent.parent
 LAG = 0.4  # s
 TRUTH = {
     "segments[0].material.youngs_modulus": 88e3,
@@ -361,9 +362,29 @@ def test_keys_that_are_not_fitted() -> None:
 def test_help_names_every_model(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = run(capsys, "calibrate", "--help")
     assert code == 0
-    text = " ".join(out.split())
+    text = re.sub(r"-\s+", "-", " ".join(out.split()))
     missing = [each.name for each in STRUCTURES if not re.search(rf"[ ,]{each.name}[,.]", text)]
     assert not missing
+
+
+def test_command_page_names_every_option_and_key(folder: Path, capsys: Any, tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "command.md").read_text(encoding="utf-8")
+    page = page[page.index("## Calibrate and validate") :]
+    for command in ("calibrate", "validate"):
+        _, out, _ = run(capsys, command, "--help")
+        options = set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", out, re.M)) - {"--help"}
+        assert {"--robot", "--json", "--report"} <= options
+        assert not {option for option in options if f"`{option}" not in page}
+    _, out, _ = run(
+        capsys, "calibrate", "--robot", "stiff-flop-1", folder / "monday.csv", "--out",
+        tmp_path / "r.yaml", "--json", *FAST,
+    )  # fmt: skip
+    found = json.loads(out)
+    keys = {*found, *found["models"][0], *found["parameters"][0]}
+    _, out, _ = run(capsys, "validate", "--robot", "stiff-flop-1", folder / "monday.csv", "--json")
+    found = json.loads(out)
+    keys |= {*found, *found["position_error_mm"]}
+    assert not {key for key in keys if f"`{key}`" not in page}
 
 
 # -- reports --------------------------------------------------------------------------------------

@@ -33,6 +33,7 @@ def calibration(result: CalibrationResult, out: str, report: str | None) -> dict
         "out": out,
         "report": report,
         "model": result.structure.name,
+        "strain_laws": [segment.strain_law for segment in result.robot.segments],
         "models": [
             {
                 "name": each.structure.name,

@@ -356,6 +356,10 @@ def _record(setup: Setup, found: Fit) -> Calibration:
     covariance = found.covariance[np.ix_(shape, shape)]
     deviation = np.sqrt(np.diag(covariance))
     correlation = np.round(covariance / np.outer(deviation, deviation), _DIGITS)
+    unlearnt = _softening(setup, found)
+    size = len(deviation) + len(unlearnt)
+    full = np.eye(size)
+    full[: len(deviation), : len(deviation)] = correlation
     pressures = [recording.pressures for recording in setup.recordings]
     pressures += [table.pressures for table in setup.tables]
     seen = np.concatenate(pressures)
@@ -372,13 +376,29 @@ def _record(setup: Setup, found: Fit) -> Calibration:
             )
             for unknown, d in zip(unknowns, deviation, strict=True)
             if unknown.parameter is not None
-        ),
-        correlation=tuple(tuple(row) for row in correlation.tolist()),
+        )
+        + unlearnt,
+        correlation=tuple(tuple(row) for row in full.tolist()),
         position_residual=found.problem.noise.position if setup.recordings else 0.0,
         angle_residual=found.problem.noise.angle if turns else None,
         pressure_min=tuple(seen.min(axis=0).tolist()),
         pressure_max=tuple(seen.max(axis=0).tolist()),
         pressure_norm=tuple(norms),
+    )
+
+
+def _softening(setup: Setup, found: Fit) -> tuple[FittedParameter, ...]:
+    """What poses alone leave open: whether pressure softens the arm or acts ever more strongly."""
+    if setup.tables:
+        return ()
+    return tuple(
+        FittedParameter(
+            key=f"segments[{s}].compensation.softening",
+            deviation=setup.tolerances.softening,
+            prior=setup.tolerances.softening,
+        )
+        for s, segment in enumerate(found.robot.segments)
+        if segment.compensation is not None and segment.compensation.modulus_per_pressure
     )
 
 

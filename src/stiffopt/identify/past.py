@@ -35,11 +35,15 @@ class Start:
         Their derivatives (m, c) by the side of each channel, see `History.settled`.
     before : ndarray
         Pressures (c,) until the first row, in Pa.
+    per_time : ndarray or None
+        Derivatives (3, m, c) of the states by lag, falling lag and dead time, which a log that
+        went before leaves; None where there was none.
     """
 
     states: Array
     per_side: Array
     before: Array
+    per_time: Array | None = None
 
     @classmethod
     def from_rest(cls, history: History, pressures: Array) -> Start:
@@ -153,7 +157,7 @@ class Past:
         def mixed(states: Array) -> Array:
             return np.asarray(states[:, 0] + memory * slow(states))
 
-        end = Start(state[:, :c], state[:, -c:], pressures[-1])
+        end = self._start(state, pressures[-1])
         return Effective(
             pressures=mixed(values),
             per_lag=mixed(by_lag),
@@ -172,7 +176,12 @@ class Past:
             _carried(end), same, same, none, none, np.array([_BETWEEN_LOGS]),
             (history.lag, history.lag_falling),
         )  # fmt: skip
-        return Start(state[:, : self._channels], state[:, -self._channels :], end.before)
+        return self._start(state, end.before)
+
+    def _start(self, state: Array, before: Array) -> Start:
+        """Where another log begins, after a state (m, 5 c) of `_Run`."""
+        states, *per_time, per_side = np.split(state, _CARRIED, axis=1)
+        return Start(states, per_side, before, np.stack(per_time))
 
     def _run(self, history: History) -> _Run:
         kind = (history.lag > 0, history.lag_falling > 0)
@@ -182,9 +191,10 @@ class Past:
 
 
 def _carried(start: Start) -> Array:
-    """State of `_Run` (m, 5 c) in which only the side has an effect yet."""
-    none = np.zeros_like(start.states)
-    return np.concatenate([start.states, none, none, none, start.per_side], axis=1)
+    """State of `_Run` (m, 5 c)."""
+    none = np.zeros((_CARRIED - 2, *start.states.shape))
+    per_time = none if start.per_time is None else start.per_time
+    return np.concatenate([start.states, *per_time, start.per_side], axis=1)
 
 
 class _Run:

@@ -24,7 +24,7 @@ from stiffopt.model.arguments import checked_measure
 from stiffopt.model.compliance import Boundary
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import NO_HISTORY, History
-from stiffopt.model.parameters import with_values
+from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.parametric import ParametricArm
 
 __all__ = ["Begin", "Noise", "Point", "Predicted", "Problem", "Sample", "Unknowns"]
@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 
 _MOST_MEMORY = 0.9  # sum of the shares of a channel, beyond which a penalty grows
 _MEMORY_SLACK = 0.01
+_LEAST_MODULUS = 0.1  # that pressure must leave of a segment's, below which a penalty grows
+_MODULUS_SLACK = 0.005
 
 Begin = Literal["rest", "previous", "unknown"]
 """How a log begins: after a rise from no pressure, as the previous one ended, or nobody knows."""
@@ -239,9 +241,9 @@ class Problem:
             value, jacobian = self._stiffness_residuals(table, x)
             values.append(value)
             jacobians.append(jacobian)
-        value, jacobian = self._too_much_memory(x)
-        values.append(value)
-        jacobians.append(jacobian)
+        for value, jacobian in (self._too_much_memory(x), self._too_soft(x)):
+            values.append(value)
+            jacobians.append(jacobian)
         return np.concatenate(values), np.concatenate(jacobians) * self.scale
 
     def _too_much_memory(self, x: Array) -> tuple[Array, Array]:
@@ -263,6 +265,39 @@ class Problem:
                         elif key == f"{prefix}.memory[{c}]":
                             slope[row, i] = memory * total / _MEMORY_SLACK
                 row += 1
+        return value, slope
+
+    def _too_soft(self, x: Array) -> tuple[Array, Array]:
+        """By how much pressure softens each segment more than within its limits it may, (s,)."""
+        segments = self.description.segments
+        value, slope = np.zeros(len(segments)), np.zeros((len(segments), self.size))
+        farthest = np.maximum(
+            np.abs(self.description.pressure_min), np.abs(self.description.pressure_max)
+        )
+        first = 0
+        for s, segment in enumerate(segments):
+            norm = float(np.linalg.norm(farthest[first : first + segment.n_channels]))
+            first += segment.n_channels
+            if segment.compensation is None or segment.compensation.modulus_law != "linear":
+                continue
+            keys = (
+                f"segments[{s}].material.youngs_modulus",
+                f"segments[{s}].compensation.modulus_per_pressure",
+            )
+            modulus, per_pressure = (
+                parameter.at(
+                    parameter.value(self.description),
+                    x[self._index[key]] * self.scale[self._index[key]] if key in self._index else 0,
+                )
+                for key, parameter in ((key, Parameter(key)) for key in keys)
+            )
+            left = 1 + per_pressure * norm / modulus  # of the modulus at the farthest pressures
+            if left < _LEAST_MODULUS:
+                value[s] = (_LEAST_MODULUS - left) / _MODULUS_SLACK
+                by = (per_pressure * norm / modulus, -norm / modulus)
+                for key, change in zip(keys, by, strict=True):
+                    if key in self._index:
+                        slope[s, self._index[key]] = change / _MODULUS_SLACK
         return value, slope
 
     def predict(self, x: Array) -> Predicted:
@@ -335,15 +370,18 @@ class Problem:
             first += segment.n_channels
             history = self._history(s, coordinates)
             end: Start | None = None
+            owner = slice(0, 0)  # the sides on which this and the logs before it depend
             for i, sample in enumerate(self.samples):
                 pressures = sample.recording.pressures[:, channels]
                 before = sample.recording.before[channels]
                 if sample.begin == "previous" and end is not None:
                     start = end
                 elif sample.begin == "unknown" and sides[i].stop > sides[i].start:
-                    own = coordinates[sides[i]][channels]
+                    owner = sides[i]
+                    own = coordinates[owner][channels]
                     start = Start.settled(history, before, own)
                 else:
+                    owner = slice(0, 0)
                     start = Start.from_rest(history, before)
                 found = past.effective(
                     sample.recording.time, pressures, sample.rows, start, history
@@ -352,10 +390,10 @@ class Problem:
                 rows = slice(starts[i], starts[i + 1])
                 effective[rows, channels] = found.pressures
                 self._enter(slopes[rows, channels], s, history, found)
-                if sample.begin == "unknown" and sides[i].stop > sides[i].start:
+                if owner.stop > owner.start:
                     for c in range(channels.start, channels.stop):
                         local = c - channels.start
-                        slopes[rows, c, sides[i].start + c] = found.per_side[:, local]
+                        slopes[rows, c, owner.start + c] = found.per_side[:, local]
         return effective, slopes
 
     def _enter(self, slopes: Array, s: int, history: History, found: Effective) -> None:

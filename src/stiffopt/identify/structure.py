@@ -63,6 +63,8 @@ class Structure:
         if self.strain_law:
             update["strain_law"] = self.strain_law
         given = segment.compensation or Compensation()
+        if not given.modulus_per_pressure:  # a robot file that softens says how
+            given = given.model_copy(update={"modulus_law": "exponential"})
         if "compensation.bending_radius" in self.shape:
             radius = given.bending_radius or _BENDS_TO * segment.length
             given = given.model_copy(update={"bending_radius": radius})
@@ -113,6 +115,21 @@ STRUCTURES = (
     Structure("hysteresis", "lag and play", _BASIC, lag=True, play=True),
     Structure("creep", "lag, play and creep", _BASIC, lag=True, play=True, creep=True),
     Structure(
+        "progressive",
+        "lag and play; a dead band, and bending that stiffens and lengthens",
+        _PROGRESSIVE,
+        lag=True,
+        play=True,
+    ),
+    Structure(
+        "progressive-creep",
+        "lag, play and creep; a dead band, and bending that stiffens and lengthens",
+        _PROGRESSIVE,
+        lag=True,
+        play=True,
+        creep=True,
+    ),
+    Structure(
         "channel-hysteresis",
         "lags when rising and falling, and play of each channel's own",
         _BASIC,
@@ -131,20 +148,5 @@ STRUCTURES = (
         memory=True,
         dead_time=True,
     ),
-    Structure(
-        "progressive",
-        "lag and play; a dead band, and bending that stiffens and lengthens",
-        _PROGRESSIVE,
-        lag=True,
-        play=True,
-    ),
-    Structure(
-        "progressive-creep",
-        "lag, play and creep; a dead band, and bending that stiffens and lengthens",
-        _PROGRESSIVE,
-        lag=True,
-        play=True,
-        creep=True,
-    ),
 )
-"""The simplest first."""
+"""Those with the fewest numbers first."""

@@ -162,10 +162,14 @@ class StrainLaw(ABC):
         return p
 
     def _modulus(self, acting: ca.SX, softening: Any = 1.0) -> ca.SX:
-        """Compensated modulus ``E + softening slope |p|``, in Pa."""
+        """Compensated modulus ``E + softening slope |p|``, or its exponential, in Pa."""
         modulus = self.segment.material.youngs_modulus
         slope = ca.SX(softening * self.compensation.modulus_per_pressure)
-        return ca.SX(modulus) if slope.is_zero() else modulus + slope * smooth_norm(acting)
+        if slope.is_zero():
+            return ca.SX(modulus)
+        if self.compensation.modulus_law == "exponential":
+            return modulus * ca.exp(slope / modulus * smooth_norm(acting))
+        return modulus + slope * smooth_norm(acting)
 
     def _loaded_modulus(self, acting: ca.SX) -> ca.SX:
         """Modulus with which the section gives way to loads, in Pa."""

@@ -123,6 +123,8 @@ class Compensation(Schema):
     Attributes
     ----------
     modulus_per_pressure : change of E per norm of a segment's pressures, Pa/Pa.
+    modulus_law : ``linear``, as in the paper: E + modulus_per_pressure |p|; or ``exponential``,
+        E exp(modulus_per_pressure |p| / E), which begins alike and stays positive.
     area : factor on A.
     inertia : factor on I.
     stiffness : factor on E where the arm gives way to loads. Free shapes depend on pressure over
@@ -138,6 +140,7 @@ class Compensation(Schema):
     """
 
     modulus_per_pressure: Number = 0.0
+    modulus_law: Literal["linear", "exponential"] = "linear"
     area: Annotated[Number, Field(gt=0)] = 1.0
     inertia: Annotated[Number, Field(gt=0)] = 1.0
     stiffness: Annotated[Number, Field(gt=0)] = 1.0

@@ -157,7 +157,8 @@ class Uncertainty:
             pressures[np.newaxis], self._rest, measure
         )
         g, h = per_coordinate[0] / k[0], per_pressure[0] / k[0]
-        deviation = float(np.sqrt(g @ self._covariance @ g + h**2 @ self._hysteresis(pressures)))
+        variance = g @ self._covariance @ g + h**2 @ self._hysteresis(pressures)
+        deviation = float(np.sqrt(max(variance, 0.0)))
         return float(k[0] * np.exp(-_NORMAL * deviation)), float(k[0] * np.exp(_NORMAL * deviation))
 
     def _hysteresis(self, pressures: Vector) -> Vector:

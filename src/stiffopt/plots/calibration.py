@@ -249,7 +249,8 @@ def _side_by_side(pressures: Sequence[Array]) -> Array:
     every = np.concatenate(pressures)
     if len(np.unique(every)) > _FEW:
         return np.zeros(len(pressures))
-    return (np.arange(len(pressures)) - (len(pressures) - 1) / 2) * _ASIDE * float(np.ptp(every))
+    places: Array = np.arange(len(pressures), dtype=float) - (len(pressures) - 1) / 2
+    return places * _ASIDE * float(np.ptp(every))
 
 
 def _shade_seen(axes: Any, robot: RobotDescription, segment: int, channel: int) -> None:

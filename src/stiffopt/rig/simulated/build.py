@@ -66,8 +66,9 @@ def make_channels(robot: RobotDescription, mismatch: Mismatch) -> Channels:
 
 def _check_compensation(given: Compensation, index: int) -> None:
     """Raise `InputError` if a segment has a compensation that the simulated arm cannot have."""
-    for name in ("bending_radius", "lengthening"):
-        if getattr(given, name) != 0:
+    plain = {"bending_radius": 0, "lengthening": 0, "modulus_law": "linear"}
+    for name, value in plain.items():
+        if getattr(given, name) != value:
             raise InputError(
                 f"the simulated arm knows no segments[{index}].compensation.{name}; simulate a "
                 "robot without it, which the optimiser's model may still have"

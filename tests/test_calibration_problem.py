@@ -1,0 +1,302 @@
+"""Residuals of a calibration: what they are, and their slopes by differences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from stiffopt import lie
+from stiffopt.identify.past import Past, Start
+from stiffopt.identify.problem import Begin, Noise, Point, Problem, Sample, Unknowns
+from stiffopt.identify.recording import Recording, Track
+from stiffopt.identify.structure import STRUCTURES, Structure
+from stiffopt.identify.unknowns import (
+    history_unknowns,
+    placement_unknowns,
+    shape_unknowns,
+    side_unknowns,
+    zero_unknowns,
+)
+from stiffopt.logs import StiffnessTable
+from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.model.history import Creep, History, Play
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.robot_files import load_description
+
+Array = NDArray[np.float64]
+
+BAR = 1e5
+KPA = 1e3
+EVERY = Structure(
+    "every",
+    "all that can be fitted",
+    (*next(s for s in STRUCTURES if s.name == "progressive").shape, "compensation.softening"),
+)
+HISTORY = History(
+    dead_time=0.0523,
+    lag=0.3,
+    lag_falling=0.5,
+    memory=(0.8, 1.1, 1.0),
+    play=(Play(width=8 * KPA, share=0.2), Play(width=30 * KPA, share=0.1)),
+    creep=(Creep(time=2.0, share=0.05),),
+)
+NOISE = Noise(2e-3, 0.05)
+
+
+def recording(n: int, count: int, seed: int, bodies: tuple[str, ...], turns: bool) -> Recording:
+    """Smooth pressures, and positions and rotations that are anywhere; some are missing."""
+    random = np.random.default_rng(seed)
+    time = np.cumsum(random.uniform(0.05, 0.15, count))
+    waves = np.sin(time[:, None] * random.uniform(0.5, 2, n) + random.uniform(0, 6, n))
+    p = BAR * (0.6 + 0.35 * waves)
+    tracks = []
+    for name in ("tip", *bodies):
+        position = random.normal(0, 0.05, (count, 3))
+        rotation = Rotation.from_rotvec(random.normal(0, 0.3, (count, 3))).as_matrix()
+        position[count // 3] = np.nan
+        rotation[count // 2 : count // 2 + 2] = np.nan
+        tracks.append(Track(name, position, rotation if turns else None))
+    return Recording(f"log {seed}", time, p, p[0] - 5 * KPA, tuple(tracks), ())
+
+
+@dataclass(frozen=True)
+class Case:
+    robot: str
+    count: int
+    begins: tuple[Begin, ...]
+    bodies: bool = False
+    turns: bool = False
+    tables: bool = False
+
+
+CASES = {
+    "one segment": Case("stiff-flop-1", 40, ("rest", "unknown")),
+    "one segment with a table": Case("stiff-flop-1", 20, ("unknown",), tables=True),
+    "two segments in sequence": Case(
+        "stiff-flop-2", 25, ("unknown", "previous", "previous"), bodies=True, turns=True
+    ),
+    "hanging": Case("stiff-flop-2-hanging", 6, ("unknown",), bodies=True, turns=True, tables=True),
+}
+
+
+def table(n: int) -> StiffnessTable:
+    return StiffnessTable(
+        pressures=BAR * np.linspace(0.2, 1.0, 4 * n).reshape(4, n),
+        directions=np.array([[1.0, 0, 0], [1.0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]]),
+        boundaries=("free", "clamped", "free", "free"),
+        stiffness=np.array([20.0, 70.0, np.nan, 15.0]),
+        sigma=np.array([1.0, 5.0, 1.0, 2.0]),
+    )
+
+
+@cache
+def problem_of(case: Case) -> Problem:
+    description = load_description(case.robot)
+    segments = tuple(s.model_copy(update={"history": HISTORY}) for s in description.segments)
+    description = description.model_copy(update={"segments": segments})
+    description = EVERY_applied(description)
+    n = description.n_pressures
+    bodies = ("mid",) if case.bodies else ()
+    random = np.random.default_rng(11)
+    samples = []
+    for i, begin in enumerate(case.begins):
+        made = recording(n, case.count, 20 + i, bodies, case.turns)
+        rows = np.unique(random.integers(0, case.count, case.count * 2 // 3))
+        samples.append(Sample(made, rows, random.uniform(0.5, 1.0, len(rows)), begin))
+    points = [Point("tip", None, lie.exp(random.normal(0, 0.01, 6)), case.turns)]
+    if case.bodies:
+        points.append(Point("mid", 0.1, lie.exp(random.normal(0, 0.01, 6)), case.turns))
+    known = Tolerances()
+    unknowns = Unknowns(
+        parameters=(
+            *shape_unknowns(description, EVERY.shape, known),
+            *history_unknowns(description, known),
+        ),
+        base=tuple(placement_unknowns("base", np.full(3, 5e-3), np.full(3, 0.1), True)),
+        sensors=tuple(
+            tuple(placement_unknowns("sensor", np.full(3, 2e-3), np.full(3, 0.05), case.turns))
+            for _ in points
+        ),
+        zeros=tuple(tuple(zero_unknowns(s.recording.name, known)) for s in samples),
+        sides=tuple(
+            tuple(side_unknowns(description, s.recording.name)) if s.begin == "unknown" else ()
+            for s in samples
+        ),
+    )
+    base = lie.exp(np.array([0.01, -0.02, 0.03, 0.2, -0.1, 0.3]))
+    tables = [table(n)] if case.tables else []
+    return Problem(description, unknowns, samples, points, base, NOISE, tables)
+
+
+def EVERY_applied(description: RobotDescription) -> RobotDescription:  # noqa: N802
+    """What `Structure.applied` leaves of the history is nothing; keep it."""
+    applied = EVERY.applied(description, 1.0 * BAR)
+    segments = tuple(s.model_copy(update={"history": HISTORY}) for s in applied.segments)
+    return applied.model_copy(update={"segments": segments})
+
+
+def somewhere(problem: Problem, seed: int = 5) -> Array:
+    """Scaled coordinates (d,) near the middle, a little inside the bounds."""
+    x = np.random.default_rng(seed).normal(0, 0.2, problem.size)
+    return np.asarray(np.clip(x, problem.low + 0.02, problem.high - 0.02))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_slopes_are_the_derivatives(name: str) -> None:
+    problem = problem_of(CASES[name])
+    x = somewhere(problem)
+    value, slope = problem.residuals(x)
+    assert slope.shape == (len(value), problem.size)
+    assert np.isfinite(value).all()
+    assert np.isfinite(slope).all()
+    step = 1e-5
+    for i, unknown in enumerate(problem.unknowns.all):
+        change = step * np.eye(problem.size)[i]
+        difference = problem.residuals(x + change)[0] - problem.residuals(x - change)[0]
+        expected = difference / (2 * step)
+        scale = np.abs(expected).max()
+        assert slope[:, i] == pytest.approx(expected, abs=2e-5 * max(scale, 0.1)), unknown.name
+        if not unknown.name.startswith("side"):
+            assert scale > 1e-6, f"{unknown.name} has no effect"
+
+
+def test_sides_of_the_first_log_act_on_the_next() -> None:
+    problem = problem_of(CASES["two segments in sequence"])
+    _, slope = problem.residuals(somewhere(problem))
+    sides = problem.unknowns.slices()[3]
+    rows = slice(3 * problem.starts[1], 3 * problem.starts[2])  # of the tip's positions
+    first = problem.unknowns.sides[0]
+    assert len(first) == 6
+    assert sides[1].stop == sides[1].start
+    assert np.abs(slope[rows, sides[0]]).max() > 1e-3
+
+
+# -- what is predicted ----------------------------------------------------------------------
+
+
+def test_prediction_is_that_of_the_robot_behind_a_tracker() -> None:
+    problem = problem_of(CASES["two segments in sequence"])
+    x = somewhere(problem)
+    coordinates = x * problem.scale
+    found = problem.predict(x)
+    robot = problem.robot(x)
+    base, sensors, zeros, _ = problem.unknowns.slices()
+    poses = Manipulator(robot).tip_pose(found.effective)
+    assert found.poses[0] == pytest.approx(poses, abs=1e-12)
+    seen = problem.base_in_tracker @ lie.exp(coordinates[base]) @ poses
+    seen = seen @ lie.exp(coordinates[sensors[0]]) @ problem.points[0].sensor
+    starts = problem.starts
+    for own, sample, begin, end in zip(
+        zeros, problem.samples, starts[:-1], starts[1:], strict=True
+    ):
+        place = seen[begin:end, :3, 3] + coordinates[own]
+        measured = sample.recording.tracks[0].position[sample.rows]
+        assert found.read[0].position[begin:end] == pytest.approx(place, abs=1e-12)
+        assert found.errors[0][begin:end] == pytest.approx(
+            measured - place, abs=1e-12, nan_ok=True
+        )
+
+
+def test_effective_pressures_are_those_of_the_robots_history() -> None:
+    problem = problem_of(CASES["one segment"])
+    x = somewhere(problem)
+    coordinates = x * problem.scale
+    history = problem.robot(x).segments[0].history
+    assert history is not None
+    found = problem.predict(x).effective
+    sides = problem.unknowns.slices()[3]
+    for i, sample in enumerate(problem.samples):
+        before = sample.recording.before
+        start = Start.from_rest(history, before)
+        if sample.begin == "unknown":
+            start = Start.settled(history, before, coordinates[sides[i]])
+        expected = Past(history, 3).effective(
+            sample.recording.time, sample.recording.pressures, sample.rows, start, history
+        )
+        own = slice(problem.starts[i], problem.starts[i + 1])
+        assert found[own] == pytest.approx(expected.pressures, rel=1e-12)
+
+
+def test_residuals_are_weighted_errors_over_the_noise() -> None:
+    problem = problem_of(CASES["two segments in sequence"])
+    x = somewhere(problem)
+    value, slope = problem.residuals(x)
+    found = problem.predict(x)
+    weight = np.concatenate([sample.weight for sample in problem.samples])
+    count = len(weight)
+    blocks = value[: 12 * count].reshape(4, count, 3)  # tip, its turn, mid, its turn
+    slopes = slope[: 12 * count].reshape(4, count, 3, -1)
+    expected = [
+        found.errors[0] / NOISE.position,
+        -found.read[0].turn / NOISE.angle,  # type: ignore[operator]
+        found.errors[1] / NOISE.position,
+        -found.read[1].turn / NOISE.angle,  # type: ignore[operator]
+    ]
+    for block, slope_of, unweighted in zip(blocks, slopes, expected, strict=True):
+        known = np.isfinite(unweighted).all(axis=1)
+        assert 0 < known.sum() < count
+        assert block[known] == pytest.approx((unweighted * weight[:, None])[known], rel=1e-12)
+        assert not block[~known].any()
+        assert not slope_of[~known].any()
+    assert value[12 * count :] == pytest.approx(np.zeros(6))  # shares are small enough
+
+
+def test_a_robot_of_coordinates() -> None:
+    problem = problem_of(CASES["one segment"])
+    assert problem.robot(np.zeros(problem.size)).segments[0].length == pytest.approx(0.09)
+    x = somewhere(problem)
+    robot = problem.robot(x)
+    for i, unknown in enumerate(problem.unknowns.parameters):
+        assert unknown.parameter is not None
+        before, after = (unknown.parameter.value(r) for r in (problem.description, robot))
+        moved = x[i] * unknown.deviation
+        is_ratio = unknown.unit == "" and unknown.parameter.is_positive
+        assert after == pytest.approx(before * np.exp(moved) if is_ratio else before + moved)
+
+
+def test_stiffness_residuals_are_those_of_the_robot() -> None:
+    problem = problem_of(CASES["one segment with a table"])
+    x = somewhere(problem)
+    value = problem.residuals(x)[0]
+    given = problem.tables[0]
+    robot = Manipulator(problem.robot(x))
+    ends = value[-3 - len(given) : -3]
+    for row in range(len(given)):
+        boundary = given.boundaries[row]
+        assert boundary in ("free", "clamped")
+        k = robot.stiffness(given.pressures[row], given.directions[row], boundary=boundary)
+        expected = (given.stiffness[row] - float(k)) / given.sigma[row]
+        assert ends[row] == pytest.approx(0.0 if np.isnan(expected) else expected, rel=1e-9)
+
+
+def test_too_much_memory_is_penalised_with_the_right_slope() -> None:
+    problem = problem_of(CASES["one segment"])
+    x = np.zeros(problem.size)
+    names = [unknown.name for unknown in problem.unknowns.all]
+    for name in names:
+        if name.startswith("share of play"):
+            x[names.index(name)] = (0.44 - 0.15) / problem.scale[names.index(name)]
+    value, slope = problem.residuals(x)
+    assert (value[-3:] > 0).any()
+    step = 1e-6
+    for i in range(problem.size):
+        change = step * np.eye(problem.size)[i]
+        up, down = (problem.residuals(x + s * change)[0][-3:] for s in (1, -1))
+        assert slope[-3:, i] == pytest.approx((up - down) / (2 * step), abs=1e-4)
+
+
+def test_other_weights_and_noise() -> None:
+    problem = problem_of(CASES["one segment"])
+    x = somewhere(problem)
+    value, slope = problem.residuals(x)
+    halved = [replace(sample, weight=sample.weight / 2) for sample in problem.samples]
+    other = problem.with_samples(halved, Noise(NOISE.position * 2, NOISE.angle))
+    again, other_slope = other.residuals(x)
+    assert again == pytest.approx(value / 4)
+    assert other_slope == pytest.approx(slope / 4)
+    assert problem.residuals(x)[0] == pytest.approx(value)  # the first is as it was
