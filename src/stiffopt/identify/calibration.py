@@ -35,11 +35,12 @@ Progress = Callable[[float, float, str], None]
 _SCREENING_ROWS = 150
 _TURNS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)  # rad; starts where the turn is not known
 _UNKNOWN_TURN = 0.5  # rad; a base that may be turned further has several starts
-_UNKNOWN_MODULUS = 0.5  # relative; a modulus that may be further off has several starts
+_MODULI = (0.0, -1.0, 1.0)  # deviations of the modulus; further starts
 _FINEST_DEAD_TIME = 0.1  # s between rows; of slower logs dead time and lag are one
 _STILL = 1e-3  # of the range of pressures; smaller changes are none
 _A_WHILE = 1.0  # s
 _HELD = 0.2  # share of the time that pressures must be held for creep to be told
+_FAR = 4.0  # deviations from the model; such rows are outliers
 _DIGITS = 4  # of correlations in the file
 
 
@@ -110,7 +111,8 @@ def calibrate(
     if not logs and not tables:
         raise InputError("there is nothing to fit to; expected a log or a table of stiffness")
     structures = _structures(settings)
-    teller = _Teller(progress, len(structures))
+    laws = _other_laws(description) if settings.strain_law == "auto" else []
+    teller = _Teller(progress, len(structures) + len(laws))
     recordings = recordings_of(description, logs, settings)
     setup = Setup.of(description, recordings, tables, settings)
     if not recordings:  # poses are taken to be as the robot file has them
@@ -125,17 +127,16 @@ def calibrate(
         candidates.append(_candidate(setup, structure, near, teller))
         near = {**near, **named(candidates[-1].fit.problem, candidates[-1].fit.x)}
     chosen = best(candidates)
-    if settings.strain_law == "auto":
-        # the robot file's law, unless another predicts clearly better
+    if laws:  # the robot file's, unless another predicts clearly better
         near = named(chosen.fit.problem, chosen.fit.x)
-        laws = [chosen]
-        for law in _other_laws(description):
+        others = [chosen]
+        for law in laws:
             structure = replace(
                 chosen.structure, strain_law=law, name=f"{chosen.structure.name}, {law}"
             )
-            laws.append(_candidate(setup, structure, near, teller))
-        candidates += laws[1:]
-        chosen = best(laws)
+            others.append(_candidate(setup, structure, near, teller))
+        candidates += others[1:]
+        chosen = best(others)
     teller.begin(f"final fit: {chosen.structure.words}")
     near = named(chosen.fit.problem, chosen.fit.x)
     final = _final(setup, chosen.structure, near, teller)
@@ -169,9 +170,9 @@ def _other_laws(description: RobotDescription) -> list[str]:
 class _Teller:
     """Tells progress as evaluations go by, of which nobody knows how many there will be."""
 
-    def __init__(self, progress: Progress | None, structures: int) -> None:
+    def __init__(self, progress: Progress | None, fits: int) -> None:
         self._progress = progress
-        self._phases = 2.0 * structures + 2.0
+        self._phases = 2.0 * fits + 3.0
         self._phase = 0
         self._evaluations = 0
         self._words = ""
@@ -231,9 +232,8 @@ def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
     problem = setup.problem(STRUCTURES[1], _SCREENING_ROWS)
     tolerances = setup.tolerances
     turns = _TURNS if tolerances.base_turn > _UNKNOWN_TURN else (0.0,)
-    moduli = (0.0, -1.0, 1.0) if tolerances.youngs_modulus > _UNKNOWN_MODULUS else (0.0,)
     starts = []
-    for turn, modulus in itertools.product(turns, moduli):
+    for turn, modulus in itertools.product(turns, _MODULI):
         start = started(problem, {})
         for i, unknown in enumerate(problem.unknowns.all):
             if unknown.name == f"{BASE}, about z":
@@ -312,8 +312,25 @@ def _result(
         calibrated=compared(robot) if setup.recordings else (),
         held_back=folds[0] if folds else {},
         tables=setup.tables,
-        remarks=(*remarks, *doubts(found, listed)),
+        remarks=(*remarks, *_outliers(found), *doubts(found, listed)),
     )
+
+
+def _outliers(found: Fit) -> list[str]:
+    """How many rows of each recording are far from the model, so that they count less."""
+    remarks = []
+    starts = found.problem.starts
+    error = np.linalg.norm(found.predicted.errors[0], axis=1) if starts[-1] else np.zeros(0)
+    far = error > _FAR * np.sqrt(3) * found.problem.noise.position
+    for sample, (a, b) in zip(found.problem.samples, itertools.pairwise(starts), strict=True):
+        if far[a:b].any():
+            times = sample.recording.time[sample.rows][far[a:b]]
+            remarks.append(
+                f"{sample.recording.name}: {far[a:b].sum()} of {b - a} rows are more than {_FAR:g} "
+                f"deviations from the model, first at {times[0]:.4g} s, last at {times[-1]:.4g} s; "
+                "they count less"
+            )
+    return remarks
 
 
 def _robot(setup: Setup, found: Fit) -> RobotDescription:
