@@ -4,7 +4,9 @@
 
 Each seed is another arm: it differs from its robot file by what the rig file's spread draws. One
 kinematics experiment is recorded and `calibrate` fits the robot file to it. Then the file as it was
-(nominal) and the fitted one (calibrated) are put side by side:
+(nominal) and the fitted one (calibrated) are put side by side, and where it is cheap a third that
+has the true values, as far as a robot file has words for them (true values): what it still misses
+is not the fit's fault but that of the model, or of what judges:
 
 - open loop: the tip at pressures that the calibration has not seen, held or along a log;
 - stiffness: what the file predicts and what the probe measures;
@@ -43,6 +45,7 @@ Array = NDArray[np.float64]
 
 RIGS = Path(__file__).resolve().parent.parent / "rig"
 FILES = ("nominal", "calibrated")
+COLUMNS = (*FILES, "true values")
 DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 STEPS = (0.010, 0.040)  # m between two targets
 TARGETS_UP_TO = 0.7  # of the highest pressures; an arm that is softer than drawn reaches them too
@@ -58,7 +61,8 @@ INSIDE_BAR = (90.0, 99.0)  # %
 TITLE = "Calibration on the simulated rig"
 TEXT = """\
 One kinematics experiment on each simulated arm, `calibrate` on its logs, and then the robot file as
-it was beside the calibrated one. All arms of a row together; the errors are those of the true tip,
+it was beside the calibrated one, and beside one with the true mismatch in it, whose error is that of
+the model. All arms of a row together; the errors are those of the true tip,
 which no file knows. Settled: held-out random pressures, creep done and no hysteresis. Log: other
 held-out pressures, one after the other, as `validate` predicts them with their history. Stiffness:
 predicted over measured by the probe, less 1. Parameters: share of true values (gains, offsets,
@@ -283,6 +287,35 @@ def fitted(
         structure=sizes.structure, sequence=True, rows=sizes.rows, trial_rows=sizes.trial_rows
     )
     return calibrate(robot, logs, settings=settings)
+
+
+def with_true_values(robot: RobotDescription, truth: Truth) -> RobotDescription:
+    """The robot file with the arm's mismatch in it; silicone has no words there."""
+    from stiffopt.model.description import Corrections, Recordings
+    from stiffopt.registration import Placement, Registration
+
+    m = truth.mismatch
+    segments = []
+    first = 0
+    for s, segment in enumerate(robot.segments):
+        own = slice(first, first := first + segment.n_channels)
+        material, lamb = segment.material, segment.compensation
+        modulus = material.youngs_modulus * m.modulus[s]
+        if lamb is not None:
+            slope = lamb.modulus_per_pressure * m.modulus[s]
+            lamb = lamb.model_copy(update={"modulus_per_pressure": slope})
+        update = {
+            "length": segment.length * m.length[s],
+            "material": material.model_copy(update={"youngs_modulus": modulus}),
+            "compensation": lamb,
+            "corrections": Corrections(
+                gain=m.gain[own], offset=m.offset[own], azimuth=m.angle[own]
+            ),
+        }
+        segments.append(segment.model_copy(update=update))
+    tracker = Placement.of(m.base.inverse() @ m.registration.transform())
+    recordings = Recordings(registration=Registration(tracker_in_base=tracker))
+    return robot.model_copy(update={"segments": tuple(segments), "recordings": recordings})
 
 
 # -- open loop, stiffness, parameters ----------------------------------------------------------
@@ -532,7 +565,8 @@ def measure(case: Case, seed: int, sizes: Sizes, folder: Path) -> Found:
     truth = Truth(description, robot)
     high, n = np.array(robot.pressure_max), robot.n_pressures
     streams = [np.random.default_rng([seed, 5, k]) for k in range(4)]
-    held_out(truth, files, streams[0].uniform(0, 1, (sizes.held, n)) * high, found)
+    judges = {**files, "true values": Known.of(with_true_values(robot, truth))}
+    held_out(truth, judges, streams[0].uniform(0, 1, (sizes.held, n)) * high, found)
     judged(result, true_values(robot, truth, case.agrees), found)
     if sizes.along:
         with tempfile.TemporaryDirectory() as other:
@@ -540,7 +574,7 @@ def measure(case: Case, seed: int, sizes: Sizes, folder: Path) -> Found:
             along_a_log(description, robots, pressures, Path(other), found)
     if sizes.probed:
         pressures = streams[2].uniform(0, 1, (sizes.probed, n)) * high
-        probed(description, robot, files, pressures, found)
+        probed(description, robot, judges, pressures, found)
     if sizes.targets:
         to_targets(description, robot, truth, files, sizes, case.gain, streams[3], found)
     found.notes.append(f"seed {seed}: {result.structure.name}")
@@ -573,21 +607,23 @@ def middle_and(values: Sequence[float], share: float) -> tuple[float, float]:
     return float(middle), float(high)
 
 
-def rows(found: Found) -> list[tuple[str, str, str]]:
-    """What was measured, nominal, calibrated, in words."""
+def rows(found: Found) -> list[tuple[str, ...]]:
+    """What was measured and each of `COLUMNS`, in words."""
 
     def row(what: str, measure: str, words: Callable[[list[float]], str]) -> None:
         if measure in found.values:
             files = found.values[measure]
-            listed.append((what, *(words(files[name]) for name in FILES)))
+            listed.append(
+                (what, *(words(files[name]) if name in files else "-" for name in COLUMNS))
+            )
 
-    listed: list[tuple[str, str, str]] = []
+    listed: list[tuple[str, ...]] = []
     row("settled tip, % of length, mean / p95", "settled", _mean_and_p95)
     row("tip along a log, % of length, mean / p95", "log", _mean_and_p95)
     for axis in DIRECTIONS:
         row(f"stiffness {axis}, %, mean / mean of size", f"stiffness {axis}", _bias_and_size)
     if found.inside:
-        listed.append(("parameters inside", "-", _share(found.inside)))
+        listed.append(("parameters inside", "-", _share(found.inside), "-"))
     row("open loop to targets, steady error, mm, median / p90", "open loop: steady", _median_p90)
     row("feedback, steady error, mm, median / p90", "feedback: steady", _median_p90)
     row("feedback, settling to 1 mm, s, median / p90", "feedback: settling", _median_p90)
@@ -637,7 +673,8 @@ def verdicts(name: str, found: Found) -> list[Verdict]:
 
 def markdown(name: str, found: Found) -> str:
     """Table of an arm, and what to know of it."""
-    lines = [f"### {name}", "", "| measure | nominal | calibrated |", "| --- | --- | --- |"]
+    header = [f"| measure | {' | '.join(COLUMNS)} |", "| --- " * (len(COLUMNS) + 1) + "|"]
+    lines = [f"### {name}", "", *header]
     lines += ["| " + " | ".join(row) + " |" for row in rows(found)]
     if found.inside:
         groups = (f"{group} {sum(f)}/{len(f)}" for group, f in found.inside.items())
@@ -659,7 +696,7 @@ def _counted(notes: Sequence[str]) -> list[str]:
 def section(sizes: Settings) -> Section:
     """The section of `run.py`."""
     own = QUICK if sizes.quick else Sizes(seeds=(sizes.seed, sizes.seed + 1))
-    out = Section(TITLE, TEXT, ("arm", "measure", *FILES))
+    out = Section(TITLE, TEXT, ("arm", "measure", *COLUMNS))
     for name, found in measured(["sim"] if sizes.quick else CASES, own).items():
         out.rows += [(name, *row) for row in rows(found)]
         if not sizes.quick:
@@ -688,6 +725,9 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, default=len(usual.seeds), help="how many arms of each")
     parser.add_argument("--first", type=int, default=0, help="the first of the seeds")
     parser.add_argument("--structure", default=usual.structure, help="model to fit, or auto")
+    parser.add_argument(
+        "--repetitions", type=int, default=usual.repetitions, help="of the kinematics experiment"
+    )
     parser.add_argument("--targets", type=int, default=usual.targets, help="for each arm")
     parser.add_argument("--probed", type=int, default=usual.probed, help="pressures to probe at")
     parser.add_argument("--quick", action="store_true", help="seconds; it proves nothing")
@@ -697,6 +737,7 @@ def main() -> int:
         usual,
         seeds=tuple(range(given.first, given.first + given.seeds)),
         structure=given.structure,
+        repetitions=given.repetitions,
         targets=given.targets,
         probed=given.probed,
     )

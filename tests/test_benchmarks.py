@@ -9,6 +9,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -18,6 +19,7 @@ HERE = Path(__file__).parent
 BENCHMARKS = HERE.parent / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
+import calibration  # noqa: E402
 import counts  # noqa: E402
 import environment  # noqa: E402
 import plots  # noqa: E402
@@ -30,7 +32,9 @@ from peers.ipopt import Ipopt, IpoptEnergy  # noqa: E402
 from peers.own import Stiffopt  # noqa: E402
 from peers.pink_chain import Pink  # noqa: E402
 from results import Comparison, Section, at_least, at_most  # noqa: E402
-from stiffopt import PressureSolver  # noqa: E402
+from stiffopt import PressureSolver, lie  # noqa: E402
+from stiffopt.identify.estimates import Estimate  # noqa: E402
+from stiffopt.model.parameters import Parameter  # noqa: E402
 
 # -- counts -----------------------------------------------------------------------------------
 
@@ -200,6 +204,112 @@ def test_ratios_are_paired_and_leave_out_what_was_not_timed():
     assert timing.ratio(peer, own) == pytest.approx(3.0)
     assert timing.median(peer) == pytest.approx(4.5)
     assert np.isnan(timing.ratio(np.full((1, 2), np.nan), own[:, :2]))
+
+
+# -- calibration ------------------------------------------------------------------------------
+
+
+def test_settling_ends_where_the_tip_comes_near_for_good():
+    times = np.arange(1, 101) * 0.1
+    errors = np.full(100, 0.5e-3)
+    assert calibration.settling_time(times, errors) == 0.0
+    errors[:20] = 5e-3
+    assert calibration.settling_time(times, errors) == pytest.approx(2.0)
+    errors[59] = 1.1e-3  # it leaves once more
+    assert calibration.settling_time(times, errors) == pytest.approx(6.0)
+    errors[95] = 1.1e-3  # so late that nobody knows whether it stays
+    assert calibration.settling_time(times, errors) == np.inf
+
+
+def test_a_step_that_never_settles_counts_in_median_and_quantile():
+    assert calibration.middle_and([1.0, 2.0, np.inf], 0.9) == (2.0, np.inf)
+    assert calibration.middle_and([1.0, np.inf, np.inf], 0.9) == (np.inf, np.inf)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    """An arm that agrees with the model, with its file as drawn and as it is in truth."""
+    pytest.importorskip("numba")
+    description, robot = calibration.described(calibration.CASES["sim-agreeing"], 3)
+    truth = calibration.Truth(description, robot)
+    same = calibration.with_true_values(robot, truth)
+    return description, robot, truth, {"nominal": robot, "calibrated": same}
+
+
+def test_a_file_that_is_the_truth_has_no_error_and_reaches_its_targets(exact):
+    description, robot, truth, robots = exact
+    files = {name: calibration.Known.of(each) for name, each in robots.items()}
+    found = calibration.Found()
+    pressures = np.random.default_rng(1).uniform(0, 1, (6, 3)) * robot.pressure_max
+    calibration.held_out(truth, files, pressures, found)
+    assert np.max(found.values["settled"]["calibrated"]) < 0.1  # % of length
+    assert np.mean(found.values["settled"]["nominal"]) > 2
+
+    sizes = calibration.Sizes(targets=1, hold=4.0)
+    rng = np.random.default_rng(2)
+    calibration.to_targets(description, robot, truth, files, sizes, 0.05, rng, found)
+    assert (
+        found.values["open loop: steady"]["calibrated"][0] < 0.2
+    )  # mm; the solver's tolerance is 0.1
+    assert found.values["open loop: steady"]["nominal"][0] > 1
+    for name in calibration.FILES:
+        assert found.values["feedback: steady"][name][0] < 0.5
+    settling = found.values["feedback: settling"]
+    assert 0.1 < settling["calibrated"][0] < settling["nominal"][0]
+    assert "| steps that never settled | 0 of 1 | 0 of 1 | - |" in calibration.markdown(
+        "sim", found
+    )
+
+
+def test_a_file_that_is_the_truth_predicts_what_the_probe_measures(exact):
+    description, robot, _, robots = exact
+    files = {name: calibration.Known.of(each) for name, each in robots.items()}
+    found = calibration.Found()
+    calibration.probed(description, robot, files, np.array([[0.3e5, 0.6e5, 0.0]]), found)
+    assert not found.notes
+    for axis in calibration.DIRECTIONS:
+        (error,) = found.values[f"stiffness {axis}"]["calibrated"]
+        assert abs(error) < 4  # %
+
+
+def test_the_true_values_are_those_of_the_plant(exact):
+    _, robot, truth, robots = exact
+    true = calibration.true_values(robot, truth, agrees=True)
+    for key, (_, value) in true.items():
+        if key.startswith("segments"):
+            assert Parameter(key).value(robots["calibrated"]) == pytest.approx(value), key
+    # the base frame, as a tracker without noise would find it
+    base = [value for group, value in true.values() if group == "base"]
+    tracker = robots["calibrated"].recordings.registration.tracker_in_base
+    np.testing.assert_allclose(lie.exp(np.array(base)), tracker.inverse(), atol=1e-8)
+
+
+def test_intervals_are_counted_by_group():
+    def estimate(key, low, high):
+        return Estimate("base, x", key, "", 0.0, 0.0, low, high, 1.0, 0.0)
+
+    listed = (estimate("a", 1.0, 3.0), estimate("b", 1.0, 1.5), estimate("", 0.0, 1.0))
+    true = {"a": ("gain", 2.0), "b": ("gain", 2.0), "base, x": ("base", 0.5)}
+    found = calibration.Found()
+    calibration.judged(SimpleNamespace(estimates=listed), true, found)
+    assert found.inside == {"gain": [True, False], "base": [True]}
+    (verdict,) = [v for v in calibration.verdicts("sim", with_settled(found)) if "inside" in v.what]
+    assert verdict.measured == "66.7 %"
+    assert not verdict.met
+
+
+def with_settled(found):
+    found.add("settled", "calibrated", [0.5])
+    return found
+
+
+@pytest.mark.long
+def test_the_quick_form_of_the_calibration_runs():
+    command = [sys.executable, str(BENCHMARKS / "calibration.py"), "--quick", "--arms", "sim"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "| settled tip, % of length, mean / p95 |" in done.stdout
+    assert "| stiffness z, %, mean / mean of size |" in done.stdout
 
 
 # -- report -----------------------------------------------------------------------------------

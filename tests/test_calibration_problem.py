@@ -23,7 +23,7 @@ from stiffopt.identify.unknowns import (
     zero_unknowns,
 )
 from stiffopt.logs import StiffnessTable
-from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.model.description import Tolerances
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description
@@ -68,6 +68,7 @@ def recording(n: int, count: int, seed: int, bodies: tuple[str, ...], turns: boo
 class Case:
     robot: str
     count: int
+    rows: int
     begins: tuple[Begin, ...]
     bodies: bool = False
     turns: bool = False
@@ -75,12 +76,14 @@ class Case:
 
 
 CASES = {
-    "one segment": Case("stiff-flop-1", 40, ("rest", "unknown")),
-    "one segment with a table": Case("stiff-flop-1", 20, ("unknown",), tables=True),
+    "one segment": Case("stiff-flop-1", 40, 25, ("rest", "unknown")),
+    "one segment with a table": Case("stiff-flop-1", 20, 12, ("unknown",), tables=True),
     "two segments in sequence": Case(
-        "stiff-flop-2", 25, ("unknown", "previous", "previous"), bodies=True, turns=True
+        "stiff-flop-2", 25, 15, ("unknown", "previous", "previous"), bodies=True, turns=True
     ),
-    "hanging": Case("stiff-flop-2-hanging", 6, ("unknown",), bodies=True, turns=True, tables=True),
+    "hanging": Case(
+        "stiff-flop-2-hanging", 40, 5, ("unknown",), bodies=True, turns=True, tables=True
+    ),
 }
 
 
@@ -96,17 +99,16 @@ def table(n: int) -> StiffnessTable:
 
 @cache
 def problem_of(case: Case) -> Problem:
-    description = load_description(case.robot)
+    description = EVERY.applied(load_description(case.robot), 1.0 * BAR)
     segments = tuple(s.model_copy(update={"history": HISTORY}) for s in description.segments)
     description = description.model_copy(update={"segments": segments})
-    description = EVERY_applied(description)
     n = description.n_pressures
     bodies = ("mid",) if case.bodies else ()
     random = np.random.default_rng(11)
     samples = []
     for i, begin in enumerate(case.begins):
         made = recording(n, case.count, 20 + i, bodies, case.turns)
-        rows = np.unique(random.integers(0, case.count, case.count * 2 // 3))
+        rows = np.unique(random.integers(0, case.count, case.rows))
         samples.append(Sample(made, rows, random.uniform(0.5, 1.0, len(rows)), begin))
     points = [Point("tip", None, lie.exp(random.normal(0, 0.01, 6)), case.turns)]
     if case.bodies:
@@ -133,13 +135,6 @@ def problem_of(case: Case) -> Problem:
     return Problem(description, unknowns, samples, points, base, NOISE, tables)
 
 
-def EVERY_applied(description: RobotDescription) -> RobotDescription:  # noqa: N802
-    """What `Structure.applied` leaves of the history is nothing; keep it."""
-    applied = EVERY.applied(description, 1.0 * BAR)
-    segments = tuple(s.model_copy(update={"history": HISTORY}) for s in applied.segments)
-    return applied.model_copy(update={"segments": segments})
-
-
 def somewhere(problem: Problem, seed: int = 5) -> Array:
     """Scaled coordinates (d,) near the middle, a little inside the bounds."""
     x = np.random.default_rng(seed).normal(0, 0.2, problem.size)
@@ -154,16 +149,21 @@ def test_slopes_are_the_derivatives(name: str) -> None:
     assert slope.shape == (len(value), problem.size)
     assert np.isfinite(value).all()
     assert np.isfinite(slope).all()
+    # of heavy arms, whose equilibria take time, mixtures of unknowns at once
+    names = [unknown.name for unknown in problem.unknowns.all]
+    ways = list(zip(names, np.eye(problem.size), strict=True))
+    if name == "hanging":
+        mixed = np.random.default_rng(6).normal(0, 0.3, (10, problem.size))
+        ways = [("a mixture", way) for way in mixed]
     step = 1e-5
-    for i, unknown in enumerate(problem.unknowns.all):
-        change = step * np.eye(problem.size)[i]
-        difference = problem.residuals(x + change)[0] - problem.residuals(x - change)[0]
-        expected = difference / (2 * step)
+    for unknown, way in ways:
+        up, down = (problem.residuals(x + s * step * way)[0] for s in (1, -1))
+        expected = (up - down) / (2 * step)
         scale = np.abs(expected).max()
-        assert slope[:, i] == pytest.approx(expected, abs=2e-5 * max(scale, 0.1)), unknown.name
-        met_by_loads_only = unknown.name.startswith(("factor on the stiff", "share of soft"))
+        assert slope @ way == pytest.approx(expected, abs=2e-5 * max(scale, 0.1)), unknown
+        met_by_loads_only = unknown.startswith(("factor on the stiff", "share of soft"))
         if not met_by_loads_only or problem.tables:
-            assert scale > 1e-6, f"{unknown.name} has no effect"
+            assert scale > 1e-6, f"{unknown} has no effect"
 
 
 def test_sides_of_the_first_log_act_on_the_next() -> None:
@@ -199,9 +199,7 @@ def test_prediction_is_that_of_the_robot_behind_a_tracker() -> None:
         place = seen[begin:end, :3, 3] + coordinates[own]
         measured = sample.recording.tracks[0].position[sample.rows]
         assert found.read[0].position[begin:end] == pytest.approx(place, abs=1e-12)
-        assert found.errors[0][begin:end] == pytest.approx(
-            measured - place, abs=1e-12, nan_ok=True
-        )
+        assert found.errors[0][begin:end] == pytest.approx(measured - place, abs=1e-12, nan_ok=True)
 
 
 def test_effective_pressures_are_those_of_the_robots_history() -> None:
@@ -265,32 +263,59 @@ def test_a_robot_of_coordinates() -> None:
 def test_stiffness_residuals_are_those_of_the_robot() -> None:
     problem = problem_of(CASES["one segment with a table"])
     x = somewhere(problem)
-    value = problem.residuals(x)[0]
     given = problem.tables[0]
     robot = Manipulator(problem.robot(x))
-    ends = value[-3 - len(given) : -3]
+    found = problem.residuals(x)[0][3 * problem.starts[-1] :][: len(given)]
     for row in range(len(given)):
         boundary = given.boundaries[row]
         assert boundary in ("free", "clamped")
         k = robot.stiffness(given.pressures[row], given.directions[row], boundary=boundary)
         expected = (given.stiffness[row] - float(k)) / given.sigma[row]
-        assert ends[row] == pytest.approx(0.0 if np.isnan(expected) else expected, abs=1e-5)
+        # the robot's values are rounded
+        assert found[row] == pytest.approx(0.0 if np.isnan(expected) else expected, abs=1e-4)
 
 
-def test_too_much_memory_is_penalised_with_the_right_slope() -> None:
+def penalised(kind: str) -> Array:
+    """Coordinates at which a penalty is felt, of the problem of one segment."""
     problem = problem_of(CASES["one segment"])
-    x = np.zeros(problem.size)
     names = [unknown.name for unknown in problem.unknowns.all]
-    for name in names:
-        if name.startswith("share of play"):
-            x[names.index(name)] = (0.44 - 0.15) / problem.scale[names.index(name)]
-    value, slope = problem.residuals(x)
-    assert (value[-3:] > 0).any()
+    x = np.zeros(problem.size)
+    if kind == "memory":
+        for name in ("share of play, segment 1 number 1", "share of play, segment 1 number 2"):
+            x[names.index(name)] = 0.29 / problem.scale[names.index(name)]
+    else:
+        x[names.index("change of modulus with pressure, segment 1")] = -1.0  # -0.4
+        x[names.index("Young's modulus, segment 1")] = -0.5
+    return x
+
+
+@pytest.mark.parametrize("kind", ["memory", "softening"])
+def test_what_an_arm_cannot_be_is_penalised_with_the_right_slope(kind: str) -> None:
+    problem = problem_of(CASES["one segment"])
+    x = penalised(kind)
+    first = 3 * problem.starts[-1]
+    value, slope = (found[first:] for found in problem.residuals(x))
+    assert len(value) == 3 + 1  # channels and segments
+    assert (value[:3] > 0).any() == (kind == "memory")
+    assert (value[3] > 0) == (kind == "softening")
+    assert not problem.residuals(np.zeros(problem.size))[0][first:].any()
     step = 1e-6
     for i in range(problem.size):
         change = step * np.eye(problem.size)[i]
-        up, down = (problem.residuals(x + s * change)[0][-3:] for s in (1, -1))
-        assert slope[-3:, i] == pytest.approx((up - down) / (2 * step), abs=1e-4)
+        up, down = (problem.residuals(x + s * change)[0][first:] for s in (1, -1))
+        assert slope[:, i] == pytest.approx((up - down) / (2 * step), abs=1e-4)
+
+
+def test_a_table_without_any_value_says_nothing() -> None:
+    problem = problem_of(CASES["one segment with a table"])
+    empty = replace(problem.tables[0], stiffness=np.full(4, np.nan))
+    other = Problem(
+        problem.description, problem.unknowns, problem.samples, problem.points,
+        problem.base_in_tracker, problem.noise, [empty],
+    )  # fmt: skip
+    value, slope = other.residuals(somewhere(other))
+    assert not value[-8:].any()
+    assert not slope[-8:].any()
 
 
 def test_other_weights_and_noise() -> None:

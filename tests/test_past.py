@@ -1,4 +1,4 @@
-"""Histories along whole logs: against a memory run in fine steps, and derivatives by differences."""
+"""Histories along whole logs: as a memory in fine steps has them; derivatives by differences."""
 
 from __future__ import annotations
 

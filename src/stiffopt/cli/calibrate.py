@@ -108,8 +108,8 @@ def calibrate(
         str,
         typer.Option(
             metavar="NAME",
-            help="auto, or one of static, lag, hysteresis, channel-hysteresis, delayed-hysteresis, "
-            "creep, progressive, progressive-creep.",
+            help="auto, or one of static, lag, hysteresis, creep, progressive, progressive-creep, "
+            "channel-hysteresis, delayed-hysteresis.",
         ),
     ] = "auto",
     strain_law: Annotated[

@@ -150,7 +150,7 @@ def _candidate(
     settings = setup.settings
     teller.begin(f"fitting {structure.words}")
     problem = setup.problem(structure, settings.trial_rows)
-    found = fit(problem, [started(problem, near)], teller)
+    found = fit(problem, [started(problem, near)], teller, rounds=1)
     teller.begin(f"predicting held-back logs: {structure.words}")
     return Candidate(structure, found, held_back_errors(found, settings.settle, teller))
 

@@ -22,6 +22,7 @@ Rows = NDArray[np.bool_]
 _LOGS = 3  # as many or more are held back one by one; of fewer, parts are
 _PARTS = 4
 _TOP = 0.2  # share of the rows with the highest pressures, which are held back too
+_MOST_EVALUATIONS = 20  # of a fit that begins near its end
 _NO_WORSE = 0.02  # a simpler model may be so much worse
 
 
@@ -63,7 +64,7 @@ def held_back_errors(found: Fit, settle: float, tell: Callable[[], None]) -> dic
     errors = {}
     for name, away in _folds(problem).items():
         kept = [_without_beginning(each, problem, i, settle) for i, each in enumerate(away)]
-        x = fit(without(problem, kept), [found.x], tell, rounds=0).x
+        x = fit(without(problem, kept), [found.x], tell, rounds=0, most=_MOST_EVALUATIONS).x
         distances = np.linalg.norm(problem.predict(x).errors[0], axis=1)
         errors[name] = Errors.of(distances[np.concatenate(kept)], None)
     return errors

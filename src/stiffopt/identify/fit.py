@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 _LOSS_SCALE = 2.0  # residuals beyond so many deviations count less and less (soft L1)
 ROUNDS = 3  # of fitting with the spread that the last one left
 _TOLERANCE = 1e-6
-_MOST_EVALUATIONS = 60
+MOST_EVALUATIONS = 60
 _LEAST_POSITION, _LEAST_ANGLE = 1e-6, 1e-5  # m and rad, of the spread: logs have few digits
 
 
@@ -74,6 +74,7 @@ def fit(
     starts: Sequence[Array],
     tell: Callable[[], None] = lambda: None,
     rounds: int = ROUNDS,
+    most: int = MOST_EVALUATIONS,
 ) -> Fit:
     """Fit from several starts and return the best minimum.
 
@@ -86,17 +87,21 @@ def fit(
         Is called at every evaluation of the problem, to show progress or to stop by raising.
     rounds : int
         How often the noise and the weights are made to fit the residuals.
+    most : int
+        Evaluations of the problem in each round.
     """
-    begun = [_minimum(problem, start, tell) for start in starts]
+    begun = [_minimum(problem, start, tell, most) for start in starts]
     x, cost = min(begun, key=lambda found: found[1])
     independent = 1.0
     for _ in range(rounds):
         problem, independent = _reweighted(problem, x, independent)
-        x, cost = _minimum(problem, x, tell)
+        x, cost = _minimum(problem, x, tell, most)
     return Fit(problem, x, cost, _covariance(problem, x), independent)
 
 
-def _minimum(problem: Problem, start: Array, tell: Callable[[], None]) -> tuple[Array, float]:
+def _minimum(
+    problem: Problem, start: Array, tell: Callable[[], None], most: int
+) -> tuple[Array, float]:
     """Scaled coordinates (d,) of a minimum near a start, and its cost."""
     from scipy.optimize import least_squares  # a large library; only fits need it
 
@@ -123,7 +128,7 @@ def _minimum(problem: Problem, start: Array, tell: Callable[[], None]) -> tuple[
         ftol=_TOLERANCE,
         xtol=_TOLERANCE,
         gtol=_TOLERANCE,
-        max_nfev=_MOST_EVALUATIONS,
+        max_nfev=most,
     )
     return np.asarray(found.x), float(found.cost)
 

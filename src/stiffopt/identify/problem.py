@@ -467,7 +467,7 @@ class Problem:
         value, slope = np.zeros(len(table)), np.zeros((len(table), self.size))
         known = np.isfinite(table.stiffness) & np.isfinite(table.sigma) & (table.sigma > 0)
         kinds = list(zip(map(tuple, table.directions.tolist()), table.boundaries, strict=True))
-        for direction, boundary in sorted(set(kinds)):
+        for direction, boundary in sorted({kinds[row] for row in np.flatnonzero(known)}):
             rows = known & np.array([kind == (direction, boundary) for kind in kinds])
             measure = checked_measure(direction, "translation", cast(Boundary, boundary), "base")
             k, _, per_coordinate = self._arm.stiffnesses(

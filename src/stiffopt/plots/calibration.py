@@ -201,6 +201,7 @@ def plot_errors_over_pressure(
     head = max(_HEAD, 0.35 + _LINE * -(-len(labels) // beside))
     figure, panels, height = _stacked(len(counts), columns, 2.5, shared=True, head=head)
     ends = np.cumsum([0, *counts])
+    beside_each_other = False
     for s, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
         for k in range(columns):
             axes = panels[s, k]
@@ -215,8 +216,9 @@ def plot_errors_over_pressure(
             else:
                 axes.set_visible(False)
                 continue
-            _shade_seen(axes, robot, s, channel)
             aside = _side_by_side(pressures)
+            beside_each_other |= bool(aside.any())
+            _shade_seen(axes, robot, s, channel, margin=float(aside.max(initial=0.0)))
             for number, (each, p) in enumerate(zip(shown, pressures, strict=True)):
                 rows = _evenly(len(p), _SCATTERED)
                 axes.plot(
@@ -240,7 +242,10 @@ def plot_errors_over_pressure(
         handles, labels, loc="upper right", bbox_to_anchor=(0.985, 1 - 0.1 / height), ncols=beside,
         fontsize=8.5, frameon=False, markerscale=4, columnspacing=1.2, handletextpad=0.4,
     )  # fmt: skip
-    _head(figure, title, _facts("error of the tip over pressure", found, _worst(found)))
+    what = "error of the tip over pressure"
+    if beside_each_other:
+        what += " (the logs, of a few pressures each, stand side by side)"
+    _head(figure, title, _facts(what, found, _worst(found)))
     return figure
 
 
@@ -253,7 +258,10 @@ def _side_by_side(pressures: Sequence[Array]) -> Array:
     return places * _ASIDE * float(np.ptp(every))
 
 
-def _shade_seen(axes: Any, robot: RobotDescription, segment: int, channel: int) -> None:
+def _shade_seen(
+    axes: Any, robot: RobotDescription, segment: int, channel: int, margin: float
+) -> None:
+    """Shade what was recorded of a channel, or (-1) of the norm of a segment."""
     calibration = robot.calibration
     if calibration is None or not calibration.pressure_max:
         return
@@ -261,7 +269,7 @@ def _shade_seen(axes: Any, robot: RobotDescription, segment: int, channel: int) 
         low, high = 0.0, calibration.pressure_norm[segment]
     else:
         low, high = calibration.pressure_min[channel], calibration.pressure_max[channel]
-    axes.axvspan(low * BAR, high * BAR, color=RANGE, zorder=0)
+    axes.axvspan((low - margin) * BAR, (high + margin) * BAR, color=RANGE, zorder=0)
 
 
 # -- models and stiffness -------------------------------------------------------------------------
