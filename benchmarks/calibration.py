@@ -61,8 +61,8 @@ INSIDE_BAR = (90.0, 99.0)  # %
 TITLE = "Calibration on the simulated rig"
 TEXT = """\
 One kinematics experiment on each simulated arm, `calibrate` on its logs, and then the robot file as
-it was beside the calibrated one, and beside one with the true mismatch in it, whose error is that of
-the model. All arms of a row together; the errors are those of the true tip,
+it was beside the calibrated one, and beside one with the true mismatch in it, whose error is the
+model's. All arms of a row together; the errors are those of the true tip,
 which no file knows. Settled: held-out random pressures, creep done and no hysteresis. Log: other
 held-out pressures, one after the other, as `validate` predicts them with their history. Stiffness:
 predicted over measured by the probe, less 1. Parameters: share of true values (gains, offsets,
@@ -729,6 +729,7 @@ def main() -> int:
         "--repetitions", type=int, default=usual.repetitions, help="of the kinematics experiment"
     )
     parser.add_argument("--targets", type=int, default=usual.targets, help="for each arm")
+    parser.add_argument("--along", type=int, default=usual.along, help="pressures of the log")
     parser.add_argument("--probed", type=int, default=usual.probed, help="pressures to probe at")
     parser.add_argument("--quick", action="store_true", help="seconds; it proves nothing")
     parser.add_argument("--keep", type=Path, help="keep the recordings here and use them again")
@@ -739,6 +740,7 @@ def main() -> int:
         structure=given.structure,
         repetitions=given.repetitions,
         targets=given.targets,
+        along=given.along,
         probed=given.probed,
     )
     begin = perf_counter()

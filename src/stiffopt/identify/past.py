@@ -12,13 +12,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.compiled import library
 from stiffopt.model.history import NO_HISTORY, History
+from stiffopt.model.native_calls import CompiledFunction
+from stiffopt.model.native_source import dense
 
 __all__ = ["Effective", "Past", "Start"]
 
 Array = NDArray[np.float64]
 
 _CHUNKS = (1, 32, 128, 512, 2048)  # rows that may be run at once; fewer are filled up
+_WORTH_COMPILING = 50  # runs of the longest kind; compiling takes a second
 _CARRIED = 5  # values and four derivatives
 _BETWEEN_LOGS = 60.0  # s at the last pressures, between two logs of a sequence
 
@@ -206,8 +210,12 @@ class _Run:
 
     def __init__(self, history: History, channels: int, lags: bool, falls: bool) -> None:
         self._shape = (history.n_states, _CARRIED * channels)
-        step = _steps(history, channels, lags, falls)
-        self._functions = {rows: step.mapaccum("run", rows) for rows in _CHUNKS}
+        self._step = _steps(history, channels, lags, falls)
+        self._functions = {rows: self._step.mapaccum("run", rows) for rows in _CHUNKS}
+        operators = [part.model_dump(exclude={"share"}) for part in history.parts]
+        self._content = ("past", operators, channels, lags, falls, _CHUNKS[-1])
+        self._compiled: CompiledFunction | None = None
+        self._runs = 0  # of the longest kind
 
     def __call__(
         self,
@@ -227,14 +235,28 @@ class _Run:
         def columns(values: Array) -> Array:
             return np.pad(values.reshape(count, -1), ((0, fill), (0, 0)), mode="edge").T
 
-        found = self._functions[size](
+        arguments = (
             state,
             *(columns(each) for each in (before, now, before_change, now_change, steps)),
-            ca.repmat(ca.DM(lags), 1, size),
+            np.tile(np.array(lags)[:, np.newaxis], size),
         )
         rows, width = self._shape
-        states = np.asarray(found.full()).reshape(rows, size, width)
+        fast = self._fast() if size == _CHUNKS[-1] else None
+        found = fast(*arguments)[0] if fast else self._functions[size](*arguments).full()
+        states = np.asarray(found).reshape(rows, size, width)
         return np.asarray(np.swapaxes(states[:, :count], 0, 1))
+
+    def _fast(self) -> CompiledFunction | None:
+        """The longest run in machine code, once it pays to compile it."""
+        self._runs += 1
+        if self._runs == _WORTH_COMPILING:
+
+            def make() -> list[ca.Function]:
+                return [dense(self._step.mapaccum("past_run", _CHUNKS[-1]))]
+
+            code = library(self._content, make)
+            self._compiled = code.function("past_run") if code else None
+        return self._compiled
 
 
 def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Function:

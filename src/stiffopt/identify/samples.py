@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _STRAIGHT = 1e-3  # of the range of pressures: commands this near to a line are on it
+_FINE = 0.04  # s; of commands that change in every row so many are kept as a lag can tell
 _LONGEST_GAP = 64  # rows that are left out at once
 _REST = 0.02  # of the range of pressures: below, an arm is at rest
 
@@ -60,7 +61,8 @@ def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording,
         kept[begins[straight]] = True
         kept[ends[straight]] = True
         gap //= 4
-    kept |= open_rows
+    slot = np.floor(recording.time / _FINE)
+    kept |= open_rows & np.append(slot[1:] != slot[:-1], True)
     position = np.cumsum(kept) - 1
     tracks = tuple(
         Track(
