@@ -49,7 +49,6 @@ COLUMNS = (*FILES, "true values")
 DIRECTIONS = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, -1.0)}
 STEPS = (0.010, 0.040)  # m between two targets
 TARGETS_UP_TO = 0.7  # of the highest pressures; an arm that is softer than drawn reaches them too
-WAIT = 0.5  # s after a step before feedback begins: until then the arm is on its way
 LAST = 2.0  # s at the end of a step over which the steady error is the mean
 NEAR = 1e-3  # m; nearer than that for good is settled
 STAYS = 1.0  # s at the end in which the tip must not leave that again
@@ -69,9 +68,28 @@ predicted over measured by the probe, less 1. Parameters: share of true values (
 azimuths, moduli, their slope, lengths, the base frame; of the agreeing arm also the factors on area
 and stiffness) inside their 95 % intervals. Targets: places of the true tip at rest, steps of 10 to
 40 mm, each as a tracker with the file's registration shows it; the error is that of the last 2 s of
-a step. Feedback: at every frame p += gain pinv(J) (target - measured), J of the file in use, from
-half a second after the step, the same gain for both files. Settled is within 1 mm of the target for
+a step of 10 s (two-segment: 20 s). Feedback: at every frame p += gain pinv(J) (target - measured),
+J of the file in use, from a moment after the step, the same gain for both files. The arm of two
+segments rings for ten seconds: its steps are ramps and its gain is small. Settled is within 1 mm for
 good; a step that never settles counts as infinitely long in median and p90."""
+
+
+@dataclass(frozen=True)
+class Loop:
+    """How targets are gone to, whatever the file; tuned by hand with the nominal one.
+
+    Attributes
+    ----------
+    gain : of the feedback, per frame.
+    slew : of the commands, in Pa/s.
+    wait : after a step until feedback begins, in s: until then the arm is on its way.
+    hold : time at each target, in s.
+    """
+
+    gain: float
+    slew: float
+    wait: float
+    hold: float
 
 
 @dataclass(frozen=True)
@@ -83,18 +101,20 @@ class Case:
     rig : name of the rig file.
     agrees : whether plant and model are of one kind: silicone linear, without creep and hysteresis,
         and a robot file whose strains are per rest length.
-    gain : of the feedback, per frame; tuned by hand with the nominal file.
+    loop : how targets are gone to.
     """
 
     rig: str
     agrees: bool
-    gain: float
+    loop: Loop
 
 
+_QUIET = Loop(gain=0.05, slew=5e5, wait=0.5, hold=10.0)
+_RINGING = Loop(gain=0.01, slew=5e4, wait=2.0, hold=20.0)  # 1.7 Hz, 3 % of critical damping
 CASES = {
-    "sim": Case("sim", False, 0.05),
-    "sim-agreeing": Case("sim", True, 0.05),
-    "two-segment": Case("sim-two-segment", False, 0.02),
+    "sim": Case("sim", False, _QUIET),
+    "sim-agreeing": Case("sim", True, _QUIET),
+    "two-segment": Case("sim-two-segment", False, _RINGING),
 }
 
 
@@ -112,7 +132,6 @@ class Sizes:
     along : held-out pressures of the log; 0 for none.
     probed : pressures at which the probe measures; 0 for none.
     targets : of the loop; 0 for none.
-    hold : time at each of them, in s.
     """
 
     seeds: tuple[int, ...] = (0, 1)
@@ -125,12 +144,11 @@ class Sizes:
     along: int = 12
     probed: int = 4
     targets: int = 12
-    hold: float = 10.0
 
 
 QUICK = Sizes(
     seeds=(0,), repetitions=1, poses=2, structure="static", rows=100, trial_rows=50,
-    held=4, along=1, probed=1, targets=1, hold=4.0,
+    held=4, along=1, probed=1, targets=1,
 )  # fmt: skip
 
 
@@ -467,8 +485,7 @@ def steered(
     robot: RobotDescription,
     known: Known,
     wanted: Sequence[tuple[Array, Array]],
-    gain: float,
-    hold: float,
+    loop: Loop,
 ) -> tuple[Array, Array, list[str]]:
     """Go from target to target; return times (T,), errors (N, T) in m, and what to know.
 
@@ -476,7 +493,7 @@ def steered(
     ----------
     known : the robot file in use.
     wanted : true position of each target, for who judges, and where the file has it.
-    gain : of the feedback, per frame; 0 for none.
+    loop : its gain may be 0, for none.
     """
     from stiffopt import PressureSolver, Target, Task
     from stiffopt.experiments.conductor import Conductor, Row
@@ -485,7 +502,7 @@ def steered(
     solver = PressureSolver(known.model, Task(robot=robot.name, target=first))
     notes: list[str] = []
     errors = []
-    count = round(hold * description.rate)
+    count = round(loop.hold * description.rate)
     with opened(description, robot, known) as rig:
         conductor = Conductor(rig, description.rate)
         conductor.start()
@@ -499,19 +516,19 @@ def steered(
                 p = np.array(answer.pressures)
             turn = known.model.tip_pose(p)[:3, :3]
             inverse = np.linalg.pinv(turn @ known.model.tip_jacobian(p)[:3])
-            begins = conductor.clock.now() + WAIT
+            begins = conductor.clock.now() + loop.wait
 
             def correct(
                 row: Row, here: Array = here, inverse: Array = inverse, begins: float = begins
             ) -> None:
                 nonlocal p
                 if row.visible and row.time >= begins:
-                    p = limits.clamp(p + gain * inverse @ (here - row.position))
+                    p = limits.clamp(p + loop.gain * inverse @ (here - row.position))
 
-            conductor.sink = correct if gain else None
+            conductor.sink = correct if loop.gain else None
             distance = np.empty(count)
             for tick in range(count):
-                conductor.tick(p)
+                conductor.tick(p, loop.slew)
                 tip = rig.world.plant.tip_pose()[:3, 3]
                 distance[tick] = np.linalg.norm(tip - true)
             errors.append(distance)
@@ -532,20 +549,20 @@ def to_targets(
     robot: RobotDescription,
     truth: Truth,
     files: dict[str, Known],
-    sizes: Sizes,
-    gain: float,
+    count: int,
+    loop: Loop,
     rng: np.random.Generator,
     found: Found,
 ) -> None:
     """Steps from target to target, open loop and with feedback."""
-    poses = places(truth, np.array(robot.pressure_max), sizes.targets, rng)
+    poses = places(truth, np.array(robot.pressure_max), count, rng)
     for name, known in files.items():
         wanted = [(pose[:3, 3], known.seen(truth.registered(pose))) for pose in poses]
-        for loop, strength in (("open loop", 0.0), ("feedback", gain)):
-            times, errors, notes = steered(description, robot, known, wanted, strength, sizes.hold)
+        for what, own in (("open loop", replace(loop, gain=0.0)), ("feedback", loop)):
+            times, errors, notes = steered(description, robot, known, wanted, own)
             last = times > times[-1] - LAST
-            found.add(f"{loop}: steady", name, 1e3 * errors[:, last].mean(axis=1))
-            if strength:
+            found.add(f"{what}: steady", name, 1e3 * errors[:, last].mean(axis=1))
+            if own.gain:
                 found.add("feedback: settling", name, [settling_time(times, e) for e in errors])
             else:
                 found.notes += [f"{name}: a target is {note}" for note in notes]
@@ -576,7 +593,7 @@ def measure(case: Case, seed: int, sizes: Sizes, folder: Path) -> Found:
         pressures = streams[2].uniform(0, 1, (sizes.probed, n)) * high
         probed(description, robot, judges, pressures, found)
     if sizes.targets:
-        to_targets(description, robot, truth, files, sizes, case.gain, streams[3], found)
+        to_targets(description, robot, truth, files, sizes.targets, case.loop, streams[3], found)
     found.notes.append(f"seed {seed}: {result.structure.name}")
     return found
 

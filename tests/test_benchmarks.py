@@ -245,9 +245,8 @@ def test_a_file_that_is_the_truth_has_no_error_and_reaches_its_targets(exact):
     assert np.max(found.values["settled"]["calibrated"]) < 0.1  # % of length
     assert np.mean(found.values["settled"]["nominal"]) > 2
 
-    sizes = calibration.Sizes(targets=1, hold=4.0)
-    rng = np.random.default_rng(2)
-    calibration.to_targets(description, robot, truth, files, sizes, 0.05, rng, found)
+    rng, loop = np.random.default_rng(2), calibration.Loop(0.05, slew=5e5, wait=0.5, hold=4.0)
+    calibration.to_targets(description, robot, truth, files, 1, loop, rng, found)
     assert (
         found.values["open loop: steady"]["calibrated"][0] < 0.2
     )  # mm; the solver's tolerance is 0.1

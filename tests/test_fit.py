@@ -124,3 +124,340 @@ def test_registration_is_found_with_orientations() -> None:
     assert result.calibrated[0].errors.angle is not None
     assert result.nominal[0].errors.angle is not None
     assert result.calibrated[0].errors.angle < 0.2 * result.nominal[0].errors.angle
+
+
+def test_gross_outliers_change_little() -> None:
+    clean, log = result_of("lag", "lag"), log_of("lag")
+    random = np.random.default_rng(0)
+    tip = log.tip_position.copy()
+    # twenty rows long, so that they are not taken for jumps of the tracker and reach the fit
+    for begin in random.choice(len(tip) // 20, 3, replace=False) * 20:
+        tip[begin : begin + 20] += random.normal(0, 0.02, 3)
+    single = random.choice(len(tip), len(tip) // 20, replace=False)
+    tip[single] += random.normal(0, 0.02, (len(single), 3))
+    spoilt = Log(log.time, log.commanded, tip)
+    result = calibrate(ONE, [("a.csv", spoilt)], settings=settings("lag"))
+    for before, after in zip(clean.estimates, result.estimates, strict=True):
+        half = (before.high - before.low) / 2
+        assert abs(after.value - before.value) < 1.5 * half, after.name
+    robots = (Manipulator(clean.robot), Manipulator(result.robot))
+    poses = [robot.tip_pose(log.commanded)[:, :3, 3] for robot in robots]
+    assert np.linalg.norm(poses[0] - poses[1], axis=1).mean() < 1e-3
+    assert any("jumps" in remark for remark in result.remarks)
+
+
+# -- how well it is known -------------------------------------------------------------------
+
+KNOWN = ONE.model_copy(
+    update={"tolerances": Tolerances(modulus_per_pressure=0.03, youngs_modulus=0.15, share=0.05)}
+)
+
+
+def recovered(seed: int, structure: str, rho: float, turns: bool = False) -> tuple[Array, Fit]:
+    """Errors (d,) of a fit over its own deviations; the truth is drawn from the prior."""
+    random = np.random.default_rng(seed)
+    time, pressures = course(3, 40.0, seed)
+    told = settings(structure)
+
+    def problem_of(log: Log) -> object:
+        setup = Setup.of(KNOWN, recordings_of(KNOWN, [("a", log)], told), [], told)
+        return setup.problem(BY_NAME[structure], 240)
+
+    problem = problem_of(made_log(KNOWN, time, pressures, turns=turns))
+    x = np.clip(random.normal(0, 1, problem.size), problem.low, problem.high)
+    coordinates = x * problem.scale
+    base, sensors, _, _ = problem.unknowns.slices()
+    sensor = np.zeros(6)
+    sensor[: sensors[0].stop - sensors[0].start] = coordinates[sensors[0]]
+    log = made_log(
+        problem.robot(x), time, pressures, seed=seed, noise=5e-4, rho=rho, turns=turns,
+        base=np.asarray(lie.exp(coordinates[base])), sensor=np.asarray(lie.exp(sensor)),
+    )  # fmt: skip
+    problem = problem_of(log)
+    found = fit(problem, [np.zeros(problem.size)])
+    return (found.x - x) / np.sqrt(np.diag(found.covariance)), found
+
+
+def check_coverage(results: list[tuple[Array, Fit]]) -> None:
+    errors = np.array([error for error, _ in results])
+    learnt = np.array([np.diag(found.covariance) for _, found in results]) < 0.5
+    inside = np.abs(errors) < 1.96
+    assert 0.90 <= inside.mean() <= 0.99
+    assert 0.90 <= inside[learnt].mean() <= 0.99
+    assert 0.8 < np.sqrt(np.mean(errors[learnt] ** 2)) < 1.2
+    assert learnt.mean() > 0.6
+
+
+def test_true_values_lie_inside_the_intervals() -> None:
+    white = [recovered(seed, "lag", 0.0) for seed in range(20)]
+    red = [recovered(seed, "lag", 0.9) for seed in range(20, 40)]
+    check_coverage(white + red)
+    assert np.mean([found.independent for _, found in white]) < 1.2
+    assert np.mean([found.independent for _, found in red]) > 5
+    deviation = [np.median([np.diag(f.covariance) for _, f in each]) for each in (white, red)]
+    assert deviation[1] > 1.2 * deviation[0]  # fewer independent rows say less
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
+@pytest.mark.parametrize(("structure", "turns"), [("lag", False), ("lag", True), ("hysteresis", 0)])
+def test_true_values_lie_inside_the_intervals_of_every_kind(
+    structure: str, turns: bool, rho: float
+) -> None:
+    check_coverage([recovered(seed, structure, rho, bool(turns)) for seed in range(100, 180)])
+
+
+def test_what_was_not_learnt_keeps_its_prior_and_is_named() -> None:
+    time, pressures = course(3, 40.0, 5)
+    pressures[:, 2] = 0.0
+    log = made_log(true_robot("lag"), time, pressures, base=BASE)
+    result = calibrate(ONE, [("a.csv", log)], settings=settings("lag", rows=200))
+    by_key = {estimate.key: estimate for estimate in result.estimates if estimate.key}
+    for name, deviation in (
+        ("corrections.gain[2]", 0.05),
+        ("corrections.azimuth[2]", 0.05),
+        ("compensation.stiffness", 0.2),
+    ):
+        found = by_key[f"segments[0].{name}"]
+        assert found.learnt < 0.05
+        assert found.value == pytest.approx(found.before, abs=0.02)
+        assert found.high == pytest.approx(
+            found.before * np.exp(1.96 * deviation)
+            if found.unit == "" and found.before
+            else 1.96 * deviation,
+            rel=0.03,
+        )
+        unlearnt = [r for r in result.remarks if r.startswith("not learnt") and found.name in r]
+        assert len(unlearnt) == 1
+    assert any("channel 3" in r and "nothing is learnt" in r for r in result.remarks)
+    assert not any("lag, segment 1" in r for r in result.remarks if r.startswith("not learnt"))
+    assert result.robot.calibration is not None
+    priors = {p.key: p.deviation / p.prior for p in result.robot.calibration.parameters}
+    assert priors["segments[0].corrections.gain[2]"] == pytest.approx(1.0, abs=0.02)
+    assert priors["segments[0].compensation.area"] < 0.2
+
+
+# -- what is chosen -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", HISTORIES)
+def test_the_model_that_made_the_log_is_chosen(kind: str) -> None:
+    result = calibrate(
+        ONE, [("a.csv", log_of(kind))], settings=settings("auto", rows=100, trial_rows=120)
+    )
+    assert result.structure.name == kind
+    scores = {each.structure.name: each.score for each in result.candidates}
+    assert len(scores) >= 5
+    simpler = list(HISTORIES)[: list(HISTORIES).index(kind)]
+    assert all(scores[name] > 1.3 * scores[kind] for name in simpler)
+    assert set(result.held_back) == {*(f"part {i} of 4" for i in (1, 2, 3, 4)), "highest pressures"}
+
+
+def test_another_strain_law_is_chosen_where_it_predicts_better() -> None:
+    soft = with_values(ONE, {Parameter("segments[0].compensation.modulus_per_pressure"): 0.0})
+    other = soft.model_copy(
+        update={"segments": (soft.segments[0].model_copy(update={"strain_law": "neo-hookean"}),)}
+    )
+    time, pressures = course(3, 60.0, 3, highest=1.4e5)
+    log = made_log(other, time, pressures, noise=1e-4)
+    told = settings("static", strain_law="auto", rows=200)
+    result = calibrate(ONE, [("a.csv", log)], settings=told)
+    assert result.robot.segments[0].strain_law == "neo-hookean"
+    kept = calibrate(ONE, [("a.csv", log)], settings=settings("static", rows=200))
+    assert kept.robot.segments[0].strain_law == "paper"
+    assert result.calibrated[0].errors.mean < kept.calibrated[0].errors.mean
+
+
+def test_what_is_fixed_stays() -> None:
+    keys = ("segments[0].length", "segments[0].corrections.gain[0]")
+    result = calibrate(ONE, [("a.csv", log_of("lag"))], settings=settings("lag", fixed=keys))
+    for key in keys:
+        assert Parameter(key).value(result.robot) == Parameter(key).value(ONE)
+        assert key not in [estimate.key for estimate in result.estimates]
+    assert result.calibrated[0].errors.mean < 1e-3
+
+
+# -- several logs ---------------------------------------------------------------------------
+
+
+def moved(log: Log, by: Array) -> Log:
+    return Log(log.time, log.commanded, log.tip_position + by)
+
+
+def test_positions_may_be_zeroed_anew_in_each_log() -> None:
+    shift = np.array([1.5e-3, -1e-3, 0.5e-3])
+    logs = [
+        ("a", log_of("lag", seed=1, duration=30.0)),
+        ("b", moved(log_of("lag", seed=2, duration=30.0), shift)),
+    ]
+    errors = {
+        rezero: [
+            c.errors.mean
+            for c in calibrate(ONE, logs, settings=settings("lag", rezero=rezero)).calibrated
+        ]
+        for rezero in (False, True)
+    }
+    assert max(errors[True]) < 0.8e-3
+    assert max(errors[False]) > 0.9e-3
+    result = calibrate(ONE, logs, settings=settings("lag", rezero=True))
+    zeros = {e.name: e.value for e in result.estimates if e.name.startswith("zero of")}
+    apart = [zeros[f"zero of b, {axis}"] - zeros[f"zero of a, {axis}"] for axis in "xyz"]
+    assert apart == pytest.approx(shift, abs=3e-4)
+
+
+def consecutive(kind: str, parts: int) -> list[tuple[str, Log]]:
+    """One recording in parts; the later ones begin under pressure."""
+    whole = log_of(kind, seed=4, duration=90.0)
+    cuts = np.linspace(0, len(whole), parts + 1).astype(int)
+    return [
+        (f"part {i}", Log(whole.time[a:b], whole.commanded[a:b], whole.tip_position[a:b]))
+        for i, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True))
+    ]
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+def test_logs_in_sequence_or_with_unknown_beginnings(sequence: bool) -> None:
+    logs = consecutive("hysteresis", 3)
+    told = settings("hysteresis", sequence=sequence, rows=300)
+    result = calibrate(ONE, logs, settings=told)
+    sides = [e for e in result.estimates if "at the beginning of" in e.name]
+    assert len(sides) == (0 if sequence else 6)
+    assert set(result.held_back) == {"part 0", "part 1", "part 2"}
+    assert [c.errors.mean for c in result.calibrated] == pytest.approx([5e-4] * 3, abs=2e-4)
+    shares = {e.key: e.value for e in result.estimates if ".play" in e.key}
+    assert sum(shares.values()) == pytest.approx(0.3, abs=0.08)
+
+
+# -- arms that hang, and stiffness ----------------------------------------------------------
+
+
+def test_a_hanging_arm_from_a_small_log() -> None:
+    true = with_values(
+        HANGING,
+        {
+            Parameter("segments[0].material.youngs_modulus"): 1.2e5,
+            Parameter("segments[1].material.youngs_modulus"): 0.9e5,
+        },
+    )
+    time, pressures = course(6, 20.0, 6, rate=2.0)
+    log = made_log(true, time, pressures, noise=2e-4)
+    told = settings("static", rows=60, trial_rows=50)
+    result = calibrate(HANGING, [("a", log)], settings=told)
+    assert result.calibrated[0].errors.mean < 0.6e-3
+    assert result.nominal[0].errors.mean > 3e-3
+    for s, value in enumerate((1.2e5, 0.9e5)):
+        key = f"segments[{s}].material.youngs_modulus"
+        (found,) = (e for e in result.estimates if e.key == key)
+        assert found.low < value < found.high
+
+
+def stiffness_table(robot: RobotDescription, sigma: float = 0.02) -> StiffnessTable:
+    """Stiffnesses of a robot, each with a relative error."""
+    random = np.random.default_rng(7)
+    pressures = random.uniform(0, 1e5, (12, 3))
+    directions = np.eye(3)[np.arange(12) % 3]
+    arm = Manipulator(robot)
+    true = np.array([float(arm.stiffness(p, d)) for p, d in zip(pressures, directions, strict=True)])
+    measured = true * (1 + sigma * random.normal(0, 1, 12))
+    return StiffnessTable(pressures, directions, ("free",) * 12, measured, sigma * true)
+
+
+def test_tables_alone() -> None:
+    true = with_values(ONE, {Parameter("segments[0].compensation.stiffness"): 1.3})
+    result = calibrate(ONE, [], [stiffness_table(true)])
+    (found,) = result.estimates
+    assert found.key == "segments[0].compensation.stiffness"
+    assert found.low < 1.3 < found.high
+    assert found.high / found.low < 1.06
+    assert result.calibrated == ()
+    assert result.robot.recordings == ONE.recordings
+    assert result.robot.calibration is not None
+    p = np.array([2e4, 6e4, 1e4])
+    assert Manipulator(result.robot).tip_pose(p) == pytest.approx(Manipulator(ONE).tip_pose(p))
+
+
+@pytest.mark.parametrize("softening", [0.01, 1.0])
+def test_tables_with_logs_tell_stiffness_and_softening(softening: float) -> None:
+    true = with_values(
+        true_robot("static"),
+        {
+            Parameter("segments[0].compensation.stiffness"): 1.3,
+            Parameter("segments[0].compensation.softening"): softening,
+        },
+    )
+    time, pressures = course(3, 40.0, 8)
+    log = made_log(true, time, pressures, base=BASE)
+    table = stiffness_table(true)
+    result = calibrate(ONE, [("a", log)], [table], settings=settings("static", rows=200))
+    arm = Manipulator(result.robot)
+    found = [float(arm.stiffness(p, d)) for p, d in zip(table.pressures, table.directions)]  # noqa: B905
+    assert found == pytest.approx(table.stiffness, rel=0.08)
+    by_key = {e.key: e for e in result.estimates if e.key}
+    stiffness = by_key["segments[0].compensation.stiffness"]
+    assert stiffness.learnt > 0.9
+    assert stiffness.value == pytest.approx(1.3, rel=0.08)
+    assert result.calibrated[0].errors.mean < 0.6e-3
+    poses_only = Manipulator(result_of("static", "static").robot)
+    apart = [
+        float(poses_only.stiffness(p, d)) / k - 1
+        for p, d, k in zip(table.pressures, table.directions, table.stiffness, strict=True)
+    ]
+    assert np.abs(apart).mean() > 0.15
+
+
+# -- what cannot be fitted ------------------------------------------------------------------
+
+
+def test_logs_of_which_nothing_can_be_used() -> None:
+    good = log_of("lag", duration=30.0)
+    unseen = Log(good.time, good.commanded, np.full_like(good.tip_position, np.nan))
+    still = Log(good.time, np.full_like(good.commanded, 3e4), good.tip_position)
+    one = Log(good.time[:1], good.commanded[:1], good.tip_position[:1])
+    two = Log(good.time, good.commanded[:, :2], good.tip_position)
+    for log, said in (
+        (unseen, "b: .*missing in every row"),
+        (still, "b: .*no pressure moves"),
+        (one, "b: "),
+        (two, "2 pressures and the robot 3"),
+    ):
+        with pytest.raises(InputError, match=said):
+            calibrate(ONE, [("a", good), ("b", log)], settings=settings("lag"))
+    with pytest.raises(InputError, match="nothing to fit"):
+        calibrate(ONE, [])
+    with pytest.raises(InputError, match="no model 'spline'"):
+        calibrate(ONE, [("a", good)], settings=settings("spline"))
+
+
+def test_a_table_of_another_arm_is_refused() -> None:
+    table = stiffness_table(ONE)
+    other = StiffnessTable(
+        np.zeros((12, 6)), table.directions, table.boundaries, table.stiffness, table.sigma
+    )
+    with pytest.raises(InputError, match="table"):
+        calibrate(ONE, [], [other])
+
+
+def test_a_short_log_beside_a_long_one_does_not_hide_that_rows_hang_together() -> None:
+    told = settings("lag")
+    random = np.random.default_rng(3)
+    long = log_of("lag", duration=60.0)
+    red = Log(long.time, long.commanded, long.tip_position + 1e-3 * reddened(random, 600, 0.95))
+    short = log_of("lag", seed=9, duration=3.0)
+    found = []
+    for logs in ([("a", red)], [("a", red), ("b", short)]):
+        setup = Setup.of(ONE, recordings_of(ONE, logs, told), [], told)
+        problem = setup.problem(BY_NAME["lag"], 600)
+        found.append(fit(problem, [np.zeros(problem.size)]).independent)
+    assert found[0] > 8
+    assert found[1] > 0.6 * found[0]
+
+
+def test_an_arm_that_buckles_during_the_fit_says_so() -> None:
+    standing = HANGING.model_copy(update={"gravity": (0.0, 0.0, -9.81), "tip_mass": 0.3})
+    time, pressures = course(6, 20.0, 6, rate=2.0)
+    tip = made_log(load_description("stiff-flop-2"), time, pressures).tip_position
+    with pytest.raises(EquilibriumError):
+        calibrate(
+            standing, [("a", Log(time, pressures, tip))],
+            settings=settings("static", rows=50, trial_rows=50),
+        )  # fmt: skip

@@ -89,6 +89,5 @@ def test_the_asu_arm_hangs_where_it_was_recorded_and_bends_that_way() -> None:
         held = np.flatnonzero((pressures == most).all(axis=1))[-1]
         moved, predicted = tip[held] - tip[0], robot.tip_pose(most)[:3, 3] - rest
         lengths = np.linalg.norm(moved), np.linalg.norm(predicted)
-        print(path.name, most, moved, predicted, moved @ predicted / np.prod(lengths))
         assert moved @ predicted > 0.9 * np.prod(lengths)
         assert 0.5 < lengths[1] / lengths[0] < 1.5

@@ -110,6 +110,12 @@ def calibrate(
     settings = settings or CalibrationSettings()
     if not logs and not tables:
         raise InputError("there is nothing to fit to; expected a log or a table of stiffness")
+    for table in tables:
+        if table.n != description.n_pressures:
+            raise InputError(
+                f"a table of stiffness has {table.n} pressures and robot '{description.name}' "
+                f"{description.n_pressures} channels; expected as many"
+            )
     structures = _structures(settings)
     laws = _other_laws(description) if settings.strain_law == "auto" else []
     teller = _Teller(progress, len(structures) + len(laws))

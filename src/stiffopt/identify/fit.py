@@ -173,12 +173,12 @@ def _spread(errors: Array, least: float) -> float:
 def _rows_per_independent(problem: Problem, predicted: Predicted) -> float:
     """Integrated autocorrelation of the tip's errors along the rows, at least 1."""
     starts = problem.starts
-    longest = max(1, min(len(s.rows) for s in problem.samples) // 3)
+    longest = max(1, max(len(sample.rows) for sample in problem.samples) // 3)
     total: Array = np.zeros(longest)
     for begin, end in pairwise(starts):
         errors = predicted.errors[0][begin:end]
         known = np.where(np.isfinite(errors), errors, 0.0)
-        size = 2 * len(known)
+        size = len(known) + longest  # so that nothing comes round
         spectrum = np.abs(np.fft.rfft(known, size, axis=0)) ** 2
         products: Array = np.fft.irfft(spectrum, size, axis=0)
         total += np.asarray(products[:longest].sum(axis=1), dtype=float)

@@ -461,9 +461,35 @@ class Problem:
                 rotations.append(track.rotation[sample.rows])
         return np.concatenate(positions), np.concatenate(rotations) if point.turns else None
 
+    def _quick(self, coordinates: Array) -> tuple[Array, Array]:
+        """Coordinates (k,) of the parameters as a quick push meets them, and their slopes (k, k).
+
+        What the histories hold on to adds to the factor on the stiffness: a table is measured
+        with quick small pushes.
+        """
+        k = len(self._parameters)
+        found, slopes = coordinates[:k].copy(), np.eye(k)
+        for s in range(len(self.description.segments)):
+            stiffness = self._index.get(f"segments[{s}].compensation.stiffness")
+            history = self._history(s, coordinates)
+            if stiffness is None or not history.parts:
+                continue
+            quick = history.quick_share
+            found[stiffness] -= np.log(quick)
+            total = sum(part.share for part in history.parts)
+            channels = len(history.memory)
+            memory = sum(history.memory) / channels if channels else 1.0
+            for key, i in self._index.items():
+                if key.startswith(f"segments[{s}].history") and key.endswith("share"):
+                    slopes[stiffness, i] = memory / quick
+                elif key.startswith(f"segments[{s}].history.memory"):
+                    own = history.memory_of(int(key[:-1].rpartition("[")[2]))
+                    slopes[stiffness, i] = own / channels * total / quick
+        return found, slopes
+
     def _stiffness_residuals(self, table: StiffnessTable, x: Array) -> tuple[Array, Array]:
         """Residuals (r,) of a table over its sigmas, and their slopes (r, d)."""
-        coordinates = (x * self.scale)[: len(self._parameters)]
+        coordinates, by_history = self._quick(x * self.scale)
         value, slope = np.zeros(len(table)), np.zeros((len(table), self.size))
         known = np.isfinite(table.stiffness) & np.isfinite(table.sigma) & (table.sigma > 0)
         kinds = list(zip(map(tuple, table.directions.tolist()), table.boundaries, strict=True))
@@ -474,7 +500,8 @@ class Problem:
                 table.pressures[rows], coordinates, measure
             )
             value[rows] = (table.stiffness[rows] - k) / table.sigma[rows]
-            slope[rows, : len(coordinates)] = -per_coordinate / table.sigma[rows, np.newaxis]
+            change = per_coordinate @ by_history
+            slope[rows, : len(coordinates)] = -change / table.sigma[rows, np.newaxis]
         return value, slope
 
 

@@ -116,6 +116,16 @@ class History(Schema):
         return sum(part.share * part.width for part in self.play)
 
     @property
+    def quick_share(self) -> float:
+        """Share of a small, quick change that has its effect at once, of all channels together.
+
+        Play and creep hold on to the rest; what holds against pressure holds against a push too,
+        so that such a push meets an arm that is 1 / quick_share times as stiff as in equilibrium.
+        """
+        memory = sum(self.memory) / len(self.memory) if self.memory else 1.0
+        return 1 - memory * sum(part.share for part in self.parts)
+
+    @property
     def n_states(self) -> int:
         """Number of states of one channel: x, each y and each z."""
         return 1 + len(self.parts)

@@ -20,7 +20,8 @@ from stiffopt.model.arguments import (
 )
 from stiffopt.model.arm import Arm, Values
 from stiffopt.model.compliance import Boundary, Frame, Kind
-from stiffopt.model.description import RobotDescription
+from stiffopt.model.description import Compensation, RobotDescription
+from stiffopt.model.history import NO_HISTORY
 from stiffopt.model.numeric import checked_integer
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.screws import Twist, Wrench
@@ -123,6 +124,7 @@ class Manipulator(Arm):
         boundary: Boundary = "free",
         frame: Frame = "base",
         at: float | None = None,
+        quick: bool = False,
     ) -> Any:
         """Stiffness along a direction (N/m), or about it for `kind` "rotation" (N m/rad).
 
@@ -138,11 +140,17 @@ class Manipulator(Arm):
         frame : {"base", "tip"}
         at : float, optional
             Arc length of another point than the tip, in m at rest; "tip" then means its axes.
+        quick : bool
+            Against a push that is too quick for the arm's creep and too small for its hysteresis,
+            as a probe's is: both then hold against it (`History.quick_share`).  Without gravity
+            and load only, whose shapes are those of equilibrium.
 
         Returns
         -------
         float or ndarray (N,), and with k directions (k,) or (N, k)
         """
+        if quick:
+            return self._quick().stiffness(p, direction, kind, boundary, frame, at)
         at = self._station(at)
         if _is_table(direction):
             each = [self.stiffness(p, row, kind, boundary, frame, at) for row in direction]
@@ -154,6 +162,15 @@ class Manipulator(Arm):
             values = self._checked_tip(lambda q: self._tip.stiffness(q, measure), p)
         result = values[..., 0, 0]
         return float(result) if result.ndim == 0 else result
+
+    def _quick(self) -> "Manipulator":
+        """The same free arm with the stiffness that its memory adds."""
+        if self.is_loaded:
+            raise InputError(
+                "the stiffness against quick pushes is for the arm without gravity and load, whose "
+                "shape does not depend on it"
+            )
+        return self.kept("quick", lambda: Manipulator(quick_description(self.description)))
 
     def stiffness_gradient(
         self,
@@ -302,6 +319,17 @@ class Manipulator(Arm):
             )
             T = T @ lie.inverse(near) @ middle @ lie.exp(twist) @ lie.inverse(middle) @ far
         return T
+
+
+def quick_description(description: RobotDescription) -> RobotDescription:
+    """The robot that gives way to loads as to a quick small push; free shapes are the same."""
+    segments = []
+    for segment in description.segments:
+        share = (segment.history or NO_HISTORY).quick_share
+        given = segment.compensation or Compensation()
+        stiffer = given.model_copy(update={"stiffness": given.stiffness / share})
+        segments.append(segment.model_copy(update={"compensation": stiffer, "history": None}))
+    return description.model_copy(update={"segments": tuple(segments)})
 
 
 def load_robot(
