@@ -70,8 +70,8 @@ and stiffness) inside their 95 % intervals. Targets: places of the true tip at r
 40 mm, each as a tracker with the file's registration shows it; the error is that of the last 2 s of
 a step of 10 s (two-segment: 20 s). Feedback: at every frame p += gain pinv(J) (target - measured),
 J of the file in use, from a moment after the step, the same gain for both files. The arm of two
-segments rings for ten seconds: its steps are ramps and its gain is small. Settled is within 1 mm for
-good; a step that never settles counts as infinitely long in median and p90."""
+segments rings for ten seconds: its steps are ramps and its gain is small. Settled is within 1 mm of
+the target for good; a step that never settles counts as infinitely long in median and p90."""
 
 
 @dataclass(frozen=True)
@@ -684,7 +684,8 @@ def verdicts(name: str, found: Found) -> list[Verdict]:
         share, (low, high) = 100 * float(np.mean(flags)), INSIDE_BAR
         bar = f"{low:g} to {high:g} %"
         met = low <= share <= high
-        listed.append(Verdict(f"{name}: parameters inside", bar, f"{share:.3g} %", met))
+        words = f"{share:.3g} % of {len(flags)}"
+        listed.append(Verdict(f"{name}: parameters inside", bar, words, met))
     return listed
 
 

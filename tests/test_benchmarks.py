@@ -293,7 +293,7 @@ def test_intervals_are_counted_by_group():
     calibration.judged(SimpleNamespace(estimates=listed), true, found)
     assert found.inside == {"gain": [True, False], "base": [True]}
     (verdict,) = [v for v in calibration.verdicts("sim", with_settled(found)) if "inside" in v.what]
-    assert verdict.measured == "66.7 %"
+    assert verdict.measured == "66.7 % of 3"
     assert not verdict.met
 
 

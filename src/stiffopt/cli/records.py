@@ -37,7 +37,7 @@ def _json_record(answer: Answer) -> Record:
         "stiffnesses_plain": answer.plain,
         "stiffness_interval": _interval(answer),
         "matrix_distance": solution.matrix_distance,
-        "tip_uncertainty_m": None if answer.uncertainty is None else answer.uncertainty.semi_axes,
+        "tip_uncertainty_m": _semi_axes(answer),
         "inside_recorded_range": None if answer.uncertainty is None else answer.uncertainty.inside,
         "compliance": solution.compliance,
         "active_bounds": solution.active_bounds,
@@ -141,6 +141,12 @@ def _tip(solution: PressureSolution) -> Record | None:
         "position": _quantities(solution.tip_position, "m", "mm"),
         "orientation": solution.tip_quaternion,
     }
+
+
+def _semi_axes(answer: Answer) -> Any:
+    """Semi-axes (3,) of the tip's ellipsoid in m; None where no calibration saw positions."""
+    known = answer.uncertainty
+    return None if known is None or not known.semi_axes.any() else known.semi_axes
 
 
 def _uncertainty(answer: Answer) -> Record | None:

@@ -136,6 +136,12 @@ def _uncertainty(answer: Answer) -> Iterable[Line]:
     known = answer.uncertainty
     if known is None:
         return
+    if not known.semi_axes.any():
+        yield (
+            "known to",
+            Text("the calibration saw no positions, so that the tip's error is unknown"),
+        )
+        return
     axes = " x ".join(f"{value * 1e3:.2f}" for value in known.semi_axes)
     yield (
         "known to",
