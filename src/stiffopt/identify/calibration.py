@@ -128,7 +128,9 @@ def calibrate(
     near = _screened(setup, teller)
     candidates = []
     for structure in structures:
-        if len(structures) > 1 and not _can_be_told(structure, recordings):
+        if len(structures) > 1 and not (
+            _can_be_told(structure, recordings) and _is_worth_it(structure, candidates)
+        ):
             continue
         candidates.append(_candidate(setup, structure, near, teller))
         near = {**near, **named(candidates[-1].fit.problem, candidates[-1].fit.x)}
@@ -216,6 +218,13 @@ def _can_be_told(structure: Structure, recordings: Sequence[Recording]) -> bool:
     if structure.dead_time and max(steps) > _FINEST_DEAD_TIME:
         return False
     return not structure.creep or _held(recordings) > _HELD
+
+
+def _is_worth_it(structure: Structure, candidates: Sequence[Candidate]) -> bool:
+    """Whether one of those that a structure adds to is the best so far."""
+    if not structure.after:
+        return True
+    return min(candidates, key=lambda each: each.score).structure.name in structure.after
 
 
 def _held(recordings: Sequence[Recording]) -> float:

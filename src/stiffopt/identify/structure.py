@@ -32,6 +32,7 @@ class Structure:
     shape : names of the parameters of each segment's equilibrium that are fitted.
     lag, falling, play, memory, dead_time, creep : whether its history has them.
     strain_law : of all segments; empty for the robot file's.
+    after : names of simpler ones; it is tried only if one of them is the best so far.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Structure:
     dead_time: bool = False
     creep: bool = False
     strain_law: str = ""
+    after: tuple[str, ...] = ()
 
     def applied(self, description: RobotDescription, seen: float) -> RobotDescription:
         """The robot from which the fit of this structure begins.
@@ -127,6 +129,7 @@ STRUCTURES = (
         _PROGRESSIVE,
         lag=True,
         play=True,
+        after=("creep", "progressive"),
         creep=True,
     ),
     Structure(
@@ -146,6 +149,7 @@ STRUCTURES = (
         falling=True,
         play=True,
         memory=True,
+        after=("channel-hysteresis",),
         dead_time=True,
     ),
 )
