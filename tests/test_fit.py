@@ -138,8 +138,8 @@ def test_gross_outliers_change_little() -> None:
     spoilt = Log(log.time, log.commanded, tip)
     result = calibrate(ONE, [("a.csv", spoilt)], settings=settings("lag"))
     for before, after in zip(clean.estimates, result.estimates, strict=True):
-        half = (before.high - before.low) / 2
-        assert abs(after.value - before.value) < 1.5 * half, after.name
+        half = (after.high - after.low) / 2
+        assert abs(after.value - before.value) < half, after.name
     robots = (Manipulator(clean.robot), Manipulator(result.robot))
     poses = [robot.tip_pose(log.commanded)[:, :3, 3] for robot in robots]
     assert np.linalg.norm(poses[0] - poses[1], axis=1).mean() < 1e-3
@@ -285,7 +285,7 @@ def moved(log: Log, by: Array) -> Log:
 
 
 def test_positions_may_be_zeroed_anew_in_each_log() -> None:
-    shift = np.array([1.5e-3, -1e-3, 0.5e-3])
+    shift = np.array([2e-3, -1.5e-3, 1e-3])
     logs = [
         ("a", log_of("lag", seed=1, duration=30.0)),
         ("b", moved(log_of("lag", seed=2, duration=30.0), shift)),
@@ -297,8 +297,8 @@ def test_positions_may_be_zeroed_anew_in_each_log() -> None:
         ]
         for rezero in (False, True)
     }
-    assert max(errors[True]) < 0.8e-3
-    assert max(errors[False]) > 0.9e-3
+    assert max(errors[True]) < 0.7e-3
+    assert max(errors[False]) > 1.5 * max(errors[True])
     result = calibrate(ONE, logs, settings=settings("lag", rezero=True))
     zeros = {e.name: e.value for e in result.estimates if e.name.startswith("zero of")}
     apart = [zeros[f"zero of b, {axis}"] - zeros[f"zero of a, {axis}"] for axis in "xyz"]
@@ -332,23 +332,19 @@ def test_logs_in_sequence_or_with_unknown_beginnings(sequence: bool) -> None:
 
 
 def test_a_hanging_arm_from_a_small_log() -> None:
-    true = with_values(
-        HANGING,
-        {
-            Parameter("segments[0].material.youngs_modulus"): 1.2e5,
-            Parameter("segments[1].material.youngs_modulus"): 0.9e5,
-        },
-    )
-    time, pressures = course(6, 20.0, 6, rate=2.0)
+    """Where weight tells pressure from stiffness: poses alone show how soft an arm is."""
+    hanging = ONE.model_copy(update={"gravity": (3.0, 0.0, 9.3), "tip_mass": 0.05})
+    key = "segments[0].material.youngs_modulus"
+    true = with_values(hanging, {Parameter(key): 0.8e5})
+    time, pressures = course(3, 15.0, 6, rate=2.0)
     log = made_log(true, time, pressures, noise=2e-4)
     told = settings("static", rows=60, trial_rows=50)
-    result = calibrate(HANGING, [("a", log)], settings=told)
-    assert result.calibrated[0].errors.mean < 0.6e-3
-    assert result.nominal[0].errors.mean > 3e-3
-    for s, value in enumerate((1.2e5, 0.9e5)):
-        key = f"segments[{s}].material.youngs_modulus"
-        (found,) = (e for e in result.estimates if e.key == key)
-        assert found.low < value < found.high
+    result = calibrate(hanging, [("a", log)], settings=told)
+    assert result.calibrated[0].errors.mean < 0.5e-3
+    assert result.nominal[0].errors.mean > 1.5e-3
+    (found,) = (e for e in result.estimates if e.key == key)
+    assert found.low < 0.8e5 < found.high
+    assert found.learnt > 0.9
 
 
 def stiffness_table(robot: RobotDescription, sigma: float = 0.02) -> StiffnessTable:
@@ -357,7 +353,9 @@ def stiffness_table(robot: RobotDescription, sigma: float = 0.02) -> StiffnessTa
     pressures = random.uniform(0, 1e5, (12, 3))
     directions = np.eye(3)[np.arange(12) % 3]
     arm = Manipulator(robot)
-    true = np.array([float(arm.stiffness(p, d)) for p, d in zip(pressures, directions, strict=True)])
+    true = np.array(
+        [float(arm.stiffness(p, d)) for p, d in zip(pressures, directions, strict=True)]
+    )
     measured = true * (1 + sigma * random.normal(0, 1, 12))
     return StiffnessTable(pressures, directions, ("free",) * 12, measured, sigma * true)
 
@@ -433,7 +431,7 @@ def test_a_table_of_another_arm_is_refused() -> None:
     other = StiffnessTable(
         np.zeros((12, 6)), table.directions, table.boundaries, table.stiffness, table.sigma
     )
-    with pytest.raises(InputError, match="table"):
+    with pytest.raises(InputError, match="a table of stiffness has 6 pressures"):
         calibrate(ONE, [], [other])
 
 
@@ -442,14 +440,14 @@ def test_a_short_log_beside_a_long_one_does_not_hide_that_rows_hang_together() -
     random = np.random.default_rng(3)
     long = log_of("lag", duration=60.0)
     red = Log(long.time, long.commanded, long.tip_position + 1e-3 * reddened(random, 600, 0.95))
-    short = log_of("lag", seed=9, duration=3.0)
+    short = log_of("lag", seed=9, duration=2.2)
     found = []
     for logs in ([("a", red)], [("a", red), ("b", short)]):
         setup = Setup.of(ONE, recordings_of(ONE, logs, told), [], told)
         problem = setup.problem(BY_NAME["lag"], 600)
         found.append(fit(problem, [np.zeros(problem.size)]).independent)
     assert found[0] > 8
-    assert found[1] > 0.6 * found[0]
+    assert found[1] > 0.85 * found[0]
 
 
 def test_an_arm_that_buckles_during_the_fit_says_so() -> None:

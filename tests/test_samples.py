@@ -64,7 +64,7 @@ def test_thinned_commands_stay_within_the_tolerance(kind: str) -> None:
     if kind == "steps":
         pressures = random.uniform(0, 1e5, (100, 3))[(time / 4).astype(int)]
     elif kind == "waves":
-        pressures = 5e4 * (1 + np.sin(time[:, None] * [0.1, 0.3, 1.0]))
+        pressures = 5e4 * (1 + np.sin(time[:, None] * [0.1, 0.3, 0.5]))
     elif kind == "noise":
         pressures = pressures + random.normal(0, 500, pressures.shape)
     time = time + random.uniform(-0.01, 0.01, len(time))
@@ -155,9 +155,7 @@ def long_log(count: int) -> tuple[Log, Array]:
     """A log of a known arm at 100 Hz, without noise but in every hundredth row's reading."""
     true = with_values(
         ONE.model_copy(
-            update={
-                "segments": (ONE.segments[0].model_copy(update={"history": History(lag=0.5)}),)
-            }
+            update={"segments": (ONE.segments[0].model_copy(update={"history": History(lag=0.5)}),)}
         ),
         {Parameter("segments[0].material.youngs_modulus"): 1.15e5},
     )

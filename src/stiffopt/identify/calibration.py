@@ -126,7 +126,7 @@ def calibrate(
         alone = Structure("stiffness", "stiffness alone", ("compensation.stiffness",))
         return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
     near = _screened(setup, teller)
-    candidates = []
+    candidates: list[Candidate] = []
     for structure in structures:
         if len(structures) > 1 and not (
             _can_be_told(structure, recordings) and _is_worth_it(structure, candidates)

@@ -1,0 +1,165 @@
+"""The choice of a model: what is held back, and which is the simplest that predicts as well."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from made_logs import course, made_log
+from stiffopt.identify import choice
+from stiffopt.identify.choice import Candidate, best, held_back_errors
+from stiffopt.identify.comparison import Errors
+from stiffopt.identify.fit import fit
+from stiffopt.identify.problem import Problem
+from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.setup import Setup, named, started, without
+from stiffopt.identify.structure import STRUCTURES
+from stiffopt.identify.validation import recordings_of
+from stiffopt.logs import Log
+from stiffopt.model.robot_files import load_description
+
+Array = NDArray[np.float64]
+
+ONE = load_description("stiff-flop-1")
+BY_NAME = {structure.name: structure for structure in STRUCTURES}
+
+
+@dataclass(frozen=True)
+class Nothing:
+    """Stands for a fit that nobody asks."""
+
+
+def candidate(index: int, means: list[float]) -> Candidate:
+    folds = {str(i): Errors(10, mean, mean, mean, mean, None) for i, mean in enumerate(means)}
+    nothing: Any = Nothing()
+    return Candidate(STRUCTURES[index], nothing, folds)
+
+
+def test_clearly_better_wins() -> None:
+    found = best([candidate(0, [5e-3, 6e-3, 5e-3]), candidate(1, [1e-3, 1.1e-3, 1e-3])])
+    assert found.structure is STRUCTURES[1]
+    assert found.score == pytest.approx(3.1e-3 / 3)
+
+
+def test_of_those_as_good_the_simplest_wins() -> None:
+    worse_by_a_little = candidate(0, [1.01e-3, 1.01e-3, 1.01e-3])
+    assert best([worse_by_a_little, candidate(1, [1e-3] * 3)]) is worse_by_a_little
+    much = candidate(0, [1.05e-3, 1.05e-3, 1.05e-3])  # the same everywhere: that is no chance
+    assert best([much, candidate(1, [1e-3] * 3)]).structure is STRUCTURES[1]
+
+
+def test_what_may_be_chance_is_taken_for_chance() -> None:
+    simple = candidate(0, [1.5e-3, 0.9e-3, 1.2e-3])  # on the average 20 % worse, but by one log
+    assert best([simple, candidate(1, [1e-3] * 3)]).structure is STRUCTURES[1]
+    simple = candidate(0, [2.2e-3, 0.9e-3, 0.8e-3])
+    assert best([simple, candidate(1, [1e-3] * 3)]) is simple
+
+
+def test_one_fold_alone_has_no_chance() -> None:
+    assert best([candidate(0, [1.3e-3]), candidate(1, [1e-3])]).structure is STRUCTURES[1]
+
+
+def log_of(seed: int, duration: float = 20.0, skip: float = 0.0) -> Log:
+    time, pressures = course(3, duration + skip, seed)
+    log = made_log(ONE, time, pressures, seed=seed)
+    kept = time >= skip
+    return Log(time[kept], pressures[kept], log.tip_position[kept])
+
+
+def problem_of(logs: list[tuple[str, Log]], rows: int = 200, structure: str = "static") -> Problem:
+    told = CalibrationSettings(structure=structure)
+    setup = Setup.of(ONE, recordings_of(ONE, logs, told), [], told)
+    return setup.problem(BY_NAME[structure], rows)
+
+
+def test_parts_and_highest_pressures_of_few_logs_are_held_back() -> None:
+    problem = problem_of([("a", log_of(1)), ("b", log_of(2))])
+    folds = choice._folds(problem)
+    parts = [f"part {i} of 4" for i in (1, 2, 3, 4)]
+    assert list(folds) == [*parts, "highest pressures"]
+    for k in range(2):
+        together = np.array([folds[part][k] for part in parts])
+        assert (together.sum(axis=0) == 1).all()  # every row once
+        assert (np.diff(np.argmax(together, axis=0)) >= 0).all()  # and in one piece
+    high = np.concatenate(folds["highest pressures"])
+    pressures = np.concatenate([s.recording.pressures[s.rows] for s in problem.samples])
+    norms = np.linalg.norm(pressures, axis=1)
+    assert high.mean() == pytest.approx(0.2, abs=0.03)
+    assert norms[high].min() >= norms[~high].max()
+
+
+def test_logs_are_held_back_one_by_one() -> None:
+    problem = problem_of([(name, log_of(i)) for i, name in enumerate("abc")])
+    folds = choice._folds(problem)
+    assert list(folds) == ["a", "b", "c"]
+    assert [[bool(rows.all()) for rows in away] for away in folds.values()] == np.eye(3).tolist()
+    assert [[bool(rows.any()) for rows in away] for away in folds.values()] == np.eye(3).tolist()
+
+
+def test_what_is_held_back_has_no_say() -> None:
+    logs = [(name, log_of(i)) for i, name in enumerate("abc")]
+    spoilt = Log(logs[2][1].time, logs[2][1].commanded, logs[2][1].tip_position + 0.01)
+    problem = problem_of([*logs[:2], ("c", spoilt)])
+    found = fit(problem, [np.zeros(problem.size)], rounds=0)
+    errors = held_back_errors(found, 2.0, lambda: None)
+    assert errors["c"].mean == pytest.approx(0.01 * np.sqrt(3), rel=0.1)
+    assert errors["c"].n == len(problem.samples[2].rows)
+    away = [np.zeros(len(s.rows), dtype=bool) for s in problem.samples]
+    away[2][:] = True
+    value, slope = without(problem, away).residuals(found.x)
+    rows = slice(3 * problem.starts[2], 3 * problem.starts[3])
+    assert not value[rows].any()
+    assert not slope[rows].any()
+    assert np.abs(value[: rows.start]).max() > 0
+
+
+def test_the_beginning_of_a_log_in_an_unknown_state_is_for_its_state() -> None:
+    logs = [(name, log_of(i, skip=5.0)) for i, name in enumerate("abc")]
+    assert (np.abs(logs[0][1].commanded[0]) > 3e3).any()
+    problem = problem_of(logs, structure="hysteresis")
+    assert problem.samples[0].begin == "unknown"
+    everything = np.ones(len(problem.samples[0].rows), dtype=bool)
+    kept = choice._without_beginning(everything, problem, 0, 2.0)
+    time = problem.samples[0].recording.time[problem.samples[0].rows]
+    assert kept.tolist() == (time > time[0] + 2.0).tolist()
+    part = everything.copy()
+    part[:10] = False
+    assert choice._without_beginning(part, problem, 0, 2.0) is part
+
+
+def test_coordinates_by_name_go_from_model_to_model() -> None:
+    one = problem_of([("a", log_of(1))], structure="lag")
+    other = problem_of([("a", log_of(1))], structure="hysteresis")
+    x = np.random.default_rng(0).normal(0, 0.3, one.size)
+    near = named(one, x)
+    begun = named(other, started(other, near))
+    assert {name: begun[name] for name in near} == near
+    new = set(begun) - set(near)
+    assert new
+    assert all(begun[name] == 0 for name in new)
+    low = started(other, dict.fromkeys(begun, -1000000000.0))
+    assert low == pytest.approx(np.maximum(other.low, -1e9))
+
+
+def test_what_these_logs_cannot_tell_is_not_tried() -> None:
+    """Creep needs pressures that are held, a dead time rows that are close."""
+    from stiffopt.identify.calibration import _can_be_told
+
+    time = np.arange(0, 60, 0.05)
+    circle = 4e4 * (1 + np.sin(time[:, None] + np.array([0, 2, 4])))
+    steps = np.repeat(np.random.default_rng(0).uniform(0, 1e5, (12, 3)), 100, axis=0)
+    told = CalibrationSettings()
+
+    def tells(name: str, pressures: Array, every: int = 1) -> bool:
+        log = made_log(ONE, time[::every], pressures[::every])
+        return _can_be_told(BY_NAME[name], recordings_of(ONE, [("a", log)], told))
+
+    assert tells("creep", steps)
+    assert not tells("creep", circle)
+    assert tells("delayed-hysteresis", steps)
+    assert not tells("delayed-hysteresis", steps, every=3)
+    assert tells("hysteresis", circle, every=3)
