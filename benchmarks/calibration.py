@@ -180,6 +180,17 @@ class Found:
             self.inside.setdefault(group, []).extend(flags)
         self.notes += other.notes
 
+    def data(self) -> dict[str, Any]:
+        """All of it as JSON has it: None for what is infinite."""
+        values = {
+            measure: {
+                file: [value if np.isfinite(value) else None for value in each]
+                for file, each in files.items()
+            }
+            for measure, files in self.values.items()
+        }
+        return {"values": values, "inside": self.inside, "notes": self.notes}
+
 
 @dataclass(frozen=True, eq=False)
 class Known:
@@ -462,7 +473,8 @@ def judged(result: CalibrationResult, true: dict[str, tuple[str, float]], found:
     for estimate in result.estimates:
         group, value = true.get(estimate.key or estimate.name, ("", np.nan))
         if group:
-            found.inside.setdefault(group, []).append(estimate.low <= value <= estimate.high)
+            inside = bool(estimate.low <= value <= estimate.high)
+            found.inside.setdefault(group, []).append(inside)
 
 
 # -- targets -----------------------------------------------------------------------------------
@@ -719,17 +731,7 @@ def section(sizes: Settings) -> Section:
         out.rows += [(name, *row) for row in rows(found)]
         if not sizes.quick:
             out.verdicts += verdicts(name, found)
-        out.data[name] = {
-            "values": {
-                measure: {
-                    file: [value if np.isfinite(value) else None for value in values]
-                    for file, values in files.items()
-                }
-                for measure, files in found.values.items()
-            },
-            "inside": found.inside,
-            "notes": found.notes,
-        }
+        out.data[name] = found.data()
     return out
 
 
@@ -749,7 +751,7 @@ def main() -> int:
     parser.add_argument("--targets", type=int, default=usual.targets, help="for each arm")
     parser.add_argument("--along", type=int, default=usual.along, help="pressures of the log")
     parser.add_argument("--probed", type=int, default=usual.probed, help="pressures to probe at")
-    parser.add_argument("--quick", action="store_true", help="seconds; it proves nothing")
+    parser.add_argument("--quick", action="store_true", help="a minute; it proves nothing")
     parser.add_argument("--keep", type=Path, help="keep the recordings here and use them again")
     given = parser.parse_args()
     sizes = replace(

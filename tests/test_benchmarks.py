@@ -288,10 +288,14 @@ def test_intervals_are_counted_by_group():
         return Estimate("base, x", key, "", 0.0, 0.0, low, high, 1.0, 0.0)
 
     listed = (estimate("a", 1.0, 3.0), estimate("b", 1.0, 1.5), estimate("", 0.0, 1.0))
-    true = {"a": ("gain", 2.0), "b": ("gain", 2.0), "base, x": ("base", 0.5)}
+    true = {"a": ("gain", np.float64(2.0)), "b": ("gain", 2.0), "base, x": ("base", 0.5)}
     found = calibration.Found()
     calibration.judged(SimpleNamespace(estimates=listed), true, found)
     assert found.inside == {"gain": [True, False], "base": [True]}
+    found.add("feedback: settling", "calibrated", [np.float64(1.5), np.inf])
+    data = json.loads(json.dumps(found.data(), allow_nan=False))
+    assert data["inside"] == found.inside
+    assert data["values"]["feedback: settling"]["calibrated"] == [1.5, None]
     (verdict,) = [v for v in calibration.verdicts("sim", with_settled(found)) if "inside" in v.what]
     assert verdict.measured == "66.7 % of 3"
     assert not verdict.met

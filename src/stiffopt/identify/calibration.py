@@ -301,13 +301,16 @@ def _result(
     robot = _robot(setup, found)
     teller.begin("comparing")
 
-    def compared(description: RobotDescription) -> tuple[Comparison, ...]:
+    def compared(
+        description: RobotDescription, known: Mapping[str, float]
+    ) -> tuple[Comparison, ...]:
         return compare(
             description,
             setup.recordings,
             sequence=settings.sequence,
             rezero=settings.rezero,
             settle=settings.settle,
+            known=known,
             tell=teller,
         )
 
@@ -323,8 +326,8 @@ def _result(
         structure=structure,
         candidates=tuple(candidates),
         estimates=listed,
-        nominal=compared(setup.description) if setup.recordings else (),
-        calibrated=compared(robot) if setup.recordings else (),
+        nominal=compared(setup.description, {}) if setup.recordings else (),
+        calibrated=compared(robot, named(found.problem, found.x)) if setup.recordings else (),
         held_back=folds[0] if folds else {},
         tables=setup.tables,
         remarks=(*remarks, *_outliers(found), *doubts(found, listed)),

@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import InputError
 from stiffopt.identify.problem import Noise, Predicted, Problem
 from stiffopt.model.description import RobotDescription
 
@@ -113,6 +114,14 @@ def _minimum(
             tell()
             memory.clear()
             value, slope = problem.residuals(x)
+            # a step to where the model fails is taken back; there must be slopes where it does not
+            fails = not np.isfinite(value).all()
+            if (fails and np.array_equal(x, inside)) or not (fails or np.isfinite(slope).all()):
+                raise InputError(
+                    f"the model of robot '{problem.description.name}' has values or slopes that "
+                    "are not finite, so that it cannot be fitted; look at its limits of pressure "
+                    "and its modulus"
+                )
             memory[key] = np.concatenate([value, x]), np.vstack([slope, np.eye(problem.size)])
         return memory[key]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -95,6 +95,7 @@ def compare(
     rezero: bool = False,
     settle: float = 2.0,
     most: int = MOST_ROWS,
+    known: Mapping[str, float] | None = None,
     tell: Callable[[], None] = lambda: None,
 ) -> tuple[Comparison, ...]:
     """Run a model along recordings.
@@ -112,6 +113,8 @@ def compare(
         Time in s at the beginning of a recording from which its zero and its state are estimated.
     most : int
         Rows of a recording that are compared.
+    known : dict of str to float, optional
+        Scaled coordinates of zeros and states by name, where a fit has found them already.
     """
     span = np.subtract(description.pressure_max, description.pressure_min)
     points = points_of(description, recordings)
@@ -127,7 +130,7 @@ def compare(
         samples.append(Sample(smaller, places, np.ones(len(places)), begin))
         kept.append(rows)
     samples = oriented(description, samples, points, base)
-    unknowns, x = _beginnings(description, samples, points, base, rezero, settle, tell)
+    unknowns, x = _beginnings(description, samples, points, base, rezero, settle, known or {}, tell)
     predicted = Problem(description, unknowns, samples, points, base, _NOISE).predict(x)
     starts = np.cumsum([0, *(len(sample.rows) for sample in samples)])
     return tuple(
@@ -214,9 +217,10 @@ def _beginnings(
     base: Array,
     rezero: bool,
     settle: float,
+    known: Mapping[str, float],
     tell: Callable[[], None],
 ) -> tuple[Unknowns, Array]:
-    """Zeros and states of the recordings, as their own beginnings tell them."""
+    """Zeros and states of the recordings, as known or as their own beginnings tell them."""
     tolerances = description.tolerances or Tolerances()
     remembers = any(segment.history and segment.history.play for segment in description.segments)
     all_zeros, all_sides, found = [], [], []
@@ -227,10 +231,12 @@ def _beginnings(
         sides = tuple(side_unknowns(description, name)) if unknown else ()
         all_zeros.append(zeros)
         all_sides.append(sides)
-        x = np.zeros(len(zeros) + len(sides))
+        names = [each.name for each in (*zeros, *sides)]
+        x = np.array([known.get(each, 0.0) for each in names])
+        told = all(each in known for each in names)
         time = sample.recording.time[sample.rows]
         first = sample.rows[time <= time[0] + settle] if len(time) else sample.rows
-        if len(x) and len(first):
+        if not told and len(first):
             begun = replace(sample, rows=first, weight=np.ones(len(first)) / np.sqrt(len(first)))
             if begun.begin == "previous":
                 begun = replace(begun, begin="rest")
