@@ -269,7 +269,9 @@ def test_stiffness_residuals_are_those_of_the_robot() -> None:
     for row in range(len(given)):
         boundary = given.boundaries[row]
         assert boundary in ("free", "clamped")
-        k = robot.stiffness(given.pressures[row], given.directions[row], boundary=boundary)
+        k = robot.stiffness(
+            given.pressures[row], given.directions[row], boundary=boundary, quick=True
+        )
         expected = (given.stiffness[row] - float(k)) / given.sigma[row]
         # the robot's values are rounded
         assert found[row] == pytest.approx(0.0 if np.isnan(expected) else expected, abs=1e-4)

@@ -98,7 +98,7 @@ def test_beyond_what_was_recorded_predictions_stay_physical(structure: str) -> N
 
 @cache
 def asu_result(short: bool) -> CalibrationResult:
-    told = CalibrationSettings(structure="delayed-hysteresis", sequence=True, strain_law="keep")
+    told = CalibrationSettings(structure="channel-hysteresis", sequence=True, strain_law="keep")
     if short:
         told = told.model_copy(update={"rows": 200, "trial_rows": 100})
     logs = [(path.name, read_log(path)) for path in ASU]

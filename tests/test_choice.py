@@ -135,7 +135,7 @@ def test_coordinates_by_name_go_from_model_to_model() -> None:
     one = problem_of([("a", log_of(1))], structure="lag")
     other = problem_of([("a", log_of(1))], structure="hysteresis")
     x = np.random.default_rng(0).normal(0, 0.3, one.size)
-    near = named(one, x)
+    near = named(one, np.clip(x, one.low, one.high))
     begun = named(other, started(other, near))
     assert {name: begun[name] for name in near} == near
     new = set(begun) - set(near)
@@ -146,7 +146,7 @@ def test_coordinates_by_name_go_from_model_to_model() -> None:
 
 
 def test_what_these_logs_cannot_tell_is_not_tried() -> None:
-    """Creep needs pressures that are held, a dead time rows that are close."""
+    """Creep needs pressures that are held."""
     from stiffopt.identify.calibration import _can_be_told
 
     time = np.arange(0, 60, 0.05)
@@ -160,6 +160,15 @@ def test_what_these_logs_cannot_tell_is_not_tried() -> None:
 
     assert tells("creep", steps)
     assert not tells("creep", circle)
-    assert tells("delayed-hysteresis", steps)
-    assert not tells("delayed-hysteresis", steps, every=3)
     assert tells("hysteresis", circle, every=3)
+
+
+@pytest.mark.parametrize(("every", "fine"), [(1, True), (3, False)])
+def test_a_lag_has_a_dead_time_where_rows_are_close(every: int, fine: bool) -> None:
+    time = np.arange(0, 60, 0.05)[::every]
+    circle = 4e4 * (1 + np.sin(time[:, None] + np.array([0, 2, 4])))
+    told = CalibrationSettings()
+    recordings = recordings_of(ONE, [("a", made_log(ONE, time, circle))], told)
+    setup = Setup.of(ONE, recordings, (), told)
+    names = [u.name for u in setup.problem(BY_NAME["lag"], 100).unknowns.parameters]
+    assert ("dead time, segment 1" in names) == fine

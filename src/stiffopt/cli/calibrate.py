@@ -109,7 +109,7 @@ def calibrate(
         typer.Option(
             metavar="NAME",
             help="auto, or one of static, lag, hysteresis, creep, progressive, progressive-creep, "
-            "channel-hysteresis, delayed-hysteresis.",
+            "channel-hysteresis.",
         ),
     ] = "auto",
     strain_law: Annotated[

@@ -36,7 +36,6 @@ _SCREENING_ROWS = 150
 _TURNS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)  # rad; starts where the turn is not known
 _UNKNOWN_TURN = 0.5  # rad; a base that may be turned further has several starts
 _MODULI = (0.0, -1.0, 1.0)  # deviations of the modulus; further starts
-_FINEST_DEAD_TIME = 0.1  # s between rows; of slower logs dead time and lag are one
 _STILL = 1e-3  # of the range of pressures; smaller changes are none
 _A_WHILE = 1.0  # s
 _HELD = 0.2  # share of the time that pressures must be held for creep to be told
@@ -211,12 +210,9 @@ def _structures(settings: CalibrationSettings) -> list[Structure]:
 def _can_be_told(structure: Structure, recordings: Sequence[Recording]) -> bool:
     """Whether recordings can tell what a structure has, whatever its error on them.
 
-    A dead time shorter than a few rows is taken for lag, and creep on a path of even speed for
-    amplitude; both then predict other runs worse than nothing.
+    On a path of even speed creep is taken for amplitude, and then predicts other runs worse than
+    nothing.
     """
-    steps = [float(np.median(np.diff(recording.time))) for recording in recordings]
-    if structure.dead_time and max(steps) > _FINEST_DEAD_TIME:
-        return False
     return not structure.creep or _held(recordings) > _HELD
 
 

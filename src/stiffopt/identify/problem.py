@@ -465,10 +465,13 @@ class Problem:
         """Coordinates (k,) of the parameters as a quick push meets them, and their slopes (k, k).
 
         What the histories hold on to adds to the factor on the stiffness: a table is measured
-        with quick small pushes.
+        with quick small pushes.  Under gravity that factor would move the arm too; there a table
+        is compared with the stiffness of equilibrium.
         """
         k = len(self._parameters)
         found, slopes = coordinates[:k].copy(), np.eye(k)
+        if any(self.description.gravity):
+            return found, slopes
         for s in range(len(self.description.segments)):
             stiffness = self._index.get(f"segments[{s}].compensation.stiffness")
             history = self._history(s, coordinates)

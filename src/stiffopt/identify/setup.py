@@ -32,6 +32,7 @@ __all__ = ["Setup"]
 Array = NDArray[np.float64]
 
 _POSITION_SHARE = 0.01  # of the arm's length: spread of positions that a first fit expects
+_FINEST_DEAD_TIME = 0.1  # s between rows; of slower logs dead time and lag are one
 _ANGLE = np.radians(3.0)  # the same of angles
 _MOST_LOADED_ROWS = 300  # of an arm under gravity, whose every pose is an equilibrium to be found
 
@@ -85,6 +86,12 @@ class Setup:
         return max(highest, default=float(max(self.description.pressure_max)))
 
     @property
+    def is_fine(self) -> bool:
+        """Whether every log has rows so close that a dead time can be told from a lag."""
+        steps = [float(np.median(np.diff(recording.time))) for recording in self.recordings]
+        return max(steps, default=0.0) <= _FINEST_DEAD_TIME
+
+    @property
     def tolerances(self) -> Tolerances:
         """How well the robot file is known."""
         return self.description.tolerances or Tolerances()
@@ -102,7 +109,7 @@ class Setup:
 
     def problem(self, structure: Structure, rows: int) -> Problem:
         """The problem of fitting a structure to so many rows."""
-        description = structure.applied(self.description, self.seen)
+        description = structure.applied(self.description, self.seen, self.is_fine)
         samples = oriented(description, self.samples(rows), self.points, self.base)
         noise = Noise(_POSITION_SHARE * description.length, _ANGLE)
         unknowns = self.unknowns(structure, description, samples)

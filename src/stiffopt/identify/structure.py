@@ -12,7 +12,7 @@ __all__ = ["STRUCTURES", "Structure"]
 STRAIN_LAWS = ("paper", "rest-length", "neo-hookean")
 
 _LAG = 0.3  # s, where the robot file does not say
-_DEAD_TIME = 0.1  # s
+_DEAD_TIME = 0.05  # s
 _WIDTHS = (0.05, 0.12, 0.24, 0.46)  # of plays, as shares of the highest pressure that was seen
 _SHARE = 0.05  # of each play, to begin with
 _CREEP_TIMES = (2.0, 20.0)  # s
@@ -30,7 +30,8 @@ class Structure:
     name : for people and the command line.
     words : what it has, in words.
     shape : names of the parameters of each segment's equilibrium that are fitted.
-    lag, falling, play, memory, dead_time, creep : whether its history has them.
+    lag, falling, play, memory, creep : whether its history has them; a lag comes with a dead time
+        where the logs are fine enough to tell the two apart.
     strain_law : of all segments; empty for the robot file's.
     after : names of simpler ones; it is tried only if one of them is the best so far.
     """
@@ -42,12 +43,13 @@ class Structure:
     falling: bool = False
     play: bool = False
     memory: bool = False
-    dead_time: bool = False
     creep: bool = False
     strain_law: str = ""
     after: tuple[str, ...] = ()
 
-    def applied(self, description: RobotDescription, seen: float) -> RobotDescription:
+    def applied(
+        self, description: RobotDescription, seen: float, fine: bool = True
+    ) -> RobotDescription:
         """The robot from which the fit of this structure begins.
 
         Parameters
@@ -56,12 +58,14 @@ class Structure:
             Where it already has what the structure has, that is where the fit begins.
         seen : float
             Highest pressure that was recorded, in Pa.
+        fine : bool
+            Whether the logs can tell a dead time from a lag.
         """
-        segments = tuple(self._segment(segment, seen) for segment in description.segments)
+        segments = tuple(self._segment(segment, seen, fine) for segment in description.segments)
         return description.model_copy(update={"segments": segments, "calibration": None})
 
-    def _segment(self, segment: Segment, seen: float) -> Segment:
-        update: dict[str, object] = {"history": self._history(segment, seen)}
+    def _segment(self, segment: Segment, seen: float, fine: bool) -> Segment:
+        update: dict[str, object] = {"history": self._history(segment, seen, fine)}
         if self.strain_law:
             update["strain_law"] = self.strain_law
         given = segment.compensation or Compensation()
@@ -78,14 +82,14 @@ class Structure:
         update["corrections"] = corrections
         return segment.model_copy(update=update)
 
-    def _history(self, segment: Segment, seen: float) -> History | None:
+    def _history(self, segment: Segment, seen: float, fine: bool) -> History | None:
         given = segment.history or History()
         if not (self.lag or self.play):
             return None
         plays = given.play or tuple(Play(width=w * seen, share=_SHARE) for w in _WIDTHS)
         creeps = given.creep or tuple(Creep(time=time, share=_CREEP_SHARE) for time in _CREEP_TIMES)
         return History(
-            dead_time=(given.dead_time or _DEAD_TIME) if self.dead_time else 0.0,
+            dead_time=(given.dead_time or _DEAD_TIME) if self.lag and fine else 0.0,
             lag=(given.lag or _LAG) if self.lag else 0.0,
             lag_falling=(given.lag_falling or given.lag or _LAG) if self.falling else 0.0,
             memory=(given.memory or (1.0,) * segment.n_channels) if self.memory else (),
@@ -140,17 +144,6 @@ STRUCTURES = (
         falling=True,
         play=True,
         memory=True,
-    ),
-    Structure(
-        "delayed-hysteresis",
-        "dead time, lags when rising and falling, and play of each channel's own",
-        _BASIC,
-        lag=True,
-        falling=True,
-        play=True,
-        memory=True,
-        after=("channel-hysteresis",),
-        dead_time=True,
     ),
 )
 """Those with the fewest numbers first."""
