@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from made_logs import course, made_log
 from stiffopt.identify import choice
+from stiffopt.identify.calibration import _can_be_told
 from stiffopt.identify.choice import Candidate, best, held_back_errors
 from stiffopt.identify.comparison import Errors
 from stiffopt.identify.fit import fit
@@ -146,29 +147,21 @@ def test_coordinates_by_name_go_from_model_to_model() -> None:
 
 
 def test_what_these_logs_cannot_tell_is_not_tried() -> None:
-    """Creep needs pressures that are held."""
-    from stiffopt.identify.calibration import _can_be_told
-
+    """Creep needs pressures that are held, a dead time rows that are close."""
     time = np.arange(0, 60, 0.05)
     circle = 4e4 * (1 + np.sin(time[:, None] + np.array([0, 2, 4])))
     steps = np.repeat(np.random.default_rng(0).uniform(0, 1e5, (12, 3)), 100, axis=0)
-    told = CalibrationSettings()
 
-    def tells(name: str, pressures: Array, every: int = 1) -> bool:
-        log = made_log(ONE, time[::every], pressures[::every])
-        return _can_be_told(BY_NAME[name], recordings_of(ONE, [("a", log)], told))
+    def recorded(pressures: Array, every: int = 1) -> tuple[str, Log]:
+        return "a", made_log(ONE, time[::every], pressures[::every])
+
+    def tells(name: str, pressures: Array) -> bool:
+        recordings = recordings_of(ONE, [recorded(pressures)], CalibrationSettings())
+        return _can_be_told(BY_NAME[name], recordings)
 
     assert tells("creep", steps)
     assert not tells("creep", circle)
-    assert tells("hysteresis", circle, every=3)
-
-
-@pytest.mark.parametrize(("every", "fine"), [(1, True), (3, False)])
-def test_a_lag_has_a_dead_time_where_rows_are_close(every: int, fine: bool) -> None:
-    time = np.arange(0, 60, 0.05)[::every]
-    circle = 4e4 * (1 + np.sin(time[:, None] + np.array([0, 2, 4])))
-    told = CalibrationSettings()
-    recordings = recordings_of(ONE, [("a", made_log(ONE, time, circle))], told)
-    setup = Setup.of(ONE, recordings, (), told)
-    names = [u.name for u in setup.problem(BY_NAME["lag"], 100).unknowns.parameters]
-    assert ("dead time, segment 1" in names) == fine
+    assert tells("hysteresis", circle)
+    for every, fine in ((1, True), (3, False)):
+        unknowns = problem_of([recorded(steps, every)], structure="lag").unknowns.all
+        assert any(unknown.name.startswith("dead time") for unknown in unknowns) == fine

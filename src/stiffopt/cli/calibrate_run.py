@@ -128,6 +128,8 @@ def _run(work: Callable[[Progress], Callable[[], None]], *, quiet: bool) -> int:
 def _calibrated(options: CalibrateOptions, progress: Progress) -> CalibrationResult:
     check_new_file(options.out, _ENDINGS)
     _check_report(options.report)
+    if options.report and Path(options.report).resolve() == Path(options.out).resolve():
+        raise InputError(f"{options.out}: the robot file and the report cannot have one name")
     if not options.reading.logs and not options.tables:
         raise InputError(
             "there is nothing to fit to; expected a LOG or a table of stiffness (--stiffness)"

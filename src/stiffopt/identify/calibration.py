@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.errors import InputError
+from stiffopt.errors import InputError, PressureError
 from stiffopt.identify.choice import Candidate, best, held_back_errors
 from stiffopt.identify.comparison import Comparison, Errors
 from stiffopt.identify.estimates import Estimate, doubts, estimates
@@ -24,6 +24,7 @@ from stiffopt.identify.validation import compare, placements, recordings_of
 from stiffopt.logs import Log, StiffnessTable
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.description import Recordings, RobotDescription
+from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.registration import Placement, Registration
 
@@ -116,23 +117,30 @@ def calibrate(
                 f"{description.n_pressures} channels; expected as many"
             )
     structures = _structures(settings)
+    for key in settings.fixed:
+        Parameter(key).value(description)  # raises if there is no such number
     laws = _other_laws(description) if settings.strain_law == "auto" else []
     teller = _Teller(progress, len(structures) + len(laws))
     recordings = recordings_of(description, logs, settings)
     setup = Setup.of(description, recordings, tables, settings)
     if not recordings:  # poses are taken to be as the robot file has them
         teller.begin("fitting the stiffness")
-        alone = Structure("stiffness", "stiffness alone", ("compensation.stiffness",))
+        alone = Structure(
+            "stiffness", "stiffness alone", ("compensation.stiffness",), as_given=True
+        )
         return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
-    near = _screened(setup, teller)
+    first = near = _screened(setup, teller)
     candidates: list[Candidate] = []
     for structure in structures:
         if len(structures) > 1 and not (
-            _can_be_told(structure, recordings) and _is_worth_it(structure, candidates)
+            _is_possible(structure, description)
+            and _can_be_told(structure, recordings)
+            and _is_worth_it(structure, candidates)
         ):
             continue
-        candidates.append(_candidate(setup, structure, near, teller))
-        near = {**near, **named(candidates[-1].fit.problem, candidates[-1].fit.x)}
+        candidates.append(_candidate(setup, structure, (first, near), teller))
+        leader = min(candidates, key=lambda each: each.score).fit
+        near = {**near, **named(leader.problem, leader.x)}
     chosen = best(candidates)
     if laws:  # the robot file's, unless another predicts clearly better
         near = named(chosen.fit.problem, chosen.fit.x)
@@ -141,7 +149,7 @@ def calibrate(
             structure = replace(
                 chosen.structure, strain_law=law, name=f"{chosen.structure.name}, {law}"
             )
-            others.append(_candidate(setup, structure, near, teller))
+            others.append(_candidate(setup, structure, (near,), teller))
         candidates += others[1:]
         chosen = best(others)
     teller.begin(f"final fit: {chosen.structure.words}")
@@ -151,13 +159,13 @@ def calibrate(
 
 
 def _candidate(
-    setup: Setup, structure: Structure, near: Mapping[str, float], teller: _Teller
+    setup: Setup, structure: Structure, near: Sequence[Mapping[str, float]], teller: _Teller
 ) -> Candidate:
     """Fit a structure to few rows, and to what is left of them when parts are held back."""
     settings = setup.settings
     teller.begin(f"fitting {structure.words}")
     problem = setup.problem(structure, settings.trial_rows)
-    found = fit(problem, [started(problem, near)], teller, rounds=1)
+    found = fit(problem, [started(problem, each) for each in near], teller, rounds=1)
     teller.begin(f"predicting held-back logs: {structure.words}")
     return Candidate(structure, found, held_back_errors(found, settings.settle, teller))
 
@@ -205,6 +213,11 @@ def _structures(settings: CalibrationSettings) -> list[Structure]:
         if name not in known:
             raise InputError(f"there is no model '{name}'; choose one of auto, {', '.join(known)}")
     return [known[name] for name in settings.structures]
+
+
+def _is_possible(structure: Structure, description: RobotDescription) -> bool:
+    """Whether the robot can have what a structure has: a dead band is of positive pressures."""
+    return "corrections.dead_band" not in structure.shape or min(description.pressure_min) >= 0
 
 
 def _can_be_told(structure: Structure, recordings: Sequence[Recording]) -> bool:
@@ -266,7 +279,13 @@ def _final(setup: Setup, structure: Structure, near: Mapping[str, float], teller
         own = replace(setup, description=description)
         problem = own.problem(structure, setup.settings.rows)
         found.append(fit(problem, [started(problem, near)], teller))
-    return min(found, key=lambda each: each.cost)
+    return min(found, key=_misfit_of_tables)
+
+
+def _misfit_of_tables(found: Fit) -> float:
+    """Sum of the squared residuals of the tables; what is compared does not move the poses."""
+    tables = [found.problem.of_table(table, found.x)[0] for table in found.problem.tables]
+    return float(sum((residuals**2).sum() for residuals in tables))
 
 
 def _softenings(setup: Setup) -> list[RobotDescription]:
@@ -314,6 +333,13 @@ def _result(
         f"{recording.name}: {remark}"
         for recording in setup.recordings
         for remark in recording.remarks
+    ]
+    known = setup.description.calibration
+    remarks += [
+        f"{recording.name} was fitted before: what it tells counts twice; begin with the robot "
+        "file as it was before that calibration"
+        for recording in setup.recordings
+        if known is not None and recording.name in known.logs
     ]
     folds = [each.folds for each in candidates if each.structure is structure]
     return CalibrationResult(
@@ -368,16 +394,61 @@ def _robot(setup: Setup, found: Fit) -> RobotDescription:
                 tip_in_sensor=places["tip"],
             ),
             bodies={
-                name: body.model_copy(update={"point_in_sensor": places[name]})
+                name: body.model_copy(
+                    update={
+                        "point_in_sensor": places[name],
+                        "at": _moved_along(body.at, setup.description, found.robot),
+                    }
+                )
                 for name, body in given.bodies.items()
             },
         )
-    robot = found.robot
+    robot = _with_the_same_mass(found.robot, setup.description)
+    _check_usable(robot)
     return robot.model_copy(update={"recordings": recordings, "calibration": _record(setup, found)})
 
 
+def _moved_along(at: float, before: RobotDescription, after: RobotDescription) -> float:
+    """Arc length in m of the point of the arm that was at another before lengths changed."""
+    begin, moved = 0.0, 0.0
+    for old, new in zip(before.segments, after.segments, strict=True):
+        soft = min(max(at - begin, 0.0), old.length)
+        rigid = min(max(at - begin - old.length, 0.0), old.connector)
+        moved += soft * new.length / old.length + rigid
+        begin += old.length + old.connector
+    return float(f"{min(moved, after.length):.8g}")
+
+
+def _with_the_same_mass(robot: RobotDescription, before: RobotDescription) -> RobotDescription:
+    """The robot with the masses of the file that was fitted, whatever its lengths."""
+    if not any(robot.gravity):
+        return robot
+    segments = []
+    for segment, old in zip(robot.segments, before.segments, strict=True):
+        density = segment.material.density
+        if density is not None:
+            density = float(f"{density * old.length / segment.length:.7g}")
+        material = segment.material.model_copy(update={"density": density})
+        segments.append(segment.model_copy(update={"material": material}))
+    return robot.model_copy(update={"segments": tuple(segments)})
+
+
+def _check_usable(robot: RobotDescription) -> None:
+    """Raise `InputError` if the fitted law breaks down within the robot's pressure limits."""
+    try:
+        Manipulator(robot.model_copy(update={"calibration": None}))
+    except PressureError as error:
+        raise InputError(
+            f"the fitted robot cannot be used within its own pressure limits: {error}; record "
+            "higher pressures, or begin with 'modulus_law: exponential'"
+        ) from None
+
+
 def _record(setup: Setup, found: Fit) -> Calibration:
-    """What the robot file says of how well it is known."""
+    """What the robot file says of how well it is known.
+
+    A fit to tables alone keeps what an earlier calibration knew of everything else.
+    """
     shape = [
         i
         for i, unknown in enumerate(found.problem.unknowns.parameters)
@@ -387,18 +458,28 @@ def _record(setup: Setup, found: Fit) -> Calibration:
     covariance = found.covariance[np.ix_(shape, shape)]
     deviation = np.sqrt(np.diag(covariance))
     correlation = np.round(covariance / np.outer(deviation, deviation), _DIGITS)
+    known = setup.description.calibration
+    fitted = {unknown.parameter.key for unknown in unknowns if unknown.parameter is not None}
     unlearnt = _softening(setup, found)
-    size = len(deviation) + len(unlearnt)
-    full = np.eye(size)
-    full[: len(deviation), : len(deviation)] = correlation
+    before = known if known is not None and not setup.recordings else Calibration()
+    kept = [i for i, each in enumerate(before.parameters) if each.key not in fitted]
+    sizes = len(deviation), len(unlearnt), len(kept)
+    full = np.eye(sum(sizes))
+    full[: sizes[0], : sizes[0]] = correlation
+    if kept:
+        full[-sizes[2] :, -sizes[2] :] = np.array(before.correlation)[np.ix_(kept, kept)]
     pressures = [recording.pressures for recording in setup.recordings]
     pressures += [table.pressures for table in setup.tables]
     seen = np.concatenate(pressures)
     ends = np.cumsum([0, *(segment.n_channels for segment in setup.description.segments)])
     norms = [float(np.linalg.norm(seen[:, a:b], axis=1).max()) for a, b in itertools.pairwise(ends)]
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    if before.pressure_min:
+        low, high = np.minimum(low, before.pressure_min), np.maximum(high, before.pressure_max)
+        norms = np.maximum(norms, before.pressure_norm).tolist()
     turns = any(point.turns for point in found.problem.points)
     return Calibration(
-        logs=tuple(recording.name for recording in setup.recordings),
+        logs=before.logs + tuple(recording.name for recording in setup.recordings),
         parameters=tuple(
             FittedParameter(
                 key=unknown.parameter.key,
@@ -408,12 +489,15 @@ def _record(setup: Setup, found: Fit) -> Calibration:
             for unknown, d in zip(unknowns, deviation, strict=True)
             if unknown.parameter is not None
         )
-        + unlearnt,
+        + unlearnt
+        + tuple(before.parameters[i] for i in kept),
         correlation=tuple(tuple(row) for row in full.tolist()),
-        position_residual=found.problem.noise.position if setup.recordings else 0.0,
-        angle_residual=found.problem.noise.angle if turns else None,
-        pressure_min=tuple(seen.min(axis=0).tolist()),
-        pressure_max=tuple(seen.max(axis=0).tolist()),
+        position_residual=found.problem.noise.position
+        if setup.recordings
+        else before.position_residual,
+        angle_residual=found.problem.noise.angle if turns else before.angle_residual,
+        pressure_min=tuple(low.tolist()),
+        pressure_max=tuple(high.tolist()),
         pressure_norm=tuple(norms),
     )
 

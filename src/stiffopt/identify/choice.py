@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import InputError
 from stiffopt.identify.comparison import Errors
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.problem import Problem
@@ -64,9 +65,17 @@ def held_back_errors(found: Fit, settle: float, tell: Callable[[], None]) -> dic
     errors = {}
     for name, away in _folds(problem).items():
         kept = [_without_beginning(each, problem, i, settle) for i, each in enumerate(away)]
+        if not any(each.any() for each in kept):
+            continue  # a log that ends before its beginning does
         x = fit(without(problem, kept), [found.x], tell, rounds=0, most=_MOST_EVALUATIONS).x
         distances = np.linalg.norm(problem.predict(x).errors[0], axis=1)
-        errors[name] = Errors.of(distances[np.concatenate(kept)], None)
+        found_there = Errors.of(distances[np.concatenate(kept)], None)
+        if found_there.n:
+            errors[name] = found_there
+    if not errors:
+        raise InputError(
+            "there is nothing left to compare models with; expected longer logs, or name a model"
+        )
     return errors
 
 
@@ -111,7 +120,8 @@ def _folds(problem: Problem) -> dict[str, list[Rows]]:
 
 def _without_beginning(away: Rows, problem: Problem, i: int, settle: float) -> Rows:
     sample = problem.samples[i]
-    if sample.begin != "unknown" or not away.all():
+    estimated = sample.begin == "unknown" or problem.unknowns.zeros[i]
+    if not (estimated and away.all()):
         return away
     time = sample.recording.time[sample.rows]
     return np.asarray(away & (time > time[0] + settle))

@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 _MOST_MEMORY = 0.9  # sum of the shares of a channel, beyond which a penalty grows
 _MEMORY_SLACK = 0.01
 _LEAST_MODULUS = 0.1  # that pressure must leave of a segment's, below which a penalty grows
+_MOST_STIFFENING = 0.7  # of a modulus that rises exponentially; at 1 more pressure bends less
 _MODULUS_SLACK = 0.005
 
 Begin = Literal["rest", "previous", "unknown"]
@@ -238,7 +239,7 @@ class Problem:
             if turn is not None and turned is not None:
                 self._append(values, jacobians, -turn, -turned, self.noise.angle)
         for table in self.tables:
-            value, jacobian = self._stiffness_residuals(table, x)
+            value, jacobian = self.of_table(table, x)
             values.append(value)
             jacobians.append(jacobian)
         for value, jacobian in (self._too_much_memory(x), self._too_soft(x)):
@@ -271,34 +272,58 @@ class Problem:
         """By how much pressure softens each segment more than within its limits it may, (s,)."""
         segments = self.description.segments
         value, slope = np.zeros(len(segments)), np.zeros((len(segments), self.size))
-        farthest = np.maximum(
-            np.abs(self.description.pressure_min), np.abs(self.description.pressure_max)
-        )
         first = 0
         for s, segment in enumerate(segments):
-            norm = float(np.linalg.norm(farthest[first : first + segment.n_channels]))
+            channels = range(first, first + segment.n_channels)
             first += segment.n_channels
-            if segment.compensation is None or segment.compensation.modulus_law != "linear":
+            compensation = segment.compensation
+            if compensation is None:
                 continue
+            prefix = f"segments[{s}]"
             keys = (
-                f"segments[{s}].material.youngs_modulus",
-                f"segments[{s}].compensation.modulus_per_pressure",
+                f"{prefix}.material.youngs_modulus",
+                f"{prefix}.compensation.modulus_per_pressure",
             )
-            modulus, per_pressure = (
-                parameter.at(
-                    parameter.value(self.description),
-                    x[self._index[key]] * self.scale[self._index[key]] if key in self._index else 0,
-                )
-                for key, parameter in ((key, Parameter(key)) for key in keys)
-            )
-            left = 1 + per_pressure * norm / modulus  # of the modulus at the farthest pressures
-            if left < _LEAST_MODULUS:
-                value[s] = (_LEAST_MODULUS - left) / _MODULUS_SLACK
-                by = (per_pressure * norm / modulus, -norm / modulus)
-                for key, change in zip(keys, by, strict=True):
-                    if key in self._index:
-                        slope[s, self._index[key]] = change / _MODULUS_SLACK
+            modulus, per_pressure = (self._value(key, x) for key in keys)
+            norm, per_unknown = self._farthest(prefix, channels, x)
+            change = per_pressure * norm / modulus  # of the modulus, relative, at the most
+            slopes = {self._index.get(key): each for key, each in per_unknown.items()}
+            slopes = {i: each * per_pressure / modulus for i, each in slopes.items()}
+            slopes[self._index.get(keys[0])] = -change
+            slopes[self._index.get(keys[1])] = norm / modulus
+            if compensation.modulus_law == "linear":
+                sign, excess = -1.0, _LEAST_MODULUS - (1 + change)
+            else:  # beyond, more pressure would bend less
+                sign, excess = 1.0, change - _MOST_STIFFENING
+            if excess > 0:
+                value[s] = excess / _MODULUS_SLACK
+                for i, each in slopes.items():
+                    if i is not None:
+                        slope[s, i] = sign * each / _MODULUS_SLACK
         return value, slope
+
+    def _value(self, key: str, x: Array) -> float:
+        """Value of a number of the robot file at scaled coordinates (d,)."""
+        parameter, i = Parameter(key), self._index.get(key)
+        nominal = parameter.value(self.description)
+        return nominal if i is None else float(parameter.at(nominal, x[i] * self.scale[i]))
+
+    def _farthest(self, prefix: str, channels: range, x: Array) -> tuple[float, dict[str, float]]:
+        """Largest norm of a segment's acting pressures within the robot's limits, in Pa.
+
+        And its slopes by the coordinates of gains and offsets, by their keys.
+        """
+        limits = np.maximum(
+            np.abs(self.description.pressure_min), np.abs(self.description.pressure_max)
+        )
+        acting, slopes = [], {}
+        for c, channel in enumerate(channels):
+            gain, offset = (f"{prefix}.corrections.{name}[{c}]" for name in ("gain", "offset"))
+            own, added = self._value(gain, x) * limits[channel], self._value(offset, x)
+            acting.append(own + abs(added))
+            slopes[gain], slopes[offset] = acting[-1] * own, acting[-1] * np.sign(added)
+        norm = float(np.linalg.norm(acting))
+        return norm, {key: float(each) / norm for key, each in slopes.items()}
 
     def predict(self, x: Array) -> Predicted:
         """What the model says at scaled coordinates (d,)."""
@@ -490,7 +515,7 @@ class Problem:
                     slopes[stiffness, i] = own / channels * total / quick
         return found, slopes
 
-    def _stiffness_residuals(self, table: StiffnessTable, x: Array) -> tuple[Array, Array]:
+    def of_table(self, table: StiffnessTable, x: Array) -> tuple[Array, Array]:
         """Residuals (r,) of a table over its sigmas, and their slopes (r, d)."""
         coordinates, by_history = self._quick(x * self.scale)
         value, slope = np.zeros(len(table)), np.zeros((len(table), self.size))

@@ -82,14 +82,14 @@ class Setup:
     @property
     def seen(self) -> float:
         """Highest pressure that was recorded, in Pa."""
-        highest = [float(recording.pressures.max()) for recording in self.recordings]
+        highest = [float(np.abs(recording.pressures).max()) for recording in self.recordings]
         return max(highest, default=float(max(self.description.pressure_max)))
 
     @property
     def is_fine(self) -> bool:
         """Whether every log has rows so close that a dead time can be told from a lag."""
         steps = [float(np.median(np.diff(recording.time))) for recording in self.recordings]
-        return max(steps, default=0.0) <= _FINEST_DEAD_TIME
+        return max(steps, default=0.0) <= 1.01 * _FINEST_DEAD_TIME
 
     @property
     def tolerances(self) -> Tolerances:

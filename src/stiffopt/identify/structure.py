@@ -33,6 +33,7 @@ class Structure:
     lag, falling, play, memory, creep : whether its history has them; a lag comes with a dead time
         where the logs are fine enough to tell the two apart.
     strain_law : of all segments; empty for the robot file's.
+    as_given : its history is that of the robot file.
     after : names of simpler ones; it is tried only if one of them is the best so far.
     """
 
@@ -45,6 +46,7 @@ class Structure:
     memory: bool = False
     creep: bool = False
     strain_law: str = ""
+    as_given: bool = False
     after: tuple[str, ...] = ()
 
     def applied(
@@ -83,6 +85,8 @@ class Structure:
         return segment.model_copy(update=update)
 
     def _history(self, segment: Segment, seen: float, fine: bool) -> History | None:
+        if self.as_given:
+            return segment.history
         given = segment.history or History()
         if not (self.lag or self.play):
             return None
