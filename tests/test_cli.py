@@ -449,7 +449,7 @@ BAD = {
     "too many values": (HEAD + TARGET.replace("free]", "free, 1 mm]"), "expected 3 items, not 4"),
     "no such robot": (
         (HEAD + TARGET).replace("flop-1", "flop-7"),
-        "The built-in robots are stiff-flop-1, stiff-flop-2",
+        "The built-in robots are asu-two-segment, stiff-flop-1",
     ),
     "no robot file": (
         (HEAD + TARGET).replace("stiff-flop-1", "[arm].yaml").replace("[arm]", "'[arm]'"),
