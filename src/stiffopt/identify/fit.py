@@ -64,11 +64,6 @@ class Fit:
         """What it says of the rows of the samples."""
         return self.problem.predict(self.x)
 
-    @property
-    def deviations(self) -> Array:
-        """Standard deviations (d,) of the unscaled coordinates."""
-        return np.asarray(np.sqrt(np.diag(self.covariance)) * self.problem.scale)
-
 
 def fit(
     problem: Problem,
