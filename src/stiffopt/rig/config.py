@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from stiffopt.errors import FileError, InputError, dotted, shown
 from stiffopt.files import line_of, read_file
-from stiffopt.model.description import PerChannelPressure, PerChannelRate, RobotDescription
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
 from stiffopt.registration import Registration
 from stiffopt.rig.drivers.aurora import AuroraSettings
@@ -22,6 +22,7 @@ from stiffopt.rig.drivers.nidaq import NidaqSettings
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.drivers.probe import ProbeSettings
 from stiffopt.rig.interface import PressureLimits, Rig, SystemClock
+from stiffopt.rig.settings import ControlSettings, LogSettings, Safety, ServiceSettings
 from stiffopt.rig.simulated.mismatch import check_mismatch
 from stiffopt.rig.simulated.settings import (
     PlantSettings,
@@ -30,7 +31,7 @@ from stiffopt.rig.simulated.settings import (
     SimulatedTrackerSettings,
 )
 from stiffopt.schema import BadKeyError, Schema
-from stiffopt.units import Duration, Frequency
+from stiffopt.units import Frequency
 
 __all__ = [
     "LabSettings",
@@ -99,34 +100,6 @@ ProbeSettingsOf = Annotated[
 ]
 
 
-class Safety(Schema):
-    """What may be done to the arm, where it is less than the robot file allows.
-
-    Attributes
-    ----------
-    max_pressure : one value or one per channel, in Pa; None: that of the robot.
-    max_slew : one value or one per channel, in Pa/s; None: that of the robot.
-    command_timeout : a command that was not repeated for this long no longer holds, in s.
-    tracker_timeout : a tracker that has not seen the tip for this long is lost, in s.
-    """
-
-    max_pressure: PerChannelPressure | None = None
-    max_slew: PerChannelRate | None = None
-    command_timeout: Annotated[Duration, Field(gt=0, le=10)] = 0.5
-    tracker_timeout: Annotated[Duration, Field(gt=0, le=10)] = 0.5
-
-
-class LogSettings(Schema):
-    """Where recordings go.
-
-    Attributes
-    ----------
-    folder : made if it is not there.
-    """
-
-    folder: Annotated[str, Field(min_length=1)] = "runs"
-
-
 class LabSettings(Schema):
     """What stands behind the protocols of the virtual lab (`stiffopt lab`).
 
@@ -152,6 +125,8 @@ class RigDescription(Schema):
     rate : of the loop that commands, in Hz.
     supply, tracker, probe : the devices; each has a ``driver``.
     safety : limits.
+    control : how the daemon's loop steers.
+    service : where the daemon listens.
     log : recordings.
     plant : the arm behind simulated devices, and in the virtual lab.
     lab : the devices in the virtual lab.
@@ -164,6 +139,8 @@ class RigDescription(Schema):
     tracker: TrackerSettings | None = None
     probe: ProbeSettingsOf | None = None
     safety: Safety = Safety()
+    control: ControlSettings = ControlSettings()
+    service: ServiceSettings = ServiceSettings()
     log: LogSettings = LogSettings()
     plant: PlantSettings | None = None
     lab: LabSettings | None = None

@@ -1,0 +1,1 @@
+"""The long-running process around the control loop: interface, telemetry and guard."""

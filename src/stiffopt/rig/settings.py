@@ -1,0 +1,104 @@
+"""What the rig file says beside its devices: limits, control, service and log."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from stiffopt.model.description import PerChannelPressure, PerChannelRate
+from stiffopt.schema import Schema
+from stiffopt.units import Duration, Force, Length, Speed
+
+__all__ = ["ControlSettings", "LogSettings", "Safety", "ServiceSettings"]
+
+
+class Safety(Schema):
+    """What may be done to the arm, and what is taken for a fault.
+
+    Attributes
+    ----------
+    max_pressure : one value or one per channel, in Pa; None: that of the robot.
+    max_slew : one value or one per channel, in Pa/s; None: that of the robot.
+    max_force : sum over all chambers of pressure times area, in N; None: no limit.
+    command_timeout : a command that was not repeated for this long no longer holds, in s.
+    guard_timeout : the guard vents when the loop has not commanded for this long, in s.
+    tracker_timeout : a tracker that has not seen the tip for this long is lost and the pressures
+        are let down, in s.
+    tracker_frames : missing frames in a row after which the pressures are held.
+    max_tip_speed : no tip moves faster; samples that say so are rejected, in m/s.
+    max_jumps : rejected samples in a row that are a fault.
+    max_pressure_error : between what a regulator should have reached and what is measured, in Pa;
+        more than that, for `pressure_error_time`, is a fault.
+    pressure_error_time : in s.
+    max_overruns : ticks in a row that came too late, which are a fault.
+    ramp_time : in which pressures are let down in a controlled way, in s.
+    heartbeat : a client that has not been heard for this long has lost control, in s.
+    """
+
+    max_pressure: PerChannelPressure | None = None
+    max_slew: PerChannelRate | None = None
+    max_force: Annotated[Force, Field(gt=0)] | None = None
+    command_timeout: Annotated[Duration, Field(gt=0, le=10)] = 0.5
+    guard_timeout: Annotated[Duration, Field(ge=0.01, le=2)] = 0.05
+    tracker_timeout: Annotated[Duration, Field(gt=0, le=10)] = 0.5
+    tracker_frames: Annotated[int, Field(ge=1, le=100)] = 3
+    max_tip_speed: Annotated[Speed, Field(gt=0)] = 1.0
+    max_jumps: Annotated[int, Field(ge=1, le=100)] = 5
+    max_pressure_error: Annotated[PerChannelPressure, Field()] = 1.5e4
+    pressure_error_time: Annotated[Duration, Field(gt=0, le=10)] = 0.3
+    max_overruns: Annotated[int, Field(ge=1)] = 10
+    ramp_time: Annotated[Duration, Field(gt=0, le=10)] = 1.0
+    heartbeat: Annotated[Duration, Field(gt=0, le=60)] = 1.0
+
+
+class ControlSettings(Schema):
+    """How the loop steers.
+
+    Attributes
+    ----------
+    regulator_lag : time constant with which a regulator follows its set-point, in s.
+    regulator_dead_time : until a set-point has any effect, in s.
+    tracker_noise : standard deviation of a tracked position in each axis, in m.
+    vibration : ``modelled``: the arm swings as its robot file says; ``none``: it follows its
+        pressures at once, as a damped arm does; ``auto``: ``none`` on a simulated rig without
+        inertia, else ``modelled``.
+    solver : of the small quadratic program of each tick.
+    """
+
+    regulator_lag: Annotated[Duration, Field(ge=0, le=2)] = 0.06
+    regulator_dead_time: Annotated[Duration, Field(ge=0, le=1)] = 0.01
+    tracker_noise: Annotated[Length, Field(gt=0)] = 5e-5
+    vibration: Literal["auto", "modelled", "none"] = "auto"
+    solver: Literal["daqp", "osqp"] = "daqp"
+
+
+class ServiceSettings(Schema):
+    """Where the daemon listens. Loopback, unless you know what you do.
+
+    Attributes
+    ----------
+    host : address.
+    port : of the control interface (HTTP and WebSocket) and of the metrics; 0: any free one.
+    foxglove_port : of the Foxglove WebSocket; 0: any free one; None: no such server.
+    token : environment variable that holds the token of those who may move the arm; where it is
+        empty, a token is drawn and written to `token_file`.
+    token_file : for this user's eyes only; by default beside the recordings.
+    """
+
+    host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8470
+    foxglove_port: Annotated[int, Field(ge=0, le=65535)] | None = 8765
+    token: Annotated[str, Field(min_length=1)] = "STIFFOPT_TOKEN"
+    token_file: str | None = None
+
+
+class LogSettings(Schema):
+    """Where recordings go.
+
+    Attributes
+    ----------
+    folder : made if it is not there.
+    """
+
+    folder: Annotated[str, Field(min_length=1)] = "runs"
