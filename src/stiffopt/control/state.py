@@ -8,6 +8,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.rig.interface import PoseSample
+
 __all__ = ["Alarm", "Event", "Severity", "Snapshot", "State", "Timing"]
 
 Array = NDArray[np.float64]
@@ -97,15 +99,20 @@ class Snapshot:
     time : on the rig's clock, in s.
     state, reason : and why, where it is not as asked.
     commanded, measured, plan : pressures (n,), in Pa; NaN where unknown.
+    measured_time : when `measured` was read, in s; NaN where unknown.
     low, high : what may be commanded (n,), in Pa.
     saturated : channels (n,) that are at a limit which keeps them from doing what they should.
     tip_position, tip_quaternion : as estimated now, (3,) and (4,) w first.
     seen_position, seen_age : latest sample of the tracker that was used, and its age in s.
+    samples : all that the tracker has delivered since the last tick, in order of arrival, used or
+        not.
+    rejected : how many of them no arm could have moved to.
     target_position, target_quaternion, target_pointing : what is asked for now; NaN for a free
         axis, None where nothing is asked.
     position_error, angle_error : of the estimate, in m and rad; NaN where nothing is asked.
     stiffness, best_stiffness : along the task's direction at the pressures now, and that of the
         plan; NaN where the task names none.
+    stiffness_unit : ``N/m``, or ``N*m/rad`` where the task is about rotation.
     disturbance : offset of the tip from the model (3,), in m.
     wrench : force and moment (6,) at the tip that would explain it, in the base frame.
     alarms : what is wrong now.
@@ -138,3 +145,7 @@ class Snapshot:
     alarms: tuple[Alarm, ...] = ()
     task: str = ""
     timing: Timing = Timing()
+    measured_time: float = float("nan")
+    samples: tuple[PoseSample, ...] = ()
+    rejected: int = 0
+    stiffness_unit: str = "N/m"

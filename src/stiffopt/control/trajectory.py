@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from stiffopt.optimise.target import Target
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
-__all__ = ["Trajectory", "Waypoint"]
+__all__ = ["Course", "Trajectory", "Waypoint"]
+
+Array = NDArray[np.float64]
 
 
 class Waypoint(Schema):
@@ -61,3 +68,74 @@ class Trajectory(Schema):
 def _kind(target: Target) -> tuple[object, ...]:
     axes = None if target.position is None else tuple(v is None for v in target.position)
     return axes, target.pointing is None, target.orientation is None
+
+
+class Course:
+    """A trajectory under way: a target for each moment.
+
+    Positions and directions run along cubic splines through the waypoints, orientations along a
+    spline of rotations; at rest at both ends, which are held.
+
+    Parameters
+    ----------
+    trajectory :
+        The waypoints.
+    begin :
+        When it begins, in s.
+    position, rotation :
+        Of the tip then, (3,) and (3, 3): where it begins if the first waypoint is later.
+    """
+
+    def __init__(
+        self, trajectory: Trajectory, begin: float, position: Array, rotation: Array
+    ) -> None:
+        self.begin, self.end = begin, begin + trajectory.duration
+        first = trajectory.waypoints[0].target
+        self._first = first
+        times = [waypoint.time for waypoint in trajectory.waypoints]
+        targets = [waypoint.target for waypoint in trajectory.waypoints]
+        later = times[0] > 0
+        knots = np.array([0.0, *times] if later else times)
+        self._position = self._pointing = None
+        self._orientation: RotationSpline | Rotation | None = None
+        if first.position is not None:
+            rows = [[0.0 if axis is None else axis for axis in t.position or ()] for t in targets]
+            self._position = _spline(knots, [list(position), *rows] if later else rows)
+        if first.pointing is not None:
+            rows = [list(t.pointing or ()) for t in targets]
+            self._pointing = _spline(knots, [list(rotation[:, 2]), *rows] if later else rows)
+        if first.orientation is not None:
+            turns = [np.roll(t.orientation, -1) for t in targets if t.orientation is not None]
+            if later:
+                turns.insert(0, Rotation.from_matrix(rotation).as_quat())
+            all_turns = Rotation.from_quat(np.array(turns))
+            self._orientation = RotationSpline(knots, all_turns) if len(knots) > 1 else all_turns[0]
+        self._knots = knots
+
+    def at(self, now: float) -> Target:
+        """Target at a moment, in s."""
+        t = float(np.clip(now - self.begin, self._knots[0], self._knots[-1]))
+        update: dict[str, object] = {}
+        if self._position is not None and self._first.position is not None:
+            values = self._position(t)
+            update["position"] = tuple(
+                None if axis is None else float(value)
+                for axis, value in zip(self._first.position, values, strict=True)
+            )
+        if self._pointing is not None:
+            direction = self._pointing(t)
+            update["pointing"] = tuple((direction / np.linalg.norm(direction)).tolist())
+        if self._orientation is not None:
+            spline = self._orientation
+            turn = spline(t) if isinstance(spline, RotationSpline) else spline
+            x, y, z, w = turn.as_quat(canonical=True)
+            update["orientation"] = (float(w), float(x), float(y), float(z))
+        return self._first.model_copy(update=update)
+
+
+def _spline(knots: Array, rows: list[list[float]]) -> Callable[[float], Array]:
+    values = np.array(rows, dtype=float)
+    if len(knots) == 1:
+        return lambda _: values[0]
+    spline: Callable[[float], Array] = CubicSpline(knots, values, bc_type="clamped")
+    return spline

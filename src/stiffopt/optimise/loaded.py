@@ -139,7 +139,9 @@ class _Rod(ctypes.Structure):
     ]
 
 
-def _equations(robot: Manipulator) -> Rod | None:
+def rod_equations(robot: Manipulator) -> Rod | None:
+    """Equations of an arm for the integrator in C; None if that cannot serve it."""
+
     def make() -> Rod | None:
         return rod(robot.description, Actuation.of(robot.description), robot.resolution)
 
@@ -148,7 +150,7 @@ def _equations(robot: Manipulator) -> Rod | None:
 
 def loaded_library(robot: Manipulator, program: Program) -> Library | None:
     """Machine code for tasks of the program's structure on this arm under any load."""
-    equations = _equations(robot)
+    equations = rod_equations(robot)
     if equations is None:
         return None
     known: dict[object, Library] = robot.kept("loaded libraries", dict)
@@ -185,7 +187,7 @@ class LoadedArm:
     """
 
     def __init__(self, code: Library, robot: Manipulator) -> None:
-        equations = _equations(robot)
+        equations = rod_equations(robot)
         if equations is None:
             raise EquilibriumError("this arm has no compiled equations")
         self._library = code

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from stiffopt.model.description import PerChannelPressure, PerChannelRate
 from stiffopt.schema import Schema
-from stiffopt.units import Duration, Force, Length, Speed
+from stiffopt.units import Duration, Force, Length, Ratio, Speed
 
 __all__ = ["ControlSettings", "LogSettings", "Safety", "ServiceSettings"]
 
@@ -43,7 +43,7 @@ class Safety(Schema):
     guard_timeout: Annotated[Duration, Field(ge=0.01, le=2)] = 0.05
     tracker_timeout: Annotated[Duration, Field(gt=0, le=10)] = 0.5
     tracker_frames: Annotated[int, Field(ge=1, le=100)] = 3
-    max_tip_speed: Annotated[Speed, Field(gt=0)] = 1.0
+    max_tip_speed: Annotated[Speed, Field(gt=0)] = 0.6
     max_jumps: Annotated[int, Field(ge=1, le=100)] = 5
     max_pressure_error: Annotated[PerChannelPressure, Field()] = 1.5e4
     pressure_error_time: Annotated[Duration, Field(gt=0, le=10)] = 0.3
@@ -63,6 +63,7 @@ class ControlSettings(Schema):
     vibration : ``modelled``: the arm swings as its robot file says; ``none``: it follows its
         pressures at once, as a damped arm does; ``auto``: ``none`` on a simulated rig without
         inertia, else ``modelled``.
+    damping : share of critical damping of that vibration.
     solver : of the small quadratic program of each tick.
     """
 
@@ -70,6 +71,7 @@ class ControlSettings(Schema):
     regulator_dead_time: Annotated[Duration, Field(ge=0, le=1)] = 0.01
     tracker_noise: Annotated[Length, Field(gt=0)] = 5e-5
     vibration: Literal["auto", "modelled", "none"] = "auto"
+    damping: Annotated[Ratio, Field(ge=0, lt=1)] = 0.04
     solver: Literal["daqp", "osqp"] = "daqp"
 
 

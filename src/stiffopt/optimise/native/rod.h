@@ -134,6 +134,7 @@ static int section_linear(const Work *work, int64_t kind) {
     }
 }
 
+#ifdef RIGID_ADJOINT_N_IN /* a library may do without add_curvature */
 static int section_adjoint(const Work *work, int64_t kind) {
     switch (kind) {
 #ifdef ADJOINT1_N_IN
@@ -148,6 +149,7 @@ static int section_adjoint(const Work *work, int64_t kind) {
     default: return adjoint0(work->arg, work->res, work->iw, work->w, 0);
     }
 }
+#endif
 
 /* -- small algebra -------------------------------------------------------------------------- */
 
@@ -691,6 +693,7 @@ static int linearise(const Work *work, const Rod *rod, const double *state, Line
     return l->known = 1;
 }
 
+#ifdef RIGID_ADJOINT_N_IN
 /* Adds d(y' C z)/dp to a gradient (n), C (6, 6) the compliance in base axes.
  *
  * With S = y' (r_dot, R delta_dot) + mu' Phi_dot along (delta_dot, z), which is stationary in
@@ -781,5 +784,6 @@ static int add_curvature(const Work *work, const Rod *rod, const Linear *l, cons
     }
     return 1;
 }
+#endif
 
 #endif

@@ -1,0 +1,493 @@
+"""The controller: from what is asked and seen to the pressures of the next tick.
+
+It moves in the space of pressures, where every straight way between allowed pressures is allowed,
+along a smooth reference to the plan (`Reference`), and corrects at the tip: for the offset that the
+estimator finds and the plan does not count with yet, and, where the arm swings, by a feedback that
+damps the swing (`Gains`).  A small quadratic program (`Allocation`) brings both together within
+all limits.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt import lie
+from stiffopt.control.allocation import Allocation
+from stiffopt.control.estimator import EstimatorSettings, TipEstimator
+from stiffopt.control.gains import Gains
+from stiffopt.control.planner import InlinePlanner, Plan, Planner, Request, ThreadPlanner
+from stiffopt.control.reference import Reference
+from stiffopt.control.regulators import RegulatorModel
+from stiffopt.control.steering import Move, Notice, Seen, Standing
+from stiffopt.control.trajectory import Course, Trajectory
+from stiffopt.control.vibration import Vibration
+from stiffopt.errors import EquilibriumError, InputError, PressureError, StiffoptError
+from stiffopt.model.compliance import directional_stiffness
+from stiffopt.model.history import History, Memory
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from stiffopt.optimise.tip import TipAt, TipModel
+from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
+from stiffopt.rig.settings import ControlSettings, Safety
+
+__all__ = ["Controller"]
+
+Array = NDArray[np.float64]
+
+_PLAN_EVERY = 0.05  # s
+_EFFORT = 1.0  # of feedback against error; see `Gains`
+_LEVER = 0.05  # m/rad; a turn of the tip weighs as much as a motion of this lever's end
+_BRISK = 40.0  # 1/s; rate of the reference of an arm that does not swing
+_SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
+
+
+class Controller:
+    """Steers an arm; see `Steering`.
+
+    Parameters
+    ----------
+    robot :
+        What the arm is believed to be.
+    limits :
+        What may be commanded.
+    slew :
+        Greatest rate of change (n,), in Pa/s.
+    period :
+        Of the loop, in s.
+    control, safety :
+        Settings of the rig.
+    swings :
+        Whether the arm vibrates as its robot file says, where the settings leave that open.
+    beside :
+        Whether plans are made in a thread of their own; otherwise at once, for simulated time.
+    """
+
+    def __init__(
+        self,
+        robot: Manipulator,
+        limits: PressureLimits,
+        slew: ArrayLike,
+        *,
+        period: float,
+        control: ControlSettings | None = None,
+        safety: Safety | None = None,
+        swings: bool = True,
+        beside: bool = False,
+    ) -> None:
+        self.robot, self.limits = robot, limits
+        self._control, self._safety = control or ControlSettings(), safety or Safety()
+        self._period = period
+        n = robot.n_pressures
+        self._slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
+        kind = self._control.vibration
+        self._swings = swings if kind == "auto" else kind == "modelled"
+        self._vibration = Vibration.of(robot.description) if self._swings else None
+        lag, dead_time = self._regulation()
+        self._lag, self._dead_time = float(np.mean(lag)), dead_time
+        self._regulators = RegulatorModel(period, lag, dead_time, self._slew)
+        self._damping = self._control.damping
+        self._estimator = TipEstimator(
+            period,
+            self._vibration,
+            EstimatorSettings(
+                noise=self._control.tracker_noise,
+                max_speed=self._safety.max_tip_speed,
+                damping=self._damping,
+            ),
+        )
+        self._gains = Gains(period, self._lag, self._damping, _EFFORT) if self._vibration else None
+        self._weight = 3.0
+        self._mean_share = float(np.mean(self._vibration.participation)) if self._vibration else 1.0
+        self._reference = Reference(period, self._slew, self._lag, dead_time)
+        self._allocation = Allocation(
+            limits.low, limits.high, self._slew * period, self._control.solver
+        )
+        self._planner: Planner = ThreadPlanner(robot) if beside else InlinePlanner(robot)
+        self._tip: TipModel | None = None
+        self._serial = 0
+        self.begin(0.0)
+
+    # -- Steering -------------------------------------------------------------------------------
+
+    def check(self) -> None:
+        """Compile and try the model; see `Steering.check`."""
+        self._tip = TipModel(self.robot)
+        if not self._tip.is_fast and self.robot.is_loaded:
+            raise InputError(
+                "the control loop needs a C compiler for an arm under gravity or a load; "
+                "install one (Debian: apt install gcc) or set STIFFOPT_COMPILER"
+            )
+        self._estimator.advance(0.0, np.zeros(self.robot.n_pressures), self._tip_at(self._none()))
+        self.begin(0.0)
+
+    def begin(self, now: float) -> None:
+        """Start anew with a vented arm and no task."""
+        none = self._none()
+        self._serial += 1
+        self._task: Task | None = None
+        self._target: Target | None = None
+        self._course: Course | None = None
+        self._plan: Plan | None = None
+        self._measure: Callable[..., float] | None = None
+        self._asked_at = -math.inf
+        self._now = now
+        self._last_move, self._commanded = none.copy(), none.copy()
+        self._effective, self._chamber = none.copy(), none.copy()
+        self._memory = self._history()
+        self._regulators.begin(none)
+        self._estimator.begin()
+        self._reference.begin(np.concatenate([none, np.zeros(6)]))
+        self._saturated = np.zeros(len(none), dtype=bool)
+        self._at_u: TipAt | None = None
+        self._fresh = True
+
+    def set_task(self, task: Task) -> None:
+        """Pursue a task; see `Steering.set_task`."""
+        self._check_task(task)
+        self._task, self._target, self._course = task, task.target, None
+        self._measure = _stiffness_of(task)
+        self._anew()
+
+    def set_target(self, target: Target) -> None:
+        """Go to another target; see `Steering.set_target`."""
+        self._pursue(target)
+        self._course = None
+
+    def follow(self, trajectory: Trajectory, now: float) -> None:
+        """Follow a trajectory; see `Steering.follow`."""
+        course = Course(
+            trajectory, now, self._estimator.estimate.position, self._estimator.rotation
+        )
+        self._pursue(course.at(now))
+        self._course = course
+
+    def resume(self, now: float) -> None:
+        """Steer again from where the pressures are."""
+        estimate = self._estimator.estimate
+        offset = np.concatenate([estimate.offset, estimate.turn])
+        self._reference.begin(np.concatenate([self._last_move + self._remembered, offset]))
+        self._fresh = False
+
+    def observe(
+        self,
+        now: float,
+        commanded: Array,
+        reading: PressureReading,
+        samples: Sequence[PoseSample],
+    ) -> Seen:
+        """Follow pressures and tip; see `Steering.observe`."""
+        steps = min(max(1, round((now - self._now) / self._period)), 50)
+        self._now = now
+        for _ in range(steps):
+            self._chamber = self._regulators.advance(commanded, reading.pressures)
+        self._last_move = commanded.copy()
+        if self._memory is None:
+            self._effective = self._chamber
+        else:
+            self._effective = self._memory.advance(steps * self._period, self._chamber)
+        self._at_u = self._tip_at(self._effective)
+        for step in range(steps):
+            moment = now - (steps - 1 - step) * self._period
+            self._estimator.advance(moment, self._effective, self._at_u)
+        return self._estimator.take(samples)
+
+    def move(self, now: float) -> Move:
+        """Decide; see `Steering.move`."""
+        if self._fresh:
+            self.resume(now)
+        self._ask(now)
+        aim = self._aim()
+        omega = self._estimator.omega
+        self._reference.rate = min(_BRISK, 1.2 * omega) if self._swings else _BRISK
+        self._reference.advance(aim)
+        n = len(self._last_move)
+        command, chamber = self._reference.command(omega, self._damping)
+        path, offset = self._reference.path[:n], self._reference.path[n:]
+        at = self._tip_at(path)
+        rotation = at.pose[:3, :3]
+        linear, angular = rotation @ at.jacobian[:3], rotation @ at.jacobian[3:]
+        estimate = self._estimator.estimate
+        shift = offset[:3] - estimate.offset
+        turn = offset[3:] - estimate.turn
+        modal, feedback = None, np.zeros(3)
+        if self._gains is not None and math.isfinite(omega):
+            modal, feedback = self._damping_rows(linear, path, chamber, shift)
+        rows, wanted = self._rows(linear, angular, shift + feedback, turn, rotation)
+        if modal is not None:
+            rows = np.concatenate([rows, self._weight * modal])
+            damped = self._mean_share * self._estimator.across(shift) + feedback
+            wanted = np.concatenate([wanted, self._weight * damped])
+        remembered = self._remembered
+        pressures, held = self._allocation.solve(
+            rows, wanted, command - remembered, self._last_move, linear,
+            self._safety.max_tip_speed * self._period,
+        )  # fmt: skip
+        if pressures is None:
+            return Move(self._last_move.copy(), False, self._saturated.copy())
+        missing = (rows @ (pressures + remembered - command) - wanted)[:3]
+        away = float(np.linalg.norm(missing)) > _SHORT
+        self._saturated = held if away else np.zeros(n, dtype=bool)
+        return Move(pressures, True, self._saturated.copy())
+
+    def standing(self, now: float) -> Standing:
+        """Say how things stand."""
+        n = self.robot.n_pressures
+        unknown = np.full(n, np.nan)
+        if self._at_u is None:
+            nowhere = np.full(3, np.nan)
+            return Standing(
+                plan=unknown, tip_position=nowhere, tip_quaternion=np.full(4, np.nan),
+                seen_position=nowhere, seen_time=-math.inf, target_position=None,
+                target_quaternion=None, target_pointing=None, position_error=math.nan,
+                angle_error=math.nan, stiffness=math.nan, best_stiffness=math.nan,
+                disturbance=np.zeros(3), wrench=np.zeros(6), task="",
+            )  # fmt: skip
+        estimate, rotation = self._estimator.estimate, self._estimator.rotation
+        target = self._course.at(now) if self._course is not None else self._target
+        position, pointing, quaternion = _parts(target)
+        sample, plan = self._estimator.sample, self._plan
+        stiffness = math.nan
+        if self._measure is not None:
+            stiffness = float(self._measure(self._at_u.compliance, self._at_u.pose[:3, :3]))
+        return Standing(
+            plan=unknown if plan is None else plan.pressures - self._remembered,
+            tip_position=estimate.position,
+            tip_quaternion=lie.quaternion_from_rotation(rotation),
+            seen_position=np.full(3, np.nan) if sample is None else sample.position,
+            seen_time=-math.inf if sample is None else sample.time,
+            target_position=position,
+            target_quaternion=quaternion,
+            target_pointing=pointing,
+            position_error=_distance(estimate.position, position),
+            angle_error=_angle(rotation, pointing, quaternion),
+            stiffness=stiffness,
+            best_stiffness=math.nan if plan is None else plan.stiffness,
+            disturbance=estimate.offset,
+            wrench=self._wrench(estimate.offset, estimate.turn),
+            task=self._what(),
+        )
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Say what is wrong."""
+        found = list(self._planner.notices())
+        plan = self._plan
+        if plan is not None and plan.serial == self._serial and not plan.reached:
+            text = f"the target cannot be reached: {plan.message}"
+            found.append(Notice("unreachable", text, standing=True))
+        return tuple(found)
+
+    def close(self) -> None:
+        """End the planner."""
+        self._planner.close()
+
+    # -- what is asked --------------------------------------------------------------------------
+
+    def _check_task(self, task: Task) -> None:
+        bounds = task.pressure_bounds(self.robot.description)
+        del bounds
+        if task.load is not None:
+            raise InputError("a load is estimated by the daemon; remove 'load' from the task")
+
+    def _pursue(self, target: Target) -> None:
+        task = self._task
+        if task is None:
+            task = Task(robot=self.robot.description.name, target=target)
+            self._check_task(task)
+            self._task = task
+            self._measure = None
+            self._target = target
+            self._anew()
+            return
+        same = self._target is not None and _kind(self._target) == _kind(target)
+        self._target = target
+        if not same:
+            self._serial += 1
+        self._asked_at = -math.inf
+
+    def _anew(self) -> None:
+        self._serial += 1
+        self._asked_at = -math.inf
+
+    def _ask(self, now: float) -> None:
+        """Ask for a plan now and then, for where the target will be when the path is there."""
+        if self._task is None or self._target is None:
+            return
+        if now - self._asked_at < _PLAN_EVERY - 1e-6:
+            return
+        new = not math.isfinite(self._asked_at)
+        self._asked_at = now
+        target = self._target
+        if self._course is not None:
+            target = self._course.at(now + self._reference.delay + self._dead_time)
+        estimate = self._estimator.estimate
+        offset = np.concatenate([estimate.offset, estimate.turn])
+        self._planner.ask(
+            Request(self._serial, self._task, target, offset, new and self._course is None)
+        )
+
+    def _aim(self) -> Array:
+        """Effective pressures of the plan and the offset that it counts with (n + 6,)."""
+        plan = self._planner.latest()
+        if plan is not None and plan.serial == self._serial:
+            self._plan = plan
+        if self._plan is None:
+            return self._reference.path.copy()
+        return np.concatenate([self._plan.pressures, self._plan.offset])
+
+    def _what(self) -> str:
+        if self._course is not None:
+            return "trajectory"
+        return "" if self._target is None else "target"
+
+    # -- the model ------------------------------------------------------------------------------
+
+    def _none(self) -> Array:
+        return np.zeros(self.robot.n_pressures)
+
+    def _regulation(self) -> tuple[Array, float]:
+        """Lags (n,) and dead time: of the regulators, or of a robot file that knows the arm's."""
+        control = self._control
+        lags, dead = [], control.regulator_dead_time
+        for segment in self.robot.description.segments:
+            history = segment.history
+            own = history is not None and history.lag > 0
+            lags += [history.lag if own and history else control.regulator_lag] * segment.n_channels
+            if own and history is not None:
+                dead = history.dead_time or dead
+        return np.array(lags), dead
+
+    def _history(self) -> Memory | None:
+        """Play and creep of the arm, from rest; lags are the regulators' business here."""
+        found: list[History | None] = []
+        places: list[int] = []
+        for segment in self.robot.description.segments:
+            history = segment.history
+            if history is not None:
+                update = {"lag": 0.0, "lag_falling": 0.0, "dead_time": 0.0}
+                history = history.model_copy(update=update)
+            found += [history] * segment.n_channels
+            places += list(range(segment.n_channels))
+        if not any(history is not None and history.parts for history in found):
+            return None
+        return Memory(found, places)
+
+    @property
+    def _remembered(self) -> Array:
+        """By how much the pressures that act differ from those in the chambers (n,)."""
+        result: Array = self._effective - self._chamber
+        return result
+
+    def _tip_at(self, pressures: Array) -> TipAt:
+        if self._tip is None:
+            self._tip = TipModel(self.robot)
+        p = np.clip(pressures, self.robot.pressure_min, self.robot.pressure_max)
+        try:
+            return self._tip.at(p)
+        except (EquilibriumError, PressureError) as error:
+            raise StiffoptError(f"the model has no answer: {error}") from error
+
+    def _damping_rows(
+        self, linear: Array, path: Array, chamber: Array, correction: Array
+    ) -> tuple[Array, Array]:
+        """Jacobian (3, n) of what the swing has of the tip's motion, and feedback (3,) that damps.
+
+        Channels of different segments excite the swing differently for the same motion of the tip;
+        at the limits, a motion of the tip alone may do so the wrong way round.
+        """
+        estimator = self._estimator
+        assert self._gains is not None and self._vibration is not None
+        share = self._vibration.participation
+        modal = estimator.across_matrix @ (linear * share)
+        ahead = self._regulators.ahead() + self._remembered
+        swing = estimator.ahead(self._dead_time)
+        home = self._mean_share * estimator.across(correction)
+        sigma = modal @ (ahead - chamber) - home
+        tip = modal @ (ahead - path) + swing[0] - home
+        speed = swing[1] - modal @ self._reference.derivatives()[0][: len(path)]
+        gain = self._gains.at(estimator.omega)
+        feedback: Array = -(gain[0] * sigma + gain[1] * tip + gain[2] * speed)
+        return modal, estimator.across(feedback)
+
+    def _rows(
+        self, linear: Array, angular: Array, shift: Array, turn: Array, rotation: Array
+    ) -> tuple[Array, Array]:
+        """What the task asks of the tip: J (t, n) and v (t,), in m."""
+        target = self._target
+        if target is None:
+            return linear, np.zeros(3)
+        rows, wanted = [], []
+        if target.position is not None:
+            asked = np.array([axis is not None for axis in target.position])
+            rows.append(linear[asked])
+            wanted.append(shift[asked])
+        if target.pointing is not None:
+            across = np.eye(3) - np.outer(rotation[:, 2], rotation[:, 2])
+            rows.append(_LEVER * across @ angular)
+            wanted.append(_LEVER * across @ turn)
+        if target.orientation is not None:
+            rows.append(_LEVER * angular)
+            wanted.append(_LEVER * turn)
+        return np.concatenate(rows), np.concatenate(wanted)
+
+    def _wrench(self, offset: Array, turn: Array) -> Array:
+        """Force and moment (6,), base axes, that would move the tip by an offset."""
+        assert self._at_u is not None
+        rotation = self._at_u.pose[:3, :3]
+        blocks = np.kron(np.eye(2), rotation)
+        compliance = blocks @ self._at_u.compliance @ blocks.T
+        force = np.linalg.solve(compliance[:3, :3], offset)
+        del turn
+        return np.concatenate([force, np.zeros(3)])
+
+
+def _stiffness_of(task: Task) -> Callable[..., float] | None:
+    """Stiffness along the first direction that a task names, by compliance and rotation."""
+    measures = task.measures
+    if not measures:
+        return None
+    measure = measures[0]
+    C, R = ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3)
+    value = directional_stiffness(
+        C, R, ca.DM(measure.direction),
+        frame=measure.frame, kind=measure.kind, boundary=measure.boundary,
+    )  # fmt: skip
+    function: Callable[..., float] = ca.Function("stiffness", [C, R], [value])
+    return function
+
+
+def _kind(target: Target) -> tuple[object, ...]:
+    axes = None if target.position is None else tuple(axis is None for axis in target.position)
+    return axes, target.pointing is None, target.orientation is None
+
+
+def _parts(target: Target | None) -> tuple[Array | None, Array | None, Array | None]:
+    """Position, pointing and orientation of a target."""
+    if target is None:
+        return None, None, None
+    position = None
+    if target.position is not None:
+        position = np.array([np.nan if axis is None else axis for axis in target.position])
+    pointing = None if target.pointing is None else np.array(target.pointing)
+    return position, pointing, None if target.orientation is None else np.array(target.orientation)
+
+
+def _distance(position: Array, target: Array | None) -> float:
+    if target is None:
+        return math.nan
+    away = position - target
+    return float(np.linalg.norm(away[np.isfinite(away)]))
+
+
+def _angle(rotation: Array, pointing: Array | None, quaternion: Array | None) -> float:
+    if pointing is not None:
+        return float(np.arccos(np.clip(rotation[:, 2] @ pointing, -1, 1)))
+    if quaternion is not None:
+        between = rotation.T @ lie.rotation_from_quaternion(quaternion)
+        return float(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1)))
+    return math.nan

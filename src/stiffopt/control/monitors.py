@@ -1,0 +1,228 @@
+"""Whether what the supply reads can be, and is what it should be after what it was told."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.rig.interface import PressureLimits, PressureReading
+from stiffopt.rig.settings import ControlSettings, Safety
+
+__all__ = ["PressureMonitor", "Trouble"]
+
+Array = NDArray[np.float64]
+
+_TOLD = 1000  # commands that a dead time may hold back
+_LOOKS = 3  # readings, at least, that it takes to find a regulator wrong, however long a pause
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """Something that is a fault.
+
+    Attributes
+    ----------
+    kind : a word for programs.
+    text : a sentence for people.
+    """
+
+    kind: str
+    text: str
+
+
+class ExpectedPressure:
+    """Where a regulator that works as its settings say would be: dead time, lag, limited rate.
+
+    Readings do not correct it, unlike the estimator's model: it is what they are held against.
+    """
+
+    def __init__(self, n: int, control: ControlSettings, slew: Array) -> None:
+        self.pressures: Array = np.zeros(n)
+        self._lag, self._dead_time = control.regulator_lag, control.regulator_dead_time
+        self._slew = slew
+        self._told: deque[tuple[float, Array]] = deque([(-np.inf, np.zeros(n))], maxlen=_TOLD)
+        self._time = -np.inf
+
+    def tell(self, time: float, commanded: Array) -> None:
+        """Take in that something else is commanded (n,) from a moment on."""
+        self._told.append((time, commanded))
+
+    def follow(self, time: float) -> float:
+        """Go on to a moment, and return by how much that is later than the last one, in s."""
+        if np.isinf(self._time):
+            self._time = time
+        elapsed = time - self._time
+        if not elapsed > 0:
+            return 0.0
+        acting = time - 0.5 * elapsed - self._dead_time  # midway, as if it were so all the while
+        told = self._told
+        while len(told) > 1 and told[1][0] <= acting:
+            told.popleft()
+        change = told[0][1] - self.pressures
+        if self._lag > 0:
+            change = change * -np.expm1(-elapsed / self._lag)
+        reach = self._slew * elapsed
+        self.pressures = self.pressures + np.minimum(np.maximum(change, -reach), reach)
+        self._time = time
+        return elapsed
+
+
+class PressureMonitor:
+    """Holds the readings of n channels against what was commanded.
+
+    A reading that is not finite in a channel that was measured before, or that no gauge of this
+    supply can show, is a fault at once, and so are readings that do not come any more. A reading
+    that is beside both the command and where a good regulator would be by now, by more than
+    `Safety.max_pressure_error`, for `Safety.pressure_error_time`, is a fault: a leak if it is
+    below, a regulator stuck if above. What is between the two is a regulator on its way.
+
+    A leak and a regulator whose supply runs out of pressure look alike: both stay below the
+    command. As one cannot tell them apart while nothing moves, both are treated alike: from half
+    of that error on the channel counts as saturated, which is an alarm; beyond the whole of it,
+    for that time, it is a leak and a fault.
+
+    Parameters
+    ----------
+    limits :
+        Of the commands.
+    safety :
+        What is too much.
+    control :
+        How regulators follow.
+    slew :
+        Greatest rate of change of a pressure, one value or (n,), in Pa/s.
+
+    Attributes
+    ----------
+    saturated : ndarray
+        Channels (n,) that stay below what they should be; another array when it changes.
+    unsupervised : tuple of int
+        Channels, counted from 0, that have never been measured.
+    """
+
+    def __init__(
+        self, limits: PressureLimits, safety: Safety, control: ControlSettings, slew: ArrayLike
+    ) -> None:
+        n = limits.n
+        most = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
+        self.saturated: NDArray[np.bool_] = np.zeros(n, dtype=bool)
+        self._expected = ExpectedPressure(n, control, np.broadcast_to(slew, n).astype(float))
+        self._commanded: Array = np.zeros(n)
+        self._time, self._oldest = safety.pressure_error_time, safety.command_timeout
+        self._tolerance: Array = np.array(most)
+        self._most = np.stack((most, most, 0.5 * most))  # (3, n): leaks, stuck, saturated
+        self._for: Array = np.zeros((3, n))  # s, for how long it was so, less how long it was not
+        self._doubtful = False  # whether any of that is not 0
+        self._beside: Array = np.zeros((3, n))
+        span = limits.high - np.minimum(limits.low, 0.0)
+        self._lowest: Array = np.minimum(limits.low, 0.0) - span - most
+        self._highest: Array = limits.high + span + most
+        self._measures: NDArray[np.bool_] = np.zeros(n, dtype=bool)
+        self.unsupervised = tuple(range(n))
+
+    def tell(self, time: float, commanded: Array) -> None:
+        """Take in what the supply is told (n,), in Pa, and when."""
+        self._commanded = commanded
+        self._expected.tell(time, commanded)
+
+    def clear(self) -> None:
+        """Forget for how long anything was wrong."""
+        self._for[:] = 0.0
+        self._doubtful = False
+        self.saturated = np.zeros_like(self.saturated)
+
+    def update(self, now: float, reading: PressureReading) -> Trouble | None:
+        """Judge a reading; return what is wrong."""
+        trouble = self.implausible(now, reading)
+        if trouble is not None:
+            return trouble
+        elapsed = min(self._expected.follow(reading.time), self._time / _LOOKS)
+        expected, p = self._expected.pressures, reading.pressures
+        beside = self._beside
+        np.subtract(np.minimum(expected, self._commanded), p, out=beside[0])
+        np.subtract(p, np.maximum(expected, self._commanded), out=beside[1])
+        beside[2] = beside[0]
+        wrong = beside > self._most  # NaN, where nothing is measured, is not
+        if wrong.any():
+            self._for += np.where(wrong, elapsed, -elapsed)
+            self._doubtful = True
+        elif self._doubtful:
+            self._for -= elapsed
+        else:
+            return None
+        np.clip(self._for, 0.0, self._time, out=self._for)
+        self._doubtful = bool(self._for.any())
+        lasting = self._for >= self._time * (1 - 1e-9)
+        self.saturated = lasting[2] | (self.saturated & (self._for[2] > 0))
+        return self._found(lasting, p)
+
+    def _found(self, lasting: NDArray[np.bool_], p: Array) -> Trouble | None:
+        """Return the trouble where a reading (n,) was wrong for long enough."""
+        for channel in np.flatnonzero(lasting[1]):
+            return Trouble(
+                "regulator-stuck",
+                f"channel {channel + 1} reads {_bar(p[channel])}, though "
+                f"{_bar(self._commanded[channel])} was commanded: its regulator is stuck; "
+                "everything is vented",
+            )
+        for channel in np.flatnonzero(lasting[0]):
+            return Trouble(
+                "leak",
+                f"channel {channel + 1} reads {_bar(p[channel])}, though "
+                f"{_bar(self._commanded[channel])} was commanded: it leaks, or its regulator has "
+                "no more pressure; it is vented with all others",
+            )
+        return None
+
+    def implausible(self, now: float, reading: PressureReading) -> Trouble | None:
+        """Return why a reading cannot be, if it cannot."""
+        p = reading.pressures
+        if not -self._oldest <= now - reading.time <= self._oldest:
+            return Trouble(
+                "pressure-reading", f"the pressure reading is {now - reading.time:.3g} s old"
+            )
+        if p.shape != self._tolerance.shape:
+            return Trouble(
+                "pressure-reading",
+                f"{p.size} pressures are read; expected {self._tolerance.size}",
+            )
+        plausible = (p >= self._lowest) & (p <= self._highest)
+        if plausible.all():
+            if self.unsupervised:
+                self._measured(plausible)
+            return None
+        missing = np.isnan(p)
+        for channel in np.flatnonzero(~plausible & (~missing | self._measures)):
+            said = "nothing" if missing[channel] else _bar(p[channel])
+            return Trouble(
+                "pressure-reading",
+                f"channel {channel + 1} reads {said}, which cannot be; check its gauge and wires",
+            )
+        self._measured(plausible)
+        return None
+
+    def _measured(self, channels: NDArray[np.bool_]) -> None:
+        self._measures |= channels
+        self.unsupervised = tuple(int(c) for c in np.flatnonzero(~self._measures))
+
+    def under_pressure(self, reading: PressureReading) -> str:
+        """Say which channel is not at 0, of a supply that is vented; empty if none is."""
+        p = reading.pressures
+        for channel in np.flatnonzero(np.abs(p) > self._tolerance):  # NaN is not
+            return f"channel {channel + 1} reads {_bar(p[channel])}, though it is vented"
+        return ""
+
+    def believable(self, reading: PressureReading) -> PressureReading:
+        """Return a reading with NaN for what cannot be."""
+        p = reading.pressures
+        if p.shape != self._tolerance.shape:
+            return PressureReading(reading.time, np.full_like(self._tolerance, np.nan))
+        plausible = (p >= self._lowest) & (p <= self._highest)
+        return PressureReading(reading.time, np.where(plausible, p, np.nan))
+
+
+def _bar(pressure: float) -> str:
+    return f"{pressure * 1e-5:.3g} bar"

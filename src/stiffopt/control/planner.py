@@ -1,0 +1,299 @@
+"""The re-planner: which pressures are best for the target, as far off as the arm is found to be.
+
+The arm's tip is found beside where the model has it, by an offset.  A target moved back by that
+offset, given to the optimiser, yields pressures that are the stiffest on the arm as it is, but for
+how stiffness itself is off.  While the offset changes little, the plan is the local optimum next to
+the last one; if it has changed much, all configurations are searched again, and the arm leaves its
+own only for one that is clearly better.
+
+Plans are made one at a time by `Planning`: at once (`InlinePlanner`, for simulated time), or in a
+thread beside the control loop (`ThreadPlanner`), which is started again when it dies.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.control.steering import Notice
+from stiffopt.errors import StiffoptError
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.solver import PressureSolver
+from stiffopt.optimise.target import Target, Tolerance
+from stiffopt.optimise.task import Task
+from stiffopt.optimise.tip import TipModel
+
+__all__ = ["InlinePlanner", "Plan", "Planner", "Planning", "Request", "ThreadPlanner", "moved_back"]
+
+Array = NDArray[np.float64]
+
+_CLEARLY = 1.02  # times as stiff is worth a move
+_MUCH = 2e-3  # m; change of the offset after which all is searched again
+_EXACT = Tolerance(position=1e-5, angle=1e-3)
+_RESTART_AFTER = 0.5  # s
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to plan for.
+
+    Attributes
+    ----------
+    serial : counts tasks; a plan for an older one is of no use.
+    task : what is asked.
+    target : where, instead of the task's own target.
+    offset : (6,) of the tip from the model, in m and rad (rotation vector), base axes.
+    anew : whether all configurations are to be searched, as for a new target.
+    """
+
+    serial: int
+    task: Task
+    target: Target
+    offset: Array
+    anew: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Pressures for a target.
+
+    Attributes
+    ----------
+    serial : of the request.
+    pressures : (n,), in Pa.
+    offset : (6,) that they count with.
+    target : that they are for.
+    reached : whether the model reaches it.
+    stiffness : of the task's first direction; NaN where it names none.
+    message : why it is not reached.
+    tip : a model of the tip under the task's load, for whoever asked; new with each task.
+    """
+
+    serial: int
+    pressures: Array
+    offset: Array
+    target: Target
+    reached: bool
+    stiffness: float
+    message: str
+    tip: TipModel
+
+
+class Planning:
+    """Makes plans, each from the one before.
+
+    Parameters
+    ----------
+    robot :
+        The arm.
+    """
+
+    def __init__(self, robot: Manipulator) -> None:
+        self._robot = robot
+        self._serial = -1
+        self._last: Plan | None = None
+        self._searched_at: Array = np.zeros(6)
+
+    def plan(self, request: Request) -> Plan:
+        """Answer a request.
+
+        Raises
+        ------
+        StiffoptError
+            The optimiser could not be run.
+        """
+        if request.serial != self._serial or self._last is None:
+            exact = request.target.model_copy(update={"tolerance": _EXACT})
+            self._solver = PressureSolver(
+                self._robot, request.task.model_copy(update={"target": exact})
+            )
+            self._tip = TipModel(self._solver.robot)
+            self._serial, self._last = request.serial, None
+        target = moved_back(request.target, request.offset)
+        change = float(np.linalg.norm((request.offset - self._searched_at)[:3]))
+        guess = None if self._last is None or request.anew else self._last.pressures
+        solution = self._solver.solve(target, guess)
+        if guess is not None and solution.found and change > _MUCH:
+            self._searched_at = request.offset
+            other = self._solver.solve(target)
+            if other.found and _value(other.stiffness) > _CLEARLY * _value(solution.stiffness):
+                solution = other
+        elif guess is None:
+            self._searched_at = request.offset
+        pressures = solution.pressures
+        if pressures is None or not np.isfinite(pressures).all():
+            raise StiffoptError(f"the optimiser has no pressures: {solution.message}")
+        self._last = Plan(
+            serial=request.serial,
+            pressures=np.array(pressures, dtype=float),
+            offset=request.offset,
+            target=request.target,
+            reached=solution.found,
+            stiffness=_value(solution.stiffness, math.nan),
+            message="" if solution.found else solution.message,
+            tip=self._tip,
+        )
+        return self._last
+
+
+class Planner(Protocol):
+    """Plans for whoever asks, when it is done."""
+
+    def ask(self, request: Request) -> None:
+        """Want a plan; one that was asked for before and is not begun is forgotten."""
+
+    def latest(self) -> Plan | None:
+        """Return the newest plan."""
+
+    def notices(self) -> tuple[Notice, ...]:
+        """What is wrong with the planner; see `Steering.notices`."""
+
+    def close(self) -> None:
+        """End."""
+
+
+class InlinePlanner:
+    """Plans at once, where it is asked: time stands still meanwhile, as in a simulation."""
+
+    def __init__(self, robot: Manipulator) -> None:
+        self._planning = Planning(robot)
+        self._plan: Plan | None = None
+        self._trouble: tuple[Notice, ...] = ()
+
+    def ask(self, request: Request) -> None:
+        """Plan."""
+        try:
+            self._plan = self._planning.plan(request)
+            self._trouble = ()
+        except StiffoptError as error:
+            self._trouble = (Notice("planner", f"the planner failed: {error}", standing=True),)
+
+    def latest(self) -> Plan | None:
+        """Return the plan."""
+        return self._plan
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Say whether the last request failed."""
+        return self._trouble
+
+    def close(self) -> None:
+        """Nothing to end."""
+
+
+class ThreadPlanner:
+    """Plans in a thread, so that whoever asks never waits.
+
+    The optimiser's machine code runs beside Python.  If planning fails in a way that no one
+    thought of, the last plan stays, an alarm says so, and a new `Planning` begins after a while.
+
+    Parameters
+    ----------
+    robot :
+        The arm.
+    patience :
+        A plan that takes longer than this is worth an alarm, in s.
+    """
+
+    def __init__(self, robot: Manipulator, patience: float = 5.0) -> None:
+        self._robot, self._patience = robot, patience
+        self._wanted: Request | None = None
+        self._begun: float | None = None
+        self._plan: Plan | None = None
+        self._trouble: str = ""
+        self._ended = False
+        self._changed = threading.Condition()
+        self._start()
+
+    def _start(self) -> None:
+        self._thread = threading.Thread(target=self._work, name="planner", daemon=True)
+        self._thread.start()
+
+    def ask(self, request: Request) -> None:
+        """Want a plan."""
+        if not self._thread.is_alive() and not self._ended:
+            self._trouble = "the planner died and is started again; the last plan stays"
+            self._start()
+        with self._changed:
+            if self._wanted is not None and self._wanted.serial == request.serial:
+                anew = self._wanted.anew or request.anew
+                request = Request(**{**request.__dict__, "anew": anew})
+            self._wanted = request
+            self._changed.notify()
+
+    def latest(self) -> Plan | None:
+        """Return the newest plan."""
+        return self._plan
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Say whether planning has failed, or takes too long."""
+        begun = self._begun
+        if begun is not None and time.monotonic() - begun > self._patience:
+            return (Notice("planner", "the planner is slow; the last plan stays", standing=True),)
+        if self._trouble:
+            return (Notice("planner", self._trouble, standing=True),)
+        return ()
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        self._thread.join(timeout=2.0)
+
+    def _work(self) -> None:
+        planning = Planning(self._robot)
+        while True:
+            with self._changed:
+                while self._wanted is None and not self._ended:
+                    self._changed.wait()
+                if self._ended:
+                    return
+                request, self._wanted = self._wanted, None
+            assert request is not None
+            self._begun = time.monotonic()
+            try:
+                self._plan = planning.plan(request)
+                self._trouble = ""
+            except Exception as error:  # whatever it is, control goes on with the last plan
+                self._trouble = f"the planner failed and begins anew: {error}"
+                planning = Planning(self._robot)
+                time.sleep(_RESTART_AFTER)
+            finally:
+                self._begun = None
+
+
+def moved_back(target: Target, offset: Array) -> Target:
+    """What the model has to reach, for an arm whose tip is off by an offset (6,) to reach a target.
+
+    Parameters
+    ----------
+    target :
+        Of the arm.
+    offset :
+        In m and rad (rotation vector), base axes.
+    """
+    update: dict[str, object] = {"tolerance": _EXACT}
+    if target.position is not None:
+        update["position"] = tuple(
+            None if axis is None else axis - float(shift)
+            for axis, shift in zip(target.position, offset[:3], strict=True)
+        )
+    back = lie.exp(np.concatenate([np.zeros(3), -offset[3:]]))[:3, :3]
+    if target.pointing is not None:
+        update["pointing"] = tuple((back @ np.array(target.pointing)).tolist())
+    if target.orientation is not None:
+        rotation = back @ lie.rotation_from_quaternion(np.array(target.orientation))
+        q = lie.quaternion_from_rotation(rotation)
+        update["orientation"] = tuple((q if q[0] >= 0 else -q).tolist())
+    return target.model_copy(update=update)
+
+
+def _value(stiffness: float | None, otherwise: float = 0.0) -> float:
+    return otherwise if stiffness is None else float(stiffness)

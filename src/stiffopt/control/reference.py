@@ -1,0 +1,98 @@
+"""From where the plan jumps to, to a reference that the arm can follow without swinging.
+
+The plan (pressures, and the offset of the tip that it counts with) goes through a limit of slew and
+four equal lags ``a / (s + a)``, which leave a path x(t) with three derivatives.  What has to be
+commanded for the arm to be on this path is ::
+
+    x_command = (1 + tau s) (1 + 2 zeta / omega s + s^2 / omega^2) x,
+
+the inverse of regulators and first bending mode, one dead time early.  All channels have the same
+filter, so that they reach their goal together on a straight way, whatever the tip does between.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Reference"]
+
+Array = NDArray[np.float64]
+
+_LAGS = 4
+
+
+class Reference:
+    """A smooth way to the plan, for n pressures and m numbers that go with them.
+
+    Parameters
+    ----------
+    period :
+        Of the steps, in s.
+    slew :
+        Greatest rates of change (n,), in Pa/s.
+    lag, dead_time :
+        Of the regulators, in s.
+
+    Attributes
+    ----------
+    rate : float
+        a of the four lags, in 1/s.
+    """
+
+    def __init__(self, period: float, slew: Array, lag: float, dead_time: float) -> None:
+        self._period, self._slew, self._lag, self._dead_time = period, slew, lag, dead_time
+        self._n = len(slew)
+        self.rate = 1.0
+        self.begin(np.zeros(self._n))
+
+    def begin(self, values: Array) -> None:
+        """Start anew, at rest at pressures and what goes with them (n + m,)."""
+        self._levels = np.tile(values, (_LAGS + 1, 1))
+
+    @property
+    def delay(self) -> float:
+        """By how much the path is later than the plan, in s."""
+        return _LAGS / self.rate
+
+    def advance(self, plan: Array) -> None:
+        """Take a step towards a plan (n + m,)."""
+        levels, n = self._levels, self._n
+        away = plan - levels[0]
+        # the share of the way that the slowest channel can go
+        needed = float(np.max(np.abs(away[:n]) / self._slew)) / self._period
+        levels[0] += away * min(1.0, 0.9 / needed if needed > 0 else 1.0)
+        share = 1 - np.exp(-self.rate * self._period)
+        for i in range(1, _LAGS + 1):
+            levels[i] += share * (levels[i - 1] - levels[i])
+
+    @property
+    def path(self) -> Array:
+        """Where the path is now (n + m,)."""
+        value: Array = self._levels[-1]
+        return value
+
+    def derivatives(self) -> tuple[Array, Array, Array]:
+        """First three derivatives (n + m,) of the path by time, in s."""
+        _, x1, x2, x3, x4 = self._levels
+        a = self.rate
+        return (
+            a * (x3 - x4),
+            a**2 * (x2 - 2 * x3 + x4),
+            a**3 * (x1 - 3 * x2 + 3 * x3 - x4),
+        )
+
+    def command(self, omega: float, damping: float) -> tuple[Array, Array]:
+        """Pressures (n,) to command, and pressures (n,) in the chambers when they take effect.
+
+        Parameters
+        ----------
+        omega :
+            Angular frequency of the vibration, in rad/s; infinite where there is none.
+        damping :
+            Its share of critical damping.
+        """
+        first, second, third = (d[: self._n] for d in self.derivatives())
+        c1, c2, tau = 2 * damping / omega, 1 / omega**2, self._lag
+        chamber = self.path[: self._n] + c1 * first + c2 * second
+        return chamber + tau * (first + c1 * second + c2 * third), chamber

@@ -1,0 +1,310 @@
+"""The last gate before the supply: what may harm the arm does not pass, whoever commands it."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.control.outlet import Applied
+from stiffopt.errors import CommandError, InputError
+from stiffopt.rig.interface import (
+    Clock,
+    PressureCommand,
+    PressureLimits,
+    PressureReading,
+    PressureSupply,
+)
+from stiffopt.rig.settings import Safety
+
+__all__ = ["SafetyGate"]
+
+Array = NDArray[np.float64]
+
+_PERIODS = 3  # a pause allows no greater step than this many periods do
+
+
+class SafetyGate:
+    """Passes commands on to a supply: bounds, rates, total force and age are checked here.
+
+    A command that is malformed, not finite, out of range, expired or from the future is refused,
+    and the last set-points stay. One that asks for too fast a change, or for too great a force, is
+    carried out as far as it may be. Rates are limited from one write to the next: falling ones
+    too, only venting is at once. A raise that would take the total force above its limit is
+    shortened, in all channels by the same share; what falls always passes.
+
+    A channel whose low limit is above 0 has no set-points between 0 and that limit: it stays at 0
+    for as long as a rise from 0 to there takes, then steps to the limit.
+
+    Parameters
+    ----------
+    supply :
+        What is commanded; nothing else may command it while the gate is in use.
+    slew :
+        Greatest rate of change, one value or one per channel (n,), in Pa/s.
+    safety :
+        Limits of pressure, force and age.
+    force_per_pressure :
+        Chamber area of each channel (n,), in m^2, see `RobotDescription.channel_areas`; needed if
+        `safety` limits the force.
+    clock :
+        The rig's.
+    period :
+        Time between commands, in s. A longer pause than three of them counts as three.
+
+    Attributes
+    ----------
+    limits : PressureLimits
+        What may be commanded: the supply's limits, tightened by those of `safety`.
+
+    Raises
+    ------
+    InputError
+        Something does not fit the number of channels, or is not a positive number.
+    """
+
+    def __init__(
+        self,
+        supply: PressureSupply,
+        *,
+        slew: ArrayLike,
+        safety: Safety,
+        force_per_pressure: ArrayLike | None,
+        clock: Clock,
+        period: float = 0.01,
+    ) -> None:
+        self.supply = supply
+        self.clock = clock
+        n = supply.n
+        self.limits = _tightened(supply.limits, safety)
+        self._slew = _positive("slew", slew, n)
+        if not period > 0:
+            raise InputError(f"the period must be above 0 s, not {period:g} s")
+        self._longest = _PERIODS * period
+        self._timeout = safety.command_timeout
+        self._max_force = safety.max_force
+        if force_per_pressure is not None:
+            self._areas = _positive("force_per_pressure", force_per_pressure, n)
+        elif self._max_force is not None:
+            raise InputError("a limit of the force needs the chambers' areas: force_per_pressure")
+        self._jumps_to_low = bool((self.limits.low > 0).any())
+        self._lock = threading.RLock()
+        self._armed = False
+        self._vent_failed = False
+        self._ramp: Array  # as far as the rates have let pressures come, in Pa
+        self._told: Array  # what was written: the same, but for gaps that a supply has
+        self._forget(clock.now())
+
+    @property
+    def armed(self) -> bool:
+        """Whether commands are taken."""
+        return self._armed
+
+    def open(self) -> None:
+        """Connect to the supply, which vents it.
+
+        Raises
+        ------
+        DeviceError
+            It does not answer.
+        """
+        self.supply.open()
+
+    def close(self) -> None:
+        """Vent and disconnect.
+
+        Raises
+        ------
+        DeviceError
+            The supply did not take it; see `PressureSupply.close`.
+        """
+        with self._lock:
+            self._armed = False
+            self.supply.close()
+
+    def arm(self) -> None:
+        """Take commands from now on; the set-points are 0 then.
+
+        Raises
+        ------
+        CommandError
+            No rate of change is set.
+        DeviceError
+            The supply did not take it.
+        """
+        with self._lock:
+            if not np.isfinite(self._slew).all():
+                raise CommandError(
+                    "there is no limit to how fast pressures may rise; set safety.max_slew in the "
+                    "rig file, or pressure.slew in the robot file"
+                )
+            self.supply.arm()
+            self._forget(self.clock.now())
+            self._armed = True
+
+    def vent(self) -> None:
+        """Let all pressure out at once; no command is taken until `arm`.
+
+        Raises
+        ------
+        DeviceError
+            The supply did not take it: try again. `expire` does so too.
+        """
+        with self._lock:
+            self._armed = False
+            self._vent_failed = True
+            self.supply.vent()
+            self._vent_failed = False
+            self._forget(self.clock.now())
+
+    def expire(self, now: float) -> bool:
+        """Vent if no valid command came for too long, or venting failed before; call it often.
+
+        Parameters
+        ----------
+        now :
+            Time on the rig's clock, in s.
+
+        Returns
+        -------
+        Whether it vented.
+
+        Raises
+        ------
+        DeviceError
+            The supply did not take it; the next call tries again.
+        """
+        with self._lock:
+            kept = not self._armed or now - self._valid_at <= self._timeout
+            if kept and not self._vent_failed:
+                return False
+            self.vent()
+            return True
+
+    def read(self) -> PressureReading:
+        """Return the measured pressures.
+
+        Raises
+        ------
+        DeviceError
+            The supply does not answer.
+        """
+        return self.supply.read()
+
+    def apply(self, command: PressureCommand) -> Applied:
+        """Carry out a command as far as it may be, or refuse it and say why.
+
+        Raises
+        ------
+        DeviceError
+            The supply does not answer; whether it has the new set-points is not known.
+        """
+        with self._lock:
+            now = self.clock.now()
+            if self.expire(now):
+                return self._refused(
+                    f"no command came for {self._timeout:g} s, so the supply was vented; arm it"
+                )
+            try:
+                asked = self._checked(command, now)
+            except CommandError as error:
+                return self._refused(str(error))
+            self._valid_at = now
+            ramp = self._within_force(self._within_rate(asked, now))
+            before, self._written_at = self._ramp, now
+            self._ramp = np.minimum(ramp, before)  # should it fail: no more than this is there
+            told = self._writable(ramp)
+            try:
+                reading = self.supply.exchange(told)
+            except CommandError as error:
+                self._ramp = before
+                if not self.supply.armed:  # somebody else vented it
+                    self._armed = False
+                    self._forget(now)
+                return self._refused(str(error))
+            self._ramp, self._told = ramp, told
+            return Applied(told, reading, limited=bool((told != asked).any()))
+
+    def _checked(self, command: PressureCommand, now: float) -> Array:
+        """Return the pressures (n,) of a command that may be carried out; refuse all others."""
+        if not self._armed:
+            raise CommandError("the supply is vented and takes no command; arm it first")
+        age = now - command.time
+        if age < 0:
+            raise CommandError(f"the command is from the future, by {-age:.3g} s")
+        if not age <= min(command.valid_for, self._timeout):  # NaN is too old as well
+            raise CommandError(f"the command has expired; it is {age:.3g} s old")
+        asked = command.pressures
+        low, high = self.limits.low, self.limits.high
+        if isinstance(asked, np.ndarray) and asked.dtype == low.dtype and asked.shape == low.shape:
+            within = (asked >= low) & (asked <= high)  # NaN is not
+            if within.all():
+                return asked.copy()
+        return self.limits.check(asked)  # which knows what to say
+
+    def _within_rate(self, asked: Array, now: float) -> Array:
+        """Return what is nearest to `asked` (n,) that can be reached by now."""
+        elapsed = min(max(now - self._written_at, 0.0), self._longest)
+        reach = self._slew * elapsed
+        nearest: Array = np.minimum(np.maximum(asked, self._ramp - reach), self._ramp + reach)
+        if self._jumps_to_low:
+            low = self.limits.low
+            nearest = np.where((self._told == 0) & (low > 0), np.minimum(nearest, low), nearest)
+        return nearest
+
+    def _within_force(self, wanted: Array) -> Array:
+        """Shorten what rises in a step to `wanted` (n,) so that the force keeps its limit."""
+        if self._max_force is None:
+            return wanted
+        most = self._force(wanted)
+        if most <= self._max_force:
+            return wanted
+        fallen = np.minimum(wanted, self._ramp)
+        least = self._force(fallen)
+        if most <= least:
+            return wanted
+        # the force is convex along the step: this share of it is never too much
+        share = max(0.0, self._max_force - least) / (most - least)
+        shortened: Array = fallen + share * (wanted - fallen)
+        return shortened
+
+    def _force(self, pressures: Array) -> float:
+        """Sum of pressure times area, in N; a vacuum relieves nothing."""
+        return float(self._areas @ np.maximum(pressures, 0.0))
+
+    def _writable(self, ramp: Array) -> Array:
+        """Return set-points (n,) that the supply has: none between 0 and a low limit above 0."""
+        if not self._jumps_to_low:
+            return ramp
+        return np.where((ramp > 0) & (ramp < self.limits.low), 0.0, ramp)
+
+    def _refused(self, reason: str) -> Applied:
+        return Applied(self._told, self.supply.read(), refused=reason)
+
+    def _forget(self, now: float) -> None:
+        """Begin anew with a vented supply."""
+        self._ramp = self._told = np.zeros(self.limits.n)
+        self._written_at = self._valid_at = now
+
+
+def _tightened(limits: PressureLimits, safety: Safety) -> PressureLimits:
+    if safety.max_pressure is None:
+        return limits
+    most = _per_channel("safety.max_pressure", safety.max_pressure, limits.n)
+    return PressureLimits(limits.low, np.minimum(limits.high, most))
+
+
+def _positive(name: str, value: ArrayLike, n: int) -> Array:
+    """Return positive numbers (n,), which need not be finite."""
+    given = _per_channel(name, value, n)
+    if not (given > 0).all():
+        raise InputError(f"{name}: expected values above 0")
+    return given
+
+
+def _per_channel(name: str, value: ArrayLike, n: int) -> Array:
+    given = np.asarray(value, dtype=float)
+    if given.shape not in ((), (n,)):
+        raise InputError(f"{name}: expected one value, or {n}, not an array of shape {given.shape}")
+    return np.broadcast_to(given, n).copy()

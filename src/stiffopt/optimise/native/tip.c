@@ -1,0 +1,91 @@
+/* The tip of an arm under gravity or loads, one set of pressures after the other. */
+#include <stdint.h>
+
+#include "functions.h"
+#include "rod_calls.h"
+
+#define FOUND 0
+#define BEYOND_LAW 1
+#define NO_EQUILIBRIUM 2
+
+/* Numbers of memory that stiffopt_tip needs. */
+int64_t stiffopt_tip_memory(const Rod *rod) { return linear_size(rod); }
+
+/* A matrix (3, 3) in the tip's axes: R' B R; all row by row but B, which is four blocks of a
+ * matrix (6, 6) by columns. */
+static void block_in_tip(const double *R, const double *B, double *to) {
+    double turned[9];
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            double sum = 0;
+            for (int k = 0; k < 3; k++) sum += B[6 * k + i] * R[3 * k + j];
+            turned[3 * i + j] = sum;
+        }
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) {
+            double sum = 0;
+            for (int k = 0; k < 3; k++) sum += R[3 * k + i] * turned[3 * k + j];
+            to[6 * i + j] = sum;
+        }
+}
+
+/* Pose (4, 4), Jacobian (6, n) and compliance (6, 6) in the tip's axes, row by row. */
+static void write_tip(const Rod *rod, const Linear *l, double *pose) {
+    int64_t n = rod->n;
+    double *jacobian = pose + 16, *compliance = jacobian + 6 * n;
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) pose[4 * i + j] = l->R[3 * i + j];
+        pose[4 * i + 3] = l->r[i], pose[12 + i] = 0;
+    }
+    pose[15] = 1;
+    for (int64_t k = 0; k < n; k++) {
+        const double *twist = l->twist + 6 * (6 + k), *turn = l->turn + 3 * (6 + k);
+        for (int i = 0; i < 3; i++) {
+            double sum = 0;
+            for (int j = 0; j < 3; j++) sum += l->R[3 * j + i] * twist[j];
+            jacobian[n * i + k] = sum, jacobian[n * (3 + i) + k] = turn[i];
+        }
+    }
+    for (int i = 0; i < 2; i++)
+        for (int j = 0; j < 2; j++)
+            block_in_tip(l->R, l->twist + 18 * j + 3 * i, compliance + 18 * i + 3 * j);
+    for (int i = 3; i < 12; i++)
+        if (rod->load[i] != 0) return;
+    /* dead forces only: symmetric but for the integrator's error of about 1e-6 */
+    for (int i = 0; i < 6; i++)
+        for (int j = 0; j < i; j++)
+            compliance[6 * i + j] = compliance[6 * j + i] =
+                (compliance[6 * i + j] + compliance[6 * j + i]) / 2;
+}
+
+/* Stable equilibrium at pressures next to that of a state, which is moved there. */
+static int settle_stably_nearby(const Work *work, const Rod *rod, const double *pressures,
+                                double *state) {
+    double from[rod->n];
+    memcpy(from, state, sizeof from);
+    if (!memcmp(from, pressures, sizeof from)) return 1;
+    Condition start = condition_of(rod, from), end = condition_of(rod, pressures);
+    return follow(work, rod, &start, &end, SHORTEST_NEARBY, 1, state) == 1;
+}
+
+/* The tip at pressures (n): pose, Jacobian and compliance, from a state's equilibrium or, where
+ * the state begins with NaN or that leads nowhere, from rest.  The state is moved along; without
+ * an equilibrium it begins with NaN. */
+int stiffopt_tip(const Rod *rod, const double *pressures, double *state, double *memory,
+                 double *found) {
+    const double *arg[WORK_ARG];
+    double *res[WORK_RES], w[WORK_W + 1], least;
+    casadi_int iw[WORK_IW + 1];
+    Work work = {arg, res, iw, w};
+    arg[0] = pressures, res[0] = &least;
+    if (margin(arg, res, iw, w, 0) || !(least > 0)) return BEYOND_LAW;
+    Linear l = linear_in(rod, memory);
+    if ((!isnan(state[0]) && settle_stably_nearby(&work, rod, pressures, state)) ||
+        settle(&work, rod, pressures, state))
+        if (linearise(&work, rod, state, &l)) {
+            write_tip(rod, &l, found);
+            return FOUND;
+        }
+    state[0] = NAN;
+    return NO_EQUILIBRIUM;
+}

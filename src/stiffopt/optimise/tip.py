@@ -1,0 +1,182 @@
+"""The tip at one set of pressures after the other, fast enough for a control loop.
+
+`Manipulator` gives the same from rest each time and in the CasADi VM, which takes milliseconds
+under gravity or loads.  Here an equilibrium is found from the one before, in machine code.
+"""
+
+import ctypes
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.compiled import CompiledFunction, Library, library
+from stiffopt.model.kinematics import Actuation
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.shape import FreeShape
+from stiffopt.optimise.loaded import LoadedArm, rod_equations
+
+Vector = NDArray[np.float64]
+
+_SOURCES = (str(Path(__file__).with_name("native") / "tip.c"),)
+_FOUND, _BEYOND_LAW, _NO_EQUILIBRIUM = range(3)  # as tip.c has them
+
+_integer, _pointer = ctypes.c_int64, ctypes.c_void_p
+
+
+class TipAt(NamedTuple):
+    """The tip at one set of pressures; the arrays belong to the caller.
+
+    Attributes
+    ----------
+    pose : ndarray (4, 4)
+        In the base frame.
+    jacobian : ndarray (6, n)
+        Twist of the tip in tip axes per pressure: m/Pa above, rad/Pa below.
+    compliance : ndarray (6, 6)
+        In tip axes, linear first, as `Manipulator.tip_compliance`.
+    """
+
+    pose: Vector
+    jacobian: Vector
+    compliance: Vector
+
+
+class _Way(Protocol):
+    """A way to the tip at checked pressures (n,); None where the model has to say why not."""
+
+    def __call__(self, pressures: Vector) -> TipAt | None: ...
+
+
+class TipModel:
+    """Pose, Jacobian and compliance of an arm's tip, one set of pressures after the other.
+
+    With gravity or a load the equilibrium is followed from that of the call before, by the
+    straight way between the pressures as long as the arm is stable on it, and otherwise from
+    rest.  An arm with several equilibria at the same pressures thus stays in its own.
+
+    An instance belongs to one thread; see `copy`.  Calls free the interpreter lock.
+
+    Parameters
+    ----------
+    robot : Manipulator
+        The arm with its gravity and load.
+
+    Attributes
+    ----------
+    is_fast : bool
+        Whether machine code serves the calls; without a compiler the model itself does, from
+        rest each time, which takes milliseconds for a loaded arm.
+
+    Raises
+    ------
+    EquilibriumError
+        If the unpressurised arm falls over under its weight.
+    """
+
+    def __init__(self, robot: Manipulator) -> None:
+        self._robot = robot
+        way = _loaded_way(robot) if robot.is_loaded else _free_way(robot)
+        self.is_fast = way is not None
+        self._way = way or _no_way
+
+    def copy(self) -> "TipModel":
+        """The same arm, from rest, for use in another thread."""
+        return TipModel(self._robot)
+
+    def at(self, pressures: ArrayLike) -> TipAt:
+        """The tip at pressures (n,) in Pa.
+
+        Raises
+        ------
+        PressureError
+            Pressures that are not n finite numbers, or are beyond the strain law.
+        EquilibriumError
+            The loaded arm has no stable equilibrium there.
+        """
+        p = self._robot.checked_pressures(pressures)
+        return self._way(p) or self._by_model(p)
+
+    def _by_model(self, p: Vector) -> TipAt:
+        robot = self._robot
+        return TipAt(robot.tip_pose(p), robot.tip_jacobian(p), robot.tip_compliance(p))
+
+
+def _no_way(pressures: Vector) -> TipAt | None:
+    return None
+
+
+class _FreeTip:
+    """Closed form, in machine code."""
+
+    def __init__(self, function: CompiledFunction) -> None:
+        self._function = function
+
+    def __call__(self, pressures: Vector) -> TipAt | None:
+        pose, jacobian, compliance, margin = self._function(pressures)
+        return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
+
+
+class _LoadedTip:
+    """Equilibria in machine code, each from the one before."""
+
+    def __init__(self, code: Library, robot: Manipulator) -> None:
+        self._arm = LoadedArm(code, robot)
+        self._tip = code.cdll.stiffopt_tip
+        self._tip.argtypes = [_pointer] * 5
+        size = code.cdll.stiffopt_tip_memory
+        size.argtypes, size.restype = [_pointer], _integer
+        n = self._n = robot.n_pressures
+        self._pressures = np.zeros(n)
+        self._state = np.full(self._arm.state_size, np.nan)  # from rest first
+        self._memory = np.zeros(size(self._arm.address))
+        self._found = np.zeros(16 + 6 * n + 36)
+        own = (self._pressures, self._state, self._memory, self._found)
+        self._call = (self._arm.address, *(array.ctypes.data for array in own))
+
+    def __call__(self, pressures: Vector) -> TipAt | None:
+        self._pressures[:] = pressures
+        outcome = self._tip(*self._call)
+        if outcome == _FOUND:
+            found = self._found.copy()
+            jacobian = found[16:-36].reshape(6, self._n)
+            return TipAt(found[:16].reshape(4, 4), jacobian, found[-36:].reshape(6, 6))
+        if outcome == _BEYOND_LAW:
+            return None
+        bars = ", ".join(f"{value / 1e5:.4g}" for value in pressures)
+        raise EquilibriumError(
+            f"no stable equilibrium was found at ({bars}) bar: the arm buckles or falls over on "
+            "the way there; lower the pressures or the load"
+        )
+
+
+def _free_way(robot: Manipulator) -> _Way | None:
+    def make() -> list[ca.Function]:
+        actuation = Actuation.of(robot.description)
+        tip = FreeShape.of(robot.description, actuation)
+        outputs = [tip.transform, tip.jacobian, tip.compliance, ca.mmin(actuation.margin)]
+        outputs = ca.cse([ca.densify(output) for output in outputs])
+        return [ca.Function("tip_at", [actuation.pressures], outputs)]
+
+    code = library(("free tip", robot.description.model_dump_json()), make)
+    return None if code is None else _FreeTip(code.function("tip_at"))
+
+
+def _loaded_way(robot: Manipulator) -> _Way | None:
+    equations = rod_equations(robot)
+    if equations is None:  # more kinds of sections than the code in C tells apart
+        return None
+
+    def make() -> list[ca.Function]:
+        actuation = Actuation.of(robot.description)
+        least = ca.densify(ca.mmin(actuation.margin))
+        margin = ca.Function("margin", [actuation.pressures], [least])
+        needed = [each for each in equations.functions if "adjoint" not in each.name()]
+        return [margin, *needed]
+
+    content = ("loaded tip", robot.description.model_dump_json(), robot.resolution)
+    code = library(content, make, _SOURCES)
+    return None if code is None else _LoadedTip(code, robot)
