@@ -20,7 +20,7 @@ import yaml
 
 from stiffopt.errors import FileError, InputError, Loc, dotted, printable, shown
 
-__all__ = ["Document", "read_document", "to_yaml", "write_file"]
+__all__ = ["Document", "document_of", "read_document", "to_yaml", "write_file"]
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 20
@@ -42,7 +42,20 @@ class Document:
 def read_document(path: str | os.PathLike[str]) -> Document:
     """Read a YAML file as plain data with line numbers; the top level must be a mapping."""
     name = os.fspath(path)
-    return _Composer(name, _read_text(name)).document()
+    return document_of(_read_text(name), name)
+
+
+def document_of(text: str, name: str) -> Document:
+    """Return a YAML text as plain data with line numbers, as `read_document` does with a file.
+
+    Parameters
+    ----------
+    text :
+        What the file would say.
+    name :
+        What errors call it.
+    """
+    return _Composer(name, text).document()
 
 
 def to_yaml(data: Mapping[str, Any]) -> str:

@@ -104,6 +104,13 @@ class CommandError(InputError):
     """A command to the rig is refused; nothing was written to any device."""
 
 
+class ServiceError(StiffoptError, ConnectionError):
+    """The daemon cannot be reached, or does not answer in time.
+
+    Whether it did what it was asked to is not known then.
+    """
+
+
 class SlowWarning(UserWarning):
     """Machine code cannot be made or kept here; the same results come more slowly."""
 

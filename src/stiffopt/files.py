@@ -20,7 +20,7 @@ from stiffopt.errors import FileError, Loc, dotted, shown
 from stiffopt.schema import Schema, explain
 from stiffopt.units import FROM_FILE
 
-__all__ = ["file_text", "line_of", "read_file", "save_file"]
+__all__ = ["file_text", "from_document", "line_of", "read_file", "save_file"]
 
 MAX_MISTAKES = 10  # told at once
 VERSIONS = {"robot": 1, "task": 1, "rig": 1}
@@ -47,7 +47,11 @@ def read_file(path: str | os.PathLike[str], kind: str, model: type[ModelT]) -> M
     FileError
         With the line and the key of the first mistake; all others are listed after it.
     """
-    document = read_document(path)
+    return from_document(read_document(path), kind, model)
+
+
+def from_document(document: Document, kind: str, model: type[ModelT]) -> ModelT:
+    """Validate what was read; as `read_file`, which says more."""
     _check_format(document, kind)
     for loc, value in _walk(document.data):
         if value is None:

@@ -20,6 +20,7 @@ from stiffopt.cli.console import Closed, report_error
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
 from stiffopt.cli.experiment import experiment_app
 from stiffopt.cli.lab import LAB_EPILOG, LAB_HELP, lab
+from stiffopt.cli.log import log_app
 from stiffopt.cli.map import map_app
 from stiffopt.cli.robots import robots
 from stiffopt.cli.solve import HELP, examples, solve
@@ -45,6 +46,7 @@ app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
 app.command("robots")(robots)
 app.add_typer(map_app, name="map")
 app.add_typer(experiment_app, name="experiment")
+app.add_typer(log_app, name="log")
 app.command("calibrate", help=CALIBRATE_HELP, epilog=CALIBRATE_EPILOG)(calibrate)
 app.command("validate", help=VALIDATE_HELP, epilog=VALIDATE_EPILOG)(validate)
 app.command("lab", help=LAB_HELP, epilog=LAB_EPILOG)(lab)

@@ -98,7 +98,7 @@ def solve(
     ] = False,
 ) -> None:
     """Solve task files."""
-    from stiffopt.cli.run import Options, run  # here, so that --help waits for no numerics
+    from stiffopt.cli.solve_run import Options, run  # here, so that --help waits for no numerics
 
     options = Options(as_json, out, plot, pareto, seed, quiet)
     raise typer.Exit(run(tasks, options))

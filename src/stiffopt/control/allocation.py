@@ -14,6 +14,7 @@ to a contradiction and NaN for ever after one NaN, DAQP may give NaN with a flag
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 
 import daqp
@@ -27,6 +28,7 @@ Array = NDArray[np.float64]
 _BAR = 1e5
 _KEPT_NEAR = 0.3e-3  # m/bar; sqrt(epsilon): tip motions cheaper than this are left to the posture
 _SLACK = 1e-7  # bar
+_TRUSTED = 1e-3  # bar; a solver that breaks a bound by more has no answer
 
 
 class QuadraticSolver(ABC):
@@ -151,20 +153,18 @@ class Allocation:
         # a limit may have been tightened below the last pressures: then down as fast as may be
         upper = np.maximum(upper, -self._step)
         lower = np.minimum(lower, upper)
-        rows = tip_jacobian * _BAR
-        reach = np.full(3, max(tip_step, 1e-9))
-        moved = np.abs(rows) @ np.maximum(-upper, 0.0)  # by what it has to come down
-        low, high = np.r_[lower, -reach - moved], np.r_[upper, reach + moved]
-        if not (np.isfinite(H).all() and np.isfinite(f).all() and np.isfinite(rows).all()):
+        rows = np.ascontiguousarray(tip_jacobian * _BAR)
+        # by as much as it has to come down where a limit was tightened, the tip may move faster
+        reach = max(tip_step, 1e-9) + np.abs(rows) @ np.maximum(-upper, 0.0)
+        low, high = np.concatenate([lower, -reach]), np.concatenate([upper, reach])
+        if not math.isfinite(float(H.sum() + f.sum() + rows.sum() + low.sum() + high.sum())):
             return None, nothing
-        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        change = self._solver.solve(H, f, rows, low, high)
+        if change is None or change.shape != last.shape:
             return None, nothing
-        change = self._solver.solve(H, f, np.ascontiguousarray(rows), low, high)
-        if change is None or change.shape != last.shape or not np.isfinite(change).all():
+        bounded = np.minimum(np.maximum(change, lower), upper)
+        if not float(np.abs(bounded - change).max()) <= _TRUSTED:  # nor if it is NaN
             return None, nothing
-        if np.any(change < lower - 1e-3) or np.any(change > upper + 1e-3):
-            return None, nothing
-        change = np.clip(change, lower, upper)
-        p = before + change
+        p = before + bounded
         held = (p <= self._low + _SLACK) | (p >= self._high - _SLACK)
-        return np.clip(p, np.minimum(self._low, before), self._high) * _BAR, held
+        return p * _BAR, held

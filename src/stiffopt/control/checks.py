@@ -37,8 +37,11 @@ def check_rig(rig: Rig, outlet: Outlet, steering: Steering) -> Iterator[str]:
             "limits: those of the gate before the supply are not the supply's; set "
             "safety.max_pressure in the rig file for both"
         )
-    if (limits.high > np.array(robot.pressure_max) * (1 + 1e-9)).any():
+    slack = 1e-9 * (limits.high - limits.low)
+    if (limits.high > np.array(robot.pressure_max) + slack).any():
         yield "limits: the supply may go above the robot's pressure.max; lower safety.max_pressure"
+    if (limits.low < np.array(robot.pressure_min) - slack).any():
+        yield "limits: the supply may go below the robot's pressure.min; take this arm's robot file"
     if not (np.isfinite(rig.slew) & (rig.slew > 0)).all():
         yield (
             "slew: there is no limit to how fast pressures may rise; set safety.max_slew in the "

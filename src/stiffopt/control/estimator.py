@@ -113,6 +113,15 @@ class TipEstimator:
         The arm's first bending mode, or None for an arm that does not swing.
     settings :
         What is believed.
+
+    Attributes
+    ----------
+    omega : float
+        Angular frequency of the swing, in rad/s; infinite while it is not known.
+    across_matrix : ndarray
+        Projection (3, 3) on the plane in which the tip is soft.
+    sample : PoseSample or None
+        The last that was used.
     """
 
     def __init__(
@@ -129,6 +138,7 @@ class TipEstimator:
         self._past.clear()
         self._swing, self._offset, self._turn = np.zeros((2, 3)), np.zeros(3), np.zeros(3)
         self._axis = np.array([0.0, 0.0, 1.0])  # along which the tip is stiffest
+        self.across_matrix = np.diag([1.0, 1.0, 0.0])
         self._lean: Array = np.zeros((3, 3))  # turn of the tip per swing
         self._pressures: Array | None = None
         wide = (0.1, 0.05, 0.1) if self._vibration is not None else (0.0, 0.0, 0.1)
@@ -139,6 +149,7 @@ class TipEstimator:
         self._used_until = -math.inf
         self._ticks = 0
         self.sample: PoseSample | None = None
+        self._first: PoseSample | None = None
         self._noise = s.noise**2
 
     @property
@@ -148,6 +159,11 @@ class TipEstimator:
         return TipEstimate(
             now.static, self._offset, self._turn, self._swing[0].copy(), self._swing[1].copy()
         )
+
+    @property
+    def turn_known(self) -> bool:
+        """Whether the tracker tells orientations."""
+        return self.sample is not None and self.sample.quaternion is not None
 
     @property
     def rotation(self) -> Array:
@@ -187,15 +203,17 @@ class TipEstimator:
         """
         used = rejected = 0
         for sample in samples:
-            if not sample.visible or sample.time <= self._used_until or not self._past:
+            if not sample.visible or not self._past:
                 continue
+            if not self._used_until < sample.time <= self._past[-1].time + self._period:
+                continue  # old, from the future, or of no time at all
             moment = self._moment(sample.time)
             if moment is None:
                 continue
             if self._plausible(sample, moment):
                 self._learn(sample, moment)
                 used += 1
-            else:
+            elif self.sample is not None:
                 rejected += 1
         return Seen(used, rejected, self._used_until)
 
@@ -210,19 +228,14 @@ class TipEstimator:
         linear = rotation @ tip.compliance[:3, :3] @ rotation.T
         softness, axes = np.linalg.eigh(linear)
         self._axis = axes[:, 0]
+        self.across_matrix = np.eye(3) - np.outer(self._axis, self._axis)
         self.omega = self._vibration.frequency(2 / float(softness[1] + softness[2]))
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
         self._lean = turning @ axes[:, 1:] @ np.diag(1 / softness[1:]) @ axes[:, 1:].T
 
     def across(self, vector: Array) -> Array:
         """Part of a vector (3,) in the plane in which the tip is soft."""
-        result: Array = vector - self._axis * float(self._axis @ vector)
-        return result
-
-    @property
-    def across_matrix(self) -> Array:
-        """Projection (3, 3) on that plane."""
-        result: Array = np.eye(3) - np.outer(self._axis, self._axis)
+        result: Array = self.across_matrix @ vector
         return result
 
     def _transition(self, duration: float) -> Array:
@@ -261,16 +274,19 @@ class TipEstimator:
 
     def _plausible(self, sample: PoseSample, moment: _Moment) -> bool:
         """Whether a tip can have got there since it was last seen, or is where it is expected."""
-        if self.sample is None:
-            return True
+        if self.sample is None:  # two must agree before the first is believed
+            before, self._first = self._first, sample
+            return before is not None and self._is_near(sample, before.position, before.time)
         expected = moment.static + moment.swing[0] + moment.offset
-        elapsed = min(sample.time - self.sample.time, _LONGEST_LEAP)
-        reach = self._settings.max_speed * elapsed + 10 * self._settings.noise
-        way = min(
-            float(np.linalg.norm(sample.position - self.sample.position)),
-            float(np.linalg.norm(sample.position - expected)),
+        return self._is_near(sample, self.sample.position, self.sample.time) or self._is_near(
+            sample, expected, self.sample.time
         )
-        return way <= reach
+
+    def _is_near(self, sample: PoseSample, position: Array, since: float) -> bool:
+        """Whether a tip that was at a position (3,) can be where the sample has it."""
+        elapsed = min(sample.time - since, _LONGEST_LEAP)
+        reach = self._settings.max_speed * elapsed + 10 * self._settings.noise
+        return float(np.linalg.norm(sample.position - position)) <= reach
 
     def _learn(self, sample: PoseSample, moment: _Moment) -> None:
         first = not math.isfinite(self._used_until)

@@ -42,11 +42,14 @@ class Gains:
             regulator(omega, damping, max(lag, 1e-3), period, weight) for omega in _FREQUENCIES
         ]
         self._table = np.array(table)
+        self._last: tuple[float, Array] = (-1.0, np.zeros(3))
 
     def at(self, omega: float) -> Array:
         """Gains (3,) for an angular frequency, in rad/s; the last in s."""
-        columns = [np.interp(omega, _FREQUENCIES, column) for column in self._table.T]
-        return np.array(columns)
+        if omega != self._last[0]:
+            columns = [np.interp(omega, _FREQUENCIES, column) for column in self._table.T]
+            self._last = omega, np.array(columns)
+        return self._last[1]
 
 
 def regulator(omega: float, damping: float, lag: float, period: float, weight: float) -> Array:

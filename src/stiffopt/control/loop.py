@@ -70,6 +70,7 @@ class ControlLoop:
         self.events: EventLog = self._machine.events
         self._nothing = _nothing_known(outlet.limits.n)
         self._snapshot = self._pictured(rig.clock.now())
+        self._listeners: list[Callable[[Snapshot], None]] = []
 
     # Requests ------------------------------------------------------------------------------------
 
@@ -178,6 +179,13 @@ class ControlLoop:
         """Return how things stood at the end of the last tick."""
         return self._snapshot
 
+    def listen(self, listener: Callable[[Snapshot], None]) -> None:
+        """Have a function told how things stand at the end of each tick, in the control thread.
+
+        It must not wait. What it raises is an alarm and does not touch control.
+        """
+        self._listeners.append(listener)
+
     def _ask(self, request: Callable[[float], None]) -> None:
         def carry_out() -> None:
             try:
@@ -251,6 +259,11 @@ class ControlLoop:
             if punctuality.overruns_in_a_row:
                 machine.overran(ended, punctuality.overruns_in_a_row)
             self._snapshot = self._pictured(now)
+        for listener in self._listeners:
+            try:
+                listener(self._snapshot)
+            except Exception as error:
+                self.add_alarm("listener", f"unexpected {type(error).__name__}: {error}")
 
     def _let_down(self, due: float) -> None:
         """Tick on until the pressures are let down, for a bounded number of ticks."""

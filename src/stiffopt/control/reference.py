@@ -12,6 +12,8 @@ filter, so that they reach their goal together on a straight way, whatever the t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,8 @@ __all__ = ["Reference"]
 Array = NDArray[np.float64]
 
 _LAGS = 4
+# of the levels, that are the derivatives of the last one in units of the rate
+_DIFFERENCES = np.array([[0, 0, 0, 1, -1], [0, 0, 1, -2, 1], [0, 1, -3, 3, -1]], dtype=float)
 
 
 class Reference:
@@ -38,6 +42,8 @@ class Reference:
     ----------
     rate : float
         a of the four lags, in 1/s.
+    derivatives : ndarray
+        First three derivatives (3, n + m) of the path by time, in s.
     """
 
     def __init__(self, period: float, slew: Array, lag: float, dead_time: float) -> None:
@@ -49,6 +55,7 @@ class Reference:
     def begin(self, values: Array) -> None:
         """Start anew, at rest at pressures and what goes with them (n + m,)."""
         self._levels = np.tile(values, (_LAGS + 1, 1))
+        self.derivatives = np.zeros((_LAGS - 1, len(values)))
 
     @property
     def delay(self) -> float:
@@ -60,27 +67,19 @@ class Reference:
         levels, n = self._levels, self._n
         away = plan - levels[0]
         # the share of the way that the slowest channel can go
-        needed = float(np.max(np.abs(away[:n]) / self._slew)) / self._period
+        needed = float((np.abs(away[:n]) / self._slew).max()) / self._period
         levels[0] += away * min(1.0, 0.9 / needed if needed > 0 else 1.0)
-        share = 1 - np.exp(-self.rate * self._period)
+        a = self.rate
+        share = -math.expm1(-a * self._period)
         for i in range(1, _LAGS + 1):
             levels[i] += share * (levels[i - 1] - levels[i])
+        self.derivatives = np.array([[a], [a**2], [a**3]]) * (_DIFFERENCES @ levels)
 
     @property
     def path(self) -> Array:
         """Where the path is now (n + m,)."""
         value: Array = self._levels[-1]
         return value
-
-    def derivatives(self) -> tuple[Array, Array, Array]:
-        """First three derivatives (n + m,) of the path by time, in s."""
-        _, x1, x2, x3, x4 = self._levels
-        a = self.rate
-        return (
-            a * (x3 - x4),
-            a**2 * (x2 - 2 * x3 + x4),
-            a**3 * (x1 - 3 * x2 + 3 * x3 - x4),
-        )
 
     def command(self, omega: float, damping: float) -> tuple[Array, Array]:
         """Pressures (n,) to command, and pressures (n,) in the chambers when they take effect.
@@ -92,7 +91,7 @@ class Reference:
         damping :
             Its share of critical damping.
         """
-        first, second, third = (d[: self._n] for d in self.derivatives())
+        first, second, third = self.derivatives[:, : self._n]
         c1, c2, tau = 2 * damping / omega, 1 / omega**2, self._lag
         chamber = self.path[: self._n] + c1 * first + c2 * second
         return chamber + tau * (first + c1 * second + c2 * third), chamber

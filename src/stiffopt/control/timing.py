@@ -8,7 +8,7 @@ from stiffopt.control.state import Timing
 
 __all__ = ["LatenessHistogram", "Punctuality"]
 
-_EDGES = tuple(m * 10.0**e for e in range(-6, 0) for m in (1.0, 2.0, 5.0))
+_EDGES = tuple(float(f"{m}e{e}") for e in range(-6, 0) for m in (1, 2, 5))
 """Upper edges from 1 us to 0.5 s, three a decade."""
 
 

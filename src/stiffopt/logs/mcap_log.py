@@ -33,8 +33,8 @@ from stiffopt.logs.reading import log_of_values
 __all__ = ["McapLogWriter", "read_mcap_log", "require_mcap"]
 
 _LOG = "stiffopt-log"
-_NUMBER = {"type": ["number", "null"]}
-_LIST = {"type": ["array", "null"], "items": _NUMBER}
+_NUMBER = {"type": "number"}  # or null; but Foxglove refuses a topic whose schema says so
+_LIST = {"type": "array", "items": _NUMBER}
 _SCHEMAS: dict[str, dict[str, Any]] = {
     "pressure": {"time_s": {"type": "number"}, "commanded_pa": _LIST, "measured_pa": _LIST},
     "pose": {"position_m": _LIST, "quaternion_wxyz": _LIST},

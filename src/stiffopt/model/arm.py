@@ -315,11 +315,23 @@ class Arm:
             raise PressureError("pressures must be finite; got NaN or an infinity")
         return values
 
-    def _single(self, p: ArrayLike) -> Vector:
-        batch, single = self._pressures(p)
-        if not single:
+    def checked_pressures(self, p: ArrayLike) -> Vector:
+        """Finite pressures (n,), one set of them, which the strain law may not allow.
+
+        Raises
+        ------
+        PressureError
+            If they are anything else.
+        """
+        values = self._checked(p)
+        if values.ndim != 1:
             raise PressureError(f"expected one set of pressures ({self.n_pressures},), not a batch")
-        return np.asarray(batch[0])
+        return values
+
+    def _single(self, p: ArrayLike) -> Vector:
+        values = self.checked_pressures(p)
+        self._check_margin(values[np.newaxis], "")
+        return values
 
     def _check_margin(self, batch: Vector, where: str) -> None:
         """Raise where the strain law of a segment breaks down."""

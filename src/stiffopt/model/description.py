@@ -430,6 +430,15 @@ class RobotDescription(Schema):
         """Greatest rate of change of each channel, in Pa/s, or None."""
         return None if self.pressure.slew is None else self._per_channel(self.pressure.slew)
 
+    @property
+    def channel_areas(self) -> tuple[float, ...]:
+        """Area of the chambers that each channel feeds, in m^2: axial force per pressure."""
+        return tuple(
+            len(chambers) * math.pi * segment.chambers.radius**2
+            for segment in self.segments
+            for chambers in segment.channels
+        )
+
     def channel_name(self, index: int) -> str:
         """Return what people call a channel (counted from 0): ``segment 2 channel 1``."""
         for number, segment in enumerate(self.segments, start=1):

@@ -180,11 +180,11 @@ class World:
     def command(self, pressures: ArrayLike) -> None:
         """Give the regulators their set-points (n,), in Pa."""
         with self.lock:
-            self._commanded_at = self.time
             p = np.array(pressures, dtype=float)
             if self.supply.resolution > 0:
                 p = np.round(p / self.supply.resolution) * self.supply.resolution
-            if self.faults["supply"] != "off":
+            if self.faults["supply"] != "off":  # what does not answer does not hear either
+                self._commanded_at = self.time
                 self.set_point[:] = p
 
     def command_channel(self, channel: int, pressure: float) -> None:

@@ -1,0 +1,261 @@
+"""The closed loop on the simulated rig, beside plain integral feedback and the model alone.
+
+    python benchmarks/control.py --cases 20 --seed 1 --jobs 2 --out out/bench/control.json
+
+Each case is another arm (see `control_cases.py`), another start and other targets, and all
+controllers get the same. The controllers see the rig through the interface of every rig; the truth
+is seen by who judges alone. Prints a table, side by side; with ``--calibrated`` the robot file has
+the arm's true values (for what of them it has words), with ``--payload`` the tip carries more than
+it says, with ``--loop`` the whole control loop with its safety gate runs and not the steering
+alone, with ``--paths`` figures-of-eight are followed instead of targets reached. ``--tune`` tries
+the gains of plain integral feedback (take other seeds for it).
+
+What the figures are: settling to 1 mm, for good, over the ideal: the settling time of an open-loop
+step with the arm's own pressures, without inertia, creep and hysteresis ("drawn": random ones;
+"stiffest": the stiffest). Steady: mean error of the last 2 of 10 s. Kept: (k - k_least) /
+(k_most - k_least) of the stiffness along the task's direction, over all pressures that hold the tip
+where it is at the end: by the true model (linear silicone), and by pushing the simulated arm.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from control_baselines import CONTROLLERS, GRID, Gains, IntegralFeedback, MakeSteering
+from control_cases import DYNAMICS, draw_case, draw_path
+from control_runs import Follow, Step, run_case, run_path
+
+STEADY_BAR = {"quasi-static": 1e-4, "full": 3e-4}
+PATH_BAR = {"quasi-static": 1.0, "full": 1.5}  # mm
+
+
+def one_case(
+    seed: int,
+    *,
+    controllers: Sequence[str],
+    dynamics: Sequence[str],
+    targets: int,
+    payload: float,
+    calibrated: bool,
+    paths: bool,
+    in_loop: bool,
+) -> list[Step | Follow]:
+    """All that one arm has to show."""
+    case = draw_case(seed, 1 if paths else targets, payload, calibrated)
+    found: list[Step | Follow] = []
+    path = draw_path(case) if paths else None
+    for kind in dynamics:
+        for name in controllers:
+            if path is not None:
+                found.append(run_path(case, path, name, CONTROLLERS[name], kind, in_loop))
+            else:
+                found += run_case(case, name, CONTROLLERS[name], kind, in_loop)
+    return found
+
+
+def in_processes(work: Any, seeds: Sequence[int], jobs: int) -> Iterable[Any]:
+    """Results of the seeds, as they come."""
+    if jobs <= 1:
+        yield from map(work, seeds)
+        return
+    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
+        yield from pool.imap_unordered(work, seeds)
+
+
+# -- tables ------------------------------------------------------------------------------------
+
+
+def step_rows(steps: Sequence[Step], dynamics: str) -> list[tuple[str, str]]:
+    """Measures and what was found for one controller and kind of plant."""
+
+    def of(name: str, share: Sequence[Step] = steps) -> Any:
+        return np.array([getattr(step, name) for step in share], float)
+
+    settling, steady = of("settling"), of("steady")
+    rows = [
+        ("unstable steps", f"{_percent(of('unstable') > 0)}"),
+        ("at a limit without saying so", f"{_percent(of('unsaid') > 0)}"),
+        (
+            "ticks that broke limits or slew; without an answer",
+            f"{of('broken').sum():.0f}; {of('unsound').sum():.0f}",
+        ),
+        (
+            f"steady error, mm, median / p90 / p95 (bar {1e3 * STEADY_BAR[dynamics]:g})",
+            _quantiles(1e3 * steady, (0.5, 0.9, 0.95), 3),
+        ),
+        ("steady error below the bar", _percent(steady <= STEADY_BAR[dynamics])),
+        ("settled", _percent(np.isfinite(settling))),
+        ("settled within 3 s, 5 s", f"{_percent(settling <= 3)}, {_percent(settling <= 5)}"),
+        ("settling, s, median / p90", _quantiles(settling, (0.5, 0.9), 2)),
+        (
+            "settling over ideal (stiffest), median / p90",
+            _quantiles(settling / of("ideal_stiffest"), (0.5, 0.9), 2),
+        ),
+        (
+            "settling over ideal (drawn), median / p90",
+            _quantiles(settling / of("ideal"), (0.5, 0.9), 2),
+        ),
+        ("overshoot, mm, median / p90", _quantiles(1e3 * of("overshoot"), (0.5, 0.9), 2)),
+        ("motion after 6 s, mm, median / p90", _quantiles(1e3 * of("motion"), (0.5, 0.9), 2)),
+    ]  # fmt: skip
+    for kind in ("axial", "lateral"):
+        mine = [step for step in steps if step.kind == kind]
+        for name, judge in (("kept", "true model"), ("kept_by_arm", "arm itself")):
+            if mine:
+                kept = of(name, mine)
+                words = f"{np.median(kept):.3f} / {_percent(kept >= 0.9)}"
+                rows.append((f"stiffness kept, {kind} ({judge}), median / share from 0.9", words))
+    rows += [
+        ("ticks with a channel at a limit", _percent(of("at_limit"))),
+        ("tick, us, median", f"{1e6 * np.median(of('tick_time')):.0f}"),
+        ("steps", str(len(steps))),
+    ]
+    return rows
+
+
+def path_rows(follows: Sequence[Follow], dynamics: str) -> list[tuple[str, str]]:
+    """The same for figures-of-eight."""
+
+    def of(name: str) -> Any:
+        return np.array([getattr(follow, name) for follow in follows])
+
+    bar = PATH_BAR[dynamics]
+    return [
+        ("RMS, mm, median / p90", _quantiles(1e3 * of("plain"), (0.5, 0.9), 2)),
+        (
+            f"RMS after 70 ms, mm, median / p90 (bar {bar:g})",
+            _quantiles(1e3 * of("known"), (0.5, 0.9), 2),
+        ),
+        ("RMS after the best latency, mm", _quantiles(1e3 * of("best"), (0.5, 0.9), 2)),
+        ("best latency, ms", _quantiles(1e3 * of("latency"), (0.5, 0.9), 0)),
+        ("below the bar", _percent(1e3 * of("known") <= bar)),
+        ("paths", str(len(follows))),
+    ]
+
+
+def _quantiles(values: Any, shares: Sequence[float], digits: int) -> str:
+    found = np.quantile(values, shares, method="inverted_cdf")
+    return " / ".join(f"{v:.{digits}f}" if np.isfinite(v) else "never" for v in found)
+
+
+def _percent(flags: Any) -> str:
+    return f"{100 * np.mean(flags):.3g} %"
+
+
+def tables(found: Sequence[Step | Follow]) -> str:
+    """Markdown: one table for each kind of plant, a column for each controller."""
+    lines = []
+    for dynamics in DYNAMICS:
+        own = [each for each in found if each.dynamics == dynamics]
+        names = list(dict.fromkeys(each.controller for each in own))
+        if not names:
+            continue
+        columns = []
+        for name in names:
+            mine = [each for each in own if each.controller == name]
+            rows: Any = path_rows if isinstance(mine[0], Follow) else step_rows
+            columns.append(dict(rows(mine, dynamics)))
+        lines += [f"### plant: {dynamics}", "", f"| measure | {' | '.join(names)} |"]
+        lines.append("| --- " * (1 + len(names)) + "|")
+        lines += [
+            f"| {what} | {' | '.join(column.get(what, '-') for column in columns)} |"
+            for what in columns[0]
+        ]
+        lines.append("")
+    return "\n".join(lines)
+
+
+# -- tuning ------------------------------------------------------------------------------------
+
+
+def tried(seed: int, *, dynamics: Sequence[str], targets: int) -> list[Step]:
+    """Plain integral feedback with all gains of the grid on one arm."""
+    case = draw_case(seed, targets)
+    found = []
+    for kind in dynamics:
+        for gains in GRID:
+
+            def make(rig: Any, robot: Any, _: str, gains: Gains = gains) -> Any:
+                return IntegralFeedback(rig, robot, gains)
+
+            steering: MakeSteering = make
+            found += run_case(case, f"{gains.gain:g} {gains.slew:g}", steering, kind)
+    return found
+
+
+def tuning_table(found: Sequence[Step]) -> str:
+    """Gains by what they are worth, the best first: settled, then by mean capped settling time."""
+    lines = []
+    for dynamics in DYNAMICS:
+        own = [step for step in found if step.dynamics == dynamics]
+        scored = []
+        for name in dict.fromkeys(step.controller for step in own):
+            mine = [step for step in own if step.controller == name]
+            settling = np.array([step.settling for step in mine])
+            steady = np.array([step.steady for step in mine])
+            unstable = np.mean([step.unstable for step in mine])
+            scored.append((
+                float(np.minimum(settling, 15).mean()), name, float(np.isfinite(settling).mean()),
+                float(1e3 * np.median(steady)), float(unstable),
+            ))  # fmt: skip
+        for score, name, settled, steady_mm, unstable in sorted(scored):
+            lines.append(
+                f"{dynamics:13} gain, slew {name:12} mean settling {score:6.2f} s (15 if never), "
+                f"settled {settled:.0%}, steady {steady_mm:.2f} mm, unstable {unstable:.0%}"
+            )
+    return "\n".join(lines)
+
+
+def main() -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    names = list(CONTROLLERS)
+    parser.add_argument("--cases", type=int, default=10, help="arms")
+    parser.add_argument("--seed", type=int, default=1, help="of the first; the others follow")
+    parser.add_argument("--targets", type=int, default=3, help="of each arm")
+    parser.add_argument("--dynamics", nargs="+", choices=DYNAMICS, default=list(DYNAMICS))
+    parser.add_argument("--controller", nargs="+", choices=names, default=names)
+    parser.add_argument("--payload", type=float, default=0.0, help="unknown mass at the tip, kg")
+    parser.add_argument("--calibrated", action="store_true", help="with the true values")
+    parser.add_argument("--paths", action="store_true", help="figures-of-eight, not targets")
+    parser.add_argument("--loop", action="store_true", help="in the whole control loop")
+    parser.add_argument("--tune", action="store_true", help="gains of plain integral feedback")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--out", type=Path, help="JSON file for all that was measured")
+    given = parser.parse_args()
+    begin = perf_counter()
+    seeds = range(given.seed, given.seed + given.cases)
+    common: dict[str, Any] = {"dynamics": given.dynamics, "targets": given.targets}
+    if given.tune:
+        work: Any = partial(tried, **common)
+    else:
+        work = partial(
+            one_case, **common, controllers=given.controller, payload=given.payload,
+            calibrated=given.calibrated, paths=given.paths, in_loop=given.loop,
+        )  # fmt: skip
+    found: list[Any] = []
+    for part in in_processes(work, seeds, given.jobs):
+        found += part
+        print(f"# seed {part[0].seed} done, {perf_counter() - begin:.0f} s", file=sys.stderr)
+        if given.out is not None:
+            given.out.parent.mkdir(parents=True, exist_ok=True)
+            given.out.write_text(json.dumps([asdict(each) for each in found], default=float))
+    print(tuning_table(found) if given.tune else tables(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

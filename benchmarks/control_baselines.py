@@ -1,0 +1,193 @@
+"""What the closed loop is compared with: the model alone, and plain integral feedback on top.
+
+Both are given the same robot file and goals, and command the stiffest pressures that it promises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from stiffopt.control.steering import Standing, Steering
+    from stiffopt.control.trajectory import Trajectory
+    from stiffopt.model.description import RobotDescription
+    from stiffopt.optimise.target import Target
+    from stiffopt.optimise.task import Task
+    from stiffopt.rig.interface import PoseSample, PressureReading, Rig
+
+Array = NDArray[np.float64]
+
+PERIOD = 0.01  # s
+
+
+MakeSteering = Callable[["Rig", "RobotDescription", str], "Steering"]
+"""From a rig, the robot file to believe in and the dynamics."""
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Of plain integral feedback.
+
+    Attributes
+    ----------
+    gain : share of the error that is taken away per second; 0 for none.
+    slew : of the ramps to new pressures, in Pa/s.
+    """
+
+    gain: float
+    slew: float
+
+
+TUNED = {"quasi-static": Gains(6.4, 5e5), "full": Gains(0.4, 1e5)}
+"""The best of `control.py --tune`."""
+
+GRID = [Gains(g, s) for g in 0.1 * 2.0 ** np.arange(9) for s in (5e5, 2e5, 1e5, 3e4)]
+
+
+class IntegralFeedback:
+    """Pressures of the model, and ``dp = gain J^+ e dt`` at every frame of the tracker."""
+
+    def __init__(self, rig: Rig, robot: RobotDescription, gains: Gains) -> None:
+        from stiffopt import load_robot
+        from stiffopt.optimise.tip import TipModel
+
+        self._limits = rig.supply.limits
+        self._model = load_robot(robot)
+        self._tip = TipModel(self._model)
+        self._gains = gains
+        self._task: Task | None = None
+        self._way: tuple[Array, Array, Array] | None = None
+        self.begin(rig.clock.now())
+
+    def check(self) -> None:
+        """Nothing to do."""
+
+    def begin(self, now: float) -> None:
+        """See `Steering.begin`."""
+        n = self._limits.n
+        self._commanded, self._added = np.zeros(n), np.zeros(n)
+        self._seen = now
+
+    def set_task(self, task: Task) -> None:
+        """Go to where the model has the target."""
+        self._task, self._added = task, np.zeros(self._limits.n)
+        self._follow(np.zeros(1), [task.target])
+
+    def set_target(self, target: Target) -> None:
+        """The same with another target."""
+        self.set_task(self._task.model_copy(update={"target": target}))
+
+    def follow(self, trajectory: Trajectory, now: float) -> None:
+        """Follow the model's pressures for the waypoints; what was added stays."""
+        times = now + np.array([point.time for point in trajectory.waypoints])
+        self._follow(times, [point.target for point in trajectory.waypoints])
+
+    def _follow(self, times: Array, targets: Sequence[Target]) -> None:
+        from stiffopt import PressureSolver
+
+        solver = PressureSolver(self._model, self._task)
+        pressures: list[Array] = []
+        for target in targets:
+            answer = solver.solve(target, guess=pressures[-1] if pressures else None)
+            if answer.pressures is not None:  # the nearest, where none reaches it
+                pressures.append(np.array(answer.pressures))
+            else:
+                pressures.append(pressures[-1] if pressures else self._commanded)
+        places = np.array([target.position for target in targets])
+        self._way = times, np.array(pressures), places
+
+    def _on_way(self, now: float, values: Array) -> Array:
+        times = self._way[0]
+        return np.array([np.interp(now, times, column) for column in values.T])
+
+    def resume(self, now: float) -> None:
+        """Nothing to do: it goes on from what was commanded."""
+
+    def observe(
+        self, now: float, commanded: Array, reading: PressureReading, samples: Sequence[PoseSample]
+    ) -> Any:
+        """Add up what the frames say."""
+        from stiffopt.control.steering import Seen
+
+        self._commanded = commanded.copy()
+        for sample in samples:
+            if not sample.visible:
+                continue
+            since, self._seen = self._seen, sample.time
+            if self._way is None or not self._gains.gain:
+                continue
+            _, pressures, places = self._way
+            model = self._on_way(now, pressures)
+            pose, jacobian, _ = self._tip.at(model)
+            error = self._on_way(sample.time, places) - sample.position
+            part = min(sample.time - since, 0.1) * self._gains.gain
+            change = part * np.linalg.pinv(pose[:3, :3] @ jacobian[:3]) @ error
+            # no wind-up: what the limits take away is not added
+            self._added = self._limits.clamp(model + self._added + change) - model
+        return Seen(len(samples), 0, self._seen)
+
+    def move(self, now: float) -> Any:
+        """Ramp to the sum of both."""
+        from stiffopt.control.steering import Move
+
+        wanted = self._commanded
+        if self._way is not None:
+            wanted = self._limits.clamp(self._on_way(now, self._way[1]) + self._added)
+        most = self._gains.slew * PERIOD
+        self._commanded = self._commanded + np.clip(wanted - self._commanded, -most, most)
+        at_limit = (wanted <= self._limits.low) | (wanted >= self._limits.high)
+        return Move(self._commanded.copy(), sound=True, saturated=at_limit)
+
+    def standing(self, now: float) -> Standing:
+        """It knows of the tip what the model says."""
+        from stiffopt.control.steering import Standing
+
+        n, nowhere, nan = self._limits.n, np.full(3, np.nan), float("nan")
+        tip = self._tip.at(self._commanded).pose[:3, 3]
+        return Standing(
+            plan=np.full(n, nan), tip_position=tip, tip_quaternion=np.full(4, nan),
+            seen_position=nowhere, seen_time=self._seen, target_position=None,
+            target_quaternion=None, target_pointing=None, position_error=nan, angle_error=nan,
+            stiffness=nan, best_stiffness=nan, disturbance=np.zeros(3), wrench=np.full(6, nan),
+            task="",
+        )  # fmt: skip
+
+    def notices(self) -> tuple[Any, ...]:
+        """None."""
+        return ()
+
+    def close(self) -> None:
+        """Nothing to do."""
+
+
+def stiffopt_steering(rig: Rig, robot: RobotDescription, dynamics: str) -> Steering:
+    """The controller that this is all about."""
+    from stiffopt import load_robot
+    from stiffopt.control.controller import Controller
+
+    return Controller(
+        load_robot(robot), rig.supply.limits, rig.slew, period=PERIOD,
+        control=rig.settings.control, safety=rig.settings.safety, swings=dynamics == "full",
+    )  # fmt: skip
+
+
+def integral_steering(rig: Rig, robot: RobotDescription, dynamics: str) -> Steering:
+    """Plain integral feedback, tuned."""
+    return IntegralFeedback(rig, robot, TUNED[dynamics])
+
+
+def open_loop_steering(rig: Rig, robot: RobotDescription, dynamics: str) -> Steering:
+    """The model alone, as fast as may be."""
+    return IntegralFeedback(rig, robot, Gains(0.0, 5e5))
+
+
+CONTROLLERS: dict[str, MakeSteering] = {
+    "stiffopt": stiffopt_steering,
+    "integral": integral_steering,
+    "open-loop": open_loop_steering,
+}

@@ -1,0 +1,340 @@
+"""Arms, targets and paths for the closed loop, drawn from a seed; see `control.py`.
+
+The arm differs from its robot file by what the issue's bars allow, uniformly: modulus by up to
+20 %, channels by up to 5 %, the base by 2 mm and 2 degrees in a random direction. Targets are
+where that very arm comes to rest, creep done and without hysteresis, so they can be reached.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from control_truth import SOFT, STIFF, Choice, Truth
+
+if TYPE_CHECKING:
+    from stiffopt.model.description import RobotDescription
+    from stiffopt.optimise.target import Target
+    from stiffopt.optimise.task import Task
+    from stiffopt.rig.config import RigDescription
+    from stiffopt.rig.simulated.rig import SimulatedRig
+    from stiffopt.rig.simulated.settings import PlantSettings
+
+Array = NDArray[np.float64]
+
+RIG = Path(__file__).resolve().parent.parent / "rig" / "sim-two-segment.yaml"
+DYNAMICS = ("quasi-static", "full")
+DIRECTIONS = {"axial": (0.0, 0.0, 1.0), "lateral": (1.0, 0.0, 0.0)}
+MODULUS, CHANNELS, SHIFT, TILT = 0.20, 0.05, 2e-3, np.deg2rad(2.0)
+STEPS = (0.010, 0.040)  # m between two targets
+UP_TO = 0.8  # of the highest pressures
+NEAR = 1e-3  # m
+CORRECTED = 1e-5  # m; how well the plant's own stiffest pressures reach a target
+MOST_CORRECTIONS = 8
+PUSH = 2e-4  # m
+IDEAL_HOLD, IDEAL_TICK = 1.5, 0.005  # s
+WIDTH, SPEED, WAYPOINTS = 0.040, 0.010, 0.2  # figure-eight: m, m/s, and s between waypoints
+MARGIN = (0.10, 0.85)  # of the pressures: a path that the model of the plant reaches with these
+TRIES = 300
+
+
+@dataclass(frozen=True)
+class Aim:
+    """A target of a case.
+
+    Attributes
+    ----------
+    position : of the tip (3,), in m.
+    kind : name of the direction to be stiff in, see `DIRECTIONS`.
+    drawn, stiffest : the plant's own pressures (n,) for it: those it was drawn with, and the
+        stiffest ones, in Pa.
+    ideal, ideal_stiffest : settling time of an open-loop step there from the aim before, with
+        the one and the other, on the plant without inertia, creep and hysteresis, in s.
+    """
+
+    position: Array
+    kind: str
+    drawn: Array
+    stiffest: Array
+    ideal: float
+    ideal_stiffest: float
+
+
+@dataclass(frozen=True)
+class Case:
+    """One arm and what is asked of it.
+
+    Attributes
+    ----------
+    seed : that all was drawn from.
+    description : of the rig; the dynamics are still open.
+    robot : what the simulated arm was made from.
+    truth : what the model says with the arm's true values.
+    aims : targets, in order.
+    calibrated : whether the controller gets a robot file with the true values.
+    """
+
+    seed: int
+    description: RigDescription
+    robot: RobotDescription
+    truth: Truth
+    aims: tuple[Aim, ...]
+    calibrated: bool = False
+
+    @property
+    def believed(self) -> RobotDescription:
+        """The robot file that the controller gets."""
+        return self.truth.model.description if self.calibrated else self.robot
+
+    def target(self, position: Array) -> Target:
+        """A place in the nominal base frame as a target in the base frame of that file."""
+        from stiffopt import Target
+
+        here = self.truth.in_own_base(position) if self.calibrated else position
+        return Target(position=tuple(here.tolist()))
+
+    def arm(self) -> Arm:
+        """The arm beside any rig."""
+        return Arm(self.robot, self.description.plant, self.truth)
+
+    def task(self, position: Array, kind: str) -> Task:
+        """To go there and be stiff in a direction of the nominal base frame."""
+        from stiffopt import StiffnessGoal, StiffnessMeasure, Task
+
+        axis = np.array(DIRECTIONS[kind])
+        if self.calibrated:
+            axis = self.truth.base[:3, :3].T @ axis
+        goal = StiffnessGoal(maximise=StiffnessMeasure(direction=tuple(axis.tolist())))
+        return Task(robot=self.robot.name, target=self.target(position), stiffness=goal)
+
+    def rig(self, dynamics: str) -> SimulatedRig:
+        """The rig, not opened; its tracker is corrected as the controller's robot file says."""
+        from stiffopt.rig.config import make_rig
+
+        plant = self.description.plant.model_copy(update={"dynamics": dynamics})
+        rig: Any = make_rig(self.description.model_copy(update={"plant": plant}), self.robot)
+        if self.calibrated:
+            known = self.believed.recordings.registration
+            rig.tracker.registration = rig.tracker.registration.then(known)
+        return rig
+
+
+def draw_case(seed: int, targets: int = 3, payload: float = 0.0, calibrated: bool = False) -> Case:
+    """Draw an arm and targets for it.
+
+    Parameters
+    ----------
+    seed : all is drawn from it, also noise.
+    targets : how many; their directions take turns, the first one changes with the seed.
+    payload : mass at the tip that nobody knows of, beside the 20 g of the robot file, in kg.
+    calibrated : see `Case`.
+    """
+    from stiffopt.model.robot_files import load_description
+    from stiffopt.rig.config import load_rig_description
+    from stiffopt.rig.simulated.settings import PlantSettings
+
+    rig = load_rig_description(RIG)
+    robot = load_description(rig.robot)
+    rng = np.random.default_rng([seed, 6])
+    plant = PlantSettings(mismatch=_mismatch(robot, rng), seed=seed, payload=payload)
+    tracker = rig.tracker.model_copy(update={"noise": 5e-5})
+    rig = rig.model_copy(update={"plant": plant, "tracker": tracker})
+    truth = Truth(robot, plant.mismatch, payload)
+    arm = Arm(robot, plant, truth)
+    kinds = list(DIRECTIONS)
+    aims: list[Aim] = []
+    for k, (position, drawn) in enumerate(_places(arm, targets, rng)):
+        kind = kinds[(seed + k) % len(kinds)]
+        stiffest = arm.stiffest(position, DIRECTIONS[kind], drawn, rng)
+        aims.append(Aim(position, kind, drawn, stiffest, np.nan, np.nan))
+    case = Case(seed, rig, robot, truth, tuple(aims), calibrated)
+    drawn = ideal_times(case, [aim.drawn for aim in aims])
+    stiffest = ideal_times(case, [aim.stiffest for aim in aims])
+    timed = [
+        replace(aim, ideal=one, ideal_stiffest=other)
+        for aim, one, other in zip(aims, drawn, stiffest, strict=True)
+    ]
+    return replace(case, aims=tuple(timed))
+
+
+def _mismatch(robot: RobotDescription, rng: np.random.Generator) -> Any:
+    from stiffopt import lie
+    from stiffopt.registration import Placement
+    from stiffopt.rig.simulated.settings import Mismatch
+
+    n, segments = robot.n_pressures, robot.n_segments
+    axes = rng.standard_normal((2, 3))
+    shift, turn = axes / np.linalg.norm(axes, axis=1)[:, None] * [[SHIFT], [TILT]]
+    base = np.asarray(lie.exp(np.concatenate([np.zeros(3), turn])))
+    base[:3, 3] = shift
+    return Mismatch(
+        gain=tuple((1 + rng.uniform(-CHANNELS, CHANNELS, n)).tolist()),
+        offset=(0.0,) * n,
+        angle=(0.0,) * n,
+        modulus=tuple((1 + rng.uniform(-MODULUS, MODULUS, segments)).tolist()),
+        length=(1.0,) * segments,
+        base=Placement.of(base),
+    )
+
+
+class Arm:
+    """The simulated arm beside any rig, at rest, without creep and hysteresis."""
+
+    def __init__(self, robot: RobotDescription, plant: PlantSettings, truth: Truth) -> None:
+        from stiffopt.rig.simulated.plant import Plant
+
+        self.high = np.array(robot.pressure_max)
+        self._plant = Plant(robot, without_memory(plant))
+        self._truth = truth
+
+    def settled(self, pressures: Array) -> Array:
+        """Tip (3,) where it comes to rest."""
+        self._plant.settle(pressures)
+        return np.array(self._plant.tip_pose()[:3, 3])
+
+    def stiffness(self, pressures: Array, direction: tuple[float, ...]) -> float:
+        """Of the tip along a unit vector, in N/m, from small pushes and pulls."""
+        from stiffopt.rig.simulated.settings import Load
+
+        d = np.array(direction)
+        push = PUSH * self._truth.stiffness(pressures, direction)
+        ends = []
+        for sign in (1.0, -1.0):
+            self._plant.settle(pressures, Load(force=tuple((sign * push * d).tolist())))
+            ends.append(self._plant.tip_pose()[:3, 3] @ d)
+        self._plant.set_load(None)
+        return 2 * push / float(ends[0] - ends[1])
+
+    def stiffest(
+        self, position: Array, direction: tuple[float, ...], drawn: Array, rng: np.random.Generator
+    ) -> Array:
+        """Stiffest pressures that bring this arm there: those of the true model, corrected.
+
+        `drawn` are pressures that are known to do so.
+        """
+        goal = position + self._truth.position(drawn) - self.settled(drawn)
+        best = self._truth.choice(drawn, direction, rng, at=goal).stiffest
+        return self._corrected(position, goal, best, direction, STIFF)
+
+    def _corrected(
+        self, place: Array, goal: Array, p: Array, direction: tuple[float, ...], sign: float
+    ) -> Array:
+        """Extreme pressures of the true model for a goal, moved until this arm is at the place."""
+        for _ in range(MOST_CORRECTIONS):
+            error = place - self.settled(p)
+            if np.linalg.norm(error) < CORRECTED:
+                break
+            goal = goal + error
+            moved = self._truth.extreme(goal, direction, p, sign)
+            if moved is None:
+                break
+            p = moved
+        return p
+
+    def kept(self, pressures: Array, direction: tuple[float, ...], choice: Choice) -> float:
+        """Share of the stiffness that this arm can choose, where these pressures hold it.
+
+        Its softest and stiffest pressures are taken to be those of the true model, but for small
+        corrections that bring the tip to the same place; then all three are tried on the arm.
+        """
+        place = self.settled(pressures)
+        ends = []
+        for extreme, sign in ((choice.softest, SOFT), (choice.stiffest, STIFF)):
+            goal = self._truth.position(extreme)
+            p = self._corrected(place, goal, extreme, direction, sign)
+            ends.append(self.stiffness(p, direction))
+        return (self.stiffness(pressures, direction) - ends[0]) / (ends[1] - ends[0])
+
+
+def without_memory(plant: PlantSettings) -> PlantSettings:
+    """The same arm without inertia, creep and hysteresis."""
+    silicone = plant.silicone.model_copy(update={"creep": (), "hysteresis": ()})
+    return plant.model_copy(update={"dynamics": "quasi-static", "silicone": silicone})
+
+
+def _places(arm: Arm, count: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+    """Places of the tip and pressures that bring it there, each a step from the one before."""
+    last = arm.settled(np.zeros(len(arm.high)))
+    found: list[tuple[Array, Array]] = []
+    while len(found) < count:
+        pressures = rng.uniform(0, UP_TO, len(arm.high)) * arm.high
+        position = arm.settled(pressures)
+        if STEPS[0] <= np.linalg.norm(position - last) <= STEPS[1]:
+            found.append((position, pressures))
+            last = position
+    return found
+
+
+def ideal_times(case: Case, pressures: list[Array]) -> list[float]:
+    """Settling times of steps to these pressures, commanded at once, from rest at 0 Pa, in s."""
+    from calibration import settling_time
+    from stiffopt.rig.config import make_rig
+
+    supply = case.description.supply.model_copy(update={"ripple": 0.0})
+    update = {"plant": without_memory(case.description.plant), "supply": supply, "tracker": None}
+    rig: Any = make_rig(case.description.model_copy(update=update), case.robot)
+    times = []
+    ticks = round(IDEAL_HOLD / IDEAL_TICK)
+    with rig:
+        rig.supply.arm()
+        for p in pressures:
+            rig.supply.command(p)
+            tips = []
+            for _ in range(ticks):
+                rig.clock.sleep(IDEAL_TICK)
+                tips.append(rig.world.plant.tip_pose()[:3, 3])
+            errors = np.linalg.norm(np.array(tips) - tips[-1], axis=1)
+            times.append(settling_time(IDEAL_TICK * (1 + np.arange(ticks)), errors, NEAR, 0.1))
+    return times
+
+
+@dataclass(frozen=True)
+class Path8:
+    """A figure-eight at constant speed.
+
+    Attributes
+    ----------
+    times : since its beginning (k,), in s.
+    positions : (k, 3), in m.
+    """
+
+    times: Array
+    positions: Array
+
+    def at(self, times: Array) -> Array:
+        """Places (m, 3) at times (m,); before and after the path its ends."""
+        return np.stack([np.interp(times, self.times, axis) for axis in self.positions.T], axis=1)
+
+
+def draw_path(case: Case) -> Path8:
+    """A horizontal figure-eight that the arm reaches, by its true model and with room to spare.
+
+    Raises
+    ------
+    RuntimeError
+        None was found; draw another case.
+    """
+    rng = np.random.default_rng([case.seed, 8])
+    high = np.array(case.robot.pressure_max)
+    turns = np.linspace(0, 2 * np.pi, 2001)
+    shape = WIDTH / 2 * np.stack([np.sin(turns), np.sin(turns) * np.cos(turns)], axis=1)
+    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(shape, axis=0), axis=1))])
+    times = np.linspace(0, way[-1] / SPEED, round(way[-1] / SPEED / WAYPOINTS) + 1)
+    plane = np.stack([np.interp(times * SPEED, way, axis) for axis in shape.T], axis=1)
+    for _ in range(TRIES):
+        angle = rng.uniform(0, 2 * np.pi)
+        p = rng.uniform(*MARGIN, len(high)) * high
+        axes = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0]])
+        positions = case.truth.position(p) + plane @ axes
+        for position in positions[::4]:
+            reached = case.truth.reach(position, p, *(share * high for share in MARGIN))
+            if reached is None:
+                break
+            p = reached
+        else:
+            return Path8(times, positions)
+    raise RuntimeError(f"no figure-eight was found for seed {case.seed}")

@@ -1,0 +1,149 @@
+"""Time of a tick of the control loop, and of its quadratic program with DAQP and with OSQP.
+
+    python benchmarks/tick.py
+
+Runs two hanging segments on the simulator, on a simulated clock, so that what the simulation itself
+costs is not in a tick; plans are made beside, as in the daemon. The quadratic programs that come up
+are recorded and solved again by both solvers in turns.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RIG = Path(__file__).parent.parent / "rig" / "sim-two-segment.yaml"
+TARGETS = ((0.01, 0.01, 0.195), (-0.015, 0.005, 0.2), (0.0, -0.02, 0.19), (0.01, 0.0, 0.205))
+
+
+class Recorder:
+    """Stands before a solver and keeps the problems."""
+
+    def __init__(self, solver: Any) -> None:
+        self.solver = solver
+        self.problems: list[tuple[np.ndarray, ...]] = []
+
+    def solve(self, *problem: np.ndarray) -> np.ndarray | None:
+        """Keep the problem and pass it on."""
+        self.problems.append(tuple(np.array(part) for part in problem))
+        return self.solver.solve(*problem)
+
+
+def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.ndarray, ...]]]:
+    """Times of ticks in us, and the quadratic programs."""
+    from stiffopt import StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
+    from stiffopt.control.controller import Controller
+    from stiffopt.control.safety import SafetyGate
+    from stiffopt.rig.config import load_rig_description, make_rig
+    from stiffopt.rig.interface import PressureCommand
+
+    description = load_rig_description(RIG)
+    robot = load_robot(description.robot)
+    rig = make_rig(description, robot.description)
+    period = 1 / description.rate
+    control = description.control.model_copy(update={"solver": solver})
+    steering = Controller(
+        robot, rig.supply.limits, rig.slew, period=period, control=control,
+        safety=description.safety, beside=True,
+    )  # fmt: skip
+    gate = SafetyGate(
+        rig.supply, slew=rig.slew, safety=description.safety,
+        force_per_pressure=None, clock=rig.clock,
+    )  # fmt: skip
+    recorder = Recorder(steering._allocation._solver)
+    steering._allocation._solver = recorder
+    steering.check()
+    gate.open()
+    rig.tracker.open()
+    gate.arm()
+    steering.begin(rig.clock.now())
+    goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(0.0, 0.0, 1.0)))
+    task = Task(robot=description.robot, target=Target(position=TARGETS[0]), stiffness=goal)
+    commanded, parts = np.zeros(robot.n_pressures), []
+    reading = gate.read()
+    per_target = seconds / len(TARGETS)
+    for target in TARGETS:
+        position = Target(position=target)
+        if target == TARGETS[0]:
+            steering.set_task(task)
+            steering._ask(0.0)
+            time.sleep(3.0)  # compiles beside
+        else:
+            steering.set_target(position)
+        for _ in range(round(per_target / period)):
+            now = rig.clock.now()
+            a = time.perf_counter()
+            samples = rig.tracker.read()
+            b = time.perf_counter()
+            steering.observe(now, commanded, reading, samples)
+            c = time.perf_counter()
+            move = steering.move(now)
+            d = time.perf_counter()
+            applied = gate.apply(PressureCommand(move.pressures, now))
+            e = time.perf_counter()
+            commanded, reading = applied.pressures, applied.reading
+            parts.append((b - a + e - d, c - b, d - c, e - a))
+            rig.clock.sleep_until(now + period)
+    rig.close()
+    steering.close()
+    times = 1e6 * np.array(parts)[50:]
+    names = ("input and output", "estimator and model", "plan, QP", "tick")
+    result = {}
+    for name, column in zip(names, times.T, strict=True):
+        result[f"{name}: median"] = float(np.median(column))
+        result[f"{name}: p99"] = float(np.quantile(column, 0.99))
+    return result, recorder.problems[50:]
+
+
+def compare(problems: list[tuple[np.ndarray, ...]]) -> dict[str, float]:
+    """Times in us of the solvers on the same problems, in turns, and how far apart they end."""
+    from stiffopt.control.allocation import SOLVERS
+
+    n, m = problems[0][0].shape[0], problems[0][2].shape[0]
+    solvers = {name: kind(n, m) for name, kind in SOLVERS.items()}
+    times: dict[str, list[float]] = {name: [] for name in solvers}
+    apart, lost = [], dict.fromkeys(solvers, 0)
+    for problem in problems:
+        answers = {}
+        for name, solver in solvers.items():
+            begin = time.perf_counter()
+            answers[name] = solver.solve(*problem)
+            times[name].append(1e6 * (time.perf_counter() - begin))
+            lost[name] += answers[name] is None
+        if all(answer is not None for answer in answers.values()):
+            first, *others = answers.values()
+            apart.append(max(float(np.abs(first - other).max()) for other in others))
+    result = {}
+    for name, values in times.items():
+        result[f"{name}: median"] = float(np.median(values))
+        result[f"{name}: p99"] = float(np.quantile(values, 0.99))
+        result[f"{name}: without an answer"] = lost[name]
+    result["apart, mbar, median"] = 1e3 * float(np.median(apart))
+    result["apart, mbar, largest"] = 1e3 * float(np.max(apart))
+    return result
+
+
+def main() -> None:
+    """Run the command."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="simulated")
+    parser.add_argument("--solver", choices=("daqp", "osqp"), default="daqp")
+    parser.add_argument("--out", type=Path, help="JSON file")
+    options = parser.parse_args()
+    ticks, problems = run(options.seconds, options.solver)
+    found = {"tick, us": ticks, "quadratic program, us": compare(problems)}
+    for title, values in found.items():
+        print(title)
+        for name, value in values.items():
+            print(f"  {name:32s} {value:10.3g}")
+    if options.out is not None:
+        options.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

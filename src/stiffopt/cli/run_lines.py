@@ -1,0 +1,127 @@
+"""What `stiffopt run` tells as lines: JSON for programs, plain for people."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import UTC, datetime
+from typing import Any, Protocol
+
+from stiffopt.control.state import Event, Severity, Snapshot, State
+from stiffopt.errors import printable
+
+__all__ = ["Display", "Facts", "Lines"]
+
+_LONGEST = 500  # characters of a text: a pipe takes 4096 bytes at once or not at all
+
+
+class Facts(Protocol):
+    """What does not change while a daemon runs."""
+
+    @property
+    def url(self) -> str | None:
+        """Of the control interface."""
+
+    @property
+    def token_file(self) -> object:
+        """Where the token is."""
+
+    @property
+    def recording(self) -> str | None:
+        """The file that is recorded to."""
+
+    @property
+    def foxglove_port(self) -> int | None:
+        """Where Foxglove can connect."""
+
+
+class Display(Protocol):
+    """Where a run is shown."""
+
+    def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
+        """Show something that is no event of the loop."""
+
+    def begin(self, facts: Facts) -> None:
+        """Show what was started."""
+
+    def update(self, now: Snapshot, events: list[Event]) -> None:
+        """Show how things stand, and what has happened since the last call."""
+
+    def end(self) -> None:
+        """Show no more."""
+
+
+class Lines:
+    """One line for each event and each change of state, on stdout.
+
+    Nothing here waits or fails: a line that nobody takes, because the reader has stopped or is
+    gone, is left out, for the arm is more important.
+
+    Parameters
+    ----------
+    as_json :
+        As an object with ``time`` (of day, UTC), ``level``, ``kind`` and ``text``; else for people.
+    now :
+        Time on the rig's clock, in s.
+    """
+
+    def __init__(self, *, as_json: bool, now: Callable[[], float] = time.monotonic) -> None:
+        self._as_json, self._now = as_json, now
+        self._state: tuple[State, str] | None = None
+
+    def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
+        """Write a line about this moment."""
+        self._line(self._now(), str(severity), kind, text)
+
+    def begin(self, facts: Facts) -> None:
+        """Write where everything is."""
+        found: dict[str, Any] = {
+            "url": facts.url,
+            "token_file": None if facts.token_file is None else str(facts.token_file),
+            "recording": facts.recording,
+            "foxglove_port": facts.foxglove_port,
+        }
+        told = {key: value for key, value in found.items() if value is not None}
+        words = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in told.items())
+        self._line(self._now(), "info", "started", f"runs; {words or 'no ports'}", **told)
+
+    def update(self, now: Snapshot, events: list[Event]) -> None:
+        """Write what is new."""
+        for event in events:
+            self._line(event.time, str(event.severity), event.kind, event.text)
+        state = (now.state, now.reason)
+        if state != self._state:
+            self._state = state
+            text = f"{now.state}: {now.reason}" if now.reason else str(now.state)
+            level = "error" if now.state is State.FAULT else "info"
+            self._line(now.time, level, "state", text, state=str(now.state), reason=now.reason)
+
+    def end(self) -> None:
+        """Nothing is left to be done."""
+
+    def _line(self, moment: float, level: str, kind: str, text: str, **more: Any) -> None:
+        text = text[:_LONGEST]
+        stamp = datetime.fromtimestamp(time.time() - (self._now() - moment), UTC)
+        if self._as_json:
+            when = stamp.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            told = {"time": when, "level": level, "kind": kind, "text": text, **more}
+            line = json.dumps(told, ensure_ascii=True)
+        else:
+            mark = "" if level == "info" else f"{level.upper()}: "
+            clock = stamp.astimezone().strftime("%H:%M:%S")
+            line = f"{clock} {mark}{printable(text)} [{kind}]"
+        self._write(line)
+
+    def _write(self, line: str) -> None:
+        data = f"{line}\n".encode(errors="backslashreplace")
+        with suppress(OSError, ValueError, AttributeError):  # gone, closed, or never there
+            stream = sys.stdout.fileno()
+            ready = select.poll()
+            ready.register(stream, select.POLLOUT)
+            if ready.poll(0):
+                os.write(stream, data)

@@ -1,0 +1,274 @@
+"""The live status of `stiffopt run` on a terminal."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+
+from numpy.typing import ArrayLike
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from stiffopt.cli.console import console_on
+from stiffopt.cli.run_lines import Facts
+from stiffopt.control.state import Event, Severity, Snapshot, State
+from stiffopt.errors import printable
+
+__all__ = ["LiveStatus", "status"]
+
+_COLOURS = {
+    State.UNCONFIGURED: "bold white",
+    State.INACTIVE: "bold cyan",
+    State.ACTIVE: "bold green",
+    State.HOLDING: "bold yellow",
+    State.FAULT: "bold white on red",
+}
+_LEVELS = {Severity.INFO: "dim", Severity.WARNING: "yellow", Severity.ERROR: "bold red"}
+_BAR = 24  # characters of a pressure's bar
+_EVENTS = 6
+_UNKNOWN = "-"
+
+
+class LiveStatus:
+    """Shows how things stand, in one place of the terminal.
+
+    A terminal that is gone or fails is no reason to end: nothing is shown then.
+
+    Parameters
+    ----------
+    name :
+        Of the rig.
+    channels :
+        Names (n,) of the channels.
+    console :
+        Where it is shown.
+    now :
+        Time on the rig's clock, in s.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        channels: Sequence[str],
+        *,
+        console: Console | None = None,
+        now: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._name, self._channels, self._now = name, channels, now
+        self._live = Live(
+            console=console or console_on(), auto_refresh=False, vertical_overflow="crop"
+        )
+        self._events: deque[Event] = deque(maxlen=_EVENTS)
+        self._facts: Facts | None = None
+        self._rate = math.nan
+        self._before: tuple[float, int] | None = None
+        self._works = True
+
+    def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
+        """Show something as an event of this moment."""
+        self._events.append(Event(self._now(), kind, text, severity))
+        if not self._live.is_started:
+            self._attempt(lambda: self._live.console.print(Text(text, _LEVELS[severity])))
+
+    def begin(self, facts: Facts) -> None:
+        """Start to show."""
+        self._facts = facts
+        self._attempt(self._live.start)
+
+    def update(self, now: Snapshot, events: list[Event]) -> None:
+        """Show how things stand now."""
+        self._events.extend(events)
+        if self._before is not None and now.time > self._before[0]:
+            self._rate = (now.timing.ticks - self._before[1]) / (now.time - self._before[0])
+        if self._before is None or now.time > self._before[0] + 1:
+            self._before = (now.time, now.timing.ticks)
+        shown = status(
+            now, self._name, self._channels, self._rate, tuple(self._events), self._facts
+        )
+        self._attempt(lambda: self._live.update(shown, refresh=True))
+
+    def end(self) -> None:
+        """Leave the last status where it is."""
+        self._attempt(self._live.stop)
+
+    def _attempt(self, show: Callable[[], object]) -> None:
+        if not self._works:
+            return
+        try:
+            show()
+        except (OSError, ValueError):
+            self._works = False
+            with suppress(OSError, ValueError):
+                self._live.stop()
+
+
+def status(
+    now: Snapshot,
+    name: str,
+    channels: Sequence[str],
+    rate: float = math.nan,
+    events: Sequence[Event] = (),
+    facts: Facts | None = None,
+) -> RenderableType:
+    """Return how things stand as something that rich shows.
+
+    Parameters
+    ----------
+    now :
+        What is shown.
+    name, channels :
+        Of the rig and of its channels (n,).
+    rate :
+        Of the loop, in Hz; NaN where unknown.
+    events :
+        The latest.
+    facts :
+        Where everything is.
+    """
+    parts: list[RenderableType] = [_headline(now, name), _table(_tip(now))]
+    parts.append(_pressures(now, channels))
+    parts.append(_table([*_stiffness(now), *_loop(now, rate), *_alarms(now)]))
+    parts += [_event(event) for event in events]
+    if facts is not None:
+        parts.append(_table(_places(facts)))
+    return Group(*parts)
+
+
+def _headline(now: Snapshot, name: str) -> Text:
+    text = Text.assemble((f" {str(now.state).upper()} ", _COLOURS[now.state]), f" {name}")
+    if now.task:
+        text.append(f"  {now.task}")
+    if now.reason:
+        text.append(f"  {printable(now.reason)}", "yellow")
+    return text
+
+
+def _tip(now: Snapshot) -> list[tuple[str, RenderableType]]:
+    rows: list[tuple[str, RenderableType]] = [("tip", f"{_triple(now.tip_position, 1e3)} mm")]
+    if now.target_position is not None:
+        free = _triple(now.target_position, 1e3, unknown="free")
+        rows.append(("target", f"{free} mm"))
+    if now.target_pointing is not None:
+        rows.append(("pointing", _triple(now.target_pointing, 1, "{:.3f}")))
+    errors = []
+    if math.isfinite(now.position_error):
+        errors.append(f"{now.position_error * 1e3:.2f} mm")
+    if math.isfinite(now.angle_error):
+        errors.append(f"{math.degrees(now.angle_error):.2f} deg")
+    rows.append(("error", ", ".join(errors) or _UNKNOWN))
+    return rows
+
+
+def _pressures(now: Snapshot, channels: Sequence[str]) -> Table:
+    table = Table.grid(padding=(0, 2, 0, 0))
+    for k, name in enumerate(channels):
+        commanded, high = float(now.commanded[k]), float(now.high[k])
+        measured = float(now.measured[k])
+        marks = []
+        if now.saturated[k]:
+            marks.append("saturated")
+        table.add_row(
+            f"  {name}",
+            _bar(measured if math.isfinite(measured) else commanded, commanded, high),
+            f"{commanded * 1e-5:.3f} bar",
+            "not measured" if math.isnan(measured) else f"is {measured * 1e-5:.3f}",
+            Text(" ".join(marks), "yellow"),
+        )
+    return table
+
+
+def _bar(measured: float, commanded: float, high: float) -> Text:
+    """Return what is measured as a bar against the limit, with a mark where it should be."""
+    share = min(max(measured / high, 0.0), 1.0) if high > 0 else 0.0
+    wanted = min(max(commanded / high, 0.0), 1.0) if high > 0 else 0.0
+    filled, mark = round(share * _BAR), min(round(wanted * _BAR), _BAR - 1)
+    colour = "red" if share > 0.98 else "green"
+    text = Text("█" * filled, colour)
+    text.append("─" * (_BAR - filled), "dim")
+    if abs(share - wanted) > 1 / _BAR:
+        text = Text.assemble(text[:mark], ("┃", "bold"), text[mark + 1 :])
+    return text
+
+
+def _stiffness(now: Snapshot) -> list[tuple[str, RenderableType]]:
+    rows: list[tuple[str, RenderableType]] = []
+    if math.isfinite(now.stiffness):
+        text = f"{now.stiffness:.3g} {now.stiffness_unit}"
+        if math.isfinite(now.best_stiffness) and now.best_stiffness > 0:
+            share = now.stiffness / now.best_stiffness
+            text += f" of {now.best_stiffness:.3g} ({share:.0%})"
+        rows.append(("stiffness", text))
+    force, moment = now.wrench[:3], now.wrench[3:]
+    if all(map(math.isfinite, now.wrench.tolist())):
+        rows.append(
+            ("wrench", f"{_triple(force, 1e3)} mN, {_triple(moment, 1e3, '{:.2f}')} mN m")
+        )
+    return rows
+
+
+def _loop(now: Snapshot, rate: float) -> list[tuple[str, RenderableType]]:
+    timing = now.timing
+    parts = [f"{rate:.1f} Hz" if math.isfinite(rate) else _UNKNOWN]
+    parts.append(f"tick {timing.tick_time * 1e3:.2f} ms")
+    parts.append(f"{timing.overruns} overruns of {timing.ticks}")
+    late = _percentile(timing.lateness, 0.99)
+    if late:
+        parts.append(f"99 % begin within {late}")
+    age = f"{now.seen_age * 1e3:.0f} ms" if math.isfinite(now.seen_age) else "never"
+    return [("loop", ", ".join(parts)), ("seen", f"{age} ago" if age != "never" else age)]
+
+
+def _percentile(lateness: tuple[tuple[float, ...], tuple[int, ...]], share: float) -> str:
+    """Return the edge of the histogram below which a share of all ticks began."""
+    edges, counts = lateness
+    total, so_far = sum(counts), 0
+    if not total:
+        return ""
+    for edge, count in zip(edges, counts, strict=False):
+        so_far += count
+        if so_far >= share * total:
+            return f"{edge * 1e3:g} ms"
+    return "more than 0.5 s"
+
+
+def _alarms(now: Snapshot) -> list[tuple[str, RenderableType]]:
+    return [
+        ("ALARM", Text(f"{printable(alarm.text)} [{alarm.kind}]", "bold red"))
+        for alarm in now.alarms
+    ]
+
+
+def _event(event: Event) -> Text:
+    return Text(f"  {printable(event.text)} [{event.kind}]", _LEVELS[event.severity])
+
+
+def _places(facts: Facts) -> list[tuple[str, RenderableType]]:
+    rows: list[tuple[str, RenderableType]] = []
+    if facts.url is not None:
+        token = "" if facts.token_file is None else f", token in {facts.token_file}"
+        rows.append(("control", f"{facts.url}{token}"))
+    if facts.foxglove_port is not None:
+        rows.append(("Foxglove", f"ws port {facts.foxglove_port}"))
+    if facts.recording is not None:
+        rows.append(("recording", facts.recording))
+    rows.append(("", Text("Ctrl-C lets the pressures down and ends; twice vents at once", "dim")))
+    return rows
+
+
+def _table(rows: Sequence[tuple[str, RenderableType]]) -> Table:
+    table = Table.grid(padding=(0, 2, 0, 0))
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column()
+    for name, value in rows:
+        table.add_row(f"  {name}", value)
+    return table
+
+
+def _triple(values: ArrayLike, factor: float, form: str = "{:.1f}", unknown: str = _UNKNOWN) -> str:
+    numbers = [float(v) * factor for v in values]  # type: ignore[union-attr]
+    return f"({', '.join(form.format(x) if math.isfinite(x) else unknown for x in numbers)})"

@@ -1,0 +1,164 @@
+"""Who may speak to the daemon at all: before any request is read."""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Iterable
+from ipaddress import ip_address
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from stiffopt.daemon.refusals import RefusedError
+from stiffopt.errors import InputError
+
+__all__ = ["MAX_BODY", "Access", "Token"]
+
+MAX_BODY = 1_000_000
+"""Bytes of the longest request."""
+_READING = ("GET", "HEAD")
+
+
+class Token:
+    """The secret of those who may move the arm.
+
+    Raises
+    ------
+    InputError
+        It is empty, or has characters that a header cannot carry.
+    """
+
+    def __init__(self, text: str) -> None:
+        if not text or not all("!" <= c <= "~" for c in text):
+            raise InputError(
+                "the token must not be empty and must consist of letters, digits and signs "
+                "without spaces"
+            )
+        self._secret = text.encode()
+
+    def check(self, given: str | None) -> None:
+        """Raise `RefusedError` unless this is the token; the time it takes tells nothing of it."""
+        if given is None:
+            raise RefusedError(
+                401, "no-token", "this needs the token: 'Authorization: Bearer TOKEN'"
+            )
+        if not hmac.compare_digest(given.encode("utf-8", "replace"), self._secret):
+            raise RefusedError(403, "wrong-token", "that is not this daemon's token")
+
+    def check_headers(self, headers: Headers) -> None:
+        """Raise `RefusedError` unless the token stands in the header Authorization."""
+        given = headers.getlist("authorization")
+        kind, _, secret = given[0].partition(" ") if len(given) == 1 else ("", "", "")
+        self.check(secret.strip() if kind.lower() == "bearer" else None)
+
+
+class Access:
+    """Refuses, in front of the application, what a stranger or a web page may send.
+
+    - A web page that someone on this machine looks at can send requests here. So the request must
+      be addressed to this machine by a name that no stranger's name server can hand out, and if
+      it comes from a page, the page must be the daemon's own.
+    - Whatever is not plain reading needs the token.
+    - A long body is not even collected.
+
+    Parameters
+    ----------
+    app :
+        What is guarded.
+    token :
+        Of those who may move the arm.
+    hosts :
+        Names of this machine beside localhost and addresses in digits.
+    """
+
+    def __init__(self, app: ASGIApp, *, token: Token, hosts: Iterable[str] = ()) -> None:
+        self._app = app
+        self._token = token
+        self._hosts = {"localhost", *(host.lower().rstrip(".") for host in hosts)} - {""}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or refuse it."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        try:
+            self._check_place(headers)
+            if scope["type"] == "http":
+                if scope["method"] not in _READING:
+                    self._token.check_headers(headers)
+                receive = await _collected(receive, headers)
+            elif "authorization" in headers:
+                self._token.check_headers(headers)
+        except RefusedError as refusal:
+            if scope["type"] == "websocket":
+                await send({"type": "websocket.close", "code": 1008})  # before accepting: a 403
+                return
+            challenge = {"WWW-Authenticate": "Bearer"} if refusal.status == 401 else None
+            await JSONResponse(refusal.body, refusal.status, challenge)(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+    def _check_place(self, headers: Headers) -> None:
+        hosts = headers.getlist("host")
+        name = _host_name(hosts[0]) if len(hosts) == 1 else ""
+        if name not in self._hosts and not _is_address(name):
+            raise RefusedError(
+                403,
+                "host",
+                "the header Host names no address of this daemon; use its IP address, localhost, "
+                "or the host of the rig file's service",
+            )
+        for origin in headers.getlist("origin"):
+            scheme, _, place = origin.partition("://")
+            if scheme not in ("http", "https") or place.lower() != hosts[0].lower():
+                raise RefusedError(
+                    403, "origin", "pages of other sites may not speak to this daemon"
+                )
+
+
+def _host_name(host: str) -> str:
+    try:
+        return (urlsplit(f"//{host}").hostname or "").rstrip(".")
+    except ValueError:
+        return ""
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+async def _collected(receive: Receive, headers: Headers) -> Receive:
+    """Read the body, if it is not too long, and return what hands it out again."""
+    too_long = RefusedError(413, "too-long", f"the body is longer than {MAX_BODY} bytes")
+    given = headers.get("content-length", "0")
+    if given.isdecimal() and (len(given) > 12 or int(given) > MAX_BODY):
+        raise too_long
+    parts: list[bytes] = []
+    size = 0
+    more = True
+    while more:
+        message = await receive()
+        if message["type"] != "http.request":  # the client is gone
+            return _again(message, receive)
+        parts.append(message.get("body", b""))
+        size += len(parts[-1])
+        if size > MAX_BODY:
+            raise too_long
+        more = message.get("more_body", False)
+    return _again({"type": "http.request", "body": b"".join(parts), "more_body": False}, receive)
+
+
+def _again(first: Message, receive: Receive) -> Receive:
+    messages = [first]
+
+    async def replayed() -> Message:
+        return messages.pop() if messages else await receive()
+
+    return replayed

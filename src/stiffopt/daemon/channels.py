@@ -1,0 +1,276 @@
+"""What is logged: a snapshot of the loop as messages, the same live and in the recording.
+
+Where Foxglove has a message of its own it is used, so that its panels show it without set-up:
+frames, the arm as a line, events as a log. Everything else is JSON with a schema.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.state import Event, Severity, Snapshot
+from stiffopt.logs.run_schemas import STATES, missing_left_out, plain, plain_list, run_schemas
+from stiffopt.rig.interface import PoseSample
+
+__all__ = ["Channels"]
+
+Array = NDArray[np.float64]
+
+BASE, TIP, TARGET, SEEN = "base", "tip", "target", "tip_seen"
+"""Names of the frames; all are children of the base."""
+
+_S, _PA, _M, _TURN = 6, 1, 7, 7  # decimals of s, Pa, m, and of what has no unit
+_ENCODER = json.JSONEncoder(allow_nan=False, check_circular=False, separators=(",", ":"))
+_TARGET_SIZE = 0.004  # m
+_ARM_COLOUR, _TARGET_COLOUR = (0.31, 0.47, 0.65, 0.7), (0.84, 0.15, 0.16, 0.8)
+
+
+class Channels:
+    """The topics of a daemon.
+
+    Parameters
+    ----------
+    context :
+        Of foxglove; whoever listens there gets all that is logged.
+    offset :
+        Nanoseconds since 1970 at the time 0 of the rig's clock. It stays, whatever becomes of the
+        wall clock.
+    thickness :
+        Of the arm as it is drawn, in m.
+    """
+
+    def __init__(self, context: Any, offset: int, thickness: float) -> None:
+        from foxglove import Channel
+        from foxglove.channels import FrameTransformsChannel, LogChannel, SceneUpdateChannel
+
+        self._offset, self._thickness = offset, thickness
+        self._seen: PoseSample | None = None
+        self._json = {
+            topic: Channel(topic, schema=schema, context=context)
+            for topic, schema in run_schemas().items()
+        }
+        self._frames = FrameTransformsChannel("/tf", context=context)
+        self._scene = SceneUpdateChannel("/scene", context=context)
+        self._log = LogChannel("/log", context=context)
+
+    def close(self) -> None:
+        """Withdraw the topics."""
+        channels: list[Any] = [*self._json.values(), self._frames, self._scene, self._log]
+        for channel in channels:
+            channel.close()
+
+    def nanoseconds(self, time: float) -> int:
+        """Return the date, in ns since 1970, of a time on the rig's clock."""
+        return self._offset + round(time * 1e9)
+
+    def log_tick(self, now: Snapshot) -> None:
+        """Log what every tick has: pressures and the tip."""
+        self._say(
+            "/pressure",
+            now.time,
+            measured_time_s=plain(now.measured_time, _S),
+            commanded_pa=_list(now.commanded, _PA),
+            measured_pa=_list(now.measured, _PA),
+            plan_pa=_list(now.plan, _PA),
+            saturated=now.saturated.tolist(),
+        )
+        self._say(
+            "/tip",
+            now.time,
+            position_m=_list(now.tip_position, _M),
+            quaternion_wxyz=_list(now.tip_quaternion, _TURN),
+            target_position_m=_list(now.target_position, _M),
+            target_quaternion_wxyz=_list(now.target_quaternion, _TURN),
+            target_pointing=_list(now.target_pointing, _TURN),
+            position_error_m=plain(now.position_error, _M),
+            angle_error_rad=plain(now.angle_error, _TURN),
+            stiffness=plain(now.stiffness, 4),
+            best_stiffness=plain(now.best_stiffness, 4),
+            disturbance_m=_list(now.disturbance, _M),
+            wrench=_list(now.wrench, 5),
+            seen_age_s=plain(now.seen_age, _S),
+        )
+
+    def log_samples(self, now: Snapshot) -> None:
+        """Log what the tracker has seen; times are those of capture."""
+        for sample in now.samples:
+            if sample.visible and not now.rejected:
+                self._seen = sample
+            self._say(
+                "/tracker",
+                sample.time,
+                at=now.time,
+                received_s=plain(sample.received, _S),
+                frame=sample.frame,
+                position_m=_list(sample.position, _M),
+                quaternion_wxyz=_list(sample.quaternion, _TURN),
+                doubted=now.rejected > 0,
+            )
+
+    def log_state(self, now: Snapshot) -> None:
+        """Log what changes seldom: state, alarms and limits."""
+        self._say(
+            "/state",
+            now.time,
+            state=str(now.state),
+            state_number=STATES.index(now.state),
+            reason=now.reason,
+            task=now.task,
+            alarms=[
+                {"kind": a.kind, "text": a.text, "since_s": plain(a.since, _S)} for a in now.alarms
+            ],
+        )
+        self._say(
+            "/limits",
+            now.time,
+            low_pa=_list(now.low, _PA),
+            high_pa=_list(now.high, _PA),
+        )
+
+    def log_timing(self, now: Snapshot, dropped: int) -> None:
+        """Log how punctual the loop is, and how many snapshots never got here."""
+        edges, counts = now.timing.lateness
+        self._say(
+            "/timing",
+            now.time,
+            ticks=now.timing.ticks,
+            overruns=now.timing.overruns,
+            tick_time_s=plain(now.timing.tick_time, 7),
+            lateness_edges_s=list(edges),
+            lateness_counts=list(counts),
+            dropped=dropped,
+        )
+
+    def log_event(self, event: Event) -> None:
+        """Log something that happened, for people and for programs."""
+        from foxglove.messages import Log, LogLevel
+
+        moment = self.nanoseconds(event.time)
+        level = {
+            Severity.INFO: LogLevel.Info,
+            Severity.WARNING: LogLevel.Warning,
+            Severity.ERROR: LogLevel.Error,
+        }[event.severity]
+        message = Log(
+            timestamp=_timestamp(moment), level=level, message=event.text, name=event.kind
+        )
+        self._log.log(message, log_time=moment)
+        self._say(
+            "/event",
+            event.time,
+            kind=event.kind,
+            text=event.text,
+            severity=str(event.severity),
+        )
+
+    def log_arm(self, now: Snapshot, poses: Array) -> None:
+        """Log the arm's shape from poses (m, 4, 4) along it, and the target."""
+        from foxglove.messages import LinePrimitive, Point3, SceneUpdate
+
+        moment = self.nanoseconds(now.time)
+        points = [Point3(x=x, y=y, z=z) for x, y, z in poses[:, :3, 3].tolist()]
+        line = LinePrimitive(points=points, thickness=self._thickness, color=_colour(_ARM_COLOUR))
+        entities = [_entity(moment, "arm", lines=[line])]
+        where = _target_place(now)
+        if where is not None:
+            entities.append(_ball(moment, where))
+        self._scene.log(SceneUpdate(entities=entities), log_time=moment)
+
+    def log_frames(self, now: Snapshot) -> None:
+        """Log where tip and target are, and where the tip was last seen."""
+        from foxglove.messages import FrameTransforms
+
+        moment = self.nanoseconds(now.time)
+        frames = [_frame(moment, TIP, now.tip_position, now.tip_quaternion)]
+        where = _target_place(now)
+        if where is not None:
+            frames.append(_frame(moment, TARGET, where, _target_turn(now)))
+        if self._seen is not None:
+            captured = self.nanoseconds(self._seen.time)
+            frames.append(_frame(captured, SEEN, self._seen.position, self._seen.quaternion))
+        known = [frame for frame in frames if frame is not None]
+        if known:
+            self._frames.log(FrameTransforms(transforms=known), log_time=moment)
+
+    def _say(self, topic: str, time: float, *, at: float | None = None, **fields: Any) -> None:
+        """Log a message of a topic whose time is `time`; it comes in the tick at `at`."""
+        message = missing_left_out({"time_s": round(time, _S), **fields})
+        data = _ENCODER.encode(message).encode()
+        self._json[topic].log(data, log_time=self.nanoseconds(time if at is None else at))
+
+
+def _list(values: Array | None, digits: int) -> Any:
+    return None if values is None else plain_list(values.tolist(), digits)
+
+
+def _timestamp(moment: int) -> Any:
+    from foxglove.messages import Timestamp
+
+    return Timestamp(moment // 10**9, moment % 10**9)
+
+
+def _colour(parts: Sequence[float]) -> Any:
+    from foxglove.messages import Color
+
+    red, green, blue, opacity = parts
+    return Color(r=red, g=green, b=blue, a=opacity)
+
+
+def _frame(moment: int, name: str, position: Array, quaternion: Array | None) -> Any:
+    """Return a frame in the base, or None while it is not known where it is."""
+    from foxglove.messages import FrameTransform, Quaternion, Vector3
+
+    w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion.tolist()
+    if not np.isfinite([*position.tolist(), w, x, y, z]).all():
+        return None
+    a, b, c = position.tolist()
+    return FrameTransform(
+        timestamp=_timestamp(moment),
+        parent_frame_id=BASE,
+        child_frame_id=name,
+        translation=Vector3(x=a, y=b, z=c),
+        rotation=Quaternion(x=x, y=y, z=z, w=w),
+    )
+
+
+def _ball(moment: int, where: Array) -> Any:
+    from foxglove.messages import Pose, Quaternion, SpherePrimitive, Vector3
+
+    x, y, z = where.tolist()
+    place = Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=0, y=0, z=0, w=1))
+    size = Vector3(x=_TARGET_SIZE, y=_TARGET_SIZE, z=_TARGET_SIZE)
+    ball = SpherePrimitive(pose=place, size=size, color=_colour(_TARGET_COLOUR))
+    return _entity(moment, TARGET, spheres=[ball])
+
+
+def _entity(moment: int, name: str, **shapes: Any) -> Any:
+    """Return something to draw in the base frame, which is gone when it is not drawn again."""
+    from foxglove.messages import Duration, SceneEntity
+
+    stamp, soon = _timestamp(moment), Duration(1)
+    return SceneEntity(timestamp=stamp, frame_id=BASE, id=name, lifetime=soon, **shapes)
+
+
+def _target_place(now: Snapshot) -> Array | None:
+    """Return where the target is (3,), with the tip's coordinate along free axes."""
+    if now.target_position is None:
+        return None
+    where: Array = np.where(np.isfinite(now.target_position), now.target_position, now.tip_position)
+    return where if np.isfinite(where).all() else None
+
+
+def _target_turn(now: Snapshot) -> Array | None:
+    """Return the target's orientation (4,): that which is asked for, or the least turn to it."""
+    if now.target_quaternion is not None:
+        return now.target_quaternion
+    if now.target_pointing is None:
+        return None
+    x, y, z = (now.target_pointing / np.linalg.norm(now.target_pointing)).tolist()
+    half = np.array([1 + z, -y, x, 0.0])  # turns the z axis there
+    length = float(np.linalg.norm(half))
+    return half / length if length > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])

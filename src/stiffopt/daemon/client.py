@@ -1,0 +1,367 @@
+"""The daemon's client: the control loop's commands, over the control interface."""
+
+from __future__ import annotations
+
+import math
+import os
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+from numpy.typing import ArrayLike
+
+from stiffopt.control.state import Event, Snapshot, State
+from stiffopt.control.trajectory import Trajectory, Waypoint
+from stiffopt.daemon.client_stream import ClientStream
+from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
+from stiffopt.daemon.reports import EventsReport, RobotReport, StateReport
+from stiffopt.daemon.wire import Wire
+from stiffopt.errors import CommandError, InputError, ServiceError, StiffoptError
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task, load_task
+
+__all__ = ["Client"]
+
+_TOKEN = "STIFFOPT_TOKEN"
+_POLL = 0.05  # s between two looks at the state
+_STEADY = 0.3  # s for which an arm that has settled stays near
+
+
+class Client:
+    """Speaks to a running daemon.
+
+    ::
+
+        with Client(name="planner") as client:
+            client.take_control()
+            client.arm()
+            client.set_target(position=[0, 0, 0.2])
+            client.wait_until_settled(1e-3, timeout=10)
+            client.disarm()
+
+    Control is lost, and the arm held, when the daemon does not hear from the client for a time.
+    With the heartbeat ``"automatic"``, a thread of the client sees to that as long as the thread
+    that took control lives. That proves that the process runs, not that the program in it makes
+    any progress: a planner that hangs keeps control. With ``"manual"``, only what the program does
+    counts: commands, `renew`, what it sends to a stream, `wait_until_settled`; take that for
+    anything that moves the arm without a person beside it.
+
+    A `with` block that ends by an exception holds the arm where it is; one that ends well gives
+    control back and lets the arm go on with what it does. Methods may be called from any thread.
+
+    Parameters
+    ----------
+    url :
+        Of the daemon.
+    token :
+        The token itself, or the path of the file that it stands in; None: that of the environment
+        variable STIFFOPT_TOKEN, which may be either too. Reading needs none.
+    name :
+        For the people who find that control is taken.
+    heartbeat :
+        Who sees to it that the client is heard, see above.
+    timeout :
+        Seconds after which an answer is given up.
+
+    Raises
+    ------
+    InputError
+        The URL is none, or the file of the token cannot be read.
+    MissingExtraError
+        httpx is not installed.
+    """
+
+    def __init__(
+        self,
+        url: str = "http://127.0.0.1:8470",
+        token: str | os.PathLike[str] | None = None,
+        *,
+        name: str = "client",
+        heartbeat: Literal["automatic", "manual"] = "automatic",
+        timeout: float = 15.0,
+    ) -> None:
+        if heartbeat not in ("automatic", "manual"):
+            raise InputError(f"heartbeat must be 'automatic' or 'manual', not {heartbeat!r}")
+        self.name = name
+        self.heartbeat = heartbeat
+        self._wire = Wire(url, _token(os.environ.get(_TOKEN) if token is None else token), timeout)
+        self._beat: threading.Thread | None = None
+        self._enough = threading.Event()
+
+    def close(self) -> None:
+        """Give control back, if this client has it, and disconnect."""
+        with suppress(StiffoptError):
+            self.release()
+        self._wire.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if kind is not None and self.in_control:
+            with suppress(StiffoptError):
+                self.hold(f"the client ended by {kind.__name__}")
+        self.close()
+
+    # Reading ------------------------------------------------------------------------------------
+
+    def state(self) -> Snapshot:
+        """Return how things stand."""
+        return StateReport.model_validate(self._wire.ask("GET", "state")).snapshot()
+
+    def events(self, since: int = 0) -> tuple[list[Event], int]:
+        """Return what has happened since an index, and the index after that."""
+        answer = self._wire.ask("GET", "events", query={"since": since})
+        report = EventsReport.model_validate(answer)
+        return [event.event() for event in report.events], report.next
+
+    def robot(self) -> RobotReport:
+        """Return what arm there is."""
+        return RobotReport.model_validate(self._wire.ask("GET", "robot"))
+
+    def wait_until_settled(
+        self, position_tolerance: float, timeout: float, *, angle_tolerance: float = math.inf
+    ) -> Snapshot:
+        """Wait until the tip is, and stays, where it shall be.
+
+        Parameters
+        ----------
+        position_tolerance, angle_tolerance :
+            How near, in m and rad, it must be for 0.3 s without a break.
+        timeout :
+            In s.
+
+        Returns
+        -------
+        Snapshot
+            The last state.
+
+        Raises
+        ------
+        CommandError
+            The arm is not being moved (any more), or nothing is asked of the tip.
+        ServiceError
+            It did not settle in time.
+        """
+        end = time.monotonic() + timeout
+        near_since = math.inf
+        while True:
+            if self.in_control and self.heartbeat == "manual":
+                self.renew()
+            now = time.monotonic()
+            state = self.state()
+            if state.state is not State.ACTIVE:
+                reason = f": {state.reason}" if state.reason else ""
+                raise CommandError(f"the arm does not move; it is {state.state}{reason}")
+            errors = (state.position_error, state.angle_error)
+            if all(map(math.isnan, errors)):
+                raise CommandError("nothing is asked of the tip; set a target first")
+            limits = (position_tolerance, angle_tolerance)
+            near = not any(e > limit for e, limit in zip(errors, limits, strict=True))
+            near_since = min(near_since, now) if near else math.inf
+            if now - near_since >= _STEADY:
+                return state
+            if now > end:
+                raise ServiceError(
+                    f"the tip did not settle within {timeout:g} s; its error is "
+                    f"{state.position_error * 1e3:.3g} mm"
+                )
+            time.sleep(_POLL)
+
+    # Control ------------------------------------------------------------------------------------
+
+    @property
+    def in_control(self) -> bool:
+        """Whether this client has taken control and does not know that it has lost it."""
+        return self._wire.lease is not None
+
+    def take_control(self) -> None:
+        """Take control of the arm.
+
+        Raises
+        ------
+        CommandError
+            Another client has it.
+        """
+        if self.in_control:
+            return
+        grant = self._wire.ask("POST", "lease", body={"client": self.name})
+        self._wire.lease = str(grant["lease"])
+        if self.heartbeat == "automatic":
+            self._enough = threading.Event()
+            self._beat = threading.Thread(
+                target=self._keep_control,
+                args=(threading.current_thread(), float(grant["renew_every_s"]), self._enough),
+                name="heartbeat",
+                daemon=True,
+            )
+            self._beat.start()
+
+    def release(self) -> None:
+        """Give control back; the arm goes on with what it does."""
+        self._enough.set()
+        if self.in_control:
+            try:
+                self._wire.ask("DELETE", "lease")
+            finally:
+                self._wire.lease = None
+
+    def renew(self) -> None:
+        """Be heard: keep control for another while."""
+        self._wire.ask("POST", "lease/renew")
+
+    def _keep_control(
+        self, owner: threading.Thread, period: float, enough: threading.Event
+    ) -> None:
+        while not enough.wait(period) and owner.is_alive():
+            try:
+                self._wire.ask("POST", "lease/renew", timeout=4 * period)
+            except ServiceError:
+                continue  # perhaps it answers the next time
+            except StiffoptError:
+                return  # control is lost; the next command says so
+
+    # Commands -----------------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """Check everything and put the arm under control."""
+        self._wire.ask("POST", "arm")
+
+    def disarm(self) -> None:
+        """Let the pressures down slowly, then vent."""
+        self._wire.ask("POST", "disarm")
+
+    def set_task(
+        self,
+        task: Task | str | os.PathLike[str] | None = None,
+        *,
+        position: Sequence[float | None] | None = None,
+        pointing: ArrayLike | None = None,
+        orientation: ArrayLike | None = None,
+        **rest: Any,
+    ) -> None:
+        """Pursue a task.
+
+        Parameters
+        ----------
+        task :
+            A `Task`, or the path of a task file on this machine. Its robot must be the daemon's.
+        position, pointing, orientation :
+            Instead of a task: its target, see `set_target`.
+        rest :
+            Instead of a task: `tolerance`, `stiffness`, `load` and `pressure` of it.
+        """
+        robot = None
+        if task is not None:
+            if rest or not (position is pointing is orientation is None):
+                raise InputError("give a task or its parts, not both")
+            task = task if isinstance(task, Task) else load_task(task)
+            robot = task.resolve_robot().name
+        else:
+            tolerance = {"tolerance": rest.pop("tolerance")} if "tolerance" in rest else {}
+            target = _target(position, pointing, orientation, **tolerance)
+            task = Task(robot="robot", target=target, **rest)  # the one that there is
+        body = TaskMessage.of(task, robot).model_dump()
+        self._wire.ask("POST", "task", body=body)
+
+    def set_target(
+        self,
+        target: Target | None = None,
+        *,
+        position: Sequence[float | None] | None = None,
+        pointing: ArrayLike | None = None,
+        orientation: ArrayLike | None = None,
+    ) -> None:
+        """Go to another target, with the stiffness goal and the limits of the task.
+
+        Parameters
+        ----------
+        target :
+            A `Target`; or instead
+        position :
+            x, y, z in m, in the base frame; None for an axis that is free.
+        pointing, orientation :
+            Direction of the tip, or its quaternion (w, x, y, z).
+        """
+        target = target or _target(position, pointing, orientation)
+        self._wire.ask("POST", "target", body=TargetMessage.of(target).model_dump())
+
+    def follow_trajectory(
+        self,
+        trajectory: Trajectory | None = None,
+        *,
+        times: Sequence[float] | None = None,
+        positions: ArrayLike | Sequence[Sequence[float | None]] | None = None,
+    ) -> None:
+        """Go through waypoints; time begins now.
+
+        Parameters
+        ----------
+        trajectory :
+            A `Trajectory`; or instead
+        times, positions :
+            (k,) in s and (k, 3) in m.
+        """
+        if trajectory is None:
+            trajectory = _trajectory(times, positions)
+        body = TrajectoryMessage.of(trajectory).model_dump()
+        self._wire.ask("POST", "trajectory", body=body)
+
+    def hold(self, reason: str = "asked to") -> None:
+        """Keep the pressures as they are."""
+        self._wire.ask("POST", "hold", body={"reason": reason[:200] or "asked to"})
+
+    def vent(self) -> None:
+        """Let all pressure out at once; needs the token, not control."""
+        self._wire.ask("POST", "vent")
+
+    def reset(self) -> None:
+        """Leave the state fault; the arm stays vented."""
+        self._wire.ask("POST", "reset")
+
+    def stream(self, rate: float = 20.0) -> ClientStream:
+        """Return a stream of states and targets, to be used in a `with` block.
+
+        Parameters
+        ----------
+        rate :
+            Of the states, in Hz; 0 for none.
+        """
+        return ClientStream(self._wire, rate)
+
+
+def _token(given: str | os.PathLike[str] | None) -> str | None:
+    """Return the token that is given, or that stands in the file that is."""
+    if given is None or (isinstance(given, str) and not given):
+        return None
+    with suppress(OSError, ValueError):
+        return Path(given).read_text(encoding="utf-8").strip()
+    if not isinstance(given, str) or os.sep in given:
+        raise InputError(f"the token's file '{os.fspath(given)}' cannot be read")
+    return given
+
+
+def _target(position: Any, pointing: Any, orientation: Any, **tolerance: Any) -> Target:
+    return Target(position=position, pointing=pointing, orientation=orientation, **tolerance)
+
+
+def _trajectory(times: Any, positions: Any) -> Trajectory:
+    if times is None or positions is None:
+        raise InputError("give a trajectory, or times and positions")
+    if len(times) != len(positions):
+        raise InputError(f"there are {len(times)} times and {len(positions)} positions")
+    return Trajectory(
+        waypoints=[
+            Waypoint(time=float(time), target=Target(position=position))
+            for time, position in zip(times, positions, strict=True)
+        ]
+    )

@@ -1,0 +1,417 @@
+"""The daemon: the control loop of a rig, and everything around it, in one piece."""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.controller import Controller
+from stiffopt.control.lifecycle import ARMED
+from stiffopt.control.loop import ControlLoop
+from stiffopt.control.realtime import real_time, tidy
+from stiffopt.control.state import Severity, Snapshot, State
+from stiffopt.daemon.keeper import Keeper
+from stiffopt.daemon.link import guarded_rig
+from stiffopt.daemon.notify import ServiceManager
+from stiffopt.daemon.secret import Secret
+from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
+from stiffopt.files import file_text
+from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.robot_files import robot_path
+from stiffopt.optimise.task import Task, load_task
+from stiffopt.rig.config import RigDescription, load_rig_description
+
+if TYPE_CHECKING:
+    from stiffopt.daemon.serving import Server
+    from stiffopt.daemon.telemetry import Telemetry
+
+__all__ = ["Daemon"]
+
+Array = NDArray[np.float64]
+
+_SHAPE = 12  # poses along the arm that Foxglove draws
+_SHARE = 0.02  # of the time, which the control thread needs too
+_TIDY = 10.0  # s between collections of garbage
+_ARMING = 10.0  # s in which an arm that was just connected must become ready
+_AGAIN = 0.1  # s between attempts to arm
+_MARGIN = 7.0  # s, beyond the ramp, in which the loop must have ended: devices answer within 5 s
+
+
+class Daemon:
+    """Runs the closed loop of a rig: guard, control, telemetry and the control interface.
+
+    Nothing is connected or started before `start`; it is vented and inactive then, until `arm` is
+    called here or by a client. `stop`, or the end of a `with` block, lets the pressures down,
+    vents, and ends everything.
+
+    Parameters
+    ----------
+    rig :
+        The rig file.
+    service :
+        Whether ports are opened: the control interface, and Foxglove.
+    log_folder :
+        Where recordings go; None: where the rig file says.
+
+    Attributes
+    ----------
+    description : RigDescription
+        What the rig file says.
+    robot : Manipulator
+        The model of the arm.
+    loop : ControlLoop
+        State, events and commands.
+    failure : BaseException or None
+        What ended the control thread, if it was not asked to end.
+    trouble : str
+        Why it is not certain that the arm is vented, after `stop`; empty if it is.
+
+    Raises
+    ------
+    FileError
+        A file is wrong.
+    MissingExtraError
+        A library is not installed.
+    """
+
+    def __init__(
+        self,
+        rig: str | os.PathLike[str],
+        *,
+        service: bool = True,
+        log_folder: str | os.PathLike[str] | None = None,
+    ) -> None:
+        self.description = description = load_rig_description(rig)
+        self.robot = load_robot(robot_path(description.robot, Path(rig).parent))
+        self.failure: BaseException | None = None
+        self.trouble = ""
+        self._folder = os.fspath(log_folder or description.log.folder)
+        self._manager = ServiceManager()
+        guarded, self.link = guarded_rig(description, self.robot.description)
+        self._clock = guarded.clock
+        period = 1 / description.rate
+        controller = Controller(
+            self.robot,
+            self.link.limits,
+            guarded.slew,
+            period=period,
+            control=description.control,
+            safety=description.safety,
+            swings=_swings(description),
+            beside=True,
+        )
+        self.loop = ControlLoop(
+            guarded, controller, self.link, safety=description.safety, period=period
+        )
+        self._secret = Secret(description.service, self._folder, description.name)
+        self._telemetry = self._make_telemetry(service)
+        self._server = self._make_server() if service else None
+        self._keeper = Keeper(
+            self.loop,
+            self.link,
+            self._manager,
+            None if self._server is None else self._is_serving,
+        )
+        self._stopping = threading.Event()
+        self._control: threading.Thread | None = None
+        self._tidied = 0.0
+        self._log = _EventHandler(self.loop)
+        self._started = self._stopped = False
+
+    # what there is -------------------------------------------------------------------------------
+
+    @property
+    def url(self) -> str | None:
+        """Of the control interface; None where there is none."""
+        return None if self._server is None else self._server.url
+
+    @property
+    def token(self) -> str:
+        """Secret of those who may move the arm."""
+        return self._secret.token
+
+    @property
+    def token_file(self) -> Path | None:
+        """Where it can be read; None where the environment has it, or nobody needs it."""
+        return None if self._server is None else self._secret.path
+
+    @property
+    def foxglove_port(self) -> int | None:
+        """Where Foxglove can connect; None where it cannot."""
+        return None if self._telemetry is None else self._telemetry.port
+
+    @property
+    def recording(self) -> str | None:
+        """The file that is recorded to; None while there is none."""
+        return None if self._telemetry is None else self._telemetry.path
+
+    @property
+    def ended(self) -> bool:
+        """Whether control has ended: asked to, or by `failure`."""
+        return self._control is None or not self._control.is_alive()
+
+    # life ----------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Listen, start the guard, connect, check the rig, and begin to tick; it stays vented.
+
+        Raises
+        ------
+        InputError
+            A port is not free, a device does not answer, or a check failed.
+        MissingExtraError
+            A library is not installed.
+        DeviceError
+            The guard does not start.
+        """
+        if self._started:
+            raise InputError("a daemon is started once; make another one")
+        self._started = True
+        try:
+            logging.getLogger("stiffopt").addHandler(self._log)
+            if self._server is not None:
+                self._listen()
+            self._manager.status("connecting to the rig")
+            self.loop.configure()
+            if self._telemetry is not None:
+                self._telemetry.start()
+            self.loop.listen(self._ticked)
+            self._control = threading.Thread(target=self._run, name="control", daemon=True)
+            self._control.start()
+            self._keeper.start()
+        except BaseException:
+            self.stop()
+            raise
+        self._manager.ready()
+
+    def read_task(self, path: str | os.PathLike[str]) -> Task:
+        """Read a task file and see that it is for this arm.
+
+        Raises
+        ------
+        FileError
+            The file is wrong, or is for another robot.
+        """
+        task = load_task(path)
+        asked, there = task.resolve_robot().name, self.robot.description.name
+        if asked != there:
+            raise FileError(path, f"is for the robot '{asked}'; this rig has '{there}'", key="robot")
+        return task
+
+    def arm(self, task: Task | None = None) -> None:
+        """Arm as soon as the vented arm has been seen for long enough, and pursue a task.
+
+        Raises
+        ------
+        InputError
+            It cannot be armed, or the task does not suit; it is inactive then.
+        """
+        end = time.monotonic() + _ARMING
+        while True:
+            try:
+                self.loop.arm()
+                break
+            except CommandError:
+                last = self.loop.snapshot().state is State.FAULT or time.monotonic() > end
+                if last or self._stopping.is_set():
+                    raise
+            self._stopping.wait(_AGAIN)
+        if task is None:
+            return
+        try:
+            self.loop.set_task(task)
+        except BaseException:
+            with suppress(StiffoptError):
+                self.loop.disarm()
+            raise
+
+    def begin_stop(self) -> None:
+        """Let the pressures down, vent and end control; this does not wait for it."""
+        if not self._stopping.is_set():
+            self._stopping.set()
+            self._manager.stopping()
+
+    def vent(self, reason: str = "asked to", patience: float = 0.5) -> None:
+        """Let all pressure out at once, also when the control thread does not answer."""
+
+        def ask() -> None:
+            with suppress(StiffoptError):  # the loop tries on
+                self.loop.vent(reason)
+
+        asking = threading.Thread(target=ask, name="vent", daemon=True)
+        asking.start()
+        asking.join(patience)
+        if asking.is_alive():
+            with suppress(StiffoptError):
+                self.link.vent()
+
+    def stop(self) -> State:
+        """End everything within some seconds, whatever happens, and return the last state.
+
+        The pressures are let down and vented first. To stop twice does nothing.
+        """
+        if self._stopped:
+            return self.loop.snapshot().state
+        self._stopped = True
+        self.begin_stop()
+        if self._control is not None:
+            self._control.join(self.description.safety.ramp_time + _MARGIN)
+            if self._control.is_alive():
+                self.failure = TimeoutError("the control thread hangs")
+                self.vent("the control thread hangs", patience=0.0)
+        self._keeper.stop()
+        state = self.loop.snapshot().state
+        try:
+            self.loop.close()
+        except Exception as error:
+            self.trouble = str(error)
+        if self._telemetry is not None and self._control is not None:
+            self._telemetry.stop()
+        if self._server is not None:
+            self._server.stop()
+            self._secret.remove()
+        logging.getLogger("stiffopt").removeHandler(self._log)
+        self._manager.close()
+        return state
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    # the parts -----------------------------------------------------------------------------------
+
+    def _make_telemetry(self, service: bool) -> Telemetry | None:
+        """Return what records; without ports it is no loss that stops anyone if it is missing."""
+        settings = self.description.service
+        if not service:
+            settings = settings.model_copy(update={"foxglove_port": None})
+        try:
+            from stiffopt.daemon.telemetry import Telemetry
+
+            return Telemetry(
+                self.robot.description,
+                self.description.name,
+                self.loop,
+                self._folder,
+                settings,
+                clock=self._clock,
+                backbone=_Shape(self.robot),
+                about={"rig_file": file_text("rig", self.description)},
+            )
+        except MissingExtraError as error:
+            if service:
+                raise
+            self.loop.add_alarm("log", f"nothing is recorded: {error}")
+            return None
+
+    def _make_server(self) -> Server:
+        from stiffopt.daemon.metrics import Metrics
+        from stiffopt.daemon.service import create_app
+        from stiffopt.daemon.serving import Server
+
+        settings, robot = self.description.service, self.robot.description
+        app = create_app(
+            self.loop,
+            robot=robot,
+            token=self._secret.token,
+            heartbeat=self.description.safety.heartbeat,
+            clock=self._clock,
+            metrics=Metrics(self.description.name, self.loop, self._telemetry).render,
+            hosts=(settings.host,),
+        )
+        return Server(app, settings.host, settings.port)
+
+    def _is_serving(self) -> bool:
+        return self._server is not None and self._server.alive
+
+    def _listen(self) -> None:
+        """Open the port, then keep the token: not in the place of that of one who has the port."""
+        if self._server is None:
+            return
+        try:
+            self._server.start()
+        except InputError as error:
+            raise InputError(f"{error} (service.host, service.port in the rig file)") from None
+        self._secret.write()
+
+    # the control thread --------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            with real_time() as granted:
+                for who, notice, well in (
+                    ("control", granted.notice, not granted.denied),
+                    ("guard", self.link.real_time, not self.link.real_time.startswith("not")),
+                ):
+                    severity = Severity.INFO if well else Severity.WARNING
+                    self.loop.events.add(
+                        self._clock.now(), "real-time", f"{who}: {notice}", severity
+                    )
+                self.loop.run(self._stopping)
+        except BaseException as error:  # `run` has vented; whoever waits is told
+            self.failure = error
+
+    def _ticked(self, now: Snapshot) -> None:
+        """Pass on what a tick has left; in the control thread."""
+        self._manager.watchdog()
+        if self._telemetry is not None:
+            self._telemetry.put(now)
+        if now.time - self._tidied > _TIDY:
+            self._tidied = now.time
+            tidy(thoroughly=now.state not in ARMED)
+
+
+class _Shape:
+    """The arm's shape, for telemetry; as often as its share of the interpreter's time permits."""
+
+    def __init__(self, robot: Manipulator) -> None:
+        self._robot = robot
+        self._due = 0.0
+        self._last: Array | None = None
+
+    def __call__(self, pressures: Array) -> Array:
+        """Return poses (m, 4, 4) along the arm, now or a little while ago."""
+        now = time.monotonic()
+        if self._last is None or now >= self._due:
+            self._last = self._robot.backbone(pressures, _SHAPE)
+            ended = time.monotonic()
+            self._due = ended + (ended - now) / _SHARE
+        return self._last
+
+
+class _EventHandler(logging.Handler):
+    """Makes events of what parts of the daemon log."""
+
+    def __init__(self, loop: ControlLoop) -> None:
+        super().__init__(logging.WARNING)
+        self._loop = loop
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Append an event."""
+        error = record.exc_info[1] if record.exc_info else None
+        text = record.getMessage() + (f" ({type(error).__name__}: {error})" if error else "")
+        severity = Severity.ERROR if record.levelno >= logging.ERROR else Severity.WARNING
+        self._loop.events.add(self._loop.rig.clock.now(), "service", text, severity)
+
+
+def _swings(description: RigDescription) -> bool:
+    """Return whether the arm has inertia: all have, but one that is simulated without."""
+    simulated, plant = description.supply.driver == "simulated", description.plant
+    return not (simulated and plant is not None and plant.dynamics == "quasi-static")

@@ -1,0 +1,358 @@
+"""The guard: a process of its own that owns the supply, and vents when the loop falls silent.
+
+Started by `stiffopt.daemon.link.GuardLink`. The control loop sends its commands here; they go
+through the safety gate to the supply at once. When none has come for the guard's timeout, because
+the loop was killed or stopped or hangs, or when the loop's process is gone, the guard vents. Then
+it is *tripped*: it takes no command until it is armed by a loop that has been told of the trip.
+
+What the guard cannot do: while the supply's driver waits for its device, at most for the driver's
+own timeouts, nothing else happens here; and a guard that is killed itself vents nothing. Both are
+what the watchdog of the device is for.
+"""
+
+from __future__ import annotations
+
+import gc
+import pickle
+import signal
+import socket
+import sys
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
+from typing import Any
+
+import numpy as np
+
+from stiffopt.control.outlet import Applied, Outlet
+from stiffopt.control.realtime import real_time
+from stiffopt.daemon.frames import Answer, Channel, CommandFrame, Message, Poses, Request, Word
+from stiffopt.daemon.hosted import Hosted, Owned, owned
+from stiffopt.errors import CommandError, DeviceError, SlowWarning, StiffoptError
+from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading
+
+__all__ = ["FIRST_COMMAND", "Guard", "main"]
+
+FIRST_COMMAND = 1.0
+"""Seconds from arming, in which nothing is under pressure yet, to the first command."""
+
+PRIORITY = 81  # of the guard's thread, where permitted: above that of the loop
+_IDLE = 0.05  # s between looks at what has to be done unasked
+_HOSTING = 0.002  # s between looks at a simulated world, so that there is little to catch up with
+_AGAIN = 0.05  # s from a failed attempt to vent to the next
+_ATTEMPTS = 20  # to vent before the process ends all the same
+_TIDY = 10.0  # s between collections of garbage while nothing is under pressure
+_ASKED = "asked to"
+_POSES = 200  # samples in a packet
+
+
+class Guard:
+    """What the guard process decides.
+
+    Parameters
+    ----------
+    outlet :
+        The gate in front of the supply; open.
+    channel :
+        To the loop.
+    timeout :
+        It vents when no command has come for this long, in s.
+    clock :
+        Time in s, `time.monotonic` of all processes.
+    pause :
+        Lets some s pass.
+    epoch :
+        Moment 0 of the rig's own clock on it, in s.
+    hosted :
+        The rest of a simulated rig.
+    """
+
+    def __init__(
+        self,
+        outlet: Outlet,
+        channel: Channel,
+        timeout: float,
+        *,
+        clock: Callable[[], float] = time.monotonic,
+        pause: Callable[[float], None] = time.sleep,
+        epoch: float = 0.0,
+        hosted: Hosted | None = None,
+    ) -> None:
+        self._outlet = outlet
+        self._channel = channel
+        self._timeout = timeout
+        self._silence = f"no command had come for {timeout * 1e3:g} ms"
+        self._clock = clock
+        self._pause = pause
+        self._epoch = epoch
+        self._hosted = hosted
+        n = outlet.limits.n
+        self._commanded = np.zeros(n)
+        self._reading = PressureReading(np.nan, np.full(n, np.nan))
+        self._due: float | None = None  # when it vents; None while no command is taken
+        self._to_vent: float | None = None  # when to try again to vent; None: it is vented or armed
+        self._trips = 0
+        self._tripped = ""
+        self._leaving = ""
+        self._tidied = clock()
+
+    def leave(self, reason: str) -> None:
+        """Vent and come to an end soon; for handlers of signals."""
+        self._leaving = reason
+
+    def serve(self) -> int:
+        """Guard until the loop has gone or asks to end; return the exit code of the process."""
+        try:
+            while not self._leaving:
+                self.step()
+        except BaseException as error:  # a bug here must not keep an arm under pressure
+            self._leaving = f"the guard failed: {type(error).__name__}: {error}"
+            raise
+        finally:
+            code = self._end()
+        return code
+
+    def step(self) -> None:
+        """Take in what has come, or wait a little for it, and do what has to be done unasked."""
+        self._take(self._channel.receive(self._patience()))
+        if self._channel.closed and not self._leaving:
+            self._leaving = "the process of the control loop has ended"
+        self._look_at_the_time()
+        now = self._clock()
+        if self._to_vent is not None and now >= self._to_vent:
+            self._vent()
+        if self._due is None and now - self._tidied > _TIDY:
+            gc.collect()
+            self._tidied = now
+        self._forward_poses()
+
+    def _patience(self) -> float:
+        moments = [self._clock() + (_IDLE if self._hosted is None else _HOSTING)]
+        moments += [moment for moment in (self._due, self._to_vent) if moment is not None]
+        return max(0.0, min(moments) - self._clock())
+
+    # what comes ----------------------------------------------------------------------------------
+
+    def _take(self, messages: Sequence[Message]) -> None:
+        """Vent first, if that is asked for; of several commands only the newest counts."""
+        vents = [i for i, m in enumerate(messages) if isinstance(m, Request) and m.do == "vent"]
+        last_vent = vents[-1] if vents else 0
+        newest: CommandFrame | None = None
+        for index, message in enumerate(messages):
+            if isinstance(message, CommandFrame):
+                self._feed(message)
+                newest = message
+            elif isinstance(message, Request) and (message.do == "vent" or index >= last_vent):
+                newest = None if message.do in ("arm", "vent") else newest
+                self._obey(message)
+            elif isinstance(message, Request):
+                self._answer(message.sequence, error="a command to vent has overtaken this")
+        if newest is not None:
+            self._look_at_the_time()
+            self._pass_on(newest)
+
+    def _feed(self, frame: CommandFrame) -> None:
+        """Note when the loop was alive: when it sent, for the frame may have waited here."""
+        if self._due is None:
+            return
+        if not frame.sent <= self._due:  # NaN is no time either
+            self._trip(self._silence)
+        else:
+            self._due = min(frame.sent, self._clock()) + self._timeout
+
+    def _look_at_the_time(self) -> None:
+        if self._due is not None and self._clock() > self._due:
+            self._trip(self._silence)
+
+    def _pass_on(self, frame: CommandFrame) -> None:
+        if self._tripped:
+            self._answer(frame.sequence)
+            return
+        command = PressureCommand(frame.pressures, frame.time - self._epoch, frame.valid_for)
+        try:
+            applied = self._outlet.apply(command)
+        except CommandError as error:
+            applied = Applied(self._commanded, self._reading, refused=str(error))
+        except Exception as error:
+            text = _told(error)
+            self._trip(f"the supply failed: {text}")
+            self._answer(frame.sequence, error=text)
+            return
+        self._commanded, self._reading = applied.pressures, applied.reading
+        self._answer(frame.sequence, applied)
+
+    def _obey(self, request: Request) -> None:
+        error, value = "", None
+        try:
+            match request.do:
+                case "arm":
+                    self._arm(request.about.get("told"))
+                case "vent":
+                    error = self._vent()
+                case "read":
+                    self._reading = self._outlet.read()
+                case "close":
+                    self._leaving = _ASKED
+                    error = self._vent()
+                case word:
+                    value = self._ask(word, request.about)
+        except Exception as problem:
+            error = _told(problem)
+        self._answer(request.sequence, error=error, value=value)
+
+    def _arm(self, told: Any) -> None:
+        """Arm, unless there is a trip that the loop has not been told of."""
+        if self._tripped and told != self._trips:
+            raise DeviceError(f"the guard had vented: {self._tripped}")
+        if self._to_vent is not None:
+            raise DeviceError("the supply could not be vented yet; it cannot be armed")
+        try:
+            if self._due is not None:  # it may be under pressure, and arming begins without
+                self._outlet.vent()
+            self._outlet.arm()
+        except BaseException:
+            self._vent()
+            raise
+        self._commanded = np.zeros_like(self._commanded)
+        self._tripped = ""
+        self._due = self._clock() + FIRST_COMMAND
+
+    def _ask(self, word: str, about: dict[str, Any]) -> Any:
+        if self._hosted is None:
+            raise DeviceError(f"the guard does not know '{word}'; only a simulated rig might")
+        return self._hosted.ask(word, about)
+
+    # what is done --------------------------------------------------------------------------------
+
+    def _trip(self, reason: str) -> None:
+        """Vent, and stay vented until a loop that knows of it arms again."""
+        self._tripped = reason
+        self._trips += 1
+        if not self._vent():
+            _say(f"vented: {reason}")
+        self._answer(0)
+
+    def _vent(self) -> str:
+        """Vent; where it fails say why, and try again soon."""
+        self._due = None
+        try:
+            self._outlet.vent()
+        except Exception as error:
+            if self._to_vent is None:
+                _say(f"COULD NOT VENT, and tries again: {_told(error)}")
+            self._to_vent = self._clock() + _AGAIN
+            return _told(error)
+        if self._to_vent is not None:
+            _say("vented after all")
+        self._to_vent = None
+        self._commanded = np.zeros_like(self._commanded)
+        return ""
+
+    def _answer(
+        self, sequence: int, applied: Applied | None = None, *, error: str = "", value: Any = None
+    ) -> None:
+        answer = Answer(
+            sequence,
+            self._commanded,
+            self._reading.pressures,
+            self._reading.time + self._epoch,
+            armed=self._due is not None,
+            limited=applied is not None and applied.limited,
+            trips=self._trips,
+            tripped=self._tripped,
+            refused="" if applied is None else applied.refused,
+            error=error,
+            value=value,
+        )
+        self._channel.send(answer)  # a loop that is stopped takes none: the newest then is lost
+
+    def _forward_poses(self) -> None:
+        if self._hosted is None:
+            return
+        samples = tuple(_later(sample, self._epoch) for sample in self._hosted.poses())
+        for first in range(0, len(samples), _POSES):
+            self._channel.send(Poses(samples[first : first + _POSES]))
+
+    def _end(self) -> int:
+        """Vent, whatever it takes, and close; 0 if the supply took it."""
+        surprised = self._due is not None and self._leaving != _ASKED
+        failure = self._vent()
+        for _ in range(_ATTEMPTS):
+            if not failure:
+                break
+            self._pause(_AGAIN)
+            failure = self._vent()
+        if surprised and not failure:
+            _say(f"vented: {self._leaving}")
+        try:
+            self._outlet.close()
+        except Exception as error:
+            failure = failure or _told(error)
+        if failure:
+            _say(f"THE SUPPLY COULD NOT BE VENTED: {failure}; cut its power or open its valve")
+        return 1 if failure else 0
+
+
+def _told(error: BaseException) -> str:
+    known = isinstance(error, StiffoptError)
+    return str(error) if known else f"{type(error).__name__}: {error}"
+
+
+def _later(sample: PoseSample, epoch: float) -> PoseSample:
+    times = (sample.time + epoch, sample.received + epoch)
+    return PoseSample(*times, sample.frame, sample.position, sample.quaternion)
+
+
+def _say(text: str) -> None:
+    with suppress(OSError, ValueError):  # whoever listened is gone; to vent matters, not to say it
+        print(f"stiffopt guard: {text}", file=sys.stderr, flush=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the guard process and return its exit code: 0 if the supply is vented at the end.
+
+    Parameters
+    ----------
+    arguments :
+        The number of the inherited end of the socket; by default that of the command line. The
+        rig comes pickled on standard input, from the process that started this one.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop ramps down; it says when it is over
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # until there is something to vent
+    descriptor = int((sys.argv[1:] if arguments is None else arguments)[0])
+    with closing(Channel(socket.socket(fileno=descriptor))) as channel:
+        try:
+            supply = _opened(channel)
+        except StiffoptError as error:
+            channel.send(Word("failed", {"kind": type(error).__name__, "args": _plain(error)}))
+            return 1
+        guard = Guard(
+            supply.outlet, channel, supply.timeout, epoch=supply.epoch, hosted=supply.hosted
+        )
+        signal.signal(signal.SIGTERM, lambda *_: guard.leave("SIGTERM"))
+        with real_time(PRIORITY) as granted:
+            channel.send(Word("ready", {"real_time": granted.notice}))
+            return guard.serve()
+
+
+def _opened(channel: Channel) -> Owned:
+    """Make what the rig on standard input speaks of and connect; tell what takes its time."""
+
+    def tell(message: Warning | str, *_: object, **__: object) -> None:
+        channel.send(Word("notice", {"text": str(message)}))
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", SlowWarning)
+        warnings.showwarning = tell
+        supply = owned(*pickle.load(sys.stdin.buffer))
+        supply.outlet.open()
+    return supply
+
+
+def _plain(error: BaseException) -> list[str]:
+    return [str(part) for part in error.args]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,166 @@
+"""Who has control: one client at a time, for as long as it is heard."""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from stiffopt.errors import CommandError
+from stiffopt.rig.interface import Clock
+
+__all__ = ["ControlLease", "Holder"]
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who has control.
+
+    Attributes
+    ----------
+    client : its name.
+    expires_in : time in s after which control is lost if nothing is heard; not negative.
+    """
+
+    client: str
+    expires_in: float
+
+
+@dataclass
+class _Grant:
+    client: str
+    identity: str
+    heard: float
+    busy: int = 0  # commands that are being carried out
+    lost: bool = False
+
+
+class ControlLease:
+    """Control over the arm, lent to one client at a time.
+
+    A client that is not heard for `heartbeat` seconds loses it. Nobody else gets it before what
+    is due then has been done: `check` says that it is due, `settle` that it has been done. Any
+    thread may call any method.
+
+    Parameters
+    ----------
+    heartbeat :
+        In s.
+    clock :
+        That of the rig, which never jumps.
+    """
+
+    def __init__(self, heartbeat: float, clock: Clock) -> None:
+        self.heartbeat = heartbeat
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._grant: _Grant | None = None
+
+    @property
+    def holder(self) -> Holder | None:
+        """Who has control, or None."""
+        with self._lock:
+            return None if self._grant is None else self._seen(self._grant)
+
+    def take(self, client: str) -> str:
+        """Give control to a client and return what it must show with each command.
+
+        Raises
+        ------
+        CommandError
+            Another has it, or has just lost it and the arm is not held yet.
+        """
+        with self._lock:
+            grant = self._grant
+            if grant is not None and self._is_lost(grant):
+                raise CommandError(
+                    f"'{grant.client}' has just lost control and the arm is being held; try again"
+                )
+            if grant is not None:
+                raise CommandError(
+                    f"'{grant.client}' has control; it ends in "
+                    f"{self._seen(grant).expires_in:.2f} s unless it is renewed"
+                )
+            self._grant = _Grant(client, secrets.token_urlsafe(16), self._clock.now())
+            return self._grant.identity
+
+    def renew(self, identity: str) -> None:
+        """Note that the client was heard.
+
+        Raises
+        ------
+        CommandError
+            It does not have control.
+        """
+        with self._lock:
+            self._own(identity).heard = self._clock.now()
+
+    def release(self, identity: str) -> None:
+        """Take control back from a client that does not want it any more; raises as `renew`."""
+        with self._lock:
+            self._own(identity)
+            self._grant = None
+
+    @contextmanager
+    def used(self, identity: str) -> Iterator[None]:
+        """Carry out a command of the client in the body: it counts as heard until that ends.
+
+        Raises
+        ------
+        CommandError
+            It does not have control.
+        """
+        with self._lock:
+            grant = self._own(identity)
+            grant.heard = self._clock.now()
+            grant.busy += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                grant.heard = self._clock.now()
+                grant.busy -= 1
+
+    def check(self, now: float) -> str | None:
+        """Return the name of a client that has lost control, until `settle` is called, or None.
+
+        Parameters
+        ----------
+        now :
+            On the clock, in s.
+        """
+        with self._lock:
+            grant = self._grant
+            return grant.client if grant is not None and self._is_lost(grant, now) else None
+
+    def settle(self) -> None:
+        """Note that what was due after a loss has been done: others may take control."""
+        with self._lock:
+            if self._grant is not None and self._grant.lost:
+                self._grant = None
+
+    def _own(self, identity: str) -> _Grant:
+        grant = self._grant
+        if grant is None:
+            raise CommandError("you do not have control; take it first")
+        if not hmac.compare_digest(grant.identity.encode(), identity.encode()):
+            raise CommandError(f"you do not have control; '{grant.client}' has it")
+        if self._is_lost(grant):
+            raise CommandError(
+                f"control was lost, as nothing was heard for {self.heartbeat:g} s; take it again"
+            )
+        return grant
+
+    def _is_lost(self, grant: _Grant, now: float | None = None) -> bool:
+        """Say whether control is lost; once it is, it stays so."""
+        now = self._clock.now() if now is None else now
+        if not grant.busy and now - grant.heard > self.heartbeat:
+            grant.lost = True
+        return grant.lost
+
+    def _seen(self, grant: _Grant) -> Holder:
+        left = grant.heard + self.heartbeat - self._clock.now()
+        return Holder(grant.client, min(max(left, 0.0), self.heartbeat))

@@ -1,0 +1,177 @@
+"""Metrics for Prometheus, made when they are asked for; the loop does nothing for them."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from math import isfinite
+from typing import Any, Protocol
+
+from stiffopt.control.state import Event, Snapshot, State
+from stiffopt.errors import MissingExtraError
+
+__all__ = ["CONTENT_TYPE", "Metrics"]
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+"""Of what `Metrics.render` returns."""
+
+
+class _Events(Protocol):
+    def since(self, index: int) -> tuple[list[Event], int]: ...
+
+
+class _Loop(Protocol):
+    @property
+    def events(self) -> _Events: ...
+
+    def snapshot(self) -> Snapshot: ...
+
+
+class _Telemetry(Protocol):
+    @property
+    def dropped(self) -> int: ...
+
+    @property
+    def written(self) -> int: ...
+
+
+class Metrics:
+    """What Prometheus may know of a loop.
+
+    Parameters
+    ----------
+    name :
+        Of the rig; a label.
+    loop :
+        What is watched.
+    telemetry :
+        Its recording is watched too.
+
+    Raises
+    ------
+    MissingExtraError
+        prometheus-client is not installed.
+    """
+
+    def __init__(self, name: str, loop: _Loop, telemetry: _Telemetry | None = None) -> None:
+        try:
+            from prometheus_client import CollectorRegistry
+        except ImportError:
+            raise MissingExtraError("prometheus-client", "daemon") from None
+        self._name, self._loop, self._telemetry = name, loop, telemetry
+        self._seen: Counter[tuple[str, str]] = Counter()
+        self._next_event = 0
+        self._lock = threading.Lock()
+        self._registry = CollectorRegistry(auto_describe=False)
+        self._registry.register(_Collector(self))
+
+    def render(self) -> bytes:
+        """Return all metrics as text; from any thread."""
+        from prometheus_client import generate_latest
+
+        with self._lock:
+            return generate_latest(self._registry)
+
+    def _families(self) -> Iterator[Any]:
+        now = self._loop.snapshot()
+        yield from self._of_state(now)
+        yield from self._of_timing(now)
+        yield from self._of_arm(now)
+        yield from self._of_events()
+        if self._telemetry is not None:
+            yield self._counter(
+                "telemetry_dropped", "Snapshots never logged.", self._telemetry.dropped
+            )
+            yield self._counter("log_bytes", "Bytes recorded.", self._telemetry.written)
+
+    def _of_state(self, now: Snapshot) -> Iterator[Any]:
+        states = self._gauges("state", "Where in its life the loop is: 1 for its state.", "state")
+        for state in State:
+            states.add_metric([self._name, str(state)], float(state == now.state))
+        yield states
+        alarms = self._gauges("alarm", "What is wrong now: 1 for each alarm.", "kind")
+        for alarm in now.alarms:
+            alarms.add_metric([self._name, alarm.kind], 1.0)
+        yield alarms
+
+    def _of_timing(self, now: Snapshot) -> Iterator[Any]:
+        from prometheus_client.core import HistogramMetricFamily
+
+        timing = now.timing
+        yield self._counter("ticks", "Ticks of the loop.", timing.ticks)
+        yield self._counter("overruns", "Ticks that ended too late.", timing.overruns)
+        yield self._gauge("tick_time_seconds", "Duration of the last tick.", timing.tick_time)
+        edges, counts = timing.lateness
+        total, buckets = 0, []
+        for edge, count in zip((*edges, float("inf")), counts, strict=True):
+            total += count
+            buckets.append(("+Inf" if edge == float("inf") else f"{edge:g}", float(total)))
+        late = HistogramMetricFamily(
+            "stiffopt_lateness_seconds", "How late ticks begin.", labels=["rig"]
+        )
+        late.add_metric([self._name], buckets, sum_value=None)
+        yield late
+
+    def _of_arm(self, now: Snapshot) -> Iterator[Any]:
+        for name, text, value in (
+            ("position_error_meters", "Of the estimated tip.", now.position_error),
+            ("angle_error_radians", "Of the estimated tip.", now.angle_error),
+            ("stiffness", "Along the task's direction, N/m or N m/rad.", now.stiffness),
+            ("best_stiffness", "Of the plan, in the same direction.", now.best_stiffness),
+            ("tracker_age_seconds", "Age of the latest sample that was used.", now.seen_age),
+        ):
+            if isfinite(value):
+                yield self._gauge(name, text, value)
+        pressures = self._gauges(
+            "pressure_pascals", "Gauge pressures of the channels.", "channel", "kind"
+        )
+        for kind, values in (
+            ("commanded", now.commanded),
+            ("measured", now.measured),
+            ("plan", now.plan),
+            ("limit", now.high),
+        ):
+            for channel, value in enumerate(values.tolist(), start=1):
+                if isfinite(value):
+                    pressures.add_metric([self._name, str(channel), kind], value)
+        yield pressures
+
+    def _of_events(self) -> Iterable[Any]:
+        from prometheus_client.core import CounterMetricFamily
+
+        events, self._next_event = self._loop.events.since(self._next_event)
+        self._seen.update((event.kind, str(event.severity)) for event in events)
+        family = CounterMetricFamily(
+            "stiffopt_events", "What has happened.", labels=["rig", "kind", "severity"]
+        )
+        for (kind, severity), count in sorted(self._seen.items()):
+            family.add_metric([self._name, kind, severity], count)
+        yield family
+
+    def _gauges(self, name: str, text: str, *labels: str) -> Any:
+        from prometheus_client.core import GaugeMetricFamily
+
+        return GaugeMetricFamily(f"stiffopt_{name}", text, labels=["rig", *labels])
+
+    def _gauge(self, name: str, text: str, value: float) -> Any:
+        family = self._gauges(name, text)
+        family.add_metric([self._name], value)
+        return family
+
+    def _counter(self, name: str, text: str, value: float) -> Any:
+        from prometheus_client.core import CounterMetricFamily
+
+        family = CounterMetricFamily(f"stiffopt_{name}", text, labels=["rig"])
+        family.add_metric([self._name], value)
+        return family
+
+
+class _Collector:
+    """What the registry asks."""
+
+    def __init__(self, metrics: Metrics) -> None:
+        self._metrics = metrics
+
+    def collect(self) -> Iterator[Any]:
+        return self._metrics._families()

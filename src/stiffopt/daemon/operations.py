@@ -1,0 +1,249 @@
+"""What a client may ask of the control loop, and what becomes of it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from stiffopt.control.state import State
+from stiffopt.daemon.calls import Commanded, LoopCalls, start
+from stiffopt.daemon.lease import ControlLease
+from stiffopt.daemon.messages import TargetMessage, TaskMessage, check_pressures, task_of
+from stiffopt.daemon.refusals import RefusedError, refusal_of
+from stiffopt.daemon.reports import (
+    DoneReport,
+    GrantReport,
+    LeaseReport,
+    RobotReport,
+    StateReport,
+    TaskReport,
+)
+from stiffopt.daemon.wire import LEASE_HEADER
+from stiffopt.errors import CommandError, StiffoptError
+from stiffopt.model.description import RobotDescription
+from stiffopt.optimise.task import Task
+from stiffopt.rig.interface import Clock
+
+__all__ = ["Operations"]
+
+_VENTED = (State.UNCONFIGURED, State.INACTIVE, State.FAULT)
+_log = logging.getLogger(__name__)
+
+
+class Operations:
+    """The interface without its wire. All methods are for one event loop.
+
+    Parameters
+    ----------
+    loop :
+        The control loop.
+    robot :
+        The arm that it steers.
+    heartbeat :
+        A client that was not heard for this long, in s, loses control, and the arm is held.
+    clock :
+        That of the rig.
+    patience :
+        Seconds after which a command to the loop is given up.
+    """
+
+    def __init__(
+        self,
+        loop: Commanded,
+        robot: RobotDescription,
+        heartbeat: float,
+        clock: Clock,
+        patience: float,
+    ) -> None:
+        self.loop = loop
+        self.robot = robot
+        self.lease = ControlLease(heartbeat, clock)
+        self._clock = clock
+        self._call = LoopCalls(patience)
+        self._task: Task | None = None  # the last one that was accepted, while it matters
+        self._settling: asyncio.Task[None] | None = None
+
+    def state(self) -> StateReport:
+        """Return how things stand."""
+        holder = self.lease.holder
+        lease = None
+        if holder is not None:
+            lease = LeaseReport(client=holder.client, expires_in_s=holder.expires_in)
+        return StateReport.of(self.loop.snapshot(), lease)
+
+    def robot_report(self) -> RobotReport:
+        """Return what arm this is."""
+        snapshot, robot = self.loop.snapshot(), self.robot
+        return RobotReport(
+            name=robot.name,
+            n=robot.n_pressures,
+            channels=[robot.channel_name(k) for k in range(robot.n_pressures)],
+            low_pa=snapshot.low.tolist(),
+            high_pa=snapshot.high.tolist(),
+            length_m=robot.length,
+        )
+
+    def task(self) -> TaskReport:
+        """Return what is being done."""
+        now = self.state()
+        asked: TargetMessage | None = None
+        if now.target_position_m or now.target_quaternion_wxyz or now.target_pointing:
+            asked = TargetMessage(
+                position_m=now.target_position_m,
+                orientation_wxyz=_whole(now.target_quaternion_wxyz),
+                pointing=_whole(now.target_pointing),
+            )
+        given = None if self._task is None or now.state in _VENTED else self._task
+        return TaskReport(
+            doing=now.task,
+            target=asked,
+            task=None if given is None else TaskMessage.of(given, self.robot.name),
+        )
+
+    # Control ----------------------------------------------------------------------------------
+
+    async def take(self, client: str) -> GrantReport:
+        """Give a client control; raise `RefusedError` if another has it."""
+        await self.watch()  # who had it may be gone
+        with _of_lease():
+            identity = self.lease.take(client)
+        beat = self.lease.heartbeat
+        return GrantReport(lease=identity, heartbeat_s=beat, renew_every_s=beat / 4)
+
+    def renew(self, identity: str | None) -> None:
+        """Note that a client was heard; raise `RefusedError` if it does not have control."""
+        with _of_lease():
+            self.lease.renew(_shown(identity))
+
+    def release(self, identity: str | None) -> None:
+        """Take control back; raise `RefusedError` if the client does not have it."""
+        with _of_lease():
+            self.lease.release(_shown(identity))
+
+    async def watch(self) -> None:
+        """Hold the arm if who had control is not heard any more; to be called again and again."""
+        client = self.lease.check(self._clock.now())
+        if client is None:
+            return
+        if self._settling is None or self._settling.done():
+            self._settling = asyncio.create_task(self._settle(client))
+        await asyncio.wait([self._settling], timeout=1.0)
+
+    async def _settle(self, client: str) -> None:
+        """Hold; nobody else gets control before the loop has done so or has said why not."""
+        try:
+            await start(self.loop.hold, f"nothing was heard from '{client}', which had control")
+        except StiffoptError as refused:  # such as: there is nothing to hold
+            _log.info("'%s' has lost control; not held: %s", client, refused)
+        except Exception:
+            _log.exception("'%s' has lost control, and the arm could not be held", client)
+            return  # `watch` tries again
+        self.lease.settle()
+
+    # Commands ---------------------------------------------------------------------------------
+
+    async def arm(self, identity: str | None) -> DoneReport:
+        """Arm."""
+        return await self._forgetting(identity, self.loop.arm)
+
+    async def disarm(self, identity: str | None) -> DoneReport:
+        """Let the pressures down, vent and disarm."""
+        return await self._forgetting(identity, self.loop.disarm)
+
+    async def reset(self, identity: str | None) -> DoneReport:
+        """Leave the state fault."""
+        return await self._forgetting(identity, self.loop.reset)
+
+    async def vent(self) -> DoneReport:
+        """Vent at once, whoever has control."""
+        await self._asked(self.loop.vent, "a client asked for it", urgent=True)
+        self._task = None
+        return self._done()
+
+    async def hold(self, identity: str | None, reason: str) -> DoneReport:
+        """Keep the pressures as they are."""
+        with self._control(identity):
+            await self._asked(self.loop.hold, reason, urgent=True)
+        return self._done()
+
+    async def set_task(self, identity: str | None, given: Any) -> DoneReport:
+        """Pursue a task, given as the JSON of a `TaskRequest`."""
+
+        def read() -> Task:
+            snapshot = self.loop.snapshot()
+            task = task_of(given, self.robot.name)
+            check_pressures(task, snapshot.low, snapshot.high)
+            return task
+
+        with self._control(identity):
+            task = await self._asked(read)
+            await self._asked(self.loop.set_task, task)
+            self._task = task
+        return self._done()
+
+    async def command(
+        self, identity: str | None, function: Callable[[Any], None], what: Callable[[], Any]
+    ) -> DoneReport:
+        """Let the loop do something with what `what` returns, or refuses with `InputError`.
+
+        That is made in another thread, as it may take long; the others must be heard meanwhile.
+        """
+        with self._control(identity):
+            await self._asked(function, await self._asked(what))
+        return self._done()
+
+    async def _forgetting(self, identity: str | None, function: Callable[[], None]) -> DoneReport:
+        """Let the loop do something after which there is no task."""
+        with self._control(identity):
+            await self._asked(function)
+            self._task = None
+        return self._done()
+
+    async def _asked(self, function: Callable[..., Any], *args: Any, urgent: bool = False) -> Any:
+        with _as_refusals():
+            return await self._call(function, *args, urgent=urgent)
+
+    def _done(self) -> DoneReport:
+        snapshot = self.loop.snapshot()
+        return DoneReport(state=snapshot.state, reason=snapshot.reason)
+
+    @contextmanager
+    def _control(self, identity: str | None) -> Iterator[None]:
+        """Do what is in the body for a client that has control, and only for that."""
+        with ExitStack() as stack:
+            with _of_lease():
+                stack.enter_context(self.lease.used(_shown(identity)))
+            yield
+
+
+@contextmanager
+def _as_refusals() -> Iterator[None]:
+    try:
+        yield
+    except StiffoptError as error:
+        raise refusal_of(error) from None
+
+
+@contextmanager
+def _of_lease() -> Iterator[None]:
+    try:
+        yield
+    except CommandError as error:
+        raise RefusedError(409, "lease", str(error)) from None
+
+
+def _shown(identity: str | None) -> str:
+    if identity is None:
+        raise RefusedError(
+            409, "lease", f"this needs control; take it, and show the lease in '{LEASE_HEADER}'"
+        )
+    return identity
+
+
+def _whole(values: list[float | None] | None) -> list[float] | None:
+    """Return the values if all are known."""
+    known = [x for x in values or () if x is not None]
+    return known if known and len(known) == len(values or ()) else None

@@ -1,0 +1,74 @@
+"""The token of those who may move the arm: from the environment, or drawn and kept in a file."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from contextlib import suppress
+from pathlib import Path
+
+from stiffopt.errors import FileError
+from stiffopt.rig.settings import ServiceSettings
+
+__all__ = ["Secret"]
+
+
+class Secret:
+    """A token, and the file in which a drawn one can be read by this user alone.
+
+    Parameters
+    ----------
+    settings :
+        Of the rig's service.
+    folder, name :
+        Where the file is, and what its name begins with, unless the settings say.
+
+    Attributes
+    ----------
+    token : str
+        The token.
+    path : Path or None
+        The file; None where the environment has the token.
+    """
+
+    def __init__(self, settings: ServiceSettings, folder: str | os.PathLike[str], name: str) -> None:
+        given = os.environ.get(settings.token, "").strip()
+        self.token = given or secrets.token_urlsafe(24)
+        self.path: Path | None = None
+        if not given:
+            self.path = Path(settings.token_file or Path(folder) / f"{name}.token")
+
+    def write(self) -> None:
+        """Write the file, in the place of what is there; nobody else can read it at any moment.
+
+        Raises
+        ------
+        FileError
+            It cannot be written.
+        """
+        if self.path is None:
+            return
+        fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with suppress(FileNotFoundError):
+                fresh.unlink()
+            descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+            with open(descriptor, "w", encoding="ascii") as file:
+                file.write(f"{self.token}\n")
+            os.replace(fresh, self.path)
+        except OSError as error:
+            with suppress(OSError):
+                fresh.unlink()
+            reason = (error.strerror or str(error)).lower()
+            raise FileError(
+                self.path, f"the token cannot be kept there: {reason}; see service.token_file"
+            ) from None
+
+    def remove(self) -> None:
+        """Remove the file, if it is still that of this token."""
+        if self.path is None:
+            return
+        with suppress(OSError, ValueError):
+            if self.path.read_text(encoding="ascii").strip() == self.token:
+                self.path.unlink()

@@ -1,0 +1,348 @@
+"""The control interface: HTTP and WebSocket over a control loop.
+
+Anyone may read; with the token one may stop the arm; with the token and control one may move it. A
+request that is refused changes nothing.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Annotated, Any
+
+from pydantic import WrapValidator
+
+from stiffopt.daemon.messages import (
+    ControlRequest,
+    HoldRequest,
+    TargetMessage,
+    TaskRequest,
+    TrajectoryMessage,
+    trajectory_of,
+)
+from stiffopt.daemon.reports import (
+    DoneReport,
+    ErrorReport,
+    EventReport,
+    EventsReport,
+    GrantReport,
+    RobotReport,
+    StateReport,
+    TaskReport,
+)
+from stiffopt.errors import MissingExtraError
+from stiffopt.model.description import RobotDescription
+from stiffopt.rig.interface import Clock, SystemClock
+
+try:
+    from fastapi import APIRouter, Depends, FastAPI, Header, Query, Request, WebSocket
+    from fastapi.exceptions import RequestValidationError
+    from fastapi.responses import HTMLResponse, JSONResponse, Response
+    from fastapi.security import HTTPBearer
+    from starlette.exceptions import HTTPException
+except ModuleNotFoundError as error:
+    raise MissingExtraError("fastapi", "daemon") from error
+
+from stiffopt.daemon.access import Access, Token
+from stiffopt.daemon.calls import Commanded
+from stiffopt.daemon.operations import Operations
+from stiffopt.daemon.page import POLICY, page_of
+from stiffopt.daemon.refusals import RefusedError, sentence
+from stiffopt.daemon.stream import Stream
+from stiffopt.daemon.wire import LEASE_HEADER
+
+__all__ = ["create_app"]
+
+_METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+_WHY = {
+    401: "The token is missing.",
+    403: "The token is wrong, or the request comes from another site.",
+    409: "You do not have control, or the control loop refuses this now.",
+    413: "The request is too long.",
+    422: "The request makes no sense.",
+    503: "The control loop does not answer; whether it will still do this is not known.",
+}
+_ABOUT = """What there is to ask of a soft arm's control loop.
+
+Reading needs nothing. What moves the arm needs the token (Authorization: Bearer TOKEN) and control
+(POST /v1/lease), which one client has at a time and loses when it is not heard. To vent needs the
+token alone. The stream of states and targets is the WebSocket /v1/stream.
+
+SI units stand in the names; null is what is not known. Gauge pressures; poses in the base frame."""
+_log = logging.getLogger(__name__)
+
+_UNREAD = WrapValidator(lambda given, _: given)
+"""Marks a body that may be long: it is read in a thread, not in that which hears all clients."""
+LeaseHeader = Annotated[
+    str | None,
+    Header(alias=LEASE_HEADER, description="from POST /v1/lease", max_length=100),
+]
+
+
+def create_app(
+    loop: Commanded,
+    *,
+    robot: RobotDescription,
+    token: str,
+    heartbeat: float = 1.0,
+    clock: Clock | None = None,
+    metrics: Callable[[], bytes] | None = None,
+    hosts: Iterable[str] = (),
+    patience: float = 10.0,
+) -> FastAPI:
+    """Return the interface as an ASGI application.
+
+    Parameters
+    ----------
+    loop :
+        A control loop.
+    robot :
+        The arm that it steers.
+    token :
+        Secret of those who may move the arm.
+    heartbeat :
+        A client that was not heard for this long, in s, loses control, and the arm is held.
+    clock :
+        That of the rig.
+    metrics :
+        Returns what Prometheus reads at ``/metrics``; None: there is nothing.
+    hosts :
+        Names of this machine by which clients may speak to it, beside localhost and addresses.
+    patience :
+        Seconds after which a command to the loop is given up.
+
+    Returns
+    -------
+    FastAPI
+        ``app.state.operations`` is the `Operations` behind it.
+
+    Raises
+    ------
+    InputError
+        The token is empty, or has characters that a header cannot carry.
+    """
+    secret = Token(token)
+    operations = Operations(loop, robot, heartbeat, clock or SystemClock(), patience)
+
+    @asynccontextmanager
+    async def watching(app: FastAPI) -> AsyncIterator[None]:
+        watch = asyncio.create_task(_watch(operations))
+        try:
+            yield
+        finally:
+            watch.cancel()
+            await asyncio.gather(watch, return_exceptions=True)
+
+    app = FastAPI(
+        title="stiffopt daemon",
+        version="1",
+        description=_ABOUT,
+        lifespan=watching,
+        docs_url=None,  # that page would be loaded from the internet
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.state.operations = operations
+    app.add_middleware(Access, token=secret, hosts=tuple(hosts))
+    app.include_router(_reading(operations), prefix="/v1")
+    app.include_router(_control(operations), prefix="/v1")
+    app.include_router(_moving(operations), prefix="/v1")
+
+    streams: set[Stream] = set()
+
+    @app.websocket("/v1/stream")
+    async def stream(websocket: WebSocket) -> None:
+        new = Stream(websocket, operations, secret)
+        others = len(streams)
+        streams.add(new)
+        try:
+            await new.run(others)
+        finally:
+            streams.discard(new)
+
+    _add_pages(app, metrics)
+    _add_refusals(app)
+    return app
+
+
+async def _watch(operations: Operations) -> None:
+    period = min(operations.lease.heartbeat / 10, 0.1)
+    while True:
+        try:
+            await operations.watch()
+        except Exception:  # whoever has control must be watched whatever happens
+            _log.exception("the watch over who has control failed; it goes on")
+        await asyncio.sleep(period)
+
+
+def _responses(*codes: int) -> dict[int | str, dict[str, Any]]:
+    return {code: {"model": ErrorReport, "description": _WHY[code]} for code in codes}
+
+
+def _reading(operations: Operations) -> APIRouter:
+    """Return the calls that anyone may make."""
+    router = APIRouter(tags=["read"], responses=_responses(403, 413))
+
+    @router.get("/state")
+    async def state() -> StateReport:
+        """How things stand."""
+        return operations.state()
+
+    @router.get("/events", responses=_responses(422))
+    async def events(since: Annotated[int, Query(ge=0, le=2**53)] = 0) -> EventsReport:
+        """What has happened since an earlier answer's `next`; from the beginning without it."""
+        found, after = operations.loop.events.since(since)
+        return EventsReport(events=[EventReport.of(event) for event in found], next=after)
+
+    @router.get("/robot")
+    async def robot() -> RobotReport:
+        """What arm this is, its channels and what may be commanded."""
+        return operations.robot_report()
+
+    @router.get("/task")
+    async def task() -> TaskReport:
+        """What is being done."""
+        return operations.task()
+
+    return router
+
+
+def _trusted(codes: Iterable[int], tag: str) -> APIRouter:
+    """Return a router of calls that need the token; that they do is seen to by `Access`."""
+    scheme = HTTPBearer(auto_error=False, description="The token.", scheme_name="token")
+    return APIRouter(
+        tags=[tag], dependencies=[Depends(scheme)], responses=_responses(401, 403, 413, *codes)
+    )
+
+
+def _control(operations: Operations) -> APIRouter:
+    """Return the calls about who has control."""
+    router = _trusted((409, 422), "control")
+
+    @router.post("/lease")
+    async def take_control(request: ControlRequest) -> GrantReport:
+        """Take control. One client has it at a time, for as long as it is heard.
+
+        Any command counts, and so does `POST /v1/lease/renew`. When nothing is heard for
+        `heartbeat_s`, control is lost and the arm is held.
+        """
+        return await operations.take(request.client)
+
+    @router.post("/lease/renew", status_code=204)
+    async def renew(lease: LeaseHeader = None) -> None:
+        """Be heard."""
+        operations.renew(lease)
+
+    @router.delete("/lease", status_code=204)
+    async def release(lease: LeaseHeader = None) -> None:
+        """Give control back. The arm goes on with what it does; hold or disarm it before."""
+        operations.release(lease)
+
+    return router
+
+
+def _moving(operations: Operations) -> APIRouter:
+    """Return the calls that change what the arm does."""
+    loop = operations.loop
+    router = _trusted((409, 422, 503), "move")
+    stopping = _trusted((409, 503), "stop")
+
+    @router.post("/arm")
+    async def arm(lease: LeaseHeader = None) -> DoneReport:
+        """Check everything and put the arm under control."""
+        return await operations.arm(lease)
+
+    @router.post("/disarm")
+    async def disarm(lease: LeaseHeader = None) -> DoneReport:
+        """Let the pressures down slowly, then vent."""
+        return await operations.disarm(lease)
+
+    @router.post("/task")
+    async def set_task(
+        request: Annotated[TaskRequest, _UNREAD], lease: LeaseHeader = None
+    ) -> DoneReport:
+        """Pursue a task, given as a message or as the text of a task file."""
+        return await operations.set_task(lease, request)  # which is JSON still
+
+    @router.post("/target")
+    async def set_target(request: TargetMessage, lease: LeaseHeader = None) -> DoneReport:
+        """Go to another target, with the stiffness goal and the limits of the task."""
+        return await operations.command(lease, loop.set_target, request.target)
+
+    @router.post("/trajectory")
+    async def follow_trajectory(
+        request: Annotated[TrajectoryMessage, _UNREAD], lease: LeaseHeader = None
+    ) -> DoneReport:
+        """Go through waypoints; time begins now."""
+        return await operations.command(
+            lease, loop.follow_trajectory, partial(trajectory_of, request)
+        )
+
+    @router.post("/hold")
+    async def hold(request: HoldRequest | None = None, lease: LeaseHeader = None) -> DoneReport:
+        """Keep the pressures as they are, until the next task, target or trajectory."""
+        return await operations.hold(lease, (request or HoldRequest()).reason)
+
+    @router.post("/reset")
+    async def reset(lease: LeaseHeader = None) -> DoneReport:
+        """Leave the state fault; the arm stays vented."""
+        return await operations.reset(lease)
+
+    @stopping.post("/vent")
+    async def vent() -> DoneReport:
+        """Let all pressure out at once.
+
+        Needs no control: whoever is trusted and sees that something goes wrong may stop the arm,
+        also while a planner that does not listen any more has control. A body is not looked at.
+        """
+        return await operations.vent()
+
+    router.include_router(stopping)
+    return router
+
+
+def _add_pages(app: FastAPI, metrics: Callable[[], bytes] | None) -> None:
+    @app.get("/", include_in_schema=False)
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> HTMLResponse:
+        return HTMLResponse(page_of(app.openapi()), headers={"Content-Security-Policy": POLICY})
+
+    if metrics is not None:
+
+        @app.get("/metrics", include_in_schema=False)
+        async def prometheus() -> Response:
+            return Response(metrics(), media_type=_METRICS_TYPE)
+
+
+def _add_refusals(app: FastAPI) -> None:
+    """Say in one way why a request was not done."""
+
+    @app.exception_handler(RefusedError)
+    async def refused(request: Request, error: RefusedError) -> JSONResponse:
+        return _answered(error)
+
+    @app.exception_handler(RequestValidationError)
+    async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        mistakes = [{**m, "loc": [s for s in m["loc"] if s != "body"]} for m in error.errors()]
+        return _answered(RefusedError(422, "input", sentence(mistakes)))
+
+    @app.exception_handler(HTTPException)
+    async def other(request: Request, error: HTTPException) -> JSONResponse:
+        if error.status_code == 400:  # a body that cannot be parsed at all
+            return _answered(RefusedError(422, "input", "the body is not JSON that can be read"))
+        answer = _answered(RefusedError(error.status_code, "http", f"{error.detail}".lower()))
+        answer.headers.update(error.headers or {})
+        return answer
+
+    @app.exception_handler(Exception)
+    async def unexpected(request: Request, error: Exception) -> JSONResponse:
+        return _answered(
+            RefusedError(500, "internal", "the daemon failed at this; its log says more")
+        )
+
+
+def _answered(refusal: RefusedError) -> JSONResponse:
+    return JSONResponse(refusal.body, refusal.status)

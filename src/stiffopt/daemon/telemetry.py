@@ -1,0 +1,318 @@
+"""Telemetry: everything a loop says of itself, live for Foxglove and recorded as MCAP.
+
+The loop hands over a snapshot in each tick, which costs it a microsecond; all the rest is done by
+a thread of its own. Whatever fails here is an alarm and never more.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.state import Alarm, Event, Snapshot
+from stiffopt.daemon.channels import Channels
+from stiffopt.daemon.recording import Recording
+from stiffopt.errors import MissingExtraError, StiffoptError
+from stiffopt.files import file_text
+from stiffopt.logs.run_schemas import FORMAT
+from stiffopt.model.description import RobotDescription
+from stiffopt.rig.device import Clock
+from stiffopt.rig.settings import ServiceSettings
+
+__all__ = ["EventSource", "Telemetry", "Watched", "about_run"]
+
+Array = NDArray[np.float64]
+
+_WAKE = 0.02  # s between two looks at what has come
+_COMMIT = 0.1  # s: what a killed process loses
+_KEPT = 4096  # snapshots that wait; the oldest go first
+_FINEST = 0.01  # s between two ticks that are logged; a faster loop would pay with its punctuality
+_SMOOTH, _OFTEN, _SELDOM = 0.04, 0.1, 1.0  # s between what is not logged in each tick: frames,
+# the arm's shape and the timing, the state
+_CALM = 10.0  # s after which a loss or a failure is forgotten
+
+
+class EventSource(Protocol):
+    """The events of a loop."""
+
+    def since(self, index: int) -> tuple[list[Event], int]:
+        """Return the events from an index on, and the next index."""
+
+
+class Watched(Protocol):
+    """What telemetry needs of a loop."""
+
+    @property
+    def events(self) -> EventSource:
+        """What has happened."""
+
+    def snapshot(self) -> Snapshot:
+        """How things stand."""
+
+    def add_alarm(self, kind: str, text: str) -> None:
+        """Say what is wrong."""
+
+    def clear_alarm(self, kind: str) -> None:
+        """Say that it is well again."""
+
+
+class Telemetry:
+    """Logs what a loop does, to Foxglove and to a recording.
+
+    Parameters
+    ----------
+    robot :
+        What the arm is believed to be; kept in the recording.
+    name :
+        Of the rig.
+    loop :
+        What is watched.
+    folder :
+        Where recordings go; None: nothing is recorded.
+    settings :
+        Where Foxglove may connect.
+    clock :
+        Of the rig.
+    backbone :
+        Gives poses (m, 4, 4) along the arm for pressures (n,), in Pa.
+    about :
+        Further metadata for the recording, such as the text of the rig file.
+    wall :
+        Nanoseconds since 1970; asked once, so that no change of the wall clock is in the messages.
+
+    Raises
+    ------
+    MissingExtraError
+        foxglove-sdk is not installed.
+    """
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        name: str,
+        loop: Watched,
+        folder: str | None,
+        settings: ServiceSettings,
+        *,
+        clock: Clock,
+        backbone: Callable[[Array], Array] | None = None,
+        about: Mapping[str, str] | None = None,
+        wall: Callable[[], int] = time.time_ns,
+    ) -> None:
+        try:
+            from foxglove import Context
+        except ImportError:
+            raise MissingExtraError("foxglove-sdk", "daemon") from None
+
+        self.dropped = 0
+        self._loop, self._name, self._settings = loop, name, settings
+        self._backbone = backbone
+        self._queue: deque[Snapshot] = deque(maxlen=_KEPT)
+        self._context = Context()
+        begin = clock.now()
+        self._offset = wall() - round(begin * 1e9)
+        self._channels = Channels(self._context, self._offset, 2 * _radius(robot))
+        first = loop.snapshot()
+        facts = {**about_run(robot, name, first, begin, self._offset), **(about or {})}
+        self._recording = (
+            None
+            if folder is None
+            else Recording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
+        )
+        self._server: Any = None
+        self._thread: threading.Thread | None = None
+        self._stop = threading.Event()
+        self._next_event = 0
+        self._last_state: object = None
+        self._logged = np.inf  # nothing was handed over yet
+        self._due_tick = self._due_state = self._due_smooth = self._due_often = (
+            self._due_commit
+        ) = -np.inf
+        self._told: dict[str, str] = {}
+        self._dropped_told = 0
+        self._dropped_at = self._failed_at = -np.inf
+
+    @property
+    def port(self) -> int | None:
+        """Where Foxglove can connect; None while it cannot."""
+        return None if self._server is None else int(self._server.port)
+
+    @property
+    def path(self) -> str | None:
+        """The file that is written, or was last."""
+        return None if self._recording is None else self._recording.path
+
+    @property
+    def written(self) -> int:
+        """Bytes recorded so far."""
+        return 0 if self._recording is None else self._recording.written
+
+    @property
+    def waiting(self) -> int:
+        """Snapshots that are not logged yet."""
+        return len(self._queue)
+
+    def put(self, snapshot: Snapshot) -> None:
+        """Hand over a snapshot; called by the control thread in each tick, and never waits."""
+        if len(self._queue) == _KEPT:
+            self.dropped += 1
+        self._queue.append(snapshot)
+
+    def start(self) -> None:
+        """Listen, record, and work in a thread of its own."""
+        self._listen()
+        self.work()
+        self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Log what is left, end the recording and listen no more; to stop twice does nothing."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        end = self._loop.snapshot()
+        if end.time > (self._queue[-1].time if self._queue else self._logged):
+            self.put(end)  # what became of it after the last tick
+        self.work(last=True)
+        if self._recording is not None:
+            self._recording.close()
+        if self._server is not None:
+            self._server.stop()
+            self._server = None
+        self._channels.close()
+
+    def work(self, *, last: bool = False) -> None:
+        """Log what has come since the last call; with `last`, see it onto the disk at once."""
+        if self._recording is not None and not self._recording.is_open:
+            self._commit(time.monotonic())  # to have it before anything is logged
+        while self._queue:
+            self._attempt(self._log, self._queue.popleft())
+            time.sleep(0)  # the control thread may want the interpreter
+        events, self._next_event = self._loop.events.since(self._next_event)
+        for event in events:
+            self._attempt(self._channels.log_event, event)
+        now = time.monotonic()
+        if last or now >= self._due_commit:
+            self._due_commit = now + _COMMIT
+            self._commit(now)
+        self._look_back(now)
+
+    def _attempt(self, log: Callable[[Any], None], what: Any) -> None:
+        """Log something; that it fails is told, and no more comes of it."""
+        try:
+            log(what)
+        except Exception as error:
+            self._failed_at = time.monotonic()
+            self._tell("telemetry", f"something could not be logged: {error}")
+
+    def _run(self) -> None:
+        while not self._stop.wait(_WAKE):
+            self.work()
+
+    def _listen(self) -> None:
+        port = self._settings.foxglove_port
+        if port is None or self._server is not None:
+            return
+        import foxglove
+
+        try:
+            self._server = foxglove.start_server(
+                name=f"stiffopt: {self._name}",
+                host=self._settings.host,
+                port=port,
+                context=self._context,
+            )
+        except RuntimeError as error:
+            where = f"{self._settings.host}:{port}"
+            self._tell("foxglove", f"Foxglove cannot connect: {where} is not free ({error})")
+
+    def _log(self, now: Snapshot) -> None:
+        self._logged = now.time
+        due = on_time = now.time >= self._due_tick - _FINEST / 2
+        state = (now.state, now.reason, now.task, _kinds(now.alarms))
+        if state != self._last_state or now.time >= self._due_state:
+            self._channels.log_state(now)
+            self._last_state, self._due_state = state, now.time + _SELDOM
+            due = True
+        if due:
+            regular = on_time and now.time <= self._due_tick + _FINEST
+            self._due_tick = (self._due_tick if regular else now.time) + _FINEST
+            self._channels.log_tick(now)
+        self._channels.log_samples(now)  # each of them
+        if now.time >= self._due_smooth:
+            self._due_smooth = now.time + _SMOOTH
+            self._channels.log_frames(now)
+        if now.time >= self._due_often:
+            self._due_often = now.time + _OFTEN
+            self._channels.log_timing(now, self.dropped)
+            self._log_arm(now)
+
+    def _log_arm(self, now: Snapshot) -> None:
+        if self._backbone is None:
+            return
+        p = np.where(np.isfinite(now.measured), now.measured, now.commanded)
+        if np.isfinite(p).all():
+            with suppress(StiffoptError):  # an arm whose shape nobody knows is not drawn
+                self._channels.log_arm(now, self._backbone(p))
+
+    def _commit(self, now: float) -> None:
+        if self._recording is not None:
+            self._recording.commit(now)
+            self._tell("log", self._recording.trouble)
+
+    def _look_back(self, now: float) -> None:
+        """Say what was lost, and that all is well when nothing has gone wrong for a while."""
+        if now > self._failed_at + _CALM:
+            self._tell("telemetry", "")
+        if self.dropped > self._dropped_told:
+            self._dropped_told, self._dropped_at = self.dropped, now
+            text = f"telemetry is too slow; {self.dropped} snapshots were never logged"
+            self._tell("telemetry-lost", text)
+        elif now > self._dropped_at + _CALM:
+            self._tell("telemetry-lost", "")
+
+    def _tell(self, kind: str, text: str) -> None:
+        """Raise an alarm, or clear it where there is nothing to say; only what changes is told."""
+        if self._told.get(kind, "") == text:
+            return
+        self._told[kind] = text
+        if text:
+            self._loop.add_alarm(kind, text)
+        else:
+            self._loop.clear_alarm(kind)
+
+
+def about_run(
+    robot: RobotDescription, name: str, first: Snapshot, begin: float, offset: int
+) -> dict[str, str]:
+    """Return what a recording says of itself, so that whoever reads it needs nothing else."""
+    from stiffopt import __version__
+
+    return {
+        "format": FORMAT,
+        "rig": name,
+        "robot": robot.name,
+        "robot_file": file_text("robot", robot),
+        "channels": ",".join(str(segment.n_channels) for segment in robot.segments),
+        "low_pa": ",".join(f"{value:g}" for value in first.low),
+        "high_pa": ",".join(f"{value:g}" for value in first.high),
+        "start_s": repr(begin),
+        "start_ns": str(offset + round(begin * 1e9)),
+        "stiffopt": __version__,
+    }
+
+
+def _radius(robot: RobotDescription) -> float:
+    return max(segment.outer_radius for segment in robot.segments)
+
+
+def _kinds(alarms: tuple[Alarm, ...]) -> frozenset[str]:
+    return frozenset(alarm.kind for alarm in alarms)

@@ -1,0 +1,75 @@
+"""The benchmark of the closed loop: its cases, its judgement and its baselines, in short form."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba")
+import stiffopt.rig.simulated.rig  # noqa: F401 - its code is kept where it always is
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
+
+import control
+import control_runs
+from control_baselines import CONTROLLERS, Gains, IntegralFeedback
+from control_cases import DIRECTIONS, STEPS, draw_case, draw_path
+
+
+@pytest.fixture(autouse=True)
+def _machine_code(compiled):
+    """Truth and controllers are too slow without."""
+
+
+def test_a_case_is_what_the_bars_say_and_its_truth_is_that_of_the_arm():
+    case = draw_case(3, targets=1)
+    m = case.description.plant.mismatch
+    assert np.linalg.norm(m.base.position) == pytest.approx(2e-3)
+    assert np.abs(np.array(m.gain) - 1).max() <= 0.05
+    assert np.abs(np.array(m.modulus) - 1).max() <= 0.2
+    arm, aim = case.arm(), case.aims[0]
+    assert arm.settled(aim.drawn) == pytest.approx(aim.position, abs=1e-6)
+    assert arm.settled(aim.stiffest) == pytest.approx(aim.position, abs=2e-5)
+    rest = arm.settled(np.zeros(6))
+    assert STEPS[0] <= np.linalg.norm(aim.position - rest) <= STEPS[1]
+    assert 0.1 < aim.ideal < 1.0
+    direction = DIRECTIONS[aim.kind]
+    # the model of the truth has linear silicone, and pressures that add nothing else
+    assert case.truth.position(aim.drawn) == pytest.approx(aim.position, abs=8e-3)
+    assert case.truth.stiffness(aim.drawn, direction) == pytest.approx(
+        arm.stiffness(aim.drawn, direction), rel=0.15
+    )
+    choice = case.truth.choice(aim.drawn, direction, np.random.default_rng(0))
+    for p, value in ((choice.softest, choice.least), (choice.stiffest, choice.most)):
+        assert case.truth.position(p) == pytest.approx(case.truth.position(aim.drawn), abs=1e-4)
+        assert case.truth.stiffness(p, direction) == pytest.approx(value)
+    assert choice.least < case.truth.stiffness(aim.drawn, direction) < choice.most * (1 + 1e-9)
+
+
+def test_feedback_beats_the_model_alone_and_the_table_says_so():
+    case = draw_case(3, targets=1)
+
+    def slow(rig, robot, dynamics):
+        return IntegralFeedback(rig, robot, Gains(1.0, 2e5))
+
+    alone = control_runs.run_case(case, "open-loop", CONTROLLERS["open-loop"], "quasi-static")
+    helped = control_runs.run_case(case, "integral", slow, "quasi-static", in_loop=True)
+    assert helped[0].steady < 0.3 * alone[0].steady
+    assert alone[0].broken == helped[0].broken == 0
+    assert not helped[0].unstable
+    assert 0.5 < helped[0].kept <= 1 + 1e-9
+    text = control.tables([*alone, *helped])
+    assert "| measure | open-loop | integral |" in text
+    assert "quasi-static" in text
+
+
+def test_a_path_has_the_right_speed():
+    case = draw_case(3, targets=1)
+    path = draw_path(case)
+    lengths = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
+    assert (lengths / np.diff(path.times)).max() == pytest.approx(0.010, rel=0.03)
+    # an eight whose axis is 40 mm long
+    spread = np.linalg.norm(path.positions[:, None] - path.positions[None], axis=2).max()
+    assert spread == pytest.approx(0.040, rel=0.05)
+    assert path.at(np.array([1e9]))[0] == pytest.approx(path.positions[-1])

@@ -1,0 +1,794 @@
+"""What the guard decides, step by step: its clock, outlet and channel are ours."""
+
+from __future__ import annotations
+
+import gc
+import io
+import math
+import pickle
+import runpy
+import signal
+import socket
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stiffopt.control.outlet import Applied
+from stiffopt.daemon import guard as guard_module
+from stiffopt.daemon import hosted
+from stiffopt.daemon.frames import (
+    Answer,
+    Channel,
+    CommandFrame,
+    Message,
+    Poses,
+    Request,
+    Word,
+    unpack,
+)
+from stiffopt.daemon.guard import FIRST_COMMAND, Guard, main
+from stiffopt.daemon.hosted import Owned, SimulatedRest, owned
+from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError, SlowWarning
+from stiffopt.model.robot_files import load_description
+from stiffopt.rig.config import load_rig_description, open_rig
+from stiffopt.rig.interface import (
+    PoseSample,
+    PressureCommand,
+    PressureLimits,
+    PressureReading,
+)
+
+TIMEOUT = 0.05
+SILENT = "no command had come for 50 ms"
+
+
+class Clock:
+    """A time that moves when it is told to."""
+
+    def __init__(self) -> None:
+        self.time = 1000.0
+
+    def __call__(self) -> float:
+        return self.time
+
+
+class FakeOutlet:
+    """An outlet that remembers; `fail` says what raises, with what."""
+
+    def __init__(self) -> None:
+        self.limits = PressureLimits(np.zeros(2), np.full(2, 1e5))
+        self.did: list[str] = []
+        self.commands: list[PressureCommand] = []
+        self.pressures = np.zeros(2)
+        self.fail: dict[str, list[BaseException]] = {}
+        self.takes = 0.0
+        self.clock: Clock | None = None
+
+    def _do(self, what: str) -> None:
+        self.did.append(what)
+        if self.clock is not None:
+            self.clock.time += self.takes
+        if self.fail.get(what):
+            raise self.fail[what].pop(0)
+
+    def open(self) -> None:
+        self._do("open")
+
+    def close(self) -> None:
+        self._do("close")
+
+    def arm(self) -> None:
+        self._do("arm")
+
+    def vent(self) -> None:
+        self._do("vent")
+        self.pressures = np.zeros(2)
+
+    def apply(self, command: PressureCommand) -> Applied:
+        self._do("apply")
+        self.commands.append(command)
+        self.pressures = command.pressures
+        return Applied(self.pressures, self._reading(), limited=command.pressures[0] > 5e4)
+
+    def read(self) -> PressureReading:
+        self._do("read")
+        return self._reading()
+
+    def _reading(self) -> PressureReading:
+        return PressureReading(7.0, self.pressures + 1.0)
+
+
+class FakeChannel:
+    """A channel whose other end is the test."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.closed = False
+        self.coming: list[Message] = []
+        self.sent: list[Message] = []
+        self.waits: list[float] = []
+        self._clock = clock
+
+    def receive(self, wait: float) -> list[Message]:
+        self.waits.append(wait)
+        if not self.coming:
+            self._clock.time += wait
+        coming, self.coming = self.coming, []
+        return coming
+
+    def send(self, message: Message) -> bool:
+        self.sent.append(message)
+        return not self.closed
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class Scene:
+    """A guard and all around it."""
+
+    def __init__(self, **options: Any) -> None:
+        self.clock = Clock()
+        self.outlet = FakeOutlet()
+        self.outlet.clock = self.clock
+        self.channel = FakeChannel(self.clock)
+        self.pauses: list[float] = []
+        self.guard = Guard(
+            self.outlet,
+            self.channel,  # type: ignore[arg-type]
+            TIMEOUT,
+            clock=self.clock,
+            pause=self.pauses.append,
+            **options,
+        )
+        self._number = 0
+
+    def request(self, do: str, **about: Any) -> Request:
+        self._number += 1
+        return Request(self._number, do, about)
+
+    def command(self, pressure: float = 2e4, age: float = 0.0) -> CommandFrame:
+        self._number += 1
+        now = self.clock.time - age
+        return CommandFrame(self._number, now, now, 0.1, np.full(2, pressure))
+
+    def step(self, *messages: Message) -> list[Answer]:
+        """Let the guard take messages; return its answers."""
+        self.channel.coming += messages
+        before = len(self.channel.sent)
+        self.guard.step()
+        return [m for m in self.channel.sent[before:] if isinstance(m, Answer)]
+
+    def pressed(self) -> Scene:
+        """Armed and under pressure."""
+        self.step(self.request("arm"))
+        (answer,) = self.step(self.command())
+        assert answer.armed
+        assert answer.commanded.tolist() == [2e4, 2e4]
+        self.outlet.did.clear()
+        return self
+
+
+# commands ----------------------------------------------------------------------------------------
+
+
+def test_a_command_is_passed_on_and_answered() -> None:
+    scene = Scene(epoch=900.0)
+    scene.step(scene.request("arm"))
+    (answer,) = scene.step(scene.command(6e4))
+    (command,) = scene.outlet.commands
+    assert command.time == pytest.approx(100.0)  # on the rig's clock
+    assert command.valid_for == 0.1
+    assert (answer.sequence, answer.armed, answer.limited) == (2, True, True)
+    assert answer.commanded.tolist() == [6e4, 6e4]
+    assert answer.measured.tolist() == [6e4 + 1, 6e4 + 1]
+    assert answer.time == pytest.approx(907.0)  # on everybody's
+    assert (answer.tripped, answer.refused, answer.error) == ("", "", "")
+
+
+def test_of_several_commands_only_the_newest_is_passed_on() -> None:
+    scene = Scene().pressed()
+    (answer,) = scene.step(*[scene.command(p) for p in (1e4, 3e4, 4e4)])
+    assert answer.sequence == 5
+    assert scene.outlet.pressures.tolist() == [4e4, 4e4]
+    assert scene.outlet.did == ["apply"]
+
+
+def test_what_the_gate_refuses_is_told_and_no_trip() -> None:
+    scene = Scene().pressed()
+    scene.outlet.fail["apply"] = [CommandError("too high")]
+    (answer,) = scene.step(scene.command(9e9))
+    assert answer.refused == "too high"
+    assert answer.armed
+    assert answer.commanded.tolist() == [2e4, 2e4]
+
+
+def test_a_refused_command_shows_that_the_loop_lives() -> None:
+    scene = Scene().pressed()
+    for _ in range(20):
+        scene.clock.time += 0.01
+        scene.outlet.fail["apply"] = [CommandError("too high")]
+        scene.step(scene.command(9e9))
+    assert "vent" not in scene.outlet.did
+
+
+@pytest.mark.parametrize("error", [DeviceError("no answer"), RuntimeError("no answer")])
+def test_a_supply_that_fails_trips(error: Exception, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene().pressed()
+    scene.outlet.fail["apply"] = [error]
+    answers = scene.step(scene.command())
+    assert scene.outlet.did == ["apply", "vent"]
+    assert [answer.sequence for answer in answers] == [0, 3]
+    assert "no answer" in answers[1].error
+    assert "the supply failed: " in answers[1].tripped
+    assert not answers[1].armed
+    assert "vented: the supply failed" in capsys.readouterr().err
+
+
+# silence -----------------------------------------------------------------------------------------
+
+
+def test_silence_vents_in_time(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene().pressed()
+    silent_since = scene.clock.time
+    while "vent" not in scene.outlet.did:
+        scene.step()
+        scene.clock.time += 1e-4
+    assert TIMEOUT < scene.clock.time - silent_since < TIMEOUT + 2e-3
+    (told,) = [m for m in scene.channel.sent if isinstance(m, Answer) and m.tripped]
+    assert (told.sequence, told.tripped, told.trips, told.armed) == (0, SILENT, 1, False)
+    assert told.commanded.tolist() == [0, 0]
+    assert f"vented: {SILENT}" in capsys.readouterr().err
+
+
+def test_a_fed_guard_does_not_vent() -> None:
+    scene = Scene().pressed()
+    for _ in range(100):
+        scene.clock.time += 0.9 * TIMEOUT
+        scene.step(scene.command())
+    assert set(scene.outlet.did) == {"apply"}
+
+
+def test_nothing_but_commands_feeds() -> None:
+    scene = Scene().pressed()
+    for _ in range(6):
+        scene.clock.time += 0.01
+        scene.step(scene.request("read"))
+    assert "vent" in scene.outlet.did
+
+
+def test_the_first_command_may_take_longer_but_not_for_ever() -> None:
+    scene = Scene()
+    scene.step(scene.request("arm"))
+    scene.clock.time += 0.9 * FIRST_COMMAND
+    scene.step()
+    assert scene.outlet.did == ["arm"]
+    scene.clock.time += 0.2 * FIRST_COMMAND
+    scene.step()
+    assert scene.outlet.did == ["arm", "vent"]
+
+
+@pytest.mark.parametrize("rest", ["nothing", "old", "new"])
+def test_a_loop_that_was_stopped_finds_the_trip(rest: str) -> None:
+    """Also if guard and loop were stopped together, and the loop went on first."""
+    scene = Scene().pressed()
+    sent = {"nothing": [], "old": [scene.command()], "new": []}[rest]
+    scene.clock.time += 1.0
+    sent += [scene.command()] if rest == "new" else []
+    answers = scene.step(*sent)
+    assert answers[0].tripped == SILENT
+    assert scene.outlet.did == ["vent"]
+    (answer,) = scene.step(scene.command())
+    assert answer.tripped == SILENT
+    assert scene.outlet.did == ["vent"]
+
+
+def test_commands_that_waited_while_the_device_was_slow_count() -> None:
+    scene = Scene().pressed()
+    frames = []
+    for _ in range(20):
+        scene.clock.time += 0.01
+        frames.append(scene.command())
+    scene.step(*frames)
+    assert scene.outlet.did == ["apply"]
+
+
+def test_a_gap_between_commands_that_waited_trips() -> None:
+    scene = Scene().pressed()
+    first = scene.command()
+    scene.clock.time += 2 * TIMEOUT
+    scene.step(first, scene.command())
+    assert scene.outlet.did == ["vent"]
+
+
+@pytest.mark.parametrize("sent", [math.nan, 1e12])
+def test_a_command_that_was_sent_at_no_time_trips(sent: float) -> None:
+    scene = Scene().pressed()
+    frame = CommandFrame(9, sent, 0.0, 0.1, np.zeros(2))
+    scene.step(frame)
+    assert scene.outlet.did == ["vent"]
+
+
+# arming and venting ------------------------------------------------------------------------------
+
+
+def test_a_trip_is_latched_until_a_loop_that_knows_of_it_arms() -> None:
+    scene = Scene().pressed()
+    scene.clock.time += 1.0
+    scene.step()
+    (answer,) = scene.step(scene.request("arm", told=0))
+    assert answer.error == f"the guard had vented: {SILENT}"
+    (answer,) = scene.step(scene.request("vent"))
+    assert answer.tripped == SILENT
+    assert "arm" not in scene.outlet.did
+    (answer,) = scene.step(scene.request("arm", told=1))
+    assert (answer.error, answer.tripped, answer.armed) == ("", "", True)
+    (answer,) = scene.step(scene.command())
+    assert answer.commanded.tolist() == [2e4, 2e4]
+
+
+def test_the_next_trip_must_be_told_too() -> None:
+    scene = Scene().pressed()
+    for told in (1, 2):
+        scene.clock.time += 2.0
+        scene.step()
+        assert scene.step(scene.request("arm", told=told - 1))[0].error
+        assert not scene.step(scene.request("arm", told=told))[0].error
+
+
+def test_to_vent_comes_first() -> None:
+    scene = Scene().pressed()
+    arm, command, read = scene.request("arm"), scene.command(), scene.request("read")
+    first, last = scene.request("vent"), scene.request("vent")
+    answers = scene.step(arm, command, first, read, last, scene.request("read"))
+    assert scene.outlet.did == ["vent", "vent", "read"]
+    assert [bool(answer.error) for answer in answers] == [True, False, True, False, False]
+    assert "overtaken" in answers[0].error
+
+
+@pytest.mark.parametrize("do", ["arm", "vent"])
+def test_a_command_from_before_does_not_survive(do: str) -> None:
+    scene = Scene().pressed()
+    scene.step(scene.command(), scene.request(do))
+    assert "apply" not in scene.outlet.did
+
+
+def test_a_vented_guard_waits_for_no_command() -> None:
+    scene = Scene().pressed()
+    scene.step(scene.request("vent"))
+    scene.clock.time += 5.0
+    scene.step()
+    assert scene.outlet.did == ["vent"]
+    assert not scene.step(scene.request("read"))[0].tripped
+
+
+def test_to_arm_what_is_armed_begins_without_pressure() -> None:
+    scene = Scene().pressed()
+    (answer,) = scene.step(scene.request("arm"))
+    assert scene.outlet.did == ["vent", "arm"]
+    assert answer.commanded.tolist() == [0, 0]
+
+
+def test_what_cannot_be_armed_is_vented() -> None:
+    scene = Scene()
+    scene.outlet.fail["arm"] = [DeviceError("valve")]
+    (answer,) = scene.step(scene.request("arm"))
+    assert (answer.error, answer.armed) == ("valve", False)
+    assert scene.outlet.did == ["arm", "vent"]
+
+
+def test_venting_is_tried_until_it_works(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene().pressed()
+    scene.outlet.fail["vent"] = [DeviceError("no answer")] * 5
+    (answer,) = scene.step(scene.request("vent"))
+    assert answer.error == "no answer"
+    assert scene.step(scene.request("arm"))[0].error.startswith("the supply could not be vented")
+    for _ in range(20):
+        scene.step()
+    assert scene.outlet.did == ["vent"] * 6
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "stiffopt guard: COULD NOT VENT, and tries again: no answer",
+        "stiffopt guard: vented after all",
+    ]
+    assert not scene.step(scene.request("arm"))[0].error
+
+
+def test_a_trip_that_cannot_vent_does_not_say_that_it_did(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scene = Scene().pressed()
+    scene.outlet.fail["vent"] = [DeviceError("no answer")]
+    scene.clock.time += 1.0
+    scene.step()
+    assert f"vented: {SILENT}" not in capsys.readouterr().err
+
+
+# other requests ----------------------------------------------------------------------------------
+
+
+def test_a_reading_is_told() -> None:
+    scene = Scene(epoch=900.0)
+    (answer,) = scene.step(scene.request("read"))
+    assert answer.measured.tolist() == [1.0, 1.0]
+    assert answer.time == pytest.approx(907.0)
+    scene.outlet.fail["read"] = [DeviceError("no answer")]
+    (answer,) = scene.step(scene.request("read"))
+    assert answer.error == "no answer"
+    assert answer.measured.tolist() == [1.0, 1.0]  # the last that is known, with its time
+
+
+class FakeRest:
+    """Hosts a tracker."""
+
+    def __init__(self) -> None:
+        self.new: list[PoseSample] = []
+
+    def poses(self) -> Sequence[PoseSample]:
+        new, self.new = self.new, []
+        return new
+
+    def ask(self, word: str, about: dict[str, Any]) -> Any:
+        if word != "truth":
+            raise InputError(f"no {word}")
+        return [about["n"]]
+
+
+def sample(frame: int) -> PoseSample:
+    return PoseSample(10.0 + frame, 10.5 + frame, frame, np.full(3, float(frame)), None)
+
+
+def test_the_poses_of_a_hosted_tracker_are_forwarded() -> None:
+    rest = FakeRest()
+    scene = Scene(epoch=900.0, hosted=rest)
+    rest.new = [sample(i) for i in range(450)]
+    scene.step()
+    packets = [m for m in scene.channel.sent if isinstance(m, Poses)]
+    assert [len(packet.samples) for packet in packets] == [200, 200, 50]
+    first = packets[0].samples[0]
+    assert (first.time, first.received, first.frame) == (910.0, 910.5, 0)
+    assert scene.channel.waits[-1] < 0.005
+    scene.step()
+    assert len([m for m in scene.channel.sent if isinstance(m, Poses)]) == 3
+
+
+def test_what_is_not_for_the_guard_is_left() -> None:
+    scene = Scene().pressed()
+    assert scene.step(Word("ready"), scene.command())[0].armed
+
+
+def test_only_a_simulation_knows_the_truth() -> None:
+    scene = Scene(hosted=FakeRest())
+    assert scene.step(scene.request("truth", n=3))[0].value == [3]
+    assert scene.step(scene.request("lie"))[0].error == "no lie"
+    scene = Scene()
+    assert "does not know 'truth'" in scene.step(scene.request("truth"))[0].error
+
+
+def test_garbage_is_collected_while_nothing_is_under_pressure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    collected: list[int] = []
+    monkeypatch.setattr(gc, "collect", lambda: collected.append(1))
+    scene = Scene()
+    begin = scene.clock.time
+    while scene.clock.time < begin + 35:
+        scene.step()
+    assert len(collected) == 3
+    scene.pressed()
+    collected.clear()
+    for _ in range(300):
+        scene.clock.time += 0.04
+        scene.step(scene.command())
+    assert not collected
+
+
+# the end -----------------------------------------------------------------------------------------
+
+
+def test_the_end_of_the_loop_s_process_vents_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene().pressed()
+    scene.channel.closed = True
+    before = scene.clock.time
+    assert scene.guard.serve() == 0
+    assert scene.clock.time - before < TIMEOUT
+    assert scene.outlet.did == ["vent", "close"]
+    assert "vented: the process of the control loop has ended" in capsys.readouterr().err
+
+
+def test_to_close_vents_and_ends_quietly(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene().pressed()
+    scene.channel.coming = [scene.request("close")]
+    assert scene.guard.serve() == 0
+    assert scene.outlet.did == ["vent", "vent", "close"]
+    assert isinstance(scene.channel.sent[-1], Answer)
+    assert capsys.readouterr().err == ""
+
+
+def test_a_signal_vents_and_ends() -> None:
+    scene = Scene().pressed()
+    scene.guard.leave("SIGTERM")
+    assert scene.guard.serve() == 0
+    assert scene.outlet.did == ["vent", "close"]
+
+
+def test_a_bug_vents(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene().pressed()
+
+    def fail(wait: float) -> list[Message]:
+        raise RuntimeError("bug")
+
+    monkeypatch.setattr(scene.channel, "receive", fail)
+    with pytest.raises(RuntimeError, match="bug"):
+        scene.guard.serve()
+    assert scene.outlet.did == ["vent", "close"]
+
+
+def test_at_the_end_venting_is_tried_again_and_again() -> None:
+    scene = Scene().pressed()
+    scene.outlet.fail["vent"] = [DeviceError("no answer")] * 7
+    scene.channel.closed = True
+    assert scene.guard.serve() == 0
+    assert scene.outlet.did == ["vent"] * 8 + ["close"]
+    assert len(scene.pauses) == 7
+
+
+@pytest.mark.parametrize("what", ["vent", "close"])
+def test_what_cannot_be_vented_is_told_loudly(
+    what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = Scene().pressed()
+    scene.outlet.fail[what] = [DeviceError("no answer")] * 100
+    scene.channel.closed = True
+    assert scene.guard.serve() == 1
+    assert len(scene.outlet.did) < 50
+    assert "THE SUPPLY COULD NOT BE VENTED: no answer" in capsys.readouterr().err
+
+
+def test_a_listener_that_is_gone_keeps_nothing_from_venting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(sys, "stderr", closed)
+    scene = Scene().pressed()
+    scene.clock.time += 1.0
+    scene.step()
+    assert scene.outlet.did == ["vent"]
+
+
+# the process -------------------------------------------------------------------------------------
+
+
+class Process:
+    """The main function of the guard, with a supply of ours."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.outlet = FakeOutlet()
+        self.error: Exception | None = None
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.channel, self._descriptor = Channel(ours), theirs.detach()
+        monkeypatch.setattr(guard_module, "owned", self._owned)
+        stdin = io.TextIOWrapper(io.BytesIO(pickle.dumps(("rig", "robot"))))
+        monkeypatch.setattr(sys, "stdin", stdin)
+
+    def _owned(self, rig: str, robot: str) -> Owned:
+        assert (rig, robot) == ("rig", "robot")
+        warnings.warn("this takes its time", SlowWarning, stacklevel=1)
+        if self.error is not None:
+            raise self.error
+        return Owned(self.outlet, TIMEOUT)
+
+    def run(self, *messages: Message) -> tuple[int, list[Message]]:
+        for message in messages:
+            assert self.channel.send(message)
+        code = main([str(self._descriptor)])
+        said = self.channel.receive()
+        self.channel.close()
+        return code, said
+
+
+@pytest.fixture
+def process(monkeypatch: pytest.MonkeyPatch) -> Iterator[Process]:
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+    made = Process(monkeypatch)
+    yield made
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    made.channel.close()
+    with suppress(OSError):
+        socket.close(made._descriptor)
+
+
+def test_the_process_opens_guards_and_ends(process: Process) -> None:
+    code, said = process.run(Request(1, "arm"), Request(2, "close"))
+    assert code == 0
+    assert process.outlet.did == ["open", "arm", "vent", "vent", "close"]
+    notice, ready, armed, closed = said
+    assert notice == Word("notice", {"text": "this takes its time"})
+    assert isinstance(ready, Word)
+    assert ready.kind == "ready"
+    assert "real-time: " in ready.about["real_time"]
+    assert isinstance(armed, Answer)
+    assert isinstance(closed, Answer)
+    assert armed.armed
+    assert not closed.armed
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+def test_the_process_leaves_at_sigterm(process: Process, monkeypatch: pytest.MonkeyPatch) -> None:
+    def arm() -> None:
+        process.outlet.did.append("arm")
+        signal.raise_signal(signal.SIGINT)  # ignored
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(process.outlet, "arm", arm)
+    assert process.run(Request(1, "arm"))[0] == 0
+    assert process.outlet.did == ["open", "arm", "vent", "close"]
+
+
+@pytest.mark.parametrize(
+    "error", [DeviceError("no answer"), MissingExtraError("pymodbus", "modbus")]
+)
+def test_the_process_says_why_it_cannot_start(process: Process, error: Exception) -> None:
+    process.error = error
+    code, said = process.run()
+    assert code == 1
+    assert said[1] == Word("failed", {"kind": type(error).__name__, "args": list(error.args)})
+
+
+def test_the_file_is_a_program(process: Process, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hosted, "owned", process._owned)
+    monkeypatch.setattr(sys, "argv", ["guard", str(process._descriptor)])
+    process.error = DeviceError("no answer")
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(guard_module.__file__), run_name="__main__")
+    assert end.value.code == 1
+
+
+def test_a_sigterm_before_there_is_a_supply_ends(
+    process: Process, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(rig: str, robot: str) -> Owned:
+        signal.raise_signal(signal.SIGTERM)
+        raise AssertionError("it did not end")
+
+    monkeypatch.setattr(guard_module, "owned", interrupted)
+    with pytest.raises(SystemExit):
+        process.run()
+
+
+# what it owns ------------------------------------------------------------------------------------
+
+RIGS = Path(__file__).parent.parent / "rig"
+
+
+def test_a_simulated_rig_is_hosted_whole() -> None:
+    supply = owned(
+        load_rig_description(RIGS / "sim-two-segment.yaml"),
+        load_description("stiff-flop-2-hanging"),
+    )
+    supply.outlet.open()
+    rest = supply.hosted
+    assert rest is not None
+    assert supply.timeout == TIMEOUT
+    assert not rest.poses()
+    time.sleep(0.2)
+    samples = rest.poses()
+    assert [sample.frame for sample in samples][:3] == [1, 2, 3]
+    assert -0.1 < time.monotonic() - supply.epoch - samples[-1].received < 1.0
+    assert np.shape(rest.ask("truth", {})) == (4, 4)
+    assert np.shape(rest.ask("pressures", {})) == (6,)
+    with pytest.raises(DeviceError, match="knows nothing of 'future'"):
+        rest.ask("future", {})
+    rest.ask("inject", {"device": "supply", "fault": "off", "channel": None})
+    with pytest.raises(DeviceError):
+        supply.outlet.vent()
+    rest.ask("inject", {"device": "supply", "fault": "ok", "channel": None})
+    supply.outlet.close()
+
+
+def test_an_arm_that_cannot_be_followed_shows_no_poses(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = open_rig(RIGS / "sim.yaml", real_time=True)
+    rest = SimulatedRest(rig)
+
+    def fail() -> None:
+        raise DeviceError("buckled")
+
+    assert rig.tracker is not None
+    rest.poses()
+    monkeypatch.setattr(rig.tracker, "_poll", fail)
+    assert rest.poses() == ()
+    rig.tracker = None
+    assert SimulatedRest(rig).poses() == ()
+
+
+def test_of_a_real_rig_only_the_supply_is_owned() -> None:
+    supply = owned(
+        load_rig_description(RIGS / "modbus-aurora.yaml"), load_description("stiff-flop-1")
+    )
+    assert supply.hosted is None
+    assert supply.epoch == 0
+    assert type(supply.outlet.supply).__name__ == "ModbusSupply"  # type: ignore[attr-defined]
+
+
+# the wire ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        CommandFrame(3, 1.0, 2.0, 0.5, np.array([1e5, np.nan])),
+        Answer(4, np.array([1.0, 2.0]), np.array([3.0, np.nan]), 5.0, True, True, 6),
+        Answer(4, np.zeros(9), np.ones(9), 5.0, tripped="a", refused="b", error="µ", value=[[1.5]]),
+        Request(5, "inject", {"device": "supply", "channel": None}),
+        Word("ready", {"real_time": "yes"}),
+        Poses((sample(3), PoseSample(1.0, 2.0, 4, np.full(3, np.nan), np.array([1.0, 0, 0, 0])))),
+        Poses(()),
+    ],
+)
+def test_messages_arrive_as_they_were_sent(message: Message) -> None:
+    again = unpack(message.pack())
+    assert type(again) is type(message)
+    np.testing.assert_equal(again.pack(), message.pack())
+    np.testing.assert_equal(_plain(again), _plain(message))
+
+
+def _plain(message: Any) -> Any:
+    parts = dict(vars(message))
+    if isinstance(message, Poses):
+        parts["samples"] = [vars(s) for s in message.samples]
+    return parts
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [b"", b"X", b"C", b"C123", b"A12", b"R", b"R[1]", b"R5", b"W{}", b"P123", b"R\xff",
+     Answer(1, np.zeros(2), np.zeros(2), 0.0).pack()[:-3],
+     CommandFrame(1, 0.0, 0.0, 0.0, np.zeros(2)).pack()[:-3]],
+)  # fmt: skip
+def test_a_broken_packet_is_no_message(packet: bytes) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011  # of struct, json, numpy or ours
+        unpack(packet)
+    if packet:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with theirs:
+            channel = Channel(ours)
+            theirs.send(packet)
+            theirs.send(Word("ready").pack())
+            assert channel.receive(1.0) == [Word("ready")]
+            channel.close()
+
+
+def test_a_channel_that_nobody_reads_waits_for_nothing() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        channel = Channel(ours)
+        for _ in range(100000):
+            if not channel.send(Word("ready")):
+                break
+        else:
+            raise AssertionError("it took everything")
+        assert not channel.closed
+    assert not channel.send(Word("ready"))
+    assert channel.closed
+    assert channel.receive(5.0) == []
+    channel.close()
+
+
+def test_a_closed_end_is_noticed() -> None:
+    for unread in (False, True):
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        channel = Channel(ours)
+        if unread:
+            assert channel.send(Word("ready"))
+        theirs.close()
+        assert channel.receive(5.0) == []
+        assert channel.closed
+        channel.close()

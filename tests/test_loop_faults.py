@@ -1,0 +1,624 @@
+"""The numbered faults, on the simulated rig: each has the stated outcome."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from simulated_loop import PERIOD, TASK, Lab
+from stiffopt.control.state import State
+from stiffopt.control.steering import Notice
+from stiffopt.errors import CommandError, InputError
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import PressureRange
+from stiffopt.rig.interface import PoseTracker, PressureCommand, PressureReading, RawPose
+
+FRAME = 0.025  # s, between samples of the tracker
+LATENCY = 0.025  # s
+
+
+@pytest.mark.parametrize("fault", ["off", "missing", "stuck"])
+def test_1_2_3_tracker_missing_not_visible_or_frozen(fault: str) -> None:
+    lab = Lab().under_pressure()
+    before = lab.loop.snapshot().commanded
+    lab.world.inject("tracker", fault)
+    assert 3 * FRAME < lab.until(State.HOLDING) < 3 * FRAME + LATENCY + 0.04
+    assert "tracker-missing" in lab.alarms
+    held = lab.ticks(20)
+    assert held.state is State.HOLDING
+    np.testing.assert_array_equal(held.commanded, before)
+    while "tracker-lost" not in lab.kinds:
+        lab.tick()
+    begin = lab.now
+    assert 0.5 < lab.loop.snapshot().seen_age < 0.5 + FRAME + LATENCY + 0.05
+    halfway = lab.ticks(50).commanded
+    assert (halfway < 0.55 * before + 1).all()
+    assert (halfway > 0.45 * before - 1).all()
+    lab.until(State.INACTIVE)
+    assert lab.now - begin == pytest.approx(1.0, abs=0.05)
+    assert lab.is_vented()
+    assert lab.gate.armed is False
+
+
+def test_1_a_tracker_that_comes_back_in_time_goes_on_by_itself() -> None:
+    lab = Lab().under_pressure()
+    lab.world.inject("tracker", "off")
+    lab.until(State.HOLDING)
+    lab.ticks(20)
+    lab.world.inject("tracker", "ok")
+    assert lab.until(State.ACTIVE) < 0.1
+    assert "resume" in lab.steering.calls
+    assert not lab.alarms
+
+
+def test_1_two_missing_frames_do_not_matter() -> None:
+    lab = Lab().under_pressure()
+    lab.world.inject("tracker", "off")
+    lab.ticks(5)  # 50 ms
+    lab.world.inject("tracker", "ok")
+    for _ in range(30):
+        assert lab.tick().state is State.ACTIVE
+
+
+def test_1_what_was_begun_to_be_let_down_is_let_down() -> None:
+    lab = Lab().under_pressure()
+    lab.world.inject("tracker", "off")
+    while "tracker-lost" not in lab.kinds:
+        lab.tick()
+    lab.world.inject("tracker", "ok")
+    lab.ticks(20)
+    assert lab.state is State.HOLDING
+    with pytest.raises(CommandError, match="letting down: the tracker has lost the tip"):
+        lab.loop.set_task(TASK)
+    with pytest.raises(CommandError, match="letting down"):
+        lab.loop.hold()
+    lab.until(State.INACTIVE)
+
+
+def test_4_quaternion_sign_flips_do_not_matter() -> None:
+    lab = Lab().under_pressure()
+    lab.world.inject("tracker", "flip")
+    for _ in range(200):
+        assert lab.tick().state is State.ACTIVE
+    assert lab.steering.seen[-1].quaternion is not None
+    assert not lab.alarms
+
+
+def test_5_a_jump_is_rejected_and_repeated_a_fault() -> None:
+    lab = Lab().under_pressure()
+    lab.world.inject("tracker", "wrong")
+    lab.ticks(4)
+    lab.world.inject("tracker", "ok")
+    lab.ticks(20)
+    assert lab.state is State.ACTIVE
+    lab.steering.speed = 1e-3  # no matter how long it stays there
+    lab.world.inject("tracker", "wrong")
+    assert lab.until(State.FAULT) < 5 * FRAME + LATENCY + 0.03
+    assert "tracker-jumps" in lab.kinds
+    assert lab.is_vented()
+    with pytest.raises(CommandError, match="still seems to jump"):
+        lab.loop.reset()
+    lab.world.inject("tracker", "ok")
+    lab.steering.speed = 0.3
+    lab.ticks(10)
+    lab.loop.reset()
+
+
+class BlockedTracker(PoseTracker):
+    """Hands over what another tracker sees, until the thread that reads it is blocked."""
+
+    def __init__(self, inner: PoseTracker) -> None:
+        super().__init__(inner.registration, inner.clock)
+        self.inner = inner
+        self.reads = threading.Semaphore(0)
+        self.answers = threading.Semaphore(0)
+        self.unblocked = threading.Event()
+        self.unblocked.set()
+        self.ended = False
+        self.thread = threading.Thread(target=self._listen, daemon=True)
+
+    def _open(self) -> None:
+        self.inner.open()
+        self.thread.start()
+
+    def _close(self) -> None:
+        self.ended = True
+        self.unblocked.set()
+        self.reads.release()
+        self.thread.join()
+
+    def _poll(self) -> None:
+        self.reads.release()
+        if self.unblocked.is_set():  # so that the test is the same each time
+            self.answers.acquire()
+
+    def _listen(self) -> None:
+        while not self.ended:
+            self.reads.acquire()
+            self.unblocked.wait()  # a serial line on which nothing comes
+            for sample in self.inner.read():
+                raw = RawPose(sample.time, sample.frame, sample.position, None, sample.received)
+                self._deliver(raw)
+            self.answers.release()
+
+
+def test_6_a_tracker_whose_read_blocks_does_not_block_the_loop() -> None:
+    lab = Lab(ready=False)
+    tracker = BlockedTracker(lab.rig.tracker)  # type: ignore[arg-type]
+    lab.rig.tracker = tracker
+    lab.arm()
+    lab.under_pressure()
+    tracker.unblocked.clear()
+    begin, longest = lab.now, 0.0
+    while lab.now < begin + 5.0:
+        longest = max(longest, lab.tick().timing.tick_time)
+    timing = lab.loop.snapshot().timing
+    assert longest < 1.0  # of a thread that is blocked for good
+    assert timing.overruns == 0
+    assert lab.state is State.INACTIVE  # as for a tracker that is missing
+    assert "tracker-lost" in lab.kinds
+    tracker.close()
+
+
+def test_7_a_late_sample_keeps_its_time() -> None:
+    lab = Lab().under_pressure()
+    known = len(lab.steering.seen)
+    lab.world.inject("tracker", "slow")
+    lab.ticks(70)
+    late = lab.steering.seen[known + 4 :]
+    assert late
+    for sample in late:
+        assert sample.received - sample.time == pytest.approx(0.525, abs=1e-6)
+    assert lab.state is State.HOLDING  # what is half a second old is no basis
+
+
+def test_7_a_sample_out_of_order_is_passed_on_but_is_not_new() -> None:
+    lab = Lab().under_pressure()
+    tracker = lab.rig.tracker
+    assert tracker is not None
+    old = lab.steering.seen[-4]
+    lab.world.inject("tracker", "off")
+    begin, number = lab.now, 10_000
+    while lab.tick().state is State.ACTIVE:
+        number -= 1
+        tracker._deliver(RawPose(old.time, number, [np.nan] * 3))
+        tracker._arrived[-1] = type(old)(old.time, lab.now, number, old.position, old.quaternion)
+        assert lab.now < begin + 0.2
+    assert lab.state is State.HOLDING
+    assert lab.steering.seen[-1].time == old.time
+
+
+def test_8_a_regulator_that_saturates_is_flagged_and_does_not_wind_up() -> None:
+    lab = Lab(supply={"driver": "simulated", "saturation": 9e4})
+    lab.steering.wanted = np.array([1e5, 5e4, 0.0])
+    snapshot = lab.ticks(300)
+    assert snapshot.state is State.ACTIVE
+    assert snapshot.saturated.tolist() == [True, False, False]
+    assert "saturated" in lab.alarms
+    assert lab.steering.observed is not None
+    assert lab.steering.observed[2].pressures[0] == pytest.approx(9e4, abs=1e3)  # is told so
+    np.testing.assert_array_equal(snapshot.commanded, [1e5, 5e4, 0.0])  # nothing has wound up
+    lab.steering.wanted = np.array([5e4, 5e4, 0.0])
+    snapshot = lab.ticks(100)
+    assert not snapshot.saturated.any()
+    assert not lab.alarms
+    assert lab.world.pressures[0] == pytest.approx(5e4, abs=1e3)
+
+
+def test_9_leak() -> None:
+    lab = Lab().under_pressure(1.4e5, 1.4e5, 0.0)
+    lab.world.inject("supply", "leak", channel=1)
+    assert lab.until(State.FAULT) < 1.0
+    assert "leak" in lab.kinds
+    assert "channel 2" in lab.loop.snapshot().reason
+    assert lab.is_vented()
+
+
+def test_10_a_regulator_that_is_stuck_high_trips_the_dump_line() -> None:
+    lab = Lab().under_pressure()
+    lab.world.inject("supply", "high", channel=2)
+    assert lab.until(State.FAULT) < 0.6
+    assert "regulator-stuck" in lab.kinds
+    assert "channel 3" in lab.loop.snapshot().reason
+    assert lab.world.valve_open
+    assert lab.is_vented()
+    lab.ticks(500)
+    assert lab.state is State.FAULT
+    with pytest.raises(CommandError, match="reset"):
+        lab.loop.arm()
+
+
+def test_10_without_a_dump_line_it_cannot_be_reset_before_it_is_repaired() -> None:
+    lab = Lab(supply={"driver": "simulated", "dump_valve": False}).under_pressure()
+    lab.world.inject("supply", "high", channel=2)
+    lab.until(State.FAULT)
+    lab.ticks(100)
+    with pytest.raises(CommandError, match=r"still there: channel 3 reads 1\.5 bar"):
+        lab.loop.reset()
+    lab.world.inject("supply", "ok")
+    assert lab.is_vented()
+    lab.loop.reset()
+    assert lab.state is State.INACTIVE
+
+
+@pytest.mark.parametrize("channel", [None, 1])
+def test_11_readings_that_cannot_be(channel: int | None) -> None:
+    lab = Lab().under_pressure()
+    lab.world.inject("supply", "garbage", channel=channel)
+    lab.ticks(2)
+    assert lab.state is State.FAULT
+    assert "pressure-reading" in lab.kinds
+    assert lab.is_vented()
+    with pytest.raises(CommandError, match="which cannot be"):
+        lab.loop.reset()
+    lab.world.inject("supply", "ok")
+    lab.ticks(1)
+    lab.loop.reset()
+
+
+def test_12_a_supply_that_is_lost_is_a_fault_and_its_watchdog_vents() -> None:
+    lab = Lab(supply={"driver": "simulated", "watchdog": 0.3, "dump_valve": False})
+    lab.under_pressure()
+    lab.world.inject("supply", "off")
+    lab.ticks(1)
+    assert lab.state is State.FAULT
+    assert "not-vented" in lab.alarms  # it is tried in each tick, and no one answers
+    lab.ticks(100)
+    assert (lab.world.pressures < 1e3).all()  # which was the watchdog
+    with pytest.raises(CommandError, match="does not answer"):
+        lab.loop.reset()
+    lab.world.inject("supply", "ok")
+    lab.ticks(1)
+    assert "not-vented" not in lab.alarms
+    lab.loop.reset()
+
+
+def test_12_a_supply_without_watchdog_is_vented_when_it_is_back() -> None:
+    lab = Lab(supply={"driver": "simulated", "watchdog": None, "dump_valve": False})
+    lab.under_pressure()
+    lab.world.inject("supply", "off")
+    lab.ticks(200)
+    assert (lab.world.pressures[:2] > 1e4).all()
+    lab.world.inject("supply", "ok")
+    assert lab.is_vented()
+    assert lab.state is State.FAULT
+
+
+def test_13_requests_above_the_limits_are_refused() -> None:
+    lab = Lab().under_pressure()
+    before = lab.loop.snapshot()
+    too_much = TASK.model_copy(update={"pressure": PressureRange(max=2e5)})
+    with pytest.raises(CommandError, match=r"channel 1: 2 bar is beyond the limit of 1\.5 bar"):
+        lab.loop.set_task(too_much)
+    for_one = TASK.model_copy(update={"pressure": PressureRange(max=(None, 1e5, 1.6e5))})
+    with pytest.raises(CommandError, match=r"channel 3: 1\.6 bar"):
+        lab.loop.set_task(for_one)
+    too_low = TASK.model_copy(update={"pressure": PressureRange(min=-1e4)})
+    with pytest.raises(CommandError, match=r"pressure\.min: channel 1: -0\.1 bar"):
+        lab.loop.set_task(too_low)
+    applied = lab.gate.apply(PressureCommand(np.array([1e4, 2e5, 0.0]), lab.now))
+    assert "channel 2: 2 bar is out of range" in applied.refused
+    after = lab.tick()
+    assert after.state is State.ACTIVE
+    np.testing.assert_array_equal(after.commanded, before.commanded)
+    assert lab.steering.calls == ["begin", "begin"]
+
+
+def test_13_a_steering_that_goes_above_the_limits_is_held() -> None:
+    lab = Lab().under_pressure()
+    before = lab.loop.snapshot().commanded
+    lab.steering.override = lambda p: p + 2e5
+    lab.ticks(3)
+    assert lab.state is State.HOLDING
+    assert "out of range" in lab.loop.snapshot().reason
+    np.testing.assert_array_equal(lab.ticks(50).commanded, before)
+    assert lab.state is State.HOLDING
+
+
+def test_14_a_slew_beyond_the_limit_is_limited_and_flagged() -> None:
+    lab = Lab()
+    lab.steering.rate = 1e9
+    lab.steering.wanted = np.array([1.4e5, 0.0, 0.0])
+    before, slew = 0.0, lab.rig.slew[0]
+    flagged = 0
+    for _ in range(60):
+        snapshot = lab.tick()
+        assert snapshot.commanded[0] - before <= slew * PERIOD * (1 + 1e-9)
+        before = snapshot.commanded[0]
+        flagged += bool(snapshot.saturated[0])
+    assert before == 1.4e5
+    assert flagged == pytest.approx(1.4e5 / (slew * PERIOD), abs=1)
+
+
+@pytest.mark.parametrize(
+    ("request_", "match"),
+    [
+        (lambda loop: loop.set_task(None), "expected a Task, not NoneType"),
+        (lambda loop: loop.set_task("high"), "expected a Task, not str"),
+        (lambda loop: loop.set_target([0, 0, 0.1]), "expected a Target, not list"),
+        (
+            lambda loop: loop.set_target(Target.model_construct(position=(math.nan, 0.0, 0.1))),
+            r"target\.position: expected finite numbers",
+        ),
+        (lambda loop: loop.follow_trajectory(TASK), "expected a Trajectory, not Task"),
+        (
+            lambda loop: loop.set_task(
+                TASK.model_copy(update={"pressure": PressureRange(max=(1e5,) * 400)})
+            ),
+            "has 400 values; expected one, or 3",
+        ),
+        (lambda loop: loop.reset(), "there is no fault"),
+        (lambda loop: loop.arm(), "disarm first"),
+    ],
+)
+def test_15_malformed_requests_change_nothing(request_: Any, match: str) -> None:
+    lab = Lab().under_pressure()
+    before, events = lab.loop.snapshot(), lab.kinds
+    with pytest.raises(CommandError, match=match):
+        request_(lab.loop)
+    after = lab.tick()
+    assert after.state is State.ACTIVE
+    np.testing.assert_array_equal(after.commanded, before.commanded)
+    assert lab.kinds == events
+    assert lab.steering.calls == ["begin", "begin"]
+
+
+def test_15_a_task_that_the_steering_refuses_changes_nothing() -> None:
+    lab = Lab().under_pressure()
+
+    def refuse(call: str) -> None:
+        if call == "set_task":
+            raise InputError("the robot is another one")
+
+    lab.steering.accident = refuse
+    with pytest.raises(InputError, match="the robot is another one"):
+        lab.loop.set_task(TASK)
+    assert lab.tick().state is State.ACTIVE
+
+
+@pytest.mark.parametrize("fault", ["ok", "off"])
+def test_18_stopping_lets_down_in_bounded_time(fault: str) -> None:
+    lab = Lab().under_pressure()
+    stop = threading.Event()
+    stopped_at, highest = lab.now + 0.1, 0.0
+
+    def at_each_tick(call: str) -> None:
+        nonlocal highest
+        if call == "notices" and lab.now >= stopped_at and not stop.is_set():
+            stop.set()
+            lab.world.inject("tracker", fault)
+        if call == "observe" and stop.is_set():
+            highest = max(highest, float(lab.world.set_point.max()))
+
+    lab.steering.accident = at_each_tick
+    lab.loop.run(stop)
+    assert lab.state is State.INACTIVE
+    assert 0.9 < lab.now - stopped_at < 1.1
+    assert highest == pytest.approx(8e4, rel=0.02)
+    assert not lab.world.set_point.any()
+    assert lab.world.valve_open
+    with pytest.raises(CommandError, match="arm first"):
+        lab.loop.set_task(TASK)  # at once, as the loop does not run
+
+
+def test_18_stopping_ends_though_the_supply_is_dead() -> None:
+    lab = Lab(supply={"driver": "simulated", "dump_valve": False}).under_pressure()
+    lab.world.inject("supply", "off")
+    stop = threading.Event()
+    stop.set()
+    begin = lab.now
+    lab.loop.run(stop)
+    assert lab.now - begin < 2.0
+    assert lab.state is State.FAULT
+
+
+def test_20_an_alarm_of_somebody_else_does_not_touch_control() -> None:
+    lab = Lab().under_pressure()
+    lab.loop.add_alarm("disk-full", "nothing is recorded any more: the disk is full")
+    for _ in range(50):
+        snapshot = lab.tick()
+        assert snapshot.state is State.ACTIVE
+        assert [alarm.kind for alarm in snapshot.alarms] == ["disk-full"]
+    lab.loop.clear_alarm("disk-full")
+    assert not lab.tick().alarms
+    assert lab.kinds[-2:] == ["disk-full", "disk-full-over"]
+
+
+def test_21_the_wall_clock_may_jump(monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = Lab().under_pressure()
+    before = lab.loop.snapshot()
+    wall = time.time()
+    for jump in (3600.0, -7200.0, 1e9):
+        monkeypatch.setattr(time, "time", lambda jump=jump: wall + jump)
+        monkeypatch.setattr(time, "time_ns", lambda jump=jump: int((wall + jump) * 1e9))
+        snapshot = lab.ticks(30)
+        assert snapshot.state is State.ACTIVE
+        assert not snapshot.alarms
+        np.testing.assert_array_equal(snapshot.commanded, before.commanded)
+    assert snapshot.time == pytest.approx(before.time + 90 * PERIOD)
+
+
+@pytest.mark.parametrize("kind", ["nan", "infinite", "unsound", "short"])
+def test_22_no_answer_of_the_solver_means_the_last_one_and_then_hold(kind: str) -> None:
+    lab = Lab().under_pressure()
+    before = lab.loop.snapshot().commanded
+    lab.steering.wanted = np.full(3, 1e5)
+    lab.steering.sound = kind != "unsound"
+    bad = {"nan": [0, math.nan, 0], "infinite": [math.inf, 0, 0], "short": [1e4]}.get(
+        kind, [1e5] * 3
+    )
+    lab.steering.override = lambda p: np.array(bad)
+    for _ in range(2):
+        snapshot = lab.tick()
+        assert snapshot.state is State.ACTIVE
+        np.testing.assert_array_equal(snapshot.commanded, before)
+    assert lab.tick().state is State.HOLDING
+    assert "solver" in lab.alarms
+    np.testing.assert_array_equal(lab.ticks(100).commanded, before)
+    lab.steering.sound, lab.steering.override = True, None
+    lab.loop.set_task(TASK)
+    lab.ticks(100)
+    assert lab.state is State.ACTIVE
+    assert "solver" not in lab.alarms
+    np.testing.assert_array_equal(lab.loop.snapshot().commanded, [1e5] * 3)
+
+
+def test_22_a_single_answer_that_is_missing_does_not_matter() -> None:
+    lab = Lab().under_pressure()
+    for _ in range(10):
+        lab.steering.sound = False
+        lab.ticks(2)
+        lab.steering.sound = True
+        lab.ticks(1)
+        assert lab.state is State.ACTIVE
+
+
+def slow(lab: Lab, duration: float) -> None:
+    """Let each move take some time of the rig's clock."""
+
+    def take_time(call: str) -> None:
+        if call == "move":
+            lab.rig.clock.sleep(duration)
+
+    lab.steering.accident = take_time
+
+
+def test_23_overruns_are_counted_and_in_a_row_a_fault() -> None:
+    lab = Lab().under_pressure()
+    slow(lab, 0.015)
+    lab.ticks(9)
+    assert lab.state is State.ACTIVE
+    assert lab.loop.snapshot().timing.overruns == 9
+    slow(lab, 0.005)
+    lab.ticks(1)
+    slow(lab, 0.015)
+    lab.ticks(9)
+    assert lab.state is State.ACTIVE
+    lab.ticks(1)
+    assert lab.state is State.FAULT
+    assert lab.loop.snapshot().timing.overruns == 19
+    assert "overruns" in lab.kinds
+    assert lab.is_vented()
+    lab.loop.reset()
+
+
+def test_23_a_loop_that_stood_still_is_a_fault() -> None:
+    lab = Lab(supply={"driver": "simulated", "watchdog": None}).under_pressure()
+    lab.rig.clock.sleep(0.6)
+    lab.loop.tick()
+    assert lab.state is State.FAULT
+    assert "stalled" in lab.kinds
+    assert lab.is_vented()
+
+
+def test_24_after_a_fault_it_is_vented_until_it_is_reset() -> None:
+    lab = Lab().under_pressure()
+    lab.world.inject("supply", "garbage")
+    lab.until(State.FAULT)
+    lab.world.inject("supply", "ok")
+    lab.ticks(300)
+    assert lab.state is State.FAULT
+    for request in (lab.loop.arm, lab.loop.hold, lab.loop.disarm, lab.loop.configure):
+        with pytest.raises(CommandError, match=r"while fault .* then reset"):
+            request()
+    with pytest.raises(CommandError, match="while fault"):
+        lab.loop.set_task(TASK)
+    lab.loop.vent()
+    assert lab.state is State.FAULT
+    lab.loop.reset()
+    assert lab.state is State.INACTIVE
+    assert lab.is_vented()
+    with pytest.raises(CommandError, match="arm first"):
+        lab.loop.set_task(TASK)
+    lab.arm()
+    lab.under_pressure()
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"tracker": None}, "tracker: this rig has none"),
+        ({"plant": {"mismatch": {"registration": {"position": ("2 cm", "0 m", "0 m")}}}}, "cali"),
+    ],
+)
+def test_25_bad_configurations_are_not_armed(changes: dict[str, Any], match: str) -> None:
+    lab = Lab(ready=False, **changes)
+    with pytest.raises(CommandError, match=match):
+        lab.arm()
+    assert lab.state in (State.UNCONFIGURED, State.INACTIVE)
+    assert not lab.gate.armed
+
+
+def test_25_without_a_slew_it_is_not_armed() -> None:
+    lab = Lab(ready=False)
+    lab.rig.slew = np.full(3, np.inf)
+    with pytest.raises(CommandError, match=r"slew: .*set safety\.max_slew"):
+        lab.loop.configure()
+    assert lab.state is State.UNCONFIGURED
+
+
+def test_25_other_limits_at_the_gate_than_at_the_supply_are_not_armed() -> None:
+    lab = Lab(ready=False)
+    lab.gate.limits = type(lab.gate.limits)(np.zeros(3), np.full(3, 1e5))
+    with pytest.raises(CommandError, match="limits: those of the gate"):
+        lab.loop.configure()
+
+
+def test_25_a_model_that_does_not_serve_is_not_armed() -> None:
+    lab = Lab(ready=False)
+    lab.steering.problem = "the robot file has no density"
+    with pytest.raises(CommandError, match="model: the robot file has no density"):
+        lab.loop.configure()
+
+
+def test_25_devices_that_do_not_answer_are_not_armed() -> None:
+    lab = Lab(ready=False)
+    lab.world.inject("supply", "off")
+    with pytest.raises(CommandError, match=r"devices: .*does not answer"):
+        lab.loop.configure()
+    lab.world.inject("supply", "ok")
+    lab.world.inject("tracker", "off")
+    with pytest.raises(CommandError, match="tracker: it has seen the tip 0 times"):
+        lab.arm()
+    lab.world.inject("tracker", "ok")
+    lab.ticks(40)
+    lab.world.inject("tracker", "off")
+    lab.ticks(30)
+    with pytest.raises(CommandError, match="tracker: the tip is not seen now"):
+        lab.loop.arm()
+    lab.world.inject("tracker", "ok")
+    lab.arm()
+
+
+def test_25_a_vented_arm_that_is_under_pressure_is_not_armed() -> None:
+    lab = Lab(ready=False)
+    lab.loop.configure()
+    lab.ticks(40)
+    honest = lab.rig.supply.read
+    lab.gate.read = lambda: PressureReading(lab.now, honest().pressures + 3e4)  # type: ignore[method-assign]
+    with pytest.raises(CommandError, match=r"pressures: channel 1 reads 0\.3\d* bar, though"):
+        lab.loop.arm()
+
+
+def test_26_what_the_steering_says_becomes_an_alarm_until_it_is_over() -> None:
+    lab = Lab().under_pressure()
+    lab.steering.said = (
+        Notice("planner-died", "the planner has died; the last plan stays", standing=True),
+        Notice("planner-restarted", "the planner is started again"),
+    )
+    lab.tick()
+    assert lab.alarms == {"planner-died"}
+    assert {"planner-died", "planner-restarted"} <= set(lab.kinds)
+    lab.steering.said = lab.steering.said[:1]
+    lab.ticks(5)
+    assert lab.state is State.ACTIVE
+    assert lab.kinds.count("planner-died") == 1
+    lab.steering.said = ()
+    lab.tick()
+    assert not lab.alarms
+    assert lab.kinds[-1] == "planner-died-over"

@@ -1,0 +1,344 @@
+"""Leaks, stuck regulators, nonsense of gauges, and trackers that see nothing."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stiffopt.control.monitors import PressureMonitor, Trouble
+from stiffopt.control.steering import Seen
+from stiffopt.control.tracker_watch import ENOUGH, Sight, TrackerWatch
+from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
+from stiffopt.rig.settings import ControlSettings, Safety
+
+Array = NDArray[np.float64]
+
+PERIOD = 0.01
+SAFETY = Safety()
+
+
+class Regulators:
+    """Two regulators that follow, and the monitor that looks at them."""
+
+    def __init__(self, *, lag: float = 0.06, dead: int = 1, slew: float = 5e5, **control: float):
+        settings = ControlSettings(**control)  # type: ignore[arg-type]
+        limits = PressureLimits(np.zeros(2), np.full(2, 1.5e5))
+        self.monitor = PressureMonitor(limits, SAFETY, settings, slew)
+        self.lag, self.slew = lag, slew
+        self.waiting = [np.zeros(2)] * (dead + 1)
+        self.t, self.p = 0.0, np.zeros(2)
+        self.saturation = np.full(2, np.inf)
+        self.leak = np.zeros(2)
+        self.gauge = lambda p: p
+        self.was_saturated = False
+
+    def step(self, commanded: Array) -> Trouble | None:
+        self.t += PERIOD
+        self.waiting.append(commanded)
+        wanted = np.minimum(self.waiting.pop(0), self.saturation)
+        for _ in range(10):
+            h = PERIOD / 10
+            change = (wanted - self.p) * (1 - math.exp(-h / self.lag)) if self.lag else wanted
+            self.p = self.p + np.clip(change, -self.slew * h, self.slew * h)
+            self.p = self.p - self.leak * h * self.p
+        found = self.monitor.update(self.t, PressureReading(self.t, self.gauge(self.p)))
+        self.monitor.tell(self.t, commanded)
+        self.was_saturated |= bool(self.monitor.saturated.any())
+        return found
+
+    def hold(self, *commanded: float, seconds: float = 1.0) -> tuple[Trouble | None, float]:
+        for k in range(round(seconds / PERIOD)):
+            if (found := self.step(np.array(commanded))) is not None:
+                return found, k * PERIOD
+        return None, seconds
+
+
+@pytest.mark.parametrize("frequency", [0.1, 0.5, 1.0, 3.0])
+@pytest.mark.parametrize("lag", [0.02, 0.06, 0.09])
+def test_9_a_set_point_that_moves_is_no_leak(frequency: float, lag: float) -> None:
+    bench = Regulators(lag=lag)
+    for k in range(1000):
+        wave = 7e4 * (1 + np.sin(2 * np.pi * frequency * k * PERIOD + np.array([0.0, 2.0])))
+        assert bench.step(wave) is None
+    assert not bench.was_saturated
+
+
+def test_9_steps_that_the_regulator_cannot_follow_are_no_leak() -> None:
+    bench = Regulators(slew=2e5)
+    for k in range(2000):
+        assert bench.step(np.full(2, 1.4e5 if k % 200 < 100 else 0.0)) is None
+    assert not bench.was_saturated
+
+
+def test_9_leak() -> None:
+    bench = Regulators()
+    assert bench.hold(1e5, 1e5) == (None, 1.0)
+    bench.leak[1] = 1 / 0.3
+    found, after = bench.hold(1e5, 1e5, seconds=2.0)
+    assert found is not None
+    assert found.kind == "leak"
+    assert found.text.startswith("channel 2 reads 0.8")
+    assert SAFETY.pressure_error_time <= after < SAFETY.pressure_error_time + 0.3
+
+
+def test_9_what_passes_is_no_leak() -> None:
+    bench = Regulators()
+    bench.hold(1e5, 1e5)
+    for _ in range(20):
+        bench.gauge = lambda p: p - 3e4
+        assert bench.hold(1e5, 1e5, seconds=0.2)[0] is None
+        bench.gauge = lambda p: p
+        assert bench.hold(1e5, 1e5, seconds=0.4)[0] is None
+
+
+def test_8_a_regulator_that_saturates_by_a_little_is_flagged_and_then_well() -> None:
+    bench = Regulators()
+    bench.saturation[0] = 9e4
+    assert bench.hold(1e5, 1e5, seconds=2.0)[0] is None  # 10 kPa: more than half of the tolerance
+    np.testing.assert_array_equal(bench.monitor.saturated, [True, False])
+    bench.hold(8e4, 8e4)
+    np.testing.assert_array_equal(bench.monitor.saturated, [False, False])
+
+
+def test_8_a_regulator_that_saturates_by_much_is_flagged_first_and_then_a_fault() -> None:
+    bench = Regulators()
+    bench.saturation[0] = 5e4
+    found, _ = bench.hold(1e5, 1e5, seconds=2.0)
+    assert found is not None
+    assert found.kind == "leak"
+    assert "no more pressure" in found.text
+    assert bench.was_saturated
+
+
+def test_10_a_regulator_that_is_stuck_high() -> None:
+    bench = Regulators()
+    bench.hold(1e5, 1e5)
+    bench.gauge = lambda p: np.array([1.5e5, p[1]])
+    found, after = bench.hold(1e5, 1e5)
+    assert found is not None
+    assert found.kind == "regulator-stuck"
+    assert found.text.startswith("channel 1 reads 1.5 bar, though 1 bar was commanded")
+    assert after == pytest.approx(SAFETY.pressure_error_time, abs=0.02)
+
+
+def test_10_a_regulator_that_does_not_fall() -> None:
+    bench = Regulators()
+    bench.hold(1e5, 1e5)
+    stuck = bench.p[1]
+    bench.gauge = lambda p: np.array([p[0], stuck])
+    found, _ = bench.hold(0.0, 0.0)
+    assert found is not None
+    assert found.kind == "regulator-stuck"
+    assert found.text.startswith("channel 2")
+
+
+@pytest.mark.parametrize(
+    ("reading", "said"),
+    [
+        ([math.nan, 0.0], "channel 1 reads nothing"),
+        ([0.0, 9.9e9], "channel 2 reads 9.9e+04 bar"),
+        ([math.inf, 0.0], "channel 1 reads inf bar"),
+        ([-2e5, 0.0], "channel 1 reads -2 bar"),
+        ([0.0], "1 pressures are read; expected 2"),
+    ],
+)
+def test_11_readings_that_cannot_be(reading: list[float], said: str) -> None:
+    bench = Regulators()
+    bench.hold(0.0, 0.0)
+    found = bench.monitor.update(bench.t, PressureReading(bench.t, np.array(reading)))
+    assert found is not None
+    assert found.kind == "pressure-reading"
+    assert said in found.text
+    believed = bench.monitor.believable(PressureReading(bench.t, np.array(reading))).pressures
+    assert believed.shape == (2,)
+    assert not (np.abs(believed) > 1.5e5).any()
+
+
+@pytest.mark.parametrize("age", [0.6, -0.6, math.nan])
+def test_11_readings_that_do_not_come_any_more(age: float) -> None:
+    bench = Regulators()
+    found = bench.monitor.update(5.0, PressureReading(5.0 - age, np.zeros(2)))
+    assert found is not None
+    assert "s old" in found.text
+
+
+def test_a_channel_without_a_gauge_is_unsupervised_until_it_is_measured() -> None:
+    bench = Regulators()
+    assert bench.monitor.unsupervised == (0, 1)
+    bench.gauge = lambda p: np.array([p[0], np.nan])
+    assert bench.hold(1e5, 1e5) == (None, 1.0)
+    assert bench.monitor.unsupervised == (1,)
+    bench.leak[:] = 1.0  # of the two only the first is seen
+    bench.leak[0] = 0.0
+    assert bench.hold(1e5, 1e5)[0] is None
+    bench.leak[:] = 0.0
+    bench.gauge = lambda p: p
+    assert bench.hold(1e5, 1e5)[0] is None
+    assert bench.monitor.unsupervised == ()
+    bench.gauge = lambda p: np.array([p[0], np.nan])
+    assert bench.hold(1e5, 1e5)[0] is not None
+
+
+def test_a_long_pause_makes_no_single_reading_a_fault() -> None:
+    bench = Regulators()
+    bench.hold(1e5, 1e5)
+    bench.t += 0.45
+    assert bench.step(np.full(2, 1e5)) is None
+    bench.gauge = lambda p: p - 5e4
+    bench.t += 0.45
+    assert bench.step(np.full(2, 1e5)) is None
+
+
+def test_what_is_left_in_a_vented_arm() -> None:
+    monitor = Regulators().monitor
+    assert monitor.under_pressure(PressureReading(0.0, np.array([1e4, np.nan]))) == ""
+    said = monitor.under_pressure(PressureReading(0.0, np.array([1e4, 2e4])))
+    assert said == "channel 2 reads 0.2 bar, though it is vented"
+
+
+# The tracker -------------------------------------------------------------------------------------
+
+
+class Watched:
+    """A tracker of 40 Hz that is 25 ms late, and what a steering makes of it."""
+
+    def __init__(self, interval: float = 0.025, latency: float = 0.025) -> None:
+        self.watch = TrackerWatch(SAFETY, PERIOD)
+        self.interval, self.latency = interval, latency
+        self.ticks = self.frame = 0
+        self.latest = -math.inf
+        self.used = True
+        self.armed = False
+
+    @property
+    def t(self) -> float:
+        return self.ticks * PERIOD
+
+    def tick(self, **changes: Any) -> Sight:
+        self.ticks += 1
+        samples = []
+        while (captured := (self.frame + 1) * self.interval) + self.latency <= self.t + 1e-9:
+            self.frame += 1
+            sample = {
+                "time": captured,
+                "received": self.t,
+                "frame": self.frame,
+                "position": np.array([0.0, 0.0, 0.1]),
+                "quaternion": None,
+                **changes,
+            }
+            if changes.get("time", 0.0) is not None:
+                samples.append(PoseSample(**sample))
+        fresh = self.watch.new(samples)
+        seen = [s for s in fresh if s.visible and self.used]
+        for sample in seen:
+            self.latest = max(self.latest, sample.time)
+        rejected = 0 if self.used else len(fresh)
+        self.watch.update(self.t, Seen(len(seen), rejected, self.latest))
+        if not self.armed:
+            self.watch.learn(self.t, fresh)
+        return self.watch.sight(self.t)
+
+    def ready(self) -> Watched:
+        while self.watch.samples < 20:
+            self.tick()
+        self.armed = True
+        return self
+
+    def until(self, sight: Sight, **changes: Any) -> float:
+        """Seconds until it is so, since the last frame that was seen arrived."""
+        begin = self.latest + self.latency
+        for _ in range(200):
+            if self.tick(**changes) is sight:
+                return self.t - begin
+        raise AssertionError(f"it was never {sight}")
+
+
+NOTHING = {"time": None}
+NAN = {"position": np.full(3, np.nan)}
+
+
+@pytest.mark.parametrize("changes", [NOTHING, NAN, {"frame": 7}])
+def test_1_2_3_missing_after_three_frames_and_lost_after_the_timeout(changes: Any) -> None:
+    watched = Watched().ready()
+    if "frame" in changes:
+        changes = {"frame": watched.frame}
+    assert 0.075 < watched.until(Sight.MISSING, **changes) <= 0.075 + 0.03
+    assert 0.5 <= watched.until(Sight.LOST, **changes) <= 0.5 + 0.03
+    assert watched.until(Sight.SEEN) is not None
+
+
+@pytest.mark.parametrize("missing", [1, 2])
+def test_1_fewer_missing_frames_do_not_matter(missing: int) -> None:
+    watched = Watched().ready()
+    for _ in range(10):
+        frame = watched.frame
+        while watched.frame < frame + missing:
+            assert watched.tick(**NOTHING) is Sight.SEEN
+        while watched.frame < frame + missing + 3:
+            assert watched.tick() is Sight.SEEN
+
+
+@pytest.mark.parametrize(("interval", "latency"), [(0.002, 0.001), (0.01, 0.0), (0.1, 0.3)])
+def test_1_other_trackers_have_other_frames(interval: float, latency: float) -> None:
+    watched = Watched(interval, latency).ready()
+    for _ in range(300):
+        assert watched.tick() is Sight.SEEN
+    gone = watched.until(Sight.MISSING, **NOTHING)
+    assert 3 * interval < gone < 3.25 * interval + 3.1 * PERIOD
+
+
+def test_7_samples_that_come_too_late_are_as_good_as_none() -> None:
+    watched = Watched().ready()
+    watched.latency = 0.3
+    assert watched.until(Sight.MISSING) < 0.3
+    for _ in range(100):
+        sight = watched.tick()
+    assert sight is Sight.MISSING  # they come again, but 0.3 s old
+
+
+def test_7_out_of_order_or_from_the_future_is_not_new() -> None:
+    watched = Watched().ready()
+    assert watched.until(Sight.MISSING, time=watched.latest - 0.01) < 0.11
+    watched = Watched().ready()
+    far = watched.t + 100.0
+    watched.tick(time=far)
+    assert watched.until(Sight.MISSING, time=far) is not None  # that it came once is all
+
+
+def test_5_rejected_samples_in_a_row() -> None:
+    watched = Watched().ready()
+    watched.used = False
+    while watched.watch.jumps < SAFETY.max_jumps:
+        assert not watched.watch.jumping
+        watched.tick()
+    assert watched.watch.jumping
+    watched.used = True
+    while watched.watch.jumps:
+        watched.tick()
+    assert not watched.watch.jumping
+
+
+def test_what_is_usual_is_learned_from_enough_samples() -> None:
+    watched = Watched()
+    assert watched.tick(**NOTHING) is Sight.SEEN  # it is given time
+    while watched.watch.samples < ENOUGH:
+        watched.tick()
+    interval, age = watched.watch.usual
+    assert interval == pytest.approx(0.025)
+    assert 0.025 <= age <= 0.036
+    np.testing.assert_allclose(watched.watch.position, [0.0, 0.0, 0.1])
+    watched.watch.forget()
+    assert watched.watch.samples == 0
+    assert watched.watch.usual == (interval, age)
+
+
+def test_a_tracker_that_never_sees_anything_is_lost() -> None:
+    watched = Watched()
+    sights = [watched.tick(**NAN) for _ in range(70)]
+    assert sights[10] is Sight.SEEN
+    assert sights[-1] is Sight.LOST
