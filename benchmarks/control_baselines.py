@@ -43,7 +43,7 @@ class Gains:
     slew: float
 
 
-TUNED = {"quasi-static": Gains(6.4, 5e5), "full": Gains(0.4, 1e5)}
+TUNED = {"quasi-static": Gains(4.5, 5e5), "full": Gains(0.4, 1e5)}
 """The best of `control.py --tune`."""
 
 GRID = [Gains(g, s) for g in 0.1 * 2.0 ** np.arange(9) for s in (5e5, 2e5, 1e5, 3e4)]

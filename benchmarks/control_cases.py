@@ -87,8 +87,11 @@ class Case:
 
     @property
     def believed(self) -> RobotDescription:
-        """The robot file that the controller gets."""
-        return self.truth.model.description if self.calibrated else self.robot
+        """The robot file that the controller gets; it never knows of a payload."""
+        if not self.calibrated:
+            return self.robot
+        update = {"tip_mass": self.robot.tip_mass}
+        return self.truth.model.description.model_copy(update=update)
 
     def target(self, position: Array) -> Target:
         """A place in the nominal base frame as a target in the base frame of that file."""

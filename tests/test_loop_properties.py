@@ -316,7 +316,9 @@ class World:
         self.tracker = Sometimes(self.clock, chance)
         self.steering = Whim(chance)
         safety = Safety(max_force=FORCE, ramp_time=0.2, max_pressure=tuple(HIGH))
-        self.rig = Rig(ROBOT, self.supply, self.tracker, clock=self.clock, slew=SLEW)
+        pressure = ROBOT.pressure.model_copy(update={"min": low})
+        robot = ROBOT.model_copy(update={"pressure": pressure})
+        self.rig = Rig(robot, self.supply, self.tracker, clock=self.clock, slew=SLEW)
         self.gate = SafetyGate(
             self.supply,
             slew=SLEW,

@@ -1,13 +1,16 @@
 """Run a fluidic soft arm stiff where it matters.
 
 The model (`load_robot`), the task (`load_task`) and the optimiser (`solve_pressure`) in SI units;
-and the model of an arm from its recordings (`calibrate`).
+the model of an arm from its recordings (`calibrate`); and a client of the daemon that holds the
+stiff pose on an arm (`Client`).
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from stiffopt.control.trajectory import Trajectory, Waypoint
+    from stiffopt.daemon.client import Client
     from stiffopt.errors import (
         CommandError,
         DeviceError,
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
         InputError,
         MissingExtraError,
         PressureError,
+        ServiceError,
         SlowWarning,
         StiffoptError,
     )
@@ -52,6 +56,7 @@ __all__ = [
     "AtLeast",
     "CalibrationResult",
     "CalibrationSettings",
+    "Client",
     "CommandError",
     "Comparison",
     "DeviceError",
@@ -74,6 +79,7 @@ __all__ = [
     "PressureSolver",
     "Rig",
     "RobotDescription",
+    "ServiceError",
     "SlowWarning",
     "StiffnessGoal",
     "StiffnessMeasure",
@@ -83,7 +89,9 @@ __all__ = [
     "Task",
     "TipUncertainty",
     "Tolerance",
+    "Trajectory",
     "Twist",
+    "Waypoint",
     "WorkspaceMap",
     "Wrench",
     "__version__",
@@ -107,9 +115,12 @@ __all__ = [
 # Names are imported when they are first asked for: NumPy, CasADi and pydantic take a quarter of a
 # second, for which neither `--help` nor a wrong option should wait.
 _NAMES = {
+    "stiffopt.control.trajectory": ("Trajectory", "Waypoint"),
+    "stiffopt.daemon.client": ("Client",),
     "stiffopt.errors": (
         *("CommandError", "DeviceError", "EquilibriumError", "FileError"),
-        *("InputError", "MissingExtraError", "PressureError", "SlowWarning", "StiffoptError"),
+        *("InputError", "MissingExtraError", "PressureError", "ServiceError"),
+        *("SlowWarning", "StiffoptError"),
     ),
     "stiffopt.identify.api": ("calibrate", "validate"),
     "stiffopt.identify.calibration": ("CalibrationResult",),
@@ -138,6 +149,8 @@ _NAMES = {
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 _MODULES = (
+    "control",
+    "daemon",
     "directions",
     "documents",
     "errors",

@@ -23,6 +23,7 @@ from stiffopt.cli.lab import LAB_EPILOG, LAB_HELP, lab
 from stiffopt.cli.log import log_app
 from stiffopt.cli.map import map_app
 from stiffopt.cli.robots import robots
+from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
 from stiffopt.cli.solve import HELP, examples, solve
 from stiffopt.cli.version import print_version
 
@@ -44,6 +45,7 @@ def _application() -> typer.Typer:
 app = _application()
 app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
 app.command("robots")(robots)
+app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
 app.add_typer(map_app, name="map")
 app.add_typer(experiment_app, name="experiment")
 app.add_typer(log_app, name="log")

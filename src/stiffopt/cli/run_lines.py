@@ -41,7 +41,9 @@ class Facts(Protocol):
 
 
 class Display(Protocol):
-    """Where a run is shown."""
+    """Where a run is shown, anew after each `period`, in s."""
+
+    period: float
 
     def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Show something that is no event of the loop."""
@@ -69,6 +71,8 @@ class Lines:
     now :
         Time on the rig's clock, in s.
     """
+
+    period = 0.05
 
     def __init__(self, *, as_json: bool, now: Callable[[], float] = time.monotonic) -> None:
         self._as_json, self._now = as_json, now

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
-from numpy.typing import ArrayLike
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
@@ -50,6 +49,8 @@ class LiveStatus:
     now :
         Time on the rig's clock, in s.
     """
+
+    period = 0.25
 
     def __init__(
         self,
@@ -130,9 +131,12 @@ def status(
     facts :
         Where everything is.
     """
-    parts: list[RenderableType] = [_headline(now, name), _table(_tip(now))]
-    parts.append(_pressures(now, channels))
-    parts.append(_table([*_stiffness(now), *_loop(now, rate), *_alarms(now)]))
+    armed = now.state in (State.ACTIVE, State.HOLDING)
+    tip: list[tuple[str, RenderableType]]
+    tip = [("tip", f"{_triple(now.tip_position, 1e3)} mm"), *(_target(now) if armed else ())]
+    parts: list[RenderableType] = [_headline(now, name), _table(tip), _pressures(now, channels)]
+    stiffness = _stiffness(now) if armed else []
+    parts.append(_table([*stiffness, *_loop(now, rate), *_alarms(now)]))
     parts += [_event(event) for event in events]
     if facts is not None:
         parts.append(_table(_places(facts)))
@@ -148,8 +152,8 @@ def _headline(now: Snapshot, name: str) -> Text:
     return text
 
 
-def _tip(now: Snapshot) -> list[tuple[str, RenderableType]]:
-    rows: list[tuple[str, RenderableType]] = [("tip", f"{_triple(now.tip_position, 1e3)} mm")]
+def _target(now: Snapshot) -> list[tuple[str, RenderableType]]:
+    rows: list[tuple[str, RenderableType]] = []
     if now.target_position is not None:
         free = _triple(now.target_position, 1e3, unknown="free")
         rows.append(("target", f"{free} mm"))
@@ -205,9 +209,7 @@ def _stiffness(now: Snapshot) -> list[tuple[str, RenderableType]]:
         rows.append(("stiffness", text))
     force, moment = now.wrench[:3], now.wrench[3:]
     if all(map(math.isfinite, now.wrench.tolist())):
-        rows.append(
-            ("wrench", f"{_triple(force, 1e3)} mN, {_triple(moment, 1e3, '{:.2f}')} mN m")
-        )
+        rows.append(("wrench", f"{_triple(force, 1e3)} mN, {_triple(moment, 1e3, '{:.2f}')} mN m"))
     return rows
 
 
@@ -269,6 +271,8 @@ def _table(rows: Sequence[tuple[str, RenderableType]]) -> Table:
     return table
 
 
-def _triple(values: ArrayLike, factor: float, form: str = "{:.1f}", unknown: str = _UNKNOWN) -> str:
-    numbers = [float(v) * factor for v in values]  # type: ignore[union-attr]
+def _triple(
+    values: Iterable[float], factor: float, form: str = "{:.1f}", unknown: str = _UNKNOWN
+) -> str:
+    numbers = [float(v) * factor for v in values]
     return f"({', '.join(form.format(x) if math.isfinite(x) else unknown for x in numbers)})"

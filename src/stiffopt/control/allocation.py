@@ -113,9 +113,14 @@ class Allocation:
     """
 
     def __init__(self, low: Array, high: Array, step: Array, solver: str = "daqp") -> None:
-        self._low, self._high, self._step = low / _BAR, high / _BAR, step / _BAR
+        self.limit(low, high)
+        self._step = step / _BAR
         self._solver = SOLVERS[solver](len(low), 3)
         self._identity = np.eye(len(low))
+
+    def limit(self, low: Array, high: Array) -> None:
+        """Allow these pressures (n,) from now on, in Pa."""
+        self._low, self._high = low / _BAR, high / _BAR
 
     def solve(
         self,

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
 from stiffopt.control.allocation import Allocation
+from stiffopt.control.closest import LEVER
 from stiffopt.control.estimator import EstimatorSettings, TipEstimator
 from stiffopt.control.gains import Gains
 from stiffopt.control.planner import InlinePlanner, Plan, Planner, Request, ThreadPlanner
@@ -31,7 +32,7 @@ from stiffopt.model.compliance import directional_stiffness
 from stiffopt.model.history import History, Memory
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Task
+from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
@@ -42,7 +43,6 @@ Array = NDArray[np.float64]
 
 _PLAN_EVERY = 0.05  # s
 _EFFORT = 1.0  # of feedback against error; see `Gains`
-_LEVER = 0.05  # m/rad; a turn of the tip weighs as much as a motion of this lever's end
 _BRISK = 40.0  # 1/s; rate of the reference of an arm that does not swing
 _OFF = 1e4  # Pa; by which the command makes up for a regulator that is off
 _SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
@@ -136,6 +136,7 @@ class Controller:
         self._course: Course | None = None
         self._plan: Plan | None = None
         self._measure: Callable[..., float] | None = None
+        self._unit = "N/m"
         self._asked_at = -math.inf
         self._now = now
         self._last_move, self._commanded = none.copy(), none.copy()
@@ -145,6 +146,7 @@ class Controller:
         self._estimator.begin()
         self._reference.begin(np.concatenate([none, np.zeros(6)]))
         self._saturated = np.zeros(len(none), dtype=bool)
+        self._allocation.limit(self.limits.low, self.limits.high)
         self._at_u: TipAt | None = None
         if self._tip is not None:
             self._at_u = self._tip_at(none)
@@ -153,9 +155,11 @@ class Controller:
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Steering.set_task`."""
-        self._check_task(task)
-        self._task, self._target, self._course = task, task.target, None
+        self._task, self._target, self._course = self._accepted(task), task.target, None
         self._measure = _stiffness_of(task)
+        self._unit = task.measures[0].unit if task.measures else "N/m"
+        lower, upper = self._task.pressure_bounds(self.robot.description)
+        self._allocation.limit(lower, upper)
         self._anew()
 
     def set_target(self, target: Target) -> None:
@@ -203,10 +207,13 @@ class Controller:
 
     def move(self, now: float) -> Move:
         """Decide; see `Steering.move`."""
-        if self._fresh:
-            self.resume(now)
         self._ask(now)
         aim = self._aim()
+        if aim is None:  # nothing to do, or not planned yet
+            self._fresh = True
+            return Move(self._last_move.copy(), True, np.zeros(len(self._last_move), dtype=bool))
+        if self._fresh:
+            self.resume(now)
         omega = self._estimator.omega
         self._reference.rate = min(_BRISK, 1.2 * omega) if self._swings else _BRISK
         self._reference.advance(aim)
@@ -276,6 +283,7 @@ class Controller:
             disturbance=estimate.offset,
             wrench=self._wrench(estimate.offset, estimate.turn),
             task=self._what(),
+            stiffness_unit=self._unit,
         )
 
     def notices(self) -> tuple[Notice, ...]:
@@ -293,26 +301,33 @@ class Controller:
 
     # -- what is asked --------------------------------------------------------------------------
 
-    def _check_task(self, task: Task) -> None:
-        bounds = task.pressure_bounds(self.robot.description)
-        del bounds
+    def _accepted(self, task: Task) -> Task:
+        """Return a task with this rig's limits of pressure; refuse one that does not suit."""
+        description = self.robot.description
         if task.load is not None:
             raise InputError("a load is estimated by the daemon; remove 'load' from the task")
+        lower, upper = task.pressure_bounds(description)
+        if task.pressure.max is not None:
+            asked = np.broadcast_to(np.array(task.pressure.max, dtype=float), upper.shape)
+            for index in np.flatnonzero(asked > self.limits.high * (1 + 1e-6)):
+                raise InputError(
+                    f"the task asks for up to {asked[index] * 1e-5:g} bar; "
+                    f"{description.channel_name(int(index))} may have "
+                    f"{self.limits.high[index] * 1e-5:g} bar on this rig"
+                )
+        lower, upper = np.maximum(lower, self.limits.low), np.minimum(upper, self.limits.high)
+        if (lower > upper).any():
+            raise InputError("the task leaves a channel no pressure within the limits of this rig")
+        limits = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
+        return task.model_copy(update={"pressure": limits})
 
     def _pursue(self, target: Target) -> None:
-        task = self._task
-        if task is None:
-            task = Task(robot=self.robot.description.name, target=target)
-            self._check_task(task)
-            self._task = task
-            self._measure = None
-            self._target = target
-            self._anew()
+        if self._task is None:
+            self.set_task(Task(robot=self.robot.description.name, target=target))
             return
-        same = self._target is not None and _kind(self._target) == _kind(target)
-        self._target = target
-        if not same:
+        if self._target is None or _kind(self._target) != _kind(target):
             self._serial += 1
+        self._target = target
         self._asked_at = -math.inf
 
     def _anew(self) -> None:
@@ -336,13 +351,13 @@ class Controller:
             Request(self._serial, self._task, target, offset, new and self._course is None)
         )
 
-    def _aim(self) -> Array:
+    def _aim(self) -> Array | None:
         """Effective pressures of the plan and the offset that it counts with (n + 6,)."""
         plan = self._planner.latest()
         if plan is not None and plan.serial == self._serial:
             self._plan = plan
         if self._plan is None:
-            return self._reference.path.copy()
+            return None
         return np.concatenate([self._plan.pressures, self._plan.offset])
 
     def _what(self) -> str:
@@ -434,11 +449,11 @@ class Controller:
             wanted.append(shift[asked])
         if target.pointing is not None:
             across = np.eye(3) - np.outer(rotation[:, 2], rotation[:, 2])
-            rows.append(_LEVER * across @ angular)
-            wanted.append(_LEVER * across @ turn)
+            rows.append(LEVER * across @ angular)
+            wanted.append(LEVER * across @ turn)
         if target.orientation is not None:
-            rows.append(_LEVER * angular)
-            wanted.append(_LEVER * turn)
+            rows.append(LEVER * angular)
+            wanted.append(LEVER * turn)
         return np.concatenate(rows), np.concatenate(wanted)
 
     def _wrench(self, offset: Array, turn: Array) -> Array:

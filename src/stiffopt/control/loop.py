@@ -324,6 +324,7 @@ class ControlLoop:
             disturbance=standing.disturbance,
             wrench=standing.wrench,
             task=standing.task,
+            stiffness_unit=standing.stiffness_unit,
         )
 
 

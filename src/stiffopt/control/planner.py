@@ -22,9 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.control.closest import closest
 from stiffopt.control.steering import Notice
 from stiffopt.errors import StiffoptError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Task
@@ -115,32 +117,65 @@ class Planning:
                 self._robot, request.task.model_copy(update={"target": exact})
             )
             self._tip = TipModel(self._solver.robot)
+            self._is_compiled = self._solver.is_compiled
             self._serial, self._last = request.serial, None
         target = moved_back(request.target, request.offset)
         change = float(np.linalg.norm((request.offset - self._searched_at)[:3]))
         guess = None if self._last is None or request.anew else self._last.pressures
-        solution = self._solver.solve(target, guess)
-        if guess is not None and solution.found and change > _MUCH:
+        if guess is None:
             self._searched_at = request.offset
-            other = self._solver.solve(target)
-            if other.found and _value(other.stiffness) > _CLEARLY * _value(solution.stiffness):
-                solution = other
-        elif guess is None:
+        solution = self._solved(target, guess)
+        if guess is not None and solution is not None and change > _MUCH:
             self._searched_at = request.offset
-        pressures = solution.pressures
-        if pressures is None or not np.isfinite(pressures).all():
-            raise StiffoptError(f"the optimiser has no pressures: {solution.message}")
-        self._last = Plan(
-            serial=request.serial,
-            pressures=np.array(pressures, dtype=float),
-            offset=request.offset,
-            target=request.target,
-            reached=solution.found,
-            stiffness=_value(solution.stiffness, math.nan),
-            message="" if solution.found else solution.message,
-            tip=self._tip,
+            other = self._solved(target, None)
+            if other is not None:
+                better = _value(other.stiffness) > _CLEARLY * _value(solution.stiffness)
+                solution = other if better else solution
+        self._last = (
+            self._closest(request, target)
+            if solution is None or solution.pressures is None
+            else Plan(
+                serial=request.serial,
+                pressures=np.array(solution.pressures, dtype=float),
+                offset=request.offset,
+                target=request.target,
+                reached=True,
+                stiffness=_value(solution.stiffness, math.nan),
+                message="",
+                tip=self._tip,
+            )
         )
         return self._last
+
+    def _solved(self, target: Target, guess: Array | None) -> PressureSolution | None:
+        """Answer of the optimiser; None if it has none that holds, soon."""
+        if self._is_compiled:
+            return self._solver.solve_at_once(target, guess)
+        solution = self._solver.solve(target, guess)
+        return solution if solution.found else None
+
+    def _closest(self, request: Request, target: Target) -> Plan:
+        """Plan for a target that is out of reach, or whose stiffness cannot be had there."""
+        bounds = self._solver.task.pressure_bounds(self._robot.description)
+        start = 0.5 * (bounds[0] + bounds[1]) if self._last is None else self._last.pressures
+        pressures, away, turned = closest(self._tip, target, bounds, start)
+        tolerance = request.task.target.tolerance
+        if away <= tolerance.position and turned <= tolerance.angle:
+            message = "the pose can be reached, but not with the stiffness that is asked for"
+        else:
+            message = f"the nearest pose is {1e3 * away:.1f} mm away"
+            if turned > tolerance.angle:
+                message += f" and {math.degrees(turned):.1f} deg"
+        return Plan(
+            serial=request.serial,
+            pressures=pressures,
+            offset=request.offset,
+            target=request.target,
+            reached=False,
+            stiffness=math.nan,
+            message=message,
+            tip=self._tip,
+        )
 
 
 class Planner(Protocol):

@@ -16,8 +16,8 @@ __all__ = ["RegulatorModel"]
 
 Array = NDArray[np.float64]
 
-_TRUST = 15.0  # 1/s, at which a reading corrects the pressure
-_LEARN = 20.0  # 1/s^2, at which it corrects the offset
+_TRUST = 30.0  # 1/s, at which a reading corrects the pressure
+_LEARN = 225.0  # 1/s^2, at which it corrects the offset
 
 
 class RegulatorModel:

@@ -92,6 +92,7 @@ class Standing:
     disturbance: Array
     wrench: Array
     task: str
+    stiffness_unit: str = "N/m"
 
 
 class Steering(Protocol):

@@ -80,7 +80,8 @@ def _beam(robot: RobotDescription) -> tuple[Array, Array, Array, NDArray[np.int6
             modulus *= segment.compensation.stiffness
         for _ in range(_POINTS):
             stations.append(stations[-1] + step)
-            masses.append(density * geometry.area * step)
+            masses[-1] += 0.5 * density * geometry.area * step
+            masses.append(0.5 * density * geometry.area * step)
             flexibilities.append(1 / (modulus * float(np.trace(geometry.second_moment)) / 2))
             owners.append(index)
         if segment.connector > 0:

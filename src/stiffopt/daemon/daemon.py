@@ -204,7 +204,9 @@ class Daemon:
         task = load_task(path)
         asked, there = task.resolve_robot().name, self.robot.description.name
         if asked != there:
-            raise FileError(path, f"is for the robot '{asked}'; this rig has '{there}'", key="robot")
+            raise FileError(
+                path, f"is for the robot '{asked}'; this rig has '{there}'", key="robot"
+            )
         return task
 
     def arm(self, task: Task | None = None) -> None:

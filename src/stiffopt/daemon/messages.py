@@ -47,7 +47,7 @@ __all__ = [
 
 MAX_MESSAGE = 16_384
 """Characters of the longest message to a stream."""
-MAX_WAYPOINTS = 10_000
+MAX_WAYPOINTS = 2_000
 _MAX_TEXT = 65_536  # characters of a task file; to read more would keep the control loop waiting
 _MAX_MEASURES = 50
 _MAX_CHANNELS = 200

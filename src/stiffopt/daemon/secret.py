@@ -31,7 +31,9 @@ class Secret:
         The file; None where the environment has the token.
     """
 
-    def __init__(self, settings: ServiceSettings, folder: str | os.PathLike[str], name: str) -> None:
+    def __init__(
+        self, settings: ServiceSettings, folder: str | os.PathLike[str], name: str
+    ) -> None:
         given = os.environ.get(settings.token, "").strip()
         self.token = given or secrets.token_urlsafe(24)
         self.path: Path | None = None

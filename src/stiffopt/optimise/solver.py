@@ -88,6 +88,26 @@ class PressureSolver:
         solution.timings["total"] = perf_counter() - begin
         return solution
 
+    def solve_at_once(
+        self, target: Target | None = None, guess: ArrayLike | None = None
+    ) -> PressureSolution | None:
+        """Solve by the compiled search alone, in a millisecond or so; for control loops.
+
+        Parameters as for `solve`.
+
+        Returns
+        -------
+        None where that search finds no answer that holds, or is not to be had; `solve` would then
+        go on by its general method, which may take minutes for an arm under gravity.
+        """
+        task = self.task if target is None else self.task.model_copy(update={"target": target})
+        return self._compiled(task, self._checked(guess))
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether there is compiled code for the task; compiles it."""
+        return self._fast(self.task, None) is not None
+
     def _compiled(self, task: Task, guess: Vector | None) -> PressureSolution | None:
         """Answer of the compiled solver, if there is one that holds."""
         fast = self._fast(task, guess)

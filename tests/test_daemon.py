@@ -1,0 +1,341 @@
+"""The daemon in one piece: what it starts, what it looks after, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import stat
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from examples import blocks
+from fake_loop import FakeLoop
+from running import ONE, TWO, patient_rig, wait_for
+from stiffopt.control.state import Snapshot, State
+from stiffopt.daemon.client import Client
+from stiffopt.daemon.daemon import Daemon
+from stiffopt.daemon.keeper import Keeper
+from stiffopt.daemon.notify import ServiceManager
+from stiffopt.daemon.secret import Secret
+from stiffopt.errors import CommandError, DeviceError, FileError, InputError
+from stiffopt.rig.settings import ServiceSettings
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="module")
+def daemon(
+    tmp_path_factory: pytest.TempPathFactory, code_cache: Path
+) -> Iterator[tuple[Daemon, Client]]:
+    """A running daemon of a simulated arm without inertia, and a client that has control."""
+    if not any(shutil.which(name) for name in ("cc", "gcc", "clang")):
+        pytest.skip("there is no C compiler")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("STIFFOPT_COMPILER", raising=False)
+        patch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
+        folder = tmp_path_factory.mktemp("daemon")
+        rig = patient_rig(folder, plant={"dynamics": "quasi-static"})
+        with Daemon(rig) as made:
+            assert made.url is not None
+            with Client(made.url, made.token, name="test") as client:
+                client.take_control()
+                yield made, client
+        assert made.trouble == ""
+        assert made.failure is None
+        assert made.loop.snapshot().state in (State.INACTIVE, State.FAULT)
+        assert made.stop() is made.loop.snapshot().state  # again: nothing happens
+
+
+def armed(client: Client) -> None:
+    """Arm the arm, wherever it is in its life."""
+    with suppress(InputError):
+        client.vent()
+    with suppress(InputError):
+        client.reset()
+
+    def done() -> bool:
+        try:
+            client.arm()
+        except InputError:
+            return False
+        return True
+
+    wait_for(done)
+
+
+def test_it_settles_where_a_client_says_and_tells_of_it(daemon: tuple[Daemon, Client]) -> None:
+    made, client = daemon
+    armed(client)
+    client.set_task(position=[-0.02, 0.005, None])
+    settled = client.wait_until_settled(1e-3, timeout=30)
+    assert settled.state is State.ACTIVE
+    truth = made.link.truth()[:3, 3]
+    assert abs(truth[:2] - [-0.02, 0.005]).max() < 2e-3
+    with urllib.request.urlopen(f"{made.url}/metrics") as answer:
+        assert b'stiffopt_state{rig="sim",state="active"} 1.0' in answer.read()
+    assert made.foxglove_port
+    assert made.recording is not None
+    wait_for(lambda: os.path.getsize(made.recording or "") > 5_000)
+    told = [event.text for event in made.loop.events.since(0)[0] if event.kind == "real-time"]
+    assert [text.split(":")[0] for text in told] == ["control", "guard"]
+
+
+def test_the_example_for_planners_streams_a_circle(
+    daemon: tuple[Daemon, Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The code of docs/daemon.md, as it stands there but for the address."""
+    made, client = daemon
+    (code,) = [b for b in blocks(_page(), "python") if "stream(" in b]
+    address = re.search(r"http://127\.0\.0\.1:8470", code)
+    assert address, "the example names the address"
+    client.release()
+    monkeypatch.setenv("STIFFOPT_TOKEN", made.token)
+    seen: list[Any] = []
+    made.loop.listen(lambda now: seen.append(now.target_position))
+    try:
+        with suppress(InputError):
+            made.loop.vent()
+        exec(compile(code.replace(address[0], str(made.url)), "daemon.md", "exec"), {})
+    finally:
+        made.loop._listeners.clear()
+        made.loop.listen(made._ticked)
+        client.take_control()
+    xy = {tuple(p[:2].round(4)) for p in seen if p is not None}
+    assert len(xy) > 40  # it went round
+    wait_for(lambda: made.loop.snapshot().state is State.INACTIVE)
+
+
+def _page() -> str:
+    return (ROOT / "docs" / "daemon.md").read_text(encoding="utf-8")
+
+
+def test_what_listens_to_ticks_cannot_hurt_them(daemon: tuple[Daemon, Client]) -> None:
+    made, _ = daemon
+    before = made.loop.snapshot().timing.ticks
+
+    def fail(now: Snapshot) -> None:
+        raise ZeroDivisionError("no luck")
+
+    made.loop.listen(fail)
+    try:
+        wait_for(lambda: any(a.kind == "listener" for a in made.loop.snapshot().alarms))
+        wait_for(lambda: made.loop.snapshot().timing.ticks > before + 20)
+        assert not made.ended
+    finally:
+        made.loop._listeners.remove(fail)
+        made.loop.clear_alarm("listener")
+
+
+def test_a_hanging_control_thread_does_not_keep_it_from_venting(
+    daemon: tuple[Daemon, Client], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, _ = daemon
+    hangs, vented = threading.Event(), []
+    monkeypatch.setattr(made.loop, "vent", lambda reason: hangs.wait(20))
+    monkeypatch.setattr(made.link, "vent", lambda: vented.append(True))
+    made.vent(patience=0.05)
+    hangs.set()
+    assert vented
+
+
+def test_another_guard_replaces_one_that_was_killed(daemon: tuple[Daemon, Client]) -> None:
+    made, client = daemon
+    armed(client)
+    first = made.link.pid
+    assert first is not None
+    os.kill(first, signal.SIGKILL)
+    wait_for(lambda: client.state().state is State.FAULT)
+    wait_for(lambda: made.link.alive and made.link.pid != first, 60)
+
+    def reset() -> bool:
+        try:
+            client.reset()
+        except InputError:
+            return False
+        return True
+
+    wait_for(reset)
+    wait_for(lambda: not any(a.kind == "guard" for a in client.state().alarms))
+    armed(client)
+    assert client.state().state is State.ACTIVE
+    client.disarm()
+
+
+def test_a_task_is_for_this_arm(daemon: tuple[Daemon, Client], tmp_path: Path) -> None:
+    made, _ = daemon
+    (tmp_path / "one.yaml").write_text(ONE)
+    (tmp_path / "two.yaml").write_text(TWO)
+    assert made.read_task(tmp_path / "one.yaml").target.position is not None
+    with pytest.raises(FileError, match="this rig has 'stiff-flop-1'"):
+        made.read_task(tmp_path / "two.yaml")
+
+
+def test_it_is_started_once(daemon: tuple[Daemon, Client]) -> None:
+    with pytest.raises(InputError, match="started once"):
+        daemon[0].start()
+
+
+def test_a_rig_that_does_not_answer_is_told_and_nothing_stays(tmp_path: Path) -> None:
+    """Nobody listens where the Modbus coupler should be."""
+    rig = patient_rig(
+        tmp_path,
+        "modbus-aurora",
+        supply={"tcp": {"host": "127.0.0.1", "port": 1}},
+        tracker={"port": str(tmp_path / "no-aurora")},
+    )
+    made = Daemon(rig)
+    with pytest.raises(CommandError, match="devices: ") as error:
+        made.start()
+    assert "no-aurora" in str(error.value) or "127.0.0.1" in str(error.value)
+    assert made.ended
+    assert made.token_file is not None
+    assert not made.token_file.exists()
+    assert not any(t.name in ("control", "keeper", "service") for t in threading.enumerate())
+
+
+# the keeper --------------------------------------------------------------------------------------
+
+
+class KeptLoop(FakeLoop):
+    def __init__(self) -> None:
+        super().__init__()
+        self.alarms: dict[str, str] = {}
+
+    def add_alarm(self, kind: str, text: str) -> None:
+        self.alarms[kind] = text
+
+    def clear_alarm(self, kind: str) -> None:
+        self.alarms.pop(kind, None)
+
+
+class FakeLink:
+    def __init__(self) -> None:
+        self.alive = False
+        self.opened = 0
+        self.fails = False
+
+    def open(self) -> None:
+        self.opened += 1
+        if self.fails:
+            raise DeviceError("nobody answers")
+        self.alive = True
+
+    def close(self) -> None:
+        raise DeviceError("the old one ended with code -9")
+
+
+class FakeManager(ServiceManager):
+    def __init__(self) -> None:
+        super().__init__()
+        self.told: list[str] = []
+
+    def status(self, text: str) -> None:
+        self.told.append(text)
+
+
+def test_the_keeper_replaces_a_guard_again_and_again() -> None:
+    loop, link, now = KeptLoop(), FakeLink(), [100.0]
+    keeper = Keeper(loop, link, FakeManager(), clock=lambda: now[0])  # type: ignore[arg-type]
+    link.fails = True
+    keeper.look()
+    keeper.look()
+    assert link.opened == 1  # not at once again
+    assert "no guard process can be started: nobody answers" in loop.alarms["guard"]
+    now[0], link.fails = 103.0, False
+    keeper.look()
+    assert link.opened == 2
+    assert not loop.alarms
+
+
+def test_the_keeper_holds_the_arm_when_the_service_ends() -> None:
+    loop, link, serves = KeptLoop(), FakeLink(), [True]
+    link.alive = True
+    keeper = Keeper(loop, link, FakeManager(), lambda: serves[0])  # type: ignore[arg-type]
+    keeper.look()
+    assert not loop.calls
+    serves[0] = False
+    keeper.look()
+    keeper.look()
+    assert loop.names == ["hold"]
+    assert "service" in loop.alarms
+
+
+def test_the_keeper_goes_on_and_tells_the_service_manager() -> None:
+    loop, link, manager = KeptLoop(), FakeLink(), FakeManager()
+    link.alive = True
+    loop.now = Snapshot(**{**loop.now.__dict__, "state": State.FAULT, "reason": "a leak"})
+
+    def serving() -> bool:
+        raise ZeroDivisionError("no luck")
+
+    keeper = Keeper(loop, link, manager, serving)  # type: ignore[arg-type]
+    keeper.start()
+    wait_for(lambda: "ZeroDivisionError" in loop.alarms.get("keeper", ""))
+    keeper.stop()
+    assert manager.told == ["fault: a leak"]
+
+
+# the token ---------------------------------------------------------------------------------------
+
+
+def test_a_drawn_token_is_for_this_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    (tmp_path / "runs").mkdir()
+    path = tmp_path / "runs" / "my-rig.token"
+    path.write_text("old")
+    path.chmod(0o666)
+    secret = Secret(ServiceSettings(), tmp_path / "runs", "my-rig")
+    secret.write()
+    assert secret.path == path
+    assert path.read_text().strip() == secret.token
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert os.listdir(path.parent) == [path.name]
+    other = Secret(ServiceSettings(), tmp_path / "runs", "my-rig")
+    assert other.token != secret.token
+    other.remove()  # not its own
+    assert path.exists()
+    secret.remove()
+    assert not path.exists()
+
+
+def test_a_token_may_come_from_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MY_TOKEN", "abc")
+    secret = Secret(ServiceSettings(token="MY_TOKEN"), tmp_path, "rig")
+    secret.write()
+    assert (secret.token, secret.path) == ("abc", None)
+    assert not os.listdir(tmp_path)
+
+
+def test_a_token_that_cannot_be_kept_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    settings = ServiceSettings(token="NOWHERE_SET", token_file=str(tmp_path / "file" / "token"))
+    with pytest.raises(FileError, match=r"service\.token_file"):
+        Secret(settings, tmp_path, "rig").write()
+
+
+def test_bounded_stop(daemon: tuple[Daemon, Client]) -> None:
+    """The last test of the running one: from under pressure to vented in bounded time."""
+    made, client = daemon
+    armed(client)
+    client.set_task(position=[-0.02, 0.005, None])
+    wait_for(lambda: client.state().commanded.max() > 1e4)
+    client.release()
+    begin = time.monotonic()
+    assert made.stop() is State.INACTIVE
+    assert time.monotonic() - begin < made.description.safety.ramp_time + 6
+    assert made.link.pid is None
+    events, _ = made.loop.events.since(0)
+    assert events[-1].kind == "vented"

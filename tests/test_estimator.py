@@ -1,0 +1,411 @@
+"""The estimator of the tip: on a truth of just the form it assumes, and against a plain filter.
+
+The plain filter is run again from the beginning for every sample, in order of capture; it has the
+state (xi, w, d) of each axis in one vector and matrices in place of what the estimator carries on.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import block_diag, expm
+
+from stiffopt import lie
+from stiffopt.control.estimator import EstimatorSettings, TipEstimator
+from stiffopt.control.vibration import Vibration
+from stiffopt.optimise.tip import TipAt
+from stiffopt.rig.interface import PoseSample
+
+PERIOD, OMEGA, ZETA = 0.01, 10.0, 0.04
+MASS = 0.04
+BASE = np.array([0.01, 0.0, 0.18])
+# m/Pa: the first channel moves the tip along x, the second along y and a little along z
+J = np.array([[3e-7, 0.0], [0.0, 3e-7], [0.0, 0.5e-7]])
+SHARES = np.array([0.9, 0.6])
+SWINGING = Vibration(MASS, SHARES)
+PLAIN = EstimatorSettings(model_error=0.0, frequency_error=0.0, damping=ZETA)
+
+
+def tip_at(p, rotation=None):
+    """A tip that is linear in the pressures, soft in x and y."""
+    R = np.eye(3) if rotation is None else rotation
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R, BASE + J @ p
+    jacobian = np.zeros((6, 2))
+    jacobian[:3] = R.T @ J
+    soft = 1 / (MASS * OMEGA**2)
+    linear = R.T @ np.diag([soft, soft, soft / 400]) @ R
+    return TipAt(pose, jacobian, block_diag(linear, np.eye(3)))
+
+
+def sample(time, position, quaternion=None, frame=0):
+    return PoseSample(time, time, frame, np.array(position, dtype=float), quaternion)
+
+
+def mode(omega=OMEGA):
+    return np.array([[0, 1], [-(omega**2), -2 * ZETA * omega]])
+
+
+class Truth:
+    """Swing in x and y, driven by what the pressures move, and an offset, in steps of 1 ms."""
+
+    STEP = 1e-3
+
+    def __init__(self, seed=0, offset=(3e-3, -2e-3, 1e-3), agitation=0.0, drift=0.0):
+        self.rng = np.random.default_rng(seed)
+        self.offset = np.array(offset)
+        self.eta = np.zeros((2, 2))  # swing and speed, x and y
+        self.p, self.agitation, self.drift = np.zeros(2), agitation, drift
+        self.F = expm(self.STEP * mode())
+        self.positions = [self.position]
+
+    @property
+    def position(self):
+        return BASE + J @ self.p + np.array([*self.eta[0], 0.0]) + self.offset
+
+    def run(self, p, duration):
+        """Pressures go straight to p (2,)."""
+        n = round(duration / self.STEP)
+        for k in range(n):
+            now = self.p + (p - self.p) / (n - k)
+            driven = (J[:2] * SHARES) @ (now - self.p)
+            self.p = now
+            self.eta[0] -= 0.5 * driven
+            self.eta = self.F @ self.eta
+            self.eta[0] -= 0.5 * driven
+            root = math.sqrt(self.STEP)
+            self.eta[1] += self.agitation * root * self.rng.normal(size=2)
+            self.offset = self.offset + self.drift * root * self.rng.normal(size=3)
+            self.positions.append(self.position)
+
+
+def pressures(k):
+    """A wandering command, smooth enough to be read each tick."""
+    t = k * PERIOD
+    return 4e4 * np.array([np.sin(1.7 * t), np.sin(1.1 * t)]) * min(1.0, t)
+
+
+def follow(estimator, truth, ticks, noise, latency, every=0.025, jitter=0.0, seed=1, spoil=None):
+    """Let both run; return errors (ticks, 3) of the estimated position."""
+    rng = np.random.default_rng(seed)
+    waiting, errors, due, frame = [], [], every, 0
+    for k in range(1, ticks + 1):
+        truth.run(pressures(k), PERIOD)
+        now = k * PERIOD
+        while due <= now:
+            seen = truth.positions[round(due / truth.STEP)] + noise * rng.normal(size=3)
+            arrives = due + latency + jitter * rng.uniform()
+            waiting.append((arrives, sample(round(due / truth.STEP) * truth.STEP, seen)))
+            due, frame = due + every, frame + 1
+        arrived = [s for a, s in waiting if a <= now]
+        waiting = [(a, s) for a, s in waiting if a > now]
+        estimator.advance(now, truth.p, tip_at(truth.p))
+        estimator.take([spoil(s, frame) if spoil else s for s in arrived])
+        errors.append(estimator.estimate.position - truth.position)
+    return np.array(errors)
+
+
+# -- on truth ---------------------------------------------------------------------------------
+
+
+def test_late_and_jittered_samples_give_truth_without_noise():
+    estimator, truth = TipEstimator(PERIOD, SWINGING, PLAIN), Truth()
+    errors = follow(estimator, truth, 600, 0.0, 0.025, jitter=0.02)
+    assert np.abs(truth.eta[0]).max() > 3e-4  # there is a swing to be estimated
+    assert np.abs(errors[300:]).max() < 3e-5
+    assert estimator.estimate.offset == pytest.approx(truth.offset, abs=3e-5)
+    assert estimator.estimate.swing[:2] == pytest.approx(truth.eta[0], abs=3e-5)
+    assert estimator.estimate.speed[:2] == pytest.approx(truth.eta[1], abs=3e-4)
+    assert estimator.omega == pytest.approx(OMEGA, rel=1e-9)
+
+
+def test_errors_are_as_small_as_the_theory_allows():
+    """Noise and drift as assumed: unbiased, and with the deviation of the Kalman filter."""
+    settings = PLAIN
+    every, latency = 0.025, 0.025
+    # covariance of (xi, w, d) right after a sample, iterated; then carried on to the present
+    F = block_diag(expm(every * mode()), 1.0)
+    fine, Q = block_diag(expm(1e-3 * mode()), 1.0), np.zeros((3, 3))
+    own = 1e-3 * np.diag([0.0, settings.agitation**2, settings.drift**2])
+    for _ in range(25):
+        Q = fine @ Q @ fine.T + own
+    row, P = np.array([1.0, 0.0, 1.0]), np.diag([1e-2, 2.5e-3, 1e-2])
+    for _ in range(2000):
+        P = F @ P @ F.T + Q
+        gain = P @ row / (row @ P @ row + settings.noise**2)
+        P = P - np.outer(gain, row @ P)
+    ages = np.arange(0.025, 0.05, 0.01)  # of the last sample, at a tick
+    variances = []
+    for age in ages:
+        later = P.copy()
+        for _ in range(round(age / 1e-3)):
+            later = fine @ later @ fine.T + own
+        variances.append(row @ later @ row)
+    best = math.sqrt(np.mean(variances))
+    errors = []
+    for seed in range(3):
+        truth = Truth(seed, agitation=settings.agitation, drift=settings.drift)
+        estimator = TipEstimator(PERIOD, SWINGING, settings)
+        errors.append(follow(estimator, truth, 1200, settings.noise, latency, seed=seed)[400:, :2])
+    found = np.concatenate(errors)
+    rms = math.sqrt((found**2).mean())
+    assert 0.8 * best < rms < 1.25 * best
+    assert np.abs(found.mean(axis=0)).max() < 0.3 * best
+
+
+def test_arm_that_does_not_swing():
+    truth = Truth()
+    truth.F = np.zeros((2, 2))
+    estimator = TipEstimator(PERIOD, None, EstimatorSettings())
+    rng = np.random.default_rng(4)
+    errors = []
+    for k in range(1, 500):
+        p = pressures(k)
+        estimator.advance(k * PERIOD, p, tip_at(p))
+        true = BASE + J @ p + truth.offset
+        if k % 3 == 0:
+            late = BASE + J @ pressures(k - 3) + truth.offset + rng.normal(0, 5e-5, 3)
+            estimator.take([sample((k - 3) * PERIOD, late)])
+        errors.append(estimator.estimate.position - true)
+    assert not estimator.estimate.swing.any()
+    assert np.sqrt((np.array(errors)[200:] ** 2).mean()) < 6e-5
+    assert estimator.omega == math.inf
+
+
+# -- against a filter that is run again ---------------------------------------------------------
+
+
+class Replay:
+    """Ticks and samples are kept; the answer is a filter over all of them in order of time."""
+
+    def __init__(self, settings):
+        self.s, self.events = settings, []
+
+    def tick(self, time, p):
+        self.events.append((time, 0, p.copy()))
+
+    def see(self, time, position):
+        self.events.append((time, 1, position))
+
+    def answer(self):
+        """State (9,): xi x y z, w x y z, d x y z, at the last tick."""
+        s = self.s
+        mean = np.zeros(9)
+        # x, y: xi, w, d; z: d alone
+        P = np.diag([1e-2, 1e-2, 0, 2.5e-3, 2.5e-3, 0, 1e-2, 1e-2, 1e-2])
+        H = np.hstack([np.diag([1.0, 1.0, 0.0]), np.zeros((3, 3)), np.eye(3)])
+        B = np.diag([1.0, 1.0, 0.0]) @ (J * SHARES)
+        at, p, last_seen, static = None, None, None, None
+        events = sorted(self.events, key=lambda e: (e[0], e[1]))
+        for time, kind, value in events:
+            if at is not None and time > at:
+                F = self.matrix(time - at)
+                if kind == 0 and p is not None:
+                    mean[:3] -= 0.5 * B @ (value - p)
+                mean = F @ mean
+                if kind == 0 and p is not None:
+                    mean[:3] -= 0.5 * B @ (value - p)
+            at = time
+            if kind == 0:
+                p, static = value, BASE + J @ value
+                continue
+            if last_seen is not None:
+                elapsed = time - last_seen
+                F = self.matrix(elapsed)
+                grown = [0, 0, 0] + [s.agitation**2] * 2 + [0] + [s.drift**2] * 3
+                P = F @ P @ F.T + elapsed * np.diag(grown)
+            last_seen = time
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + s.noise**2 * np.eye(3))
+            mean = mean + K @ (value - static - H @ mean)
+            P = (np.eye(9) - K @ H) @ P
+        return mean
+
+    @staticmethod
+    def matrix(duration):
+        F = np.eye(9)
+        F[np.ix_([0, 3], [0, 3])] = F[np.ix_([1, 4], [1, 4])] = expm(duration * mode())
+        F[2, 2] = 1.0
+        return F
+
+
+@pytest.mark.parametrize("late", [1, 3, 7])
+def test_carrying_corrections_on_is_a_replay(late):
+    """Samples of ticks, delivered some ticks later, give the same as a filter run again."""
+    estimator, truth = TipEstimator(PERIOD, SWINGING, PLAIN), Truth(3)
+    replay, rng = Replay(PLAIN), np.random.default_rng(8)
+    seen = {}
+    for k in range(1, 90):
+        truth.run(pressures(k), PERIOD)
+        now = k * PERIOD
+        estimator.advance(now, truth.p, tip_at(truth.p))
+        replay.tick(now, truth.p)
+        if k == 1:
+            estimator._look_at_mode(tip_at(truth.p))
+        if k % 3 == 0:
+            seen[k] = truth.position + rng.normal(0, 5e-5, 3)
+        if k - late in seen:
+            before = estimator.sample
+            estimator.take([sample((k - late) * PERIOD, seen[k - late])])
+            if estimator.sample is not before:
+                replay.see((k - late) * PERIOD, seen[k - late])
+        if k % 11 == 0 and k > 30:
+            e = estimator.estimate
+            found = np.concatenate([e.swing, e.speed, e.offset])
+            assert found == pytest.approx(replay.answer(), abs=1e-9)
+
+
+def test_samples_between_ticks_are_nearly_a_replay():
+    """There, the swing is taken on the straight way between ticks."""
+    estimator, truth = TipEstimator(PERIOD, SWINGING, PLAIN), Truth(3)
+    errors = follow(estimator, truth, 500, 0.0, 0.03, every=0.017, jitter=0.01)
+    assert np.abs(errors[250:]).max() < 3e-5
+
+
+def test_two_samples_within_a_tick():
+    """A tracker faster than the loop: the second sample knows of the first."""
+    twice, once = (TipEstimator(PERIOD, SWINGING, PLAIN) for _ in range(2))
+    truth = Truth(3)
+    for k in range(1, 40):
+        truth.run(np.zeros(2), PERIOD)
+        now = k * PERIOD
+        for estimator in (twice, once):
+            estimator.advance(now, np.zeros(2), tip_at(np.zeros(2)))
+        if k > 20 and k % 3 == 0:
+            positions = truth.positions[-8], truth.positions[-5]
+            times = now - 7e-3, now - 4e-3
+            twice.take([sample(t, x) for t, x in zip(times, positions, strict=True)])
+            once.take([sample(times[1], positions[1])])
+            # the arm is at rest with an offset: all of it is seen, at once and without noise
+            for estimator in (twice, once) if k > 24 else ():
+                assert estimator.estimate.position == pytest.approx(truth.position, abs=2e-4)
+
+
+# -- what is not believed -----------------------------------------------------------------------
+
+
+def settled(ticks=200, settings=PLAIN, vibration=SWINGING):
+    estimator, truth = TipEstimator(PERIOD, vibration, settings), Truth()
+    follow(estimator, truth, ticks, 0.0, 0.025)
+    return estimator, truth, ticks * PERIOD
+
+
+def state(estimator):
+    e = estimator.estimate
+    return np.concatenate([e.swing, e.speed, e.offset, e.turn])
+
+
+def test_old_samples_are_left_out():
+    estimator, truth, now = settled()
+    before = state(estimator)
+    seen = estimator.take([sample(now - 0.1, truth.position), sample(now - 2.0, truth.position)])
+    assert (seen.used, seen.rejected) == (0, 0)
+    assert np.array_equal(state(estimator), before)
+
+
+def test_older_after_newer_is_left_out():
+    estimator, truth, now = settled()
+    newer, older = sample(now, truth.position), sample(now - 0.01, truth.position)
+    assert estimator.take([newer, older]).used == 1
+    assert estimator.sample is newer
+
+
+@pytest.mark.parametrize("time", [1e3, math.nan, math.inf, -math.inf])
+def test_samples_of_no_sensible_time_do_no_harm(time):
+    estimator, truth, now = settled()
+    before = state(estimator)
+    assert estimator.take([sample(time, truth.position)]).used == 0
+    assert np.array_equal(state(estimator), before)
+    assert estimator.take([sample(now, truth.position)]).used == 1
+
+
+def test_pose_that_was_not_seen_is_ignored():
+    estimator, _, now = settled()
+    before = state(estimator)
+    seen = estimator.take([sample(now, [np.nan, 0, 0]), sample(now, [np.nan] * 3)])
+    assert (seen.used, seen.rejected) == (0, 0)
+    assert np.array_equal(state(estimator), before)
+
+
+def test_jump_is_rejected_and_stays_so():
+    estimator, truth, now = settled()
+    before = state(estimator)
+    jumped = truth.position + [0.2, 0, 0]
+    for k in range(1, 30):
+        estimator.advance(now + k * PERIOD, truth.p, tip_at(truth.p))
+        seen = estimator.take([sample(now + k * PERIOD, jumped)])
+        assert (seen.used, seen.rejected) == (0, 1)
+        assert seen.latest < now
+    # the swing runs on; the offset has learned nothing
+    assert state(estimator)[6:] == pytest.approx(before[6:], abs=0)
+    # and where the tip is expected, it is believed again
+    assert estimator.take([sample(now + 0.3, estimator.estimate.position)]).used == 1
+
+
+def test_outliers_among_good_samples_make_no_difference():
+    good, bad = (TipEstimator(PERIOD, SWINGING, PLAIN) for _ in range(2))
+    follow(good, Truth(), 300, 5e-5, 0.025)
+    rng = np.random.default_rng(0)
+    errors = follow(
+        bad, Truth(), 300, 5e-5, 0.025,
+        spoil=lambda s, frame: sample(s.time, s.position + 0.3) if rng.uniform() < 0.2 else s,
+    )  # fmt: skip
+    assert np.abs(errors[150:]).max() < 5e-4
+    assert bad.estimate.offset == pytest.approx(good.estimate.offset, abs=2e-4)
+
+
+def test_wrong_first_sample_does_not_make_all_others_wrong():
+    estimator, truth = TipEstimator(PERIOD, SWINGING, PLAIN), Truth()
+    rejected = 0
+    for k in range(1, 40):
+        truth.run(np.zeros(2), PERIOD)
+        estimator.advance(k * PERIOD, np.zeros(2), tip_at(np.zeros(2)))
+        shift = 0.3 if k == 1 else 0.0
+        rejected += estimator.take([sample(k * PERIOD, truth.position + shift)]).rejected
+    assert rejected <= 1
+    assert estimator.estimate.position == pytest.approx(truth.position, abs=2e-4)
+
+
+# -- orientation --------------------------------------------------------------------------------
+
+
+def turned(vector):
+    return lie.exp(np.concatenate([np.zeros(3), vector]))[:3, :3]
+
+
+def quaternion(R):
+    return lie.quaternion_from_rotation(R)
+
+
+def test_offset_of_the_orientation_is_found_and_its_sign_does_not_matter():
+    off = turned(np.array([0.05, -0.08, 0.03]))
+    answers = []
+    for signs in ([1.0], [-1.0], [1.0, -1.0]):
+        estimator, truth = TipEstimator(PERIOD, SWINGING, EstimatorSettings()), Truth()
+        for k in range(1, 80):
+            truth.run(np.zeros(2), PERIOD)
+            estimator.advance(k * PERIOD, np.zeros(2), tip_at(np.zeros(2)))
+            q = quaternion(off) * signs[k % len(signs)]
+            estimator.take([sample(k * PERIOD, truth.position, q)])
+        assert estimator.rotation == pytest.approx(off, abs=1e-3)
+        assert estimator.estimate.turn == pytest.approx([0.05, -0.08, 0.03], abs=1e-3)
+        answers.append(state(estimator))
+    assert answers[1] == pytest.approx(answers[0], abs=1e-12)
+    assert answers[2] == pytest.approx(answers[0], abs=1e-12)
+
+
+def test_tracker_of_positions_alone():
+    estimator, truth, _ = settled()
+    assert estimator.estimate.turn == pytest.approx(np.zeros(3), abs=0)
+    assert np.isfinite(estimator.rotation).all()
+    assert estimator.estimate.position == pytest.approx(truth.position, abs=5e-5)
+
+
+def test_begin_forgets():
+    estimator, truth, now = settled()
+    estimator.begin()
+    p = np.zeros(2)
+    estimator.advance(now, p, tip_at(p))
+    assert not state(estimator).any()
+    assert estimator.take([sample(now - 0.02, truth.position)]).used == 0

@@ -1,0 +1,152 @@
+"""The reference and its inverse, driven through regulators and a swing in fine steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import cont2discrete
+
+from stiffopt.control.reference import Reference
+
+BAR = 1e5
+SLEW = np.array([5 * BAR, 5 * BAR])
+
+
+def made(period=0.01, lag=0.06, dead_time=0.01, rate=12.0):
+    reference = Reference(period, SLEW, lag, dead_time)
+    reference.rate = rate
+    return reference
+
+
+def swung(commands, period, lag, dead_time, omega, damping, fine=1e-3):
+    """What regulators (exact lag and dead time) and a mode make of held commands (k,)."""
+    A = np.array([[-1 / lag, 0, 0], [0, 0, 1], [omega**2, -(omega**2), -2 * damping * omega]])
+    B = np.array([[1 / lag], [0], [0]])
+    F, G, *_ = cont2discrete((A, B, np.eye(3), np.zeros((3, 1))), fine)
+    held = np.repeat(commands, round(period / fine))
+    held = np.concatenate([np.zeros(round(dead_time / fine)), held])
+    x, out = np.zeros(3), []
+    for u in held:
+        out.append(x[1])
+        x = F @ x + G[:, 0] * u
+    return np.arange(len(held)) * fine, np.array(out)
+
+
+@pytest.mark.parametrize("period, bound", [(0.002, 0.005), (0.01, 0.03)])
+@pytest.mark.parametrize("omega", [6.0, 10.0, 20.0])
+def test_commands_put_the_arm_on_the_path_without_a_swing(period, bound, omega):
+    damping, lag, dead_time = 0.04, 0.06, 0.01
+    reference = made(period, lag, dead_time, rate=1.2 * omega)
+    goal = np.array([0.5 * BAR, 0.2 * BAR])
+    commands, paths, times = [], [], []
+    for k in range(round(40 / omega / period)):
+        reference.advance(goal)
+        commands.append(reference.command(omega, damping)[0][0])
+        paths.append(reference.path[0])
+        times.append(k * period)
+    t, tip = swung(np.array(commands), period, lag, dead_time, omega, damping)
+    # a command is held for a period: on average half a one late
+    expected = np.interp(t, np.array(times) + dead_time + 0.5 * period, paths, left=0.0)
+    assert np.abs(tip - expected)[: len(expected)].max() < bound * goal[0]
+    # the swing left at the end, against that of a step, which is all of it
+    assert np.abs(tip[-200:] - goal[0]).max() < 0.01 * goal[0]
+    _, raw = swung(np.full(len(commands), goal[0]), period, lag, dead_time, omega, damping)
+    late = t > 8 / omega
+    assert np.abs(raw[late] - goal[0]).max() > 0.3 * goal[0]
+
+
+def test_chamber_pressures_are_those_without_the_lag():
+    omega, damping = 10.0, 0.04
+    reference = made()
+    for _ in range(12):
+        reference.advance(np.full(2, BAR))
+    first, second, _ = reference.derivatives
+    _, chamber = reference.command(omega, damping)
+    expected = reference.path + 2 * damping / omega * first + second / omega**2
+    assert chamber == pytest.approx(expected, rel=1e-12)
+
+
+def test_arm_that_does_not_swing():
+    reference = made()
+    for _ in range(8):
+        reference.advance(np.full(2, BAR))
+    command, chamber = reference.command(np.inf, 0.04)
+    assert chamber == pytest.approx(reference.path, rel=1e-12)
+    assert command == pytest.approx(reference.path + 0.06 * reference.derivatives[0], rel=1e-12)
+
+
+def test_derivatives_are_those_of_the_path():
+    period = 1e-4
+    reference = made(period, rate=15.0)
+    path, given = [], []
+    for k in range(6000):
+        goal = np.array([np.sin(3 * k * period), np.cos(2 * k * period) - 1]) * 0.05 * BAR
+        reference.advance(goal)
+        path.append(reference.path.copy())
+        given.append(np.array(reference.derivatives))
+    path, given = np.array(path), np.array(given)
+    for order in range(3):
+        path = np.diff(path, axis=0) / period
+        middle = given[len(given) - len(path) :, order] * 1.0
+        # finite differences lag by half a step for each order
+        scale = np.abs(middle).max()
+        shift = (order + 1) // 2
+        aligned = given[: len(path) + shift, order][shift:]
+        assert np.abs(path - aligned)[50:].max() < 0.02 * scale
+
+
+def test_slew_is_kept_by_path_and_by_all_channels_together():
+    """The way between pressures is straight: all channels are at the same share of it."""
+    reference = made()
+    goal = np.array([1.2 * BAR, -0.3 * BAR])
+    before = reference.path.copy()
+    for _ in range(120):
+        reference.advance(goal)
+        now = reference.path.copy()
+        assert np.all(np.abs(now - before) <= SLEW * 0.01 * (1 + 1e-9))
+        assert now / goal == pytest.approx(np.full(2, now[0] / goal[0]), abs=1e-12)
+        before = now
+    assert now == pytest.approx(goal, rel=0.02)
+
+
+def test_what_goes_with_the_pressures_is_on_the_same_way():
+    reference = made()
+    reference.begin(np.zeros(3))
+    goal = np.array([1.0 * BAR, 0.5 * BAR, 7e-3])
+    for _ in range(40):
+        reference.advance(goal)
+        share = reference.path / goal
+        assert share == pytest.approx(np.full(3, share[0]), abs=1e-12)
+    assert len(reference.command(10.0, 0.04)[0]) == 2
+
+
+@pytest.mark.parametrize("rate", [5.0, 12.0, 40.0])
+def test_delay_is_by_how_much_a_ramp_is_late(rate):
+    period = 1e-3
+    reference = made(period, rate=rate)
+    slope = 0.2 * BAR
+    for k in range(4000):
+        reference.advance(np.full(2, slope * k * period))
+    late = (slope * 3999 * period - reference.path[0]) / slope
+    assert late == pytest.approx(reference.delay, abs=5 * period)
+
+
+def test_begin_is_at_rest():
+    reference = made()
+    values = np.array([0.3 * BAR, 0.1 * BAR])
+    for _ in range(5):
+        reference.advance(np.full(2, BAR))
+    reference.begin(values)
+    assert np.array_equal(reference.path, values)
+    assert not np.any(reference.derivatives)
+    reference.advance(values)
+    assert reference.command(10.0, 0.04)[0] == pytest.approx(values, rel=1e-12)
+
+
+def test_change_of_rate_leaves_the_path_where_it_is():
+    reference = made()
+    for _ in range(10):
+        reference.advance(np.full(2, BAR))
+    path = reference.path.copy()
+    reference.rate = 20.0
+    assert np.array_equal(reference.path, path)

@@ -1,0 +1,315 @@
+"""`stiffopt run`, as its users meet it: started, driven by a client, ended, killed."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from fake_loop import FakeLoop
+from running import COMMAND, ONE, RIGS, TWO, guard_of, patient_rig, running, wait_for
+from stiffopt.cli.main import main
+from stiffopt.cli.run_lines import Lines
+from stiffopt.cli.run_status import LiveStatus, status
+from stiffopt.control.state import Alarm, Event, Severity, State, Timing
+from stiffopt.daemon.client import Client
+
+ROOT = Path(__file__).resolve().parent.parent
+EDGES, COUNTS = (1e-4, 1e-3, 1e-2), (90, 8, 2, 0)
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> str:
+    path = tmp_path / "task.yaml"
+    path.write_text(ONE, encoding="utf-8")
+    return str(path)
+
+
+# bad input ---------------------------------------------------------------------------------------
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Return what is said, on one line, of a run that must not even begin."""
+    assert main(["run", *arguments]) == 2
+    told = capsys.readouterr()
+    assert "Traceback" not in told.err
+    return " ".join(told.err.split())
+
+
+def test_what_cannot_be_run_is_refused(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, task: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = str(patient_rig(tmp_path))
+    (tmp_path / "bad.yaml").write_text("format: stiffopt-rig/1\nrobot: stiff-flop-1\n")
+    (tmp_path / "two.yaml").write_text(TWO)
+    alone = ("--no-service", "--arm", "--task")
+    assert "no such file" in refused(capsys, str(tmp_path / "none.yaml"))
+    assert "supply" in refused(capsys, str(tmp_path / "bad.yaml"))
+    assert "--task needs --arm" in refused(capsys, rig, "--task", task)
+    assert "nobody else could" in refused(capsys, rig, "--no-service")
+    assert "nobody else could" in refused(capsys, rig, "--no-service", "--arm")
+    assert "above 0 s" in refused(capsys, rig, "--duration", "0 s")
+    assert "--duration" in refused(capsys, rig, "--duration", "soon")
+    assert "not both" in refused(capsys, rig, "--plain", "--json-lines")
+    assert "no such file" in refused(capsys, rig, *alone, str(tmp_path / "none.yaml"))
+    other = refused(capsys, rig, *alone, str(tmp_path / "two.yaml"))
+    assert "robot 'stiff-flop-2-hanging'; this rig has 'stiff-flop-1'" in other
+    monkeypatch.setenv("NOTIFY_SOCKET", "/nowhere")
+    assert "must not arm by itself" in refused(capsys, rig, "--arm", "--task", task)
+
+
+def test_a_port_in_use_is_told_and_the_others_token_stays(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    (runs / "sim.token").write_text("of the other daemon\n")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        error = refused(capsys, str(patient_rig(tmp_path, service={"port": port})))
+    assert f"port {port}" in error
+    assert "service.port" in error
+    assert (runs / "sim.token").read_text() == "of the other daemon\n"
+
+
+def test_without_the_extra_it_says_what_to_install(tmp_path: Path) -> None:
+    script = f"import sys; sys.modules['fastapi'] = None; {COMMAND[2].removeprefix('import sys; ')}"
+    done = subprocess.run(
+        [sys.executable, "-c", script, "run", str(patient_rig(tmp_path))],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert "pip install 'stiffopt[daemon]'" in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+
+
+def test_its_page_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["run", "--help"])
+    options = set(re.findall(r"^  (?:-\w, )?(--[\w-]+)", capsys.readouterr().out, re.M))
+    assert {"--task", "--arm", "--duration", "--no-service"} <= options
+    page = (ROOT / "docs" / "daemon.md").read_text(encoding="utf-8")
+    assert not {option for option in options if f"`{option}" not in page}
+
+
+# runs --------------------------------------------------------------------------------------------
+
+
+def test_a_client_drives_it_and_sigterm_ends_it_vented(tmp_path: Path, compiled: Path) -> None:
+    with running("run", str(patient_rig(tmp_path))) as run:
+        started = run.line("started")
+        token = Path(started["token_file"])
+        assert stat.S_IMODE(token.stat().st_mode) == 0o600
+        with Client(started["url"], token, name="test") as client:
+            assert client.state().state is State.INACTIVE
+            client.take_control()
+            wait_for(lambda: _arms(client))
+            client.set_task(position=[-0.02, 0.005, None])
+            settled = client.wait_until_settled(1e-3, timeout=30)
+            assert settled.commanded.max() > 1e4
+            client.release()
+        begin = time.monotonic()
+        assert run.end(signal.SIGTERM) == 0
+        assert time.monotonic() - begin < 8
+        last = [line for line in run.lines if line["kind"] == "state"][-1]
+        assert last["state"] == "inactive"
+        assert {"armed", "disarming", "vented"} <= {line["kind"] for line in run.lines}
+        assert all({"time", "level", "kind", "text"} <= set(line) for line in run.lines)
+        assert not token.exists()
+        assert Path(started["recording"]).stat().st_size > 10_000
+
+
+def _arms(client: Client) -> bool:
+    """Arm; say whether it could be: the tracker must have been seen for a while."""
+    try:
+        client.arm()
+    except ValueError:
+        return False
+    return True
+
+
+def test_two_segments_hold_a_task_without_the_extra_and_for_a_time(
+    tmp_path: Path, compiled: Path
+) -> None:
+    (tmp_path / "two.yaml").write_text(TWO, encoding="utf-8")
+    missing = ("fastapi", "uvicorn", "websockets", "httpx", "foxglove", "prometheus_client")
+    hidden = f"import sys; sys.modules.update(dict.fromkeys({missing})); "
+    rig = str(patient_rig(tmp_path, "sim-two-segment"))
+    task = str(tmp_path / "two.yaml")
+    with running(
+        "run", rig, "--task", task, "--arm", "--no-service", "--duration", "4 s", prefix=hidden
+    ) as run:
+        assert run.wait(120) == 0, run.err
+        kinds = [line["kind"] for line in run.lines]
+        assert "url" not in run.line("started")
+    assert {"armed", "task", "vented", "log"} <= set(kinds)  # `log`: nothing is recorded
+
+
+def test_a_second_ctrl_c_vents_at_once(tmp_path: Path, compiled: Path, task: str) -> None:
+    rig = str(patient_rig(tmp_path, safety={"ramp_time": "10 s"}))
+    with running("run", rig, "--task", task, "--arm", "--plain") as run:
+        wait_for(lambda: any("[task]" in line for line in run.out), 60)
+        run.popen.send_signal(signal.SIGINT)
+        wait_for(lambda: any("[disarming]" in line for line in run.out))
+        begin = time.monotonic()
+        assert run.end(signal.SIGINT) == 0
+        assert time.monotonic() - begin < 5  # not 10
+        assert any("Ctrl-C, twice" in line for line in run.out)
+
+
+def test_a_killed_guard_is_a_fault_and_the_exit_code_says_so(
+    tmp_path: Path, compiled: Path, task: str
+) -> None:
+    rig = str(patient_rig(tmp_path))
+    with running("run", rig, "--task", task, "--arm", "--no-service") as run:
+        run.line("task")
+        os.kill(guard_of(run.popen.pid), signal.SIGKILL)
+        assert run.wait(30) == 5
+        assert any(line.get("state") == "fault" for line in run.lines)
+        assert "ended in the state fault" in " ".join(" ".join(run.err).split())
+
+
+def test_the_lab_is_driven_over_its_protocols_and_vented_whatever_happens(
+    tmp_path: Path, compiled: Path, task: str
+) -> None:
+    """Modbus and Aurora, a lab process and a run process: SIGTERM ramps down, SIGKILL vents."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    shipped = patient_rig(tmp_path, "virtual-lab")
+    text = shipped.read_text().replace("port: 0\n  scale", f"port: {port}\n  scale")
+    assert str(port) in text
+    shipped.write_text(text)
+    out = tmp_path / "lab.yaml"
+    with running("lab", str(shipped), "--out", str(out)) as lab:
+        wait_for(out.exists, 60)
+
+        def pressures() -> np.ndarray:
+            told = len(lab.err)
+            lab.say("status")
+            wait_for(lambda: any("pressures" in line for line in lab.err[told:]))
+            found = re.search(
+                r"pressures ([-\d., ]+) bar", " ".join(" ".join(lab.err[told:]).split())
+            )
+            assert found
+            return np.array([float(p) for p in found[1].split(",")])
+
+        with running("run", str(out)) as run:
+            started = run.line("started")
+            with Client(started["url"], started["token_file"]) as client:
+                client.take_control()
+                wait_for(lambda: _arms(client))
+                client.set_task(position=[-0.02, 0.005, None])
+                client.wait_until_settled(1e-3, timeout=40)
+                client.release()
+            assert pressures().max() > 0.1
+            assert run.end(signal.SIGTERM) == 0
+            wait_for(lambda: pressures().max() < 0.02)
+        with running("run", str(out), "--task", task, "--arm") as run:
+            run.line("task")
+            wait_for(lambda: pressures().max() > 0.2)
+            run.popen.kill()
+            run.wait()
+            wait_for(lambda: pressures().max() < 0.05, 5)
+
+
+# what is shown -----------------------------------------------------------------------------------
+
+
+class Places:
+    url = "http://127.0.0.1:8470"
+    token_file = Path("runs/sim.token")
+    recording = "runs/sim.mcap"
+    foxglove_port = 8765
+
+
+def shown(width: int = 100) -> str:
+    loop = FakeLoop()
+    now = replace(
+        loop.now,
+        state=State.HOLDING,
+        reason="the tracker does not see the tip",
+        commanded=np.linspace(0, 1.5e5, 6),
+        saturated=np.arange(6) == 5,
+        target_position=np.array([0.0, 0.011, np.nan]),
+        position_error=1.25e-3,
+        stiffness=1.2,
+        best_stiffness=1.5,
+        wrench=np.arange(6) * 1e-3,
+        alarms=(Alarm("tracker-missing", "the tracker [bold]does not see the tip", 1.0),),
+        timing=Timing(100, 3, 2e-3, (EDGES, COUNTS)),
+    )
+    events = [Event(1.0, "armed", "armed"), Event(2.0, "leak", "channel 2 leaks", Severity.ERROR)]
+    console = Console(file=io.StringIO(), width=width, markup=False)
+    names = [f"channel {k + 1}" for k in range(6)]
+    console.print(status(now, "my-rig", names, 99.9, events, Places()))
+    assert isinstance(console.file, io.StringIO)
+    return console.file.getvalue()
+
+
+def test_the_status_says_how_things_stand() -> None:
+    text = shown()
+    for words in (
+        "HOLDING  my-rig  the tracker does not see the tip",
+        "target  (0.0, 11.0, free) mm",
+        "1.25 mm",
+        "channel 6",
+        "saturated",
+        "not measured",
+        "1.2 N/m of 1.5 (80%)",
+        "99.9 Hz",
+        "3 overruns of 100",
+        "99 % begin within 10 ms",
+        "the tracker [bold]does not see the tip [tracker-missing]",
+        "channel 2 leaks [leak]",
+        "http://127.0.0.1:8470, token in runs/sim.token",
+        "runs/sim.mcap",
+    ):
+        assert words in text, f"{words!r} is not in\n{text}"
+    bars = [line.count("█") for line in text.splitlines() if "bar" in line]
+    assert len(bars) == 6
+    assert max(len(line) for line in shown(60).splitlines()) <= 60
+
+
+def test_a_terminal_that_is_gone_does_no_harm() -> None:
+    class Gone(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(5, "Input/output error")
+
+    loop = FakeLoop()
+    names = [f"channel {k + 1}" for k in range(6)]
+    live = LiveStatus("rig", names, console=Console(file=Gone(), force_terminal=True))
+    live.say("starting", "connecting")
+    live.begin(Places())
+    live.update(loop.now, loop.events.all)
+    live.end()
+
+
+def test_lines_are_left_out_where_nobody_takes_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    receive, send = os.pipe()
+    monkeypatch.setattr(sys, "stdout", os.fdopen(send, "w"))
+    lines, loop = Lines(as_json=True, now=lambda: 12.5), FakeLoop()
+    for _ in range(2000):  # far more than a pipe holds
+        lines.say("x", "y" * 1000)
+    assert len(os.read(receive, 10_000)) > 1000
+    os.close(receive)
+    lines.update(loop.now, loop.events.all)  # nobody is there any more
+    sys.stdout.close()
+    lines.say("x", "closed")
+
+
+def test_every_shipped_simulated_rig_is_run_somewhere_here() -> None:
+    text = Path(__file__).read_text(encoding="utf-8")
+    for path in RIGS.glob("sim*.yaml"):
+        assert path.stem == "sim" or f'"{path.stem}"' in text
