@@ -19,7 +19,7 @@ import pytest
 
 from examples import blocks
 from fake_loop import FakeLoop
-from running import ONE, TWO, patient_rig, wait_for
+from running import ONE, TWO, patient_rig, wait_for, with_simulator
 from stiffopt.control.state import Snapshot, State
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.daemon import Daemon
@@ -27,7 +27,7 @@ from stiffopt.daemon.keeper import Keeper
 from stiffopt.daemon.notify import ServiceManager
 from stiffopt.daemon.secret import Secret
 from stiffopt.errors import CommandError, DeviceError, FileError, InputError
-from stiffopt.rig.settings import ServiceSettings
+from stiffopt.rig.settings import Safety, ServiceSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -41,7 +41,7 @@ def daemon(
         pytest.skip("there is no C compiler")
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("STIFFOPT_COMPILER", raising=False)
-        patch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
+        patch.setenv("STIFFOPT_CACHE_DIR", str(with_simulator(code_cache)))
         folder = tmp_path_factory.mktemp("daemon")
         rig = patient_rig(folder, plant={"dynamics": "quasi-static"})
         with Daemon(rig) as made:
@@ -66,6 +66,7 @@ def armed(client: Client) -> None:
         try:
             client.arm()
         except InputError:
+            time.sleep(0.2)  # each attempt checks everything; the tracker must see the tip between
             return False
         return True
 
@@ -94,6 +95,10 @@ def test_the_example_for_planners_streams_a_circle(
 ) -> None:
     """The code of docs/daemon.md, as it stands there but for the address."""
     made, client = daemon
+    armed(client)
+    client.disarm()
+    wait_for(lambda: made.loop.snapshot().state is State.INACTIVE)
+    time.sleep(1.0)  # the example arms: the tip must have been seen for a moment
     (code,) = [b for b in blocks(_page(), "python") if "stream(" in b]
     address = re.search(r"http://127\.0\.0\.1:8470", code)
     assert address, "the example names the address"
@@ -102,8 +107,6 @@ def test_the_example_for_planners_streams_a_circle(
     seen: list[Any] = []
     made.loop.listen(lambda now: seen.append(now.target_position))
     try:
-        with suppress(InputError):
-            made.loop.vent()
         exec(compile(code.replace(address[0], str(made.url)), "daemon.md", "exec"), {})
     finally:
         made.loop._listeners.clear()
@@ -192,6 +195,7 @@ def test_a_rig_that_does_not_answer_is_told_and_nothing_stays(tmp_path: Path) ->
         supply={"tcp": {"host": "127.0.0.1", "port": 1}},
         tracker={"port": str(tmp_path / "no-aurora")},
     )
+    before = {thread.ident for thread in threading.enumerate()}
     made = Daemon(rig)
     with pytest.raises(CommandError, match="devices: ") as error:
         made.start()
@@ -199,7 +203,7 @@ def test_a_rig_that_does_not_answer_is_told_and_nothing_stays(tmp_path: Path) ->
     assert made.ended
     assert made.token_file is not None
     assert not made.token_file.exists()
-    assert not any(t.name in ("control", "keeper", "service") for t in threading.enumerate())
+    wait_for(lambda: {thread.ident for thread in threading.enumerate()} <= before)
 
 
 # the keeper --------------------------------------------------------------------------------------
@@ -282,6 +286,27 @@ def test_the_keeper_goes_on_and_tells_the_service_manager() -> None:
     wait_for(lambda: "ZeroDivisionError" in loop.alarms.get("keeper", ""))
     keeper.stop()
     assert manager.told == ["fault: a leak"]
+
+
+# the unit ----------------------------------------------------------------------------------------
+
+
+def test_the_unit_restarts_vented_and_lets_the_pressures_down() -> None:
+    """What in the unit must agree with the code."""
+    lines = (ROOT / "rig" / "stiffopt-daemon.service").read_text(encoding="utf-8").splitlines()
+    pairs = [line.split("=", 1) for line in lines if "=" in line and not line.startswith("#")]
+    unit = dict(pairs)
+    assert " run " in unit["ExecStart"]
+    assert "--arm" not in unit["ExecStart"]  # it would be refused, too
+    assert unit["Type"] == "notify"
+    assert unit["KillMode"] == "mixed"  # the guard is not signalled
+    longest = next(m.le for m in Safety.model_fields["ramp_time"].metadata if hasattr(m, "le"))
+    assert (
+        float(unit["TimeoutStopSec"]) > longest + 7 + 10
+    )  # and `Daemon.stop`, and the guard's end
+    assert unit["Restart"] == "on-failure"
+    assert "5" not in unit["RestartPreventExitStatus"].split()
+    assert "RestrictRealtime" not in unit
 
 
 # the token ---------------------------------------------------------------------------------------

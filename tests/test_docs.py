@@ -13,6 +13,7 @@ from pydantic import BaseModel
 
 import stiffopt
 from examples import run_examples
+from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.logs import read_log
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.description import (
@@ -46,6 +47,7 @@ from stiffopt.rig.drivers.modbus import ModbusSettings, SerialLine, Tcp
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.drivers.probe import ForceSettings, ProbeSettings
 from stiffopt.rig.drivers.zaber import StageSettings
+from stiffopt.rig.settings import ControlSettings, ServiceSettings
 from stiffopt.rig.simulated import settings as simulated
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -59,6 +61,7 @@ SCHEMAS: list[type[BaseModel]] = [
     *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
     *(RigDescription, Safety, LogSettings, LabSettings, Registration, Placement),
+    *(ControlSettings, ServiceSettings, Trajectory, Waypoint),
     *(simulated.PlantSettings, simulated.Silicone, simulated.Creep, simulated.Hysteresis),
     *(simulated.Mismatch, simulated.Spread, simulated.Load, simulated.Discretisation),
     *(simulated.SimulatedSupplySettings, simulated.SimulatedTrackerSettings),
@@ -80,6 +83,7 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.registration": "Rig file",
     "stiffopt.model": "Robot file",
     "stiffopt.optimise": "Task file",
+    "stiffopt.control": "Trajectory",
 }
 
 

@@ -19,7 +19,17 @@ import pytest
 from rich.console import Console
 
 from fake_loop import FakeLoop
-from running import COMMAND, ONE, RIGS, TWO, guard_of, patient_rig, running, wait_for
+from running import (
+    COMMAND,
+    ONE,
+    RIGS,
+    TWO,
+    guard_of,
+    patient_rig,
+    running,
+    wait_for,
+    with_simulator,
+)
 from stiffopt.cli.main import main
 from stiffopt.cli.run_lines import Lines
 from stiffopt.cli.run_status import LiveStatus, status
@@ -28,6 +38,11 @@ from stiffopt.daemon.client import Client
 
 ROOT = Path(__file__).resolve().parent.parent
 EDGES, COUNTS = (1e-4, 1e-3, 1e-2), (90, 8, 2, 0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _simulator(code_cache: Path) -> None:
+    with_simulator(code_cache)
 
 
 @pytest.fixture
@@ -107,7 +122,9 @@ def test_its_page_names_every_option(capsys: pytest.CaptureFixture[str]) -> None
 # runs --------------------------------------------------------------------------------------------
 
 
-def test_a_client_drives_it_and_sigterm_ends_it_vented(tmp_path: Path, compiled: Path) -> None:
+def test_a_client_drives_it_and_a_closed_terminal_ends_it_vented(
+    tmp_path: Path, compiled: Path
+) -> None:
     with running("run", str(patient_rig(tmp_path))) as run:
         started = run.line("started")
         token = Path(started["token_file"])
@@ -121,7 +138,7 @@ def test_a_client_drives_it_and_sigterm_ends_it_vented(tmp_path: Path, compiled:
             assert settled.commanded.max() > 1e4
             client.release()
         begin = time.monotonic()
-        assert run.end(signal.SIGTERM) == 0
+        assert run.end(signal.SIGHUP) == 0
         assert time.monotonic() - begin < 8
         last = [line for line in run.lines if line["kind"] == "state"][-1]
         assert last["state"] == "inactive"
@@ -136,6 +153,7 @@ def _arms(client: Client) -> bool:
     try:
         client.arm()
     except ValueError:
+        time.sleep(0.2)
         return False
     return True
 

@@ -99,7 +99,9 @@ def _run(rig: str, name: str, options: Options, seconds: float, signals: _Signal
         try:
             with signals.interrupting():
                 task = None if options.task is None else daemon.read_task(options.task)
-                watch.display.say("starting", f"connecting to {name}")
+                watch.display.say(
+                    "starting", f"connecting to {name}; a first start compiles the model"
+                )
                 daemon.start()
                 watch.display.begin(daemon)
                 if options.arm:

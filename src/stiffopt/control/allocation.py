@@ -27,7 +27,7 @@ Array = NDArray[np.float64]
 
 _BAR = 1e5
 _KEPT_NEAR = 0.3e-3  # m/bar; sqrt(epsilon): tip motions cheaper than this are left to the posture
-_SLACK = 1e-7  # bar
+_SLACK = 1e-4  # bar
 _TRUSTED = 1e-3  # bar; a solver that breaks a bound by more has no answer
 
 
@@ -148,6 +148,9 @@ class Allocation:
         are held by a limit.
         """
         nothing = np.zeros(len(last), dtype=bool)
+        given = jacobian.sum() + wanted.sum() + reference.sum() + last.sum() + tip_jacobian.sum()
+        if not math.isfinite(float(given)):
+            return None, nothing
         J, r, before = jacobian * _BAR, reference / _BAR, last / _BAR
         scale = 1 / _KEPT_NEAR
         Js = J * scale
@@ -160,10 +163,9 @@ class Allocation:
         lower = np.minimum(lower, upper)
         rows = np.ascontiguousarray(tip_jacobian * _BAR)
         # by as much as it has to come down where a limit was tightened, the tip may move faster
-        reach = max(tip_step, 1e-9) + np.abs(rows) @ np.maximum(-upper, 0.0)
+        forced = np.maximum(np.maximum(-upper, lower), 0.0)
+        reach = max(tip_step, 1e-9) + np.abs(rows) @ forced
         low, high = np.concatenate([lower, -reach]), np.concatenate([upper, reach])
-        if not math.isfinite(float(H.sum() + f.sum() + rows.sum() + low.sum() + high.sum())):
-            return None, nothing
         change = self._solver.solve(H, f, rows, low, high)
         if change is None or change.shape != last.shape:
             return None, nothing

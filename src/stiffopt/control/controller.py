@@ -42,8 +42,10 @@ __all__ = ["Controller"]
 Array = NDArray[np.float64]
 
 _PLAN_EVERY = 0.05  # s
+_UNHURRIED = 0.7  # s; with which the plan follows the offset
 _EFFORT = 1.0  # of feedback against error; see `Gains`
-_BRISK = 40.0  # 1/s; rate of the reference of an arm that does not swing
+_HASTE = 1.2  # rate of the reference of an arm that swings, over its frequency
+_BRISK = 100.0  # 1/s; rate of the reference of an arm that does not swing
 _OFF = 1e4  # Pa; by which the command makes up for a regulator that is off
 _SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
 
@@ -138,6 +140,7 @@ class Controller:
         self._measure: Callable[..., float] | None = None
         self._unit = "N/m"
         self._asked_at = -math.inf
+        self._planned_offset = np.zeros(6)
         self._now = now
         self._last_move, self._commanded = none.copy(), none.copy()
         self._effective, self._chamber = none.copy(), none.copy()
@@ -215,7 +218,7 @@ class Controller:
         if self._fresh:
             self.resume(now)
         omega = self._estimator.omega
-        self._reference.rate = min(_BRISK, 1.2 * omega) if self._swings else _BRISK
+        self._reference.rate = min(_BRISK, _HASTE * omega) if self._swings else _BRISK
         self._reference.advance(aim)
         n = len(self._last_move)
         command, chamber = self._reference.command(omega, self._damping)
@@ -347,9 +350,15 @@ class Controller:
             target = self._course.at(now + self._reference.delay + self._dead_time)
         estimate = self._estimator.estimate
         offset = np.concatenate([estimate.offset, estimate.turn])
+        # The offset depends on the posture too; the posture follows it slowly, the tip at once.
+        share = 1.0 if new else -math.expm1(-_PLAN_EVERY / _UNHURRIED)
+        self._planned_offset = self._planned_offset + share * (offset - self._planned_offset)
         self._planner.ask(
-            Request(self._serial, self._task, target, offset, new and self._course is None)
-        )
+            Request(
+                self._serial, self._task, target, self._planned_offset.copy(),
+                new and self._course is None,
+            )
+        )  # fmt: skip
 
     def _aim(self) -> Array | None:
         """Effective pressures of the plan and the offset that it counts with (n + 6,)."""

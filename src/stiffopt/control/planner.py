@@ -2,8 +2,8 @@
 
 The arm's tip is found beside where the model has it, by an offset.  A target moved back by that
 offset, given to the optimiser, yields pressures that are the stiffest on the arm as it is, but for
-how stiffness itself is off.  While the offset changes little, the plan is the local optimum next to
-the last one; if it has changed much, all configurations are searched again, and the arm leaves its
+how stiffness itself is off.  The plan is the local optimum next to the last one; if the offset has
+changed much and the arm is at rest, all configurations are searched again, and the arm leaves its
 own only for one that is clearly better.
 
 Plans are made one at a time by `Planning`: at once (`InlinePlanner`, for simulated time), or in a
@@ -36,8 +36,12 @@ __all__ = ["InlinePlanner", "Plan", "Planner", "Planning", "Request", "ThreadPla
 
 Array = NDArray[np.float64]
 
-_CLEARLY = 1.02  # times as stiff is worth a move
+_CLEARLY = 0.02  # by which share a configuration must be stiffer to be worth a move
 _MUCH = 2e-3  # m; change of the offset after which all is searched again
+_STILL = 5e-5  # m from plan to plan; more, and the arm is not at rest
+_NEAR = 2e4  # Pa; an answer that is farther from the last plan is another configuration
+_FAR_PER_METRE = 2e7  # Pa/m; the same for each metre that the target has moved
+_PATIENCE = 20  # plans
 _EXACT = Tolerance(position=1e-5, angle=1e-3)
 _RESTART_AFTER = 0.5  # s
 
@@ -102,6 +106,7 @@ class Planning:
         self._serial = -1
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
+        self._advantage, self._misses = _CLEARLY, 0
 
     def plan(self, request: Request) -> Plan:
         """Answer a request.
@@ -120,32 +125,59 @@ class Planning:
             self._is_compiled = self._solver.is_compiled
             self._serial, self._last = request.serial, None
         target = moved_back(request.target, request.offset)
-        change = float(np.linalg.norm((request.offset - self._searched_at)[:3]))
-        guess = None if self._last is None or request.anew else self._last.pressures
-        if guess is None:
-            self._searched_at = request.offset
-        solution = self._solved(target, guess)
-        if guess is not None and solution is not None and change > _MUCH:
-            self._searched_at = request.offset
-            other = self._solved(target, None)
-            if other is not None:
-                better = _value(other.stiffness) > _CLEARLY * _value(solution.stiffness)
-                solution = other if better else solution
-        self._last = (
-            self._closest(request, target)
-            if solution is None or solution.pressures is None
-            else Plan(
-                serial=request.serial,
-                pressures=np.array(solution.pressures, dtype=float),
-                offset=request.offset,
-                target=request.target,
-                reached=True,
-                stiffness=_value(solution.stiffness, math.nan),
-                message="",
-                tip=self._tip,
-            )
-        )
+        last = self._last
+        if last is None or request.anew:
+            self._searched_at, self._advantage, self._misses = request.offset, _CLEARLY, 0
+            solution = self._solved(target, None)
+        else:
+            solution = self._next_to(last, target)
+            solution = self._better(request, target, solution, last) if solution else None
+        if solution is not None and solution.pressures is not None:
+            pressures = np.array(solution.pressures, dtype=float)
+            stiffness = _value(solution.stiffness, math.nan)
+            self._last = Plan(
+                request.serial, pressures, request.offset, request.target, True, stiffness, "",
+                self._tip,
+            )  # fmt: skip
+        else:
+            self._last = self._closest(request, target)
         return self._last
+
+    def _next_to(self, last: Plan, target: Target) -> PressureSolution | None:
+        """The optimum next to the last plan; another one only if that is not to be had for long."""
+        solution = self._solved(target, last.pressures)
+        if solution is None or solution.pressures is None:
+            return None
+        way = float(np.max(np.abs(solution.pressures - last.pressures)))
+        if way <= _NEAR + _FAR_PER_METRE * float(np.linalg.norm(_shift(last, target))):
+            self._misses = 0
+            return solution
+        self._misses += 1
+        if self._misses <= _PATIENCE:
+            return None
+        self._misses = 0
+        return solution
+
+    def _better(
+        self, request: Request, target: Target, solution: PressureSolution, last: Plan
+    ) -> PressureSolution:
+        """The stiffest configuration, where things have changed and the arm is at rest.
+
+        Each change of configuration makes the next one harder: on another one the offset is
+        another, and so may the choice be.
+        """
+        changed = float(np.linalg.norm((request.offset - self._searched_at)[:3]))
+        drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
+        if changed <= _MUCH or drift > _STILL:
+            return solution
+        self._searched_at = request.offset
+        other = self._solved(target, None)
+        if other is None or other.pressures is None:
+            return solution
+        if _value(other.stiffness) <= (1 + self._advantage) * _value(solution.stiffness):
+            return solution
+        self._advantage *= 2
+        return other
 
     def _solved(self, target: Target, guess: Array | None) -> PressureSolution | None:
         """Answer of the optimiser; None if it has none that holds, soon."""
@@ -328,6 +360,15 @@ def moved_back(target: Target, offset: Array) -> Target:
         q = lie.quaternion_from_rotation(rotation)
         update["orientation"] = tuple((q if q[0] >= 0 else -q).tolist())
     return target.model_copy(update=update)
+
+
+def _shift(last: Plan, target: Target) -> Array:
+    """By how much a target for the model differs from the one of the last plan, in m."""
+    before = moved_back(last.target, last.offset).position
+    if before is None or target.position is None:
+        return np.zeros(3)
+    pairs = zip(before, target.position, strict=True)
+    return np.array([0.0 if a is None or b is None else b - a for a, b in pairs])
 
 
 def _value(stiffness: float | None, otherwise: float = 0.0) -> float:

@@ -42,7 +42,7 @@ _SHAPE = 12  # poses along the arm that Foxglove draws
 _SHARE = 0.02  # of the time, which the control thread needs too
 _TIDY = 10.0  # s between collections of garbage
 _ARMING = 10.0  # s in which an arm that was just connected must become ready
-_AGAIN = 0.1  # s between attempts to arm
+_AGAIN = 0.2  # s between attempts to arm, in which the tracker sees the tip some times
 _MARGIN = 7.0  # s, beyond the ramp, in which the loop must have ended: devices answer within 5 s
 
 

@@ -1,0 +1,412 @@
+"""The controller on simulated rigs: arrives, stays within limits, and bears what goes wrong.
+
+The arms differ from their robot files in gains, moduli and base.  Times are short and bounds wide;
+what the controller reaches is measured by the benchmark.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stiffopt as so
+from stiffopt.control.controller import Controller
+from stiffopt.control.trajectory import Trajectory, Waypoint
+from stiffopt.errors import InputError
+from stiffopt.model.robot_files import load_description
+from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.optimise.task import Load as TaskLoad
+from stiffopt.rig.config import RigDescription, limits_of, make_rig, slew_of
+from stiffopt.rig.interface import PressureReading
+from stiffopt.rig.settings import ControlSettings
+from stiffopt.rig.simulated.plant import Plant
+from stiffopt.rig.simulated.settings import Load
+
+BAR = 1e5
+HANGING, ONE, FREE = "stiff-flop-2-hanging", "stiff-flop-1", "stiff-flop-2"
+LATERAL = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
+
+pytestmark = pytest.mark.usefixtures("compiled")
+
+
+class Bench:
+    """A controller, its rig, and the truth; time passes in `run`."""
+
+    def __init__(
+        self,
+        robot: str = HANGING,
+        dynamics: str = "quasi-static",
+        *,
+        seed: int = 1,
+        period: float = 0.01,
+        control: ControlSettings | None = None,
+        spread: float = 1.0,
+        modulus: float | None = None,
+        **blocks: dict[str, Any],
+    ) -> None:
+        self.rng = np.random.default_rng(seed)
+        self.name, self.robot = robot, load_description(robot)
+        n, m = self.robot.n_pressures, self.robot.n_segments
+        stiffer = self.rng.uniform(-0.1, 0.1, m) * spread if modulus is None else [modulus - 1] * m
+        mismatch = {
+            "gain": list(1 + self.rng.uniform(-0.05, 0.05, n) * spread),
+            "modulus": [float(1 + share) for share in stiffer],
+            "base": {"position": [1e-3 * spread, -1e-3 * spread, 0.0]},
+        }
+        plant = {"dynamics": dynamics, "seed": seed, "mismatch": mismatch, "faults": True}
+        self.description = RigDescription(
+            robot=robot,
+            supply={"driver": "simulated", "ripple": 100.0, "noise": 150.0}
+            | blocks.get("supply", {}),
+            tracker={"driver": "simulated", "rate": 40.0, "latency": 0.025, "noise": 5e-5}
+            | blocks.get("tracker", {}),
+            safety=blocks.get("safety", {}),
+            plant=plant | blocks.get("plant", {}),
+        )
+        self.rig: Any = make_rig(self.description, self.robot)
+        self.limits = limits_of(self.description, self.robot)
+        self.slew = np.broadcast_to(slew_of(self.description, self.robot), n)
+        self.period = period
+        self.controller = Controller(
+            so.load_robot(robot), self.limits, self.slew, period=period,
+            control=control or ControlSettings(), safety=self.description.safety,
+            swings=dynamics == "full",
+        )  # fmt: skip
+        self.controller.check()
+        self.rig.open()
+        self.rig.supply.arm()
+        self.controller.begin(self.rig.clock.now())
+        self.command = np.zeros(n)
+        self.n, self.saturated, self.rejected = n, np.zeros(n, dtype=bool), 0
+
+    @property
+    def tip(self):
+        return self.rig.world.plant.tip_pose()
+
+    def pose_at(self, pressures) -> Any:
+        """Where the true arm is at rest at pressures (n,), but for creep."""
+        settings = self.description.plant
+        silicone = settings.silicone.model_copy(update={"creep": (), "hysteresis": ()})
+        still = settings.model_copy(update={"silicone": silicone, "dynamics": "quasi-static"})
+        plant = Plant(self.robot, still)
+        plant.settle(pressures)
+        return plant.tip_pose()
+
+    def run(self, duration, target=None, *, steer=True, blind=False, deaf=False):
+        """Let time pass; return distances (k,) of the true tip from a position, free axes NaN."""
+        wanted = np.full(3, np.nan) if target is None else np.array(target, dtype=float)
+        asked, errors = np.isfinite(wanted), []
+        for _ in range(round(duration / self.period)):
+            now = self.rig.clock.now()
+            reading, samples = self.rig.supply.read(), self.rig.tracker.read()
+            if deaf:
+                reading = PressureReading(now, np.full(self.n, np.nan))
+            before = self.command
+            seen = self.controller.observe(now, before, reading, () if blind else samples)
+            self.rejected += seen.rejected
+            if steer:
+                move = self.controller.move(now)
+                self.command, self.saturated = move.pressures, move.saturated
+                assert move.sound
+                assert np.isfinite(self.command).all()
+                assert np.all(self.command >= self.limits.low - 1e-3)
+                assert np.all(self.command <= self.limits.high + 1e-3)
+                assert np.all(np.abs(self.command - before) <= self.slew * self.period + 1e-3)
+            self.rig.supply.command(self.command)
+            errors.append(np.linalg.norm((self.tip[:3, 3] - wanted)[asked]))
+            self.rig.clock.sleep_until(now + self.period)
+        return np.array(errors)
+
+    def task(self, **target: Any) -> Task:
+        return Task(robot=self.name, target=Target(**target), stiffness=LATERAL)
+
+    def settled(self, pressures=(0.5, 0.7, 0.4, 0.3, 0.6, 0.5), duration=3.0):
+        """Go to the position that some pressures have, and return it."""
+        position = tuple(map(float, self.pose_at(np.array(pressures[: self.n]) * BAR)[:3, 3]))
+        self.controller.set_task(self.task(position=position))
+        self.run(duration)
+        return position
+
+
+def angle(R, goal):
+    return np.arccos(np.clip((np.trace(R.T @ goal) - 1) / 2, -1, 1))
+
+
+# -- arriving ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "robot, dynamics, kind, duration",
+    [
+        (HANGING, "quasi-static", "position", 3.0),
+        (HANGING, "full", "position", 4.5),
+        (HANGING, "full", "free axes", 4.0),
+        (HANGING, "quasi-static", "pointing", 3.0),
+        (FREE, "quasi-static", "orientation", 3.0),
+        (FREE, "full", "position", 4.5),
+        (ONE, "quasi-static", "free axes", 3.0),
+        (ONE, "full", "free axes", 3.0),
+    ],
+)
+def test_arrives_and_stays(robot, dynamics, kind, duration):
+    bench = Bench(robot, dynamics)
+    pose = bench.pose_at(np.array([0.5, 0.8, 0.4, 0.3, 0.6, 0.5][: bench.n]) * BAR)
+    x, y, z = map(float, pose[:3, 3])
+    R = pose[:3, :3]
+    target: dict[str, Any] = {
+        "position": {"position": (x, y, z)},
+        "free axes": {"position": (x, y, None)},
+        "pointing": {"position": (x, y, None), "pointing": tuple(map(float, R[:, 2]))},
+        "orientation": {
+            "position": (x, y, None),
+            "orientation": tuple(map(float, so.lie.quaternion_from_rotation(R))),
+        },
+    }[kind]
+    bench.controller.set_task(bench.task(**target))
+    wanted = [np.nan if axis is None else axis for axis in target["position"]]
+    errors = bench.run(duration, wanted)
+    late = errors[-round(0.5 / bench.period) :]
+    assert errors[0] > 5e-3
+    assert late.max() < 1e-3
+    assert late.mean() < 3e-4
+    if "pointing" in target:
+        assert np.arccos(np.clip(bench.tip[:3, 2] @ R[:, 2], -1, 1)) < np.radians(1)
+    if "orientation" in target:
+        assert angle(bench.tip[:3, :3], R) < np.radians(1)
+    assert not bench.saturated.any()
+    assert bench.rejected == 0
+    assert bench.controller.notices() == ()
+    standing = bench.controller.standing(bench.rig.clock.now())
+    assert standing.position_error < 1e-3
+    assert standing.tip_position == pytest.approx(bench.tip[:3, 3], abs=3e-4)
+    assert standing.stiffness == pytest.approx(standing.best_stiffness, rel=0.05)
+    assert standing.task == "target"
+
+
+def test_new_target_of_another_kind():
+    bench = Bench(FREE)
+    x, y, _ = bench.settled(duration=1.5)
+    bench.controller.set_target(Target(position=(x, y, None), pointing=(0.0, 0.0, 1.0)))
+    errors = bench.run(2.5, (x, y, np.nan))
+    assert errors[-20:].max() < 1e-3
+    assert np.arccos(np.clip(bench.tip[2, 2], -1, 1)) < np.radians(1)
+
+
+def test_trajectory_is_followed():
+    bench = Bench(HANGING)
+    x, y, z = bench.settled(duration=2.0)
+    way = [(x + 0.008, y, z), (x + 0.008, y + 0.008, z)]
+    trajectory = Trajectory(
+        waypoints=tuple(
+            Waypoint(time=1.0 + k, target=Target(position=point)) for k, point in enumerate(way)
+        )
+    )
+    begin = bench.rig.clock.now()
+    bench.controller.follow(trajectory, begin)
+    worst = 0.0
+    for _ in range(10):
+        bench.run(0.3)
+        now = bench.rig.clock.now()
+        wanted = np.array(bench.controller._course.at(now).position)
+        worst = max(worst, float(np.linalg.norm(bench.tip[:3, 3] - wanted)))
+        assert bench.controller.standing(now).task == "trajectory"
+    assert worst < 2e-3
+    assert np.linalg.norm(bench.tip[:3, 3] - way[-1]) < 5e-4
+
+
+# -- what goes wrong ----------------------------------------------------------------------------
+
+
+def test_load_at_the_tip_is_found():
+    bench = Bench(HANGING)
+    bench.settled()
+    before = bench.controller.standing(bench.rig.clock.now()).wrench
+    force = np.array([0.02, -0.015, 0.03])
+    bench.rig.world.plant.set_load(Load(force=tuple(force)))
+    bench.run(3.0)
+    after = bench.controller.standing(bench.rig.clock.now()).wrench
+    assert np.linalg.norm((after - before)[:3] - force) < 0.25 * np.linalg.norm(force)
+
+
+@pytest.mark.parametrize("dynamics", ["quasi-static", "full"])
+def test_load_that_is_let_go_all_at_once(dynamics):
+    bench = Bench(HANGING, dynamics)
+    position = bench.settled(duration=3.0)
+    bench.rig.world.plant.set_load(Load(force=(0.03, 0.0, 0.0)))
+    bench.run(2.0)
+    bench.rig.world.plant.set_load(None)
+    errors = bench.run(4.0, position)
+    assert errors.max() > 2e-3
+    assert errors.max() < 30e-3
+    assert errors[-50:].max() < 1e-3
+
+
+@pytest.mark.parametrize("dynamics", ["quasi-static", "full"])
+def test_going_on_after_a_hold_is_no_jump(dynamics):
+    bench = Bench(HANGING, dynamics)
+    position = bench.settled(duration=3.0)
+    bench.run(0.5, steer=False)
+    bench.controller.resume(bench.rig.clock.now())
+    before = bench.command
+    errors = bench.run(0.1, position)
+    assert np.abs(bench.command - before).max() < 0.05 * BAR
+    assert errors.max() < 1.5e-3
+    # others let it down half-way
+    for _ in range(50):
+        bench.command = bench.command * 0.99
+        bench.run(bench.period, steer=False)
+    before = bench.command
+    bench.controller.resume(bench.rig.clock.now())
+    bench.run(bench.period)
+    assert np.abs(bench.command - before).max() < 0.03 * BAR
+    assert bench.run(4.0, position)[-30:].max() < 1e-3
+
+
+def test_readings_that_are_not_there():
+    bench = Bench(HANGING)
+    position = bench.settled(duration=2.0)
+    assert bench.run(1.0, position, deaf=True)[-50:].max() < 2e-3
+
+
+def test_tracker_that_sees_nothing_for_a_while():
+    bench = Bench(HANGING, "full")
+    position = bench.settled(duration=4.0)
+    assert bench.run(0.3, position, blind=True).max() < 1e-3
+    assert bench.run(0.7, position).max() < 1e-3
+
+
+def test_regulators_that_end_beside_their_set_points():
+    """A leak takes a little of what is commanded; the readings tell."""
+    bench = Bench(HANGING, supply={"leak": 3.0})
+    position = bench.settled(duration=3.0)
+    assert bench.run(1.0, position).mean() < 3e-4
+
+
+def test_target_out_of_reach_is_said():
+    bench = Bench(HANGING)
+    bench.controller.set_task(bench.task(position=(0.15, 0.0, 0.1)))
+    bench.run(1.0)
+    (notice,) = bench.controller.notices()
+    assert (notice.kind, notice.standing) == ("unreachable", True)
+    assert "away" in notice.text
+    bench.controller.set_target(Target(position=bench_middle(bench)))
+    bench.run(0.3)
+    assert bench.controller.notices() == ()
+
+
+def bench_middle(bench):
+    return tuple(map(float, bench.pose_at(np.full(bench.n, 0.5 * BAR))[:3, 3]))
+
+
+def test_limit_that_keeps_it_from_the_target_is_said():
+    """In reach of the model, not of the arm: its chambers act less than they should."""
+    bench = Bench(ONE, spread=0.0, plant={"mismatch": {"gain": [0.8, 0.8, 0.8]}})
+    pose = so.load_robot(ONE).tip_pose(np.array([0.0, 1.45, 1.45]) * BAR)
+    bench.controller.set_task(bench.task(position=(*map(float, pose[:2, 3]), None)))
+    bench.run(2.0)
+    assert bench.saturated.any() or bench.controller.notices()
+
+
+# -- limits -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dynamics, seed", [("quasi-static", 5), ("full", 6)])
+def test_never_beyond_limits_whatever_is_asked(dynamics, seed):
+    """Random targets, many out of reach, every 0.3 s; `run` checks each command."""
+    bench = Bench(HANGING, dynamics, seed=seed)
+    rng = np.random.default_rng(seed)
+    for k in range(27):
+        position = rng.normal(size=3) * [0.05, 0.05, 0.02] + [0, 0, 0.19]
+        x, y, z = map(float, position)
+        kinds: list[dict[str, Any]] = [
+            {"position": (x, y, z)},
+            {"position": (x, y, None)},
+            {"position": (x, None, z), "pointing": (0.0, 0.0, 1.0)},
+        ]
+        target = Target(**kinds[k % 3])
+        if k % 4 == 0:
+            bench.controller.set_task(Task(robot=HANGING, target=target, stiffness=LATERAL))
+        else:
+            bench.controller.set_target(target)
+        bench.run(0.3)
+
+
+def test_limits_of_the_task_hold():
+    bench = Bench(HANGING)
+    target = Target(position=bench_middle(bench))
+    task = Task(
+        robot=HANGING, target=target, stiffness=LATERAL, pressure=PressureRange(max=0.6 * BAR)
+    )
+    bench.controller.set_task(task)
+    for _ in range(100):
+        bench.run(bench.period)
+        assert np.all(bench.command <= 0.6 * BAR + 1.0)
+
+
+def test_tasks_that_do_not_suit_change_nothing():
+    bench = Bench(HANGING)
+    bench.settled(duration=0.5)
+    now = bench.rig.clock.now()
+    before = bench.controller.standing(now)
+    position = bench_middle(bench)
+    loaded = Task(
+        robot=HANGING, target=Target(position=position), load=TaskLoad(force=(0, 0, 0.1))
+    )
+    many = Task(
+        robot=HANGING, target=Target(position=position), pressure=PressureRange(max=(BAR,) * 3)
+    )
+    empty = Task(
+        robot=HANGING, target=Target(position=position), pressure=PressureRange(min=2 * BAR)
+    )
+    for task, words in ((loaded, "load"), (many, "3"), (empty, "no pressure")):
+        with pytest.raises(InputError, match=words):
+            bench.controller.set_task(task)
+        after = bench.controller.standing(now)
+        assert after.target_position == pytest.approx(before.target_position)
+        assert after.task == before.task
+    bench.run(0.1)
+
+
+def test_begin_forgets():
+    bench = Bench(HANGING)
+    bench.settled(duration=0.5)
+    bench.controller.begin(bench.rig.clock.now())
+    standing = bench.controller.standing(bench.rig.clock.now())
+    assert standing.task == ""
+    assert standing.target_position is None
+    bench.command = np.zeros(bench.n)
+    bench.run(0.2)
+    assert not bench.command.any()
+
+
+# -- wrong models -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "modulus 0.6", "modulus 1.4", "slow tracker", "50 Hz", "500 Hz", "lag x 2", "lag / 2",
+        "damping 0.01", "damping 0.3",
+    ],
+)  # fmt: skip
+def test_stays_stable_with_wrong_models(case):
+    """Settled to 3 mm at the end, at most; nothing is tuned to these."""
+    options: dict[str, dict[str, Any]] = {
+        "modulus 0.6": {"modulus": 0.6},
+        "modulus 1.4": {"modulus": 1.4},
+        "slow tracker": {"tracker": {"rate": 20.0, "latency": 0.06}},
+        "50 Hz": {"period": 0.02},
+        "500 Hz": {"period": 0.002},
+        "lag x 2": {"supply": {"lag": 0.12}},
+        "lag / 2": {"supply": {"lag": 0.03}},
+        "damping 0.01": {"plant": {"silicone": {"damping": 0.01}}},
+        "damping 0.3": {"plant": {"silicone": {"damping": 0.3}}},
+    }
+    bench = Bench(HANGING, "full", **options[case])
+    position = bench.settled((0.5, 0.7, 0.4, 0.3, 0.4, 0.5), duration=4.0)
+    errors = bench.run(1.0, position)
+    assert errors.max() < 3e-3

@@ -1,0 +1,267 @@
+"""The re-planner: targets moved back, the same plans in a thread, and what outlives its death."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import stiffopt as so
+from stiffopt.control import planner as module
+from stiffopt.control.planner import InlinePlanner, Planning, Request, ThreadPlanner, moved_back
+from stiffopt.errors import StiffoptError
+from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+
+ROBOT = "stiff-flop-1"
+BAR = 1e5
+PRESSURES = np.array([0.9, 0.4, 0.2]) * BAR
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return so.load_robot(ROBOT)
+
+
+def tip(robot, p=PRESSURES):
+    pose = robot.tip_pose(p)
+    return pose[:3, :3], pose[:3, 3]
+
+
+def request(robot, serial=1, offset=(0,) * 6, p=PRESSURES, **changes):
+    _, position = tip(robot, p)
+    target = Target(position=(float(position[0]), float(position[1]), None))
+    goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
+    task = Task(robot=ROBOT, target=target, stiffness=goal)
+    return Request(serial, task, target, np.array(offset, dtype=float), **changes)
+
+
+def wait_for(condition, seconds=20.0):
+    """Real threads take real time; a generous bound for busy machines."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it never came to that"
+        time.sleep(0.002)
+
+
+@pytest.fixture
+def threaded(robot):
+    planners = []
+
+    def make(**options):
+        planners.append(ThreadPlanner(robot, **options))
+        return planners[-1]
+
+    yield make
+    for planner in planners:
+        planner.close()
+
+
+# -- moved back -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_offset_put_on_what_the_model_reaches_is_the_target(seed):
+    rng = np.random.default_rng(seed)
+    offset = np.concatenate([rng.normal(size=3) * 5e-3, rng.normal(size=3) * 0.3])
+    turn = Rotation.from_rotvec(offset[3:])
+    aim = Rotation.random(random_state=seed)
+    x, y, z, w = aim.as_quat(canonical=True)
+    position = rng.normal(size=3) * 0.1
+
+    target = Target(position=tuple(position), orientation=(w, x, y, z))
+    model = moved_back(target, offset)
+    assert np.array(model.position) + offset[:3] == pytest.approx(position, abs=1e-15)
+    w, x, y, z = model.orientation
+    assert w >= 0
+    arm = turn * Rotation.from_quat([x, y, z, w])
+    assert (arm * aim.inv()).magnitude() < 1e-12
+
+    pointing = aim.as_matrix()[:, 2]
+    model = moved_back(Target(pointing=tuple(pointing)), offset)
+    assert model.position is None
+    assert turn.apply(model.pointing) == pytest.approx(pointing, abs=1e-12)
+    assert np.linalg.norm(model.pointing) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_free_axes_stay_free_and_nothing_is_changed_in_place():
+    target = Target(position=(0.01, None, 0.1))
+    model = moved_back(target, np.array([1e-3, 2e-3, 3e-3, 0, 0, 0]))
+    assert model.position == pytest.approx((0.009, None, 0.097))
+    assert target.position == (0.01, None, 0.1)
+
+
+def test_model_is_asked_to_be_exact():
+    target = Target(position=(0, 0, 0.1), tolerance={"position": "5 mm", "angle": "10 deg"})
+    assert moved_back(target, np.zeros(6)).tolerance.position <= 1e-5
+
+
+# -- plans ------------------------------------------------------------------------------------
+
+
+def test_plan_puts_the_arm_on_the_target(robot):
+    offset = np.array([2e-3, -1e-3, 0.5e-3, 0, 0, 0])
+    asked = request(robot, offset=offset)
+    plan = Planning(robot).plan(asked)
+    assert plan.reached
+    assert plan.message == ""
+    assert plan.serial == asked.serial
+    assert np.array_equal(plan.offset, offset)
+    _, position = tip(robot, plan.pressures)
+    assert (position + offset[:3])[:2] == pytest.approx(asked.target.position[:2], abs=2e-5)
+    assert np.all((plan.pressures >= 0) & (plan.pressures <= 1.5 * BAR))
+    compliance, R = robot.tip_compliance(plan.pressures), tip(robot, plan.pressures)[0]
+    d = R.T @ np.array([1.0, 0, 0])
+    assert plan.stiffness == pytest.approx(1 / (d @ compliance[:3, :3] @ d), rel=1e-6)
+
+
+def test_small_changes_of_the_offset_change_the_plan_little(robot):
+    planning = Planning(robot)
+    first = planning.plan(request(robot))
+    for k in range(1, 6):
+        again = planning.plan(request(robot, offset=[2e-4 * k, 0, 0, 0, 0, 0]))
+        assert again.reached
+        assert np.abs(again.pressures - first.pressures).max() < 0.05 * BAR * k
+
+
+def test_target_that_cannot_be_reached_has_a_plan_that_says_why(robot):
+    asked = request(robot)
+    far = asked.target.model_copy(update={"position": (0.2, 0.0, None)})
+    plan = Planning(robot).plan(Request(1, asked.task, far, np.zeros(6)))
+    assert not plan.reached
+    assert "away" in plan.message
+    assert np.isfinite(plan.pressures).all()
+    assert np.all((plan.pressures >= -1e-6) & (plan.pressures <= 1.5 * BAR + 1e-6))
+    # nearest along the way out
+    _, position = tip(robot, plan.pressures)
+    edge = max(tip(robot, np.array(p) * BAR)[1][0] for p in [(1.5, 0, 0), (0, 1.5, 1.5)])
+    assert position[0] > edge - 3e-3
+
+
+def test_inline_and_thread_have_the_same_plan(robot, threaded):
+    inline, beside = InlinePlanner(robot), threaded()
+    assert inline.latest() is None
+    assert beside.latest() is None
+    for serial in (1, 2):
+        asked = request(robot, serial, p=PRESSURES * (1 - 0.3 * (serial - 1)))
+        inline.ask(asked)
+        beside.ask(asked)
+        wait_for(lambda s=serial: beside.latest() is not None and beside.latest().serial == s)
+        one, other = inline.latest(), beside.latest()
+        assert one.pressures == pytest.approx(other.pressures, abs=1.0)
+        assert one.stiffness == pytest.approx(other.stiffness, rel=1e-9)
+    assert inline.notices() == beside.notices() == ()
+    inline.close()
+
+
+def test_asking_does_not_wait_and_the_newest_counts(robot, threaded, monkeypatch):
+    begun, done = [], []
+    plan = Planning.plan
+
+    def slow(self, asked):
+        begun.append(asked)
+        while not done:
+            time.sleep(0.002)
+        return plan(self, asked)
+
+    monkeypatch.setattr(Planning, "plan", slow)
+    planner = threaded()
+    start = time.monotonic()
+    planner.ask(request(robot, 1))
+    wait_for(lambda: begun)
+    planner.ask(request(robot, 2, anew=True))
+    planner.ask(request(robot, 2))
+    assert time.monotonic() - start < 10
+    assert planner.latest() is None
+    done.append(True)
+    wait_for(lambda: planner.latest() is not None and planner.latest().serial == 2)
+    assert [asked.serial for asked in begun] == [1, 2]
+    assert begun[1].anew  # it was wanted, and is not lost with the request that was replaced
+
+
+def test_slow_planner_is_an_alarm(robot, threaded, monkeypatch):
+    done = []
+
+    def stuck(self, asked):
+        wait_for(lambda: done)
+        raise StiffoptError("enough")
+
+    monkeypatch.setattr(Planning, "plan", stuck)
+    planner = threaded(patience=0.01)
+    planner.ask(request(robot))
+    wait_for(lambda: planner.notices())
+    (notice,) = planner.notices()
+    assert notice.standing
+    assert "slow" in notice.text
+    done.append(True)
+    wait_for(lambda: "enough" in planner.notices()[0].text)
+
+
+# -- failures ---------------------------------------------------------------------------------
+
+
+def failing(monkeypatch, error):
+    plan = Planning.plan
+
+    def fail(self, asked):
+        if asked.serial == 13:
+            raise error
+        return plan(self, asked)
+
+    monkeypatch.setattr(Planning, "plan", fail)
+    monkeypatch.setattr(module, "_RESTART_AFTER", 0.01)
+
+
+def test_inline_failure_keeps_the_plan_and_says_so(robot, monkeypatch):
+    failing(monkeypatch, StiffoptError("no luck"))
+    planner = InlinePlanner(robot)
+    planner.ask(request(robot, 1))
+    before = planner.latest()
+    planner.ask(request(robot, 13))
+    assert planner.latest() is before
+    (notice,) = planner.notices()
+    assert notice.kind == "planner"
+    assert notice.standing
+    assert "no luck" in notice.text
+    planner.ask(request(robot, 14))
+    assert planner.latest().serial == 14
+    assert planner.notices() == ()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.parametrize("error", [StiffoptError("no"), RuntimeError("no"), SystemExit(1)])
+def test_failed_or_dead_thread_keeps_the_plan_and_begins_anew(robot, threaded, monkeypatch, error):
+    failing(monkeypatch, error)
+    planner = threaded()
+    planner.ask(request(robot, 1))
+    wait_for(lambda: planner.latest() is not None)
+    before, thread = planner.latest(), planner._thread
+    planner.ask(request(robot, 13))
+    if isinstance(error, SystemExit):
+        wait_for(lambda: not thread.is_alive())
+        planner.ask(request(robot, 13))  # the next request finds out, and is deadly too
+    wait_for(lambda: planner.notices())
+    assert planner.latest() is before
+    (notice,) = planner.notices()
+    assert (notice.kind, notice.standing) == ("planner", True)
+
+    def recovered():
+        planner.ask(request(robot, 14))
+        return planner.latest().serial == 14
+
+    wait_for(recovered)
+    wait_for(lambda: planner.notices() == ())
+    assert planner.latest().pressures == pytest.approx(before.pressures, abs=0.02 * BAR)
+
+
+def test_close_ends_the_thread_and_asking_after_that_does_nothing(robot):
+    planner = ThreadPlanner(robot)
+    planner.close()
+    assert not planner._thread.is_alive()
+    planner.ask(request(robot))
+    assert not planner._thread.is_alive()
+    assert planner.latest() is None
+    planner.close()
