@@ -106,7 +106,7 @@ def test_speed_of_the_tip_is_limited_as_it_is_best(solver):
             bounds=list(zip(low, high, strict=True)),
             constraints={
                 "type": "ineq",
-                "fun": lambda x, s=sides, case=case: (reach - s @ (x - case.last / BAR)) * 100,
+                "fun": lambda x, s=sides, c=case, h=reach: (h - s @ (x - c.last / BAR)) * 100,
                 "jac": lambda x, s=sides: -100 * s,
             },
             options={"ftol": 1e-12, "maxiter": 500},

@@ -331,7 +331,7 @@ def test_pose_that_was_not_seen_is_ignored():
 def test_jump_is_rejected_and_stays_so():
     estimator, truth, now = settled()
     before = state(estimator)
-    jumped = truth.position + [0.2, 0, 0]
+    jumped = [*truth.position, 0.2, 0, 0]
     for k in range(1, 30):
         estimator.advance(now + k * PERIOD, truth.p, tip_at(truth.p))
         seen = estimator.take([sample(now + k * PERIOD, jumped)])

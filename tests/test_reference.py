@@ -32,7 +32,7 @@ def swung(commands, period, lag, dead_time, omega, damping, fine=1e-3):
     return np.arange(len(held)) * fine, np.array(out)
 
 
-@pytest.mark.parametrize("period, bound", [(0.002, 0.005), (0.01, 0.03)])
+@pytest.mark.parametrize(("period", "bound"), [(0.002, 0.001), (0.01, 0.01)])
 @pytest.mark.parametrize("omega", [6.0, 10.0, 20.0])
 def test_commands_put_the_arm_on_the_path_without_a_swing(period, bound, omega):
     damping, lag, dead_time = 0.04, 0.06, 0.01
@@ -49,7 +49,7 @@ def test_commands_put_the_arm_on_the_path_without_a_swing(period, bound, omega):
     expected = np.interp(t, np.array(times) + dead_time + 0.5 * period, paths, left=0.0)
     assert np.abs(tip - expected)[: len(expected)].max() < bound * goal[0]
     # the swing left at the end, against that of a step, which is all of it
-    assert np.abs(tip[-200:] - goal[0]).max() < 0.01 * goal[0]
+    assert np.abs(tip[-200:] - goal[0]).max() < 0.3 * bound * goal[0]
     _, raw = swung(np.full(len(commands), goal[0]), period, lag, dead_time, omega, damping)
     late = t > 8 / omega
     assert np.abs(raw[late] - goal[0]).max() > 0.3 * goal[0]

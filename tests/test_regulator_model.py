@@ -38,7 +38,7 @@ def commands(n, period, seed=3):
 
 
 @pytest.mark.parametrize("period", [0.002, 0.01])
-@pytest.mark.parametrize("lag, dead_time", [(0.06, 0.01), (0.03, 0.04)])
+@pytest.mark.parametrize(("lag", "dead_time"), [(0.06, 0.01), (0.03, 0.04)])
 def test_open_loop_follows_lag_and_dead_time(period, lag, dead_time):
     slew = np.full(2, 100 * BAR)
     model = RegulatorModel(period, lag, dead_time, slew)
@@ -137,7 +137,8 @@ def test_readings_that_are_not_there_change_nothing():
     # one channel that is read does not touch the other
     one = np.array([0.9 * BAR, np.nan])
     a, b = with_.advance(command, one), without.advance(command, NAN)
-    assert a[0] != b[0] and a[1] == b[1]
+    assert a[0] != b[0]
+    assert a[1] == b[1]
 
 
 def test_begin_forgets():

@@ -171,7 +171,7 @@ def test_duration_and_files():
 
 
 @pytest.mark.parametrize(
-    "waypoints, words",
+    ("waypoints", "words"),
     [
         ([], "no waypoints"),
         ([(1.0, {"position": POINTS[0]}), (1.0, {"position": POINTS[1]})], "order of time"),

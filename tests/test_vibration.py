@@ -141,7 +141,7 @@ def test_no_stiffness_no_frequency():
 
 
 @pytest.mark.parametrize(
-    "name, share", [(TWO, 0.06), ("stiff-flop-1", 0.06), ("stiff-flop-2", 0.1)]
+    ("name", "share"), [(TWO, 0.06), ("stiff-flop-1", 0.06), ("stiff-flop-2", 0.1)]
 )
 def test_frequency_is_that_of_the_simulated_arm(name, share):
     """From the model's compliance, at rest and bent; the first two modes are nearly equal."""

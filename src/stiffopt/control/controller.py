@@ -42,9 +42,11 @@ __all__ = ["Controller"]
 Array = NDArray[np.float64]
 
 _PLAN_EVERY = 0.05  # s
-_UNHURRIED = 0.7  # s; with which the plan follows the offset
+_UNHURRIED = 1.0  # s; with which the plan follows the offset
 _EFFORT = 1.0  # of feedback against error; see `Gains`
 _HASTE = 1.2  # rate of the reference of an arm that swings, over its frequency
+_SWINGS = 3.0  # rad of the arm's swing that this takes at least
+_HEED = 0.6  # rate with which a swinging arm's offset is corrected, over its frequency
 _BRISK = 100.0  # 1/s; rate of the reference of an arm that does not swing
 _OFF = 1e4  # Pa; by which the command makes up for a regulator that is off
 _SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
@@ -140,7 +142,7 @@ class Controller:
         self._measure: Callable[..., float] | None = None
         self._unit = "N/m"
         self._asked_at = -math.inf
-        self._planned_offset = np.zeros(6)
+        self._planned_offset, self._heeded = np.zeros(6), np.zeros(6)
         self._now = now
         self._last_move, self._commanded = none.copy(), none.copy()
         self._effective, self._chamber = none.copy(), none.copy()
@@ -182,6 +184,7 @@ class Controller:
         """Steer again from where the pressures are."""
         estimate = self._estimator.estimate
         offset = np.concatenate([estimate.offset, estimate.turn])
+        self._heeded = offset
         self._reference.begin(np.concatenate([self._last_move + self._remembered, offset]))
         self._fresh = False
 
@@ -226,9 +229,8 @@ class Controller:
         at = self._tip_at(path)
         rotation = at.pose[:3, :3]
         linear, angular = rotation @ at.jacobian[:3], rotation @ at.jacobian[3:]
-        estimate = self._estimator.estimate
-        shift = offset[:3] - estimate.offset
-        turn = offset[3:] - estimate.turn
+        self._heed(omega)
+        shift, turn = offset[:3] - self._heeded[:3], offset[3:] - self._heeded[3:]
         modal, feedback = None, np.zeros(3)
         if self._gains is not None and math.isfinite(omega):
             modal, feedback = self._damping_rows(linear, path, chamber, shift)
@@ -351,7 +353,8 @@ class Controller:
         estimate = self._estimator.estimate
         offset = np.concatenate([estimate.offset, estimate.turn])
         # The offset depends on the posture too; the posture follows it slowly, the tip at once.
-        share = 1.0 if new else -math.expm1(-_PLAN_EVERY / _UNHURRIED)
+        slowness = max(_UNHURRIED, _SWINGS / self._estimator.omega)
+        share = 1.0 if new else -math.expm1(-_PLAN_EVERY / slowness)
         self._planned_offset = self._planned_offset + share * (offset - self._planned_offset)
         self._planner.ask(
             Request(
@@ -420,6 +423,17 @@ class Controller:
             return self._tip.at(p)
         except (EquilibriumError, PressureError) as error:
             raise StiffoptError(f"the model has no answer: {error}") from error
+
+    def _heed(self, omega: float) -> None:
+        """Let the offset that is corrected follow the one that is found.
+
+        For an arm that swings not at once: part of each swing is taken for an offset, and what the
+        model has no words for (higher modes) all of it.
+        """
+        estimate = self._estimator.estimate
+        found = np.concatenate([estimate.offset, estimate.turn])
+        share = 1.0 if not math.isfinite(omega) else -math.expm1(-_HEED * omega * self._period)
+        self._heeded = self._heeded + share * (found - self._heeded)
 
     def _damping_rows(
         self, linear: Array, path: Array, chamber: Array, correction: Array

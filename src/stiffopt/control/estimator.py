@@ -35,6 +35,7 @@ __all__ = ["EstimatorSettings", "TipEstimate", "TipEstimator"]
 Array = NDArray[np.float64]
 
 _REMEMBERED = 0.4  # s; older samples are of no use
+_SOFT = 0.15  # of the softest direction's compliance; directions with less swing less
 _LONGEST_LEAP = 0.05  # s; a tip that jumps and stays there is not believed after any time
 
 
@@ -119,7 +120,7 @@ class TipEstimator:
     omega : float
         Angular frequency of the swing, in rad/s; infinite while it is not known.
     across_matrix : ndarray
-        Projection (3, 3) on the plane in which the tip is soft.
+        What of a vector (3, 3) is in the directions in which the tip is soft.
     sample : PoseSample or None
         The last that was used.
     """
@@ -137,7 +138,6 @@ class TipEstimator:
         s = self._settings
         self._past.clear()
         self._swing, self._offset, self._turn = np.zeros((2, 3)), np.zeros(3), np.zeros(3)
-        self._axis = np.array([0.0, 0.0, 1.0])  # along which the tip is stiffest
         self.across_matrix = np.diag([1.0, 1.0, 0.0])
         self._lean: Array = np.zeros((3, 3))  # turn of the tip per swing
         self._pressures: Array | None = None
@@ -227,14 +227,15 @@ class TipEstimator:
         rotation = tip.pose[:3, :3]
         linear = rotation @ tip.compliance[:3, :3] @ rotation.T
         softness, axes = np.linalg.eigh(linear)
-        self._axis = axes[:, 0]
-        self.across_matrix = np.eye(3) - np.outer(self._axis, self._axis)
+        # of a strongly bent arm, no direction is stiff altogether
+        share = np.minimum(1.0, softness / (_SOFT * softness[2]))
+        self.across_matrix = axes * share @ axes.T
         self.omega = self._vibration.frequency(2 / float(softness[1] + softness[2]))
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
         self._lean = turning @ axes[:, 1:] @ np.diag(1 / softness[1:]) @ axes[:, 1:].T
 
     def across(self, vector: Array) -> Array:
-        """Part of a vector (3,) in the plane in which the tip is soft."""
+        """Part of a vector (3,) in the directions in which the tip is soft."""
         result: Array = self.across_matrix @ vector
         return result
 

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
@@ -19,6 +20,8 @@ from stiffopt.units import Duration
 __all__ = ["Course", "Trajectory", "Waypoint"]
 
 Array = NDArray[np.float64]
+
+_OPPOSITE = -0.99  # cosine between directions, beyond which the way is not clear
 
 
 class Waypoint(Schema):
@@ -84,6 +87,11 @@ class Course:
         When it begins, in s.
     position, rotation :
         Of the tip then, (3,) and (3, 3): where it begins if the first waypoint is later.
+
+    Raises
+    ------
+    InputError
+        Waypoints point in opposite directions.
     """
 
     def __init__(
@@ -103,7 +111,9 @@ class Course:
             self._position = _spline(knots, [list(position), *rows] if later else rows)
         if first.pointing is not None:
             rows = [list(t.pointing or ()) for t in targets]
-            self._pointing = _spline(knots, [list(rotation[:, 2]), *rows] if later else rows)
+            rows = [list(rotation[:, 2]), *rows] if later else rows
+            _refuse_opposites(rows)
+            self._pointing = _spline(knots, rows)
         if first.orientation is not None:
             turns = [np.roll(t.orientation, -1) for t in targets if t.orientation is not None]
             if later:
@@ -131,6 +141,14 @@ class Course:
             x, y, z, w = turn.as_quat(canonical=True)
             update["orientation"] = (float(w), float(x), float(y), float(z))
         return self._first.model_copy(update=update)
+
+
+def _refuse_opposites(directions: list[list[float]]) -> None:
+    for before, after in itertools.pairwise(np.array(directions)):
+        if float(before @ after) < _OPPOSITE:
+            raise InputError(
+                "two waypoints after each other point in opposite directions; put one between them"
+            )
 
 
 def _spline(knots: Array, rows: list[list[float]]) -> Callable[[float], Array]:

@@ -71,7 +71,7 @@ class ControlSettings(Schema):
     regulator_dead_time: Annotated[Duration, Field(ge=0, le=1)] = 0.01
     tracker_noise: Annotated[Length, Field(gt=0)] = 5e-5
     vibration: Literal["auto", "modelled", "none"] = "auto"
-    damping: Annotated[Ratio, Field(ge=0, lt=1)] = 0.04
+    damping: Annotated[Ratio, Field(ge=0, lt=1)] = 0.06
     solver: Literal["daqp", "osqp"] = "daqp"
 
 
