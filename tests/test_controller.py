@@ -146,12 +146,12 @@ def angle(R, goal):
 @pytest.mark.parametrize(
     ("robot", "dynamics", "kind", "duration"),
     [
-        (HANGING, "quasi-static", "position", 3.0),
+        (HANGING, "quasi-static", "position", 2.0),
         (HANGING, "full", "position", 4.5),
-        (HANGING, "quasi-static", "pointing", 3.0),
-        (FREE, "quasi-static", "orientation", 3.0),
+        (HANGING, "quasi-static", "pointing", 2.0),
+        (FREE, "quasi-static", "orientation", 2.5),
         (FREE, "full", "position", 5.0),
-        (ONE, "quasi-static", "free axes", 3.0),
+        (ONE, "quasi-static", "free axes", 1.5),
         (ONE, "full", "free axes", 3.0),
     ],
 )
@@ -237,9 +237,8 @@ def test_load_at_the_tip_is_found():
     assert np.abs(after - before)[3:].max() < 2e-3
 
 
-@pytest.mark.parametrize("dynamics", ["quasi-static", "full"])
-def test_load_that_is_let_go_all_at_once(dynamics):
-    bench = Bench(HANGING, dynamics)
+def test_load_that_is_let_go_all_at_once():
+    bench = Bench(HANGING, "full")
     position = bench.settled(duration=3.0)
     bench.rig.world.plant.set_load(Load(force=(0.03, 0.0, 0.0)))
     bench.run(2.0)
@@ -250,9 +249,8 @@ def test_load_that_is_let_go_all_at_once(dynamics):
     assert errors[-50:].max() < 1e-3
 
 
-@pytest.mark.parametrize("dynamics", ["quasi-static", "full"])
-def test_going_on_after_a_hold_is_no_jump(dynamics):
-    bench = Bench(HANGING, dynamics)
+def test_going_on_after_a_hold_is_no_jump():
+    bench = Bench(HANGING, "full")
     position = bench.settled(duration=3.0)
     bench.run(0.5, steer=False)
     bench.controller.resume(bench.rig.clock.now())
@@ -320,7 +318,7 @@ def test_never_beyond_limits_whatever_is_asked(dynamics, seed):
     """Random targets, many out of reach, every 0.3 s; `run` checks each command."""
     bench = Bench(HANGING, dynamics, seed=seed)
     rng = np.random.default_rng(seed)
-    for k in range(12 if dynamics == "full" else 20):
+    for k in range(10):
         position = rng.normal(size=3) * [0.05, 0.05, 0.02] + [0, 0, 0.19]
         x, y, z = map(float, position)
         kinds: list[dict[str, Any]] = [
@@ -405,8 +403,9 @@ def test_begin_forgets():
 @pytest.mark.parametrize(
     "case",
     [
-        "modulus 0.6", "modulus 1.4", "slow tracker", "50 Hz", "500 Hz", "lag x 2", "lag / 2",
-        "damping 0.01", "damping 0.3",
+        "modulus 0.6", "slow tracker", "500 Hz", "lag x 2", "damping 0.01",
+        *(pytest.param(c, marks=pytest.mark.long) for c in ("modulus 1.4", "50 Hz", "lag / 2")),
+        pytest.param("damping 0.3", marks=pytest.mark.long),
     ],
 )  # fmt: skip
 def test_stays_stable_with_wrong_models(case):

@@ -349,7 +349,9 @@ class Controller:
         self._asked_at = now
         target = self._target
         if self._course is not None:
-            target = self._course.at(now + self._reference.delay + self._dead_time)
+            target = self._course.at(
+                now + self._reference.delay + self._dead_time + 0.5 * self._period
+            )
         estimate = self._estimator.estimate
         offset = np.concatenate([estimate.offset, estimate.turn])
         # The offset depends on the posture too; the posture follows it slowly, the tip at once.

@@ -49,6 +49,7 @@ class Reference:
     def __init__(self, period: float, slew: Array, lag: float, dead_time: float) -> None:
         self._period, self._slew, self._lag, self._dead_time = period, slew, lag, dead_time
         self._n = len(slew)
+        self._exact: tuple[float, Array] = (math.nan, np.eye(_LAGS + 1))
         self.rate = 1.0
         self.begin(np.zeros(self._n))
 
@@ -70,10 +71,22 @@ class Reference:
         needed = float((np.abs(away[:n]) / self._slew).max()) / self._period
         levels[0] += away * min(1.0, 0.9 / needed if needed > 0 else 1.0)
         a = self.rate
-        share = -math.expm1(-a * self._period)
-        for i in range(1, _LAGS + 1):
-            levels[i] += share * (levels[i - 1] - levels[i])
+        levels = self._levels = self._transition() @ levels
         self.derivatives = np.array([[a], [a**2], [a**3]]) * (_DIFFERENCES @ levels)
+
+    def _transition(self) -> Array:
+        """What a step does to the levels (5, 5) while the first one stays: exactly."""
+        if self._exact[0] != self.rate:
+            x = self.rate * self._period
+            # a step of the first of k lags in a row has gone through the last by 1 - sum of these
+            parts = [math.exp(-x) * x**k / math.factorial(k) for k in range(_LAGS)]
+            M = np.eye(_LAGS + 1)
+            for i in range(1, _LAGS + 1):
+                M[i, 0] = 1 - sum(parts[:i])
+                for k in range(i):
+                    M[i, i - k] = parts[k]
+            self._exact = self.rate, M
+        return self._exact[1]
 
     @property
     def path(self) -> Array:
