@@ -263,9 +263,6 @@ def test_samples_between_ticks_are_nearly_a_replay():
     assert np.abs(errors[250:]).max() < 3e-5
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the second is compared with what was thought before the first"
-)
 def test_two_samples_within_a_tick():
     """A tracker faster than the loop: the second sample knows of the first."""
     twice, once = (TipEstimator(PERIOD, SWINGING, PLAIN) for _ in range(2))

@@ -148,8 +148,8 @@ class Allocation:
         are held by a limit.
         """
         nothing = np.zeros(len(last), dtype=bool)
-        given = jacobian.sum() + wanted.sum() + reference.sum() + last.sum() + tip_jacobian.sum()
-        if not math.isfinite(float(given)):
+        given = (jacobian, wanted, reference, last, tip_jacobian)
+        if not all(math.isfinite(float(np.abs(part).sum())) for part in given):
             return None, nothing
         J, r, before = jacobian * _BAR, reference / _BAR, last / _BAR
         scale = 1 / _KEPT_NEAR

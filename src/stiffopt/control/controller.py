@@ -21,7 +21,7 @@ from stiffopt.control.allocation import Allocation
 from stiffopt.control.closest import LEVER
 from stiffopt.control.estimator import EstimatorSettings, TipEstimator
 from stiffopt.control.gains import Gains
-from stiffopt.control.planner import InlinePlanner, Plan, Planner, Request, ThreadPlanner
+from stiffopt.control.planner import InlinePlanner, Plan, Planner, ProcessPlanner, Request
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import RegulatorModel
 from stiffopt.control.steering import Move, Notice, Seen, Standing
@@ -48,6 +48,7 @@ _HASTE = 1.2  # rate of the reference of an arm that swings, over its frequency
 _SWINGS = 3.0  # rad of the arm's swing that this takes at least
 _HEED = 0.6  # rate with which a swinging arm's offset is corrected, over its frequency
 _BRISK = 100.0  # 1/s; rate of the reference of an arm that does not swing
+_FAR, _TURNED = 5e-3, math.cos(math.radians(5))  # m, and the cosine of an angle
 _OFF = 1e4  # Pa; by which the command makes up for a regulator that is off
 _SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
 
@@ -70,7 +71,7 @@ class Controller:
     swings :
         Whether the arm vibrates as its robot file says, where the settings leave that open.
     beside :
-        Whether plans are made in a thread of their own; otherwise at once, for simulated time.
+        Whether plans are made in a process of their own; otherwise at once, for simulated time.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class Controller:
         self._allocation = Allocation(
             limits.low, limits.high, self._slew * period, self._control.solver
         )
-        self._planner: Planner = ThreadPlanner(robot) if beside else InlinePlanner(robot)
+        self._planner: Planner = ProcessPlanner(robot) if beside else InlinePlanner(robot)
         self._tip: TipModel | None = None
         self._serial = 0
         self.begin(0.0)
@@ -123,6 +124,8 @@ class Controller:
 
     def check(self) -> None:
         """Compile and try the model; see `Steering.check`."""
+        if self._tip is not None:
+            return
         self._tip = TipModel(self.robot)
         if not self._tip.is_fast and self.robot.is_loaded:
             raise InputError(
@@ -142,6 +145,7 @@ class Controller:
         self._measure: Callable[..., float] | None = None
         self._unit = "N/m"
         self._asked_at = -math.inf
+        self._search = True
         self._planned_offset, self._heeded = np.zeros(6), np.zeros(6)
         self._now = now
         self._last_move, self._commanded = none.copy(), none.copy()
@@ -331,12 +335,15 @@ class Controller:
             self.set_task(Task(robot=self.robot.description.name, target=target))
             return
         if self._target is None or _kind(self._target) != _kind(target):
-            self._serial += 1
+            self._anew()
+        elif _is_far(self._target, target):
+            self._search = True
         self._target = target
         self._asked_at = -math.inf
 
     def _anew(self) -> None:
         self._serial += 1
+        self._search = True
         self._asked_at = -math.inf
 
     def _ask(self, now: float) -> None:
@@ -345,8 +352,8 @@ class Controller:
             return
         if now - self._asked_at < _PLAN_EVERY - 1e-6:
             return
-        new = not math.isfinite(self._asked_at)
-        self._asked_at = now
+        anew = self._search and self._course is None
+        self._asked_at, self._search = now, False
         target = self._target
         if self._course is not None:
             target = self._course.at(
@@ -356,12 +363,12 @@ class Controller:
         offset = np.concatenate([estimate.offset, estimate.turn])
         # The offset depends on the posture too; the posture follows it slowly, the tip at once.
         slowness = max(_UNHURRIED, _SWINGS / self._estimator.omega)
-        share = 1.0 if new else -math.expm1(-_PLAN_EVERY / slowness)
+        share = 1.0 if anew else -math.expm1(-_PLAN_EVERY / slowness)
         self._planned_offset = self._planned_offset + share * (offset - self._planned_offset)
         self._planner.ask(
             Request(
                 self._serial, self._task, target, self._planned_offset.copy(),
-                new and self._course is None,
+                anew,
             )
         )  # fmt: skip
 
@@ -458,7 +465,7 @@ class Controller:
         speed = swing[1] - modal @ self._reference.derivatives[0][: len(path)]
         gain = self._gains.at(estimator.omega)
         feedback: Array = -(gain[0] * sigma + gain[1] * tip + gain[2] * speed)
-        return modal, estimator.across(feedback)
+        return modal, feedback
 
     def _rows(
         self, linear: Array, angular: Array, shift: Array, turn: Array, rotation: Array
@@ -521,6 +528,23 @@ def _stiffness_of(task: Task) -> Callable[..., float] | None:
 def _kind(target: Target) -> tuple[object, ...]:
     axes = None if target.position is None else tuple(axis is None for axis in target.position)
     return axes, target.pointing is None, target.orientation is None
+
+
+def _is_far(before: Target, target: Target) -> bool:
+    """Whether another configuration may be better for a target than for the one before."""
+    (here, *directions), (there, *others) = _parts(before), _parts(target)
+    if (
+        here is not None
+        and there is not None
+        and np.linalg.norm(np.nan_to_num(there - here)) > _FAR
+    ):
+        return True
+    turned = [
+        abs(float(a @ b)) < _TURNED
+        for a, b in zip(directions, others, strict=True)
+        if a is not None and b is not None
+    ]
+    return any(turned)
 
 
 def _parts(target: Target | None) -> tuple[Array | None, Array | None, Array | None]:

@@ -270,7 +270,7 @@ class TipEstimator:
             before.static + share * (after.static - before.static),
             before.rotation if share < 0.5 else after.rotation,
             before.swing + share * (after.swing - before.swing),
-            before.offset,
+            self._offset,
         )
 
     def _plausible(self, sample: PoseSample, moment: _Moment) -> bool:
@@ -308,7 +308,7 @@ class TipEstimator:
         swing = np.outer(gain[:2], across)
         self._offset = self._offset + offset
         for past in self._past:
-            if past.time >= sample.time:
+            if past.time >= sample.time - self._period:  # also what lies just before
                 past.offset = past.offset + offset
                 if self._vibration is not None:
                     past.swing = past.swing + self._transition(past.time - sample.time) @ swing

@@ -7,15 +7,19 @@ changed much and the arm is at rest, all configurations are searched again, and 
 own only for one that is clearly better.
 
 Plans are made one at a time by `Planning`: at once (`InlinePlanner`, for simulated time), or in a
-thread beside the control loop (`ThreadPlanner`), which is started again when it dies.
+process beside the control loop (`ProcessPlanner`), which is started again when it dies.
 """
 
 from __future__ import annotations
 
 import math
-import threading
+import pickle
+import socket
+import subprocess
+import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from multiprocessing.connection import Connection
 from typing import Protocol
 
 import numpy as np
@@ -32,7 +36,15 @@ from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipModel
 
-__all__ = ["InlinePlanner", "Plan", "Planner", "Planning", "Request", "ThreadPlanner", "moved_back"]
+__all__ = [
+    "InlinePlanner",
+    "Plan",
+    "Planner",
+    "Planning",
+    "ProcessPlanner",
+    "Request",
+    "moved_back",
+]
 
 Array = NDArray[np.float64]
 
@@ -43,7 +55,7 @@ _NEAR = 2e4  # Pa; an answer that is farther from the last plan is another confi
 _FAR_PER_METRE = 2e7  # Pa/m; the same for each metre that the target has moved
 _PATIENCE = 20  # plans
 _EXACT = Tolerance(position=1e-5, angle=1e-3)
-_RESTART_AFTER = 0.5  # s
+_RESTART_AFTER = 1.0  # s
 
 
 @dataclass(frozen=True)
@@ -79,7 +91,6 @@ class Plan:
     reached : whether the model reaches it.
     stiffness : of the task's first direction; NaN where it names none.
     message : why it is not reached.
-    tip : a model of the tip under the task's load, for whoever asked; new with each task.
     """
 
     serial: int
@@ -89,7 +100,6 @@ class Plan:
     reached: bool
     stiffness: float
     message: str
-    tip: TipModel
 
 
 class Planning:
@@ -103,6 +113,7 @@ class Planning:
 
     def __init__(self, robot: Manipulator) -> None:
         self._robot = robot
+        self._tip = TipModel(robot)
         self._serial = -1
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
@@ -121,7 +132,6 @@ class Planning:
             self._solver = PressureSolver(
                 self._robot, request.task.model_copy(update={"target": exact})
             )
-            self._tip = TipModel(self._solver.robot)
             self._is_compiled = self._solver.is_compiled
             self._serial, self._last = request.serial, None
         target = moved_back(request.target, request.offset)
@@ -136,9 +146,8 @@ class Planning:
             pressures = np.array(solution.pressures, dtype=float)
             stiffness = _value(solution.stiffness, math.nan)
             self._last = Plan(
-                request.serial, pressures, request.offset, request.target, True, stiffness, "",
-                self._tip,
-            )  # fmt: skip
+                request.serial, pressures, request.offset, request.target, True, stiffness, ""
+            )
         else:
             self._last = self._closest(request, target)
         return self._last
@@ -206,7 +215,6 @@ class Planning:
             reached=False,
             stiffness=math.nan,
             message=message,
-            tip=self._tip,
         )
 
 
@@ -254,86 +262,104 @@ class InlinePlanner:
         """Nothing to end."""
 
 
-class ThreadPlanner:
-    """Plans in a thread, so that whoever asks never waits.
+class ProcessPlanner:
+    """Plans in a process of its own, so that neither whoever asks nor Python's lock ever waits.
 
-    The optimiser's machine code runs beside Python.  If planning fails in a way that no one
-    thought of, the last plan stays, an alarm says so, and a new `Planning` begins after a while.
+    If planning fails in a way that no one thought of, or the process dies, the last plan stays, an
+    alarm says so, and another process is started.
 
     Parameters
     ----------
     robot :
         The arm.
     patience :
-        A plan that takes longer than this is worth an alarm, in s.
+        A plan that takes longer than this is worth an alarm, in s. The first one of a kind may be
+        compiled, which takes seconds.
     """
 
     def __init__(self, robot: Manipulator, patience: float = 5.0) -> None:
         self._robot, self._patience = robot, patience
         self._wanted: Request | None = None
-        self._begun: float | None = None
         self._plan: Plan | None = None
-        self._trouble: str = ""
-        self._ended = False
-        self._changed = threading.Condition()
+        self._trouble, self._ended = "", False
         self._start()
 
     def _start(self) -> None:
-        self._thread = threading.Thread(target=self._work, name="planner", daemon=True)
-        self._thread.start()
+        ours, theirs = socket.socketpair()
+        with theirs:
+            self._process = subprocess.Popen(
+                [
+                    sys.executable,
+                    "-P",
+                    "-m",
+                    "stiffopt.control.planner_process",
+                    str(theirs.fileno()),
+                ],
+                pass_fds=(theirs.fileno(),),
+                start_new_session=True,  # a terminal's Ctrl-C is not for it
+            )
+        self._line = Connection(ours.detach())
+        self._begun: float | None = time.monotonic()
+        self._started_at = time.monotonic()
+        self._line.send(self._robot)
 
     def ask(self, request: Request) -> None:
         """Want a plan."""
-        if not self._thread.is_alive() and not self._ended:
-            self._trouble = "the planner died and is started again; the last plan stays"
-            self._start()
-        with self._changed:
-            if self._wanted is not None and self._wanted.serial == request.serial:
-                anew = self._wanted.anew or request.anew
-                request = Request(**{**request.__dict__, "anew": anew})
-            self._wanted = request
-            self._changed.notify()
+        if self._wanted is not None and self._wanted.serial == request.serial:
+            request = replace(request, anew=self._wanted.anew or request.anew)
+        self._wanted = request
+        self._exchange()
 
     def latest(self) -> Plan | None:
         """Return the newest plan."""
+        self._exchange()
         return self._plan
 
     def notices(self) -> tuple[Notice, ...]:
         """Say whether planning has failed, or takes too long."""
         begun = self._begun
-        if begun is not None and time.monotonic() - begun > self._patience:
-            return (Notice("planner", "the planner is slow; the last plan stays", standing=True),)
         if self._trouble:
             return (Notice("planner", self._trouble, standing=True),)
+        if begun is not None and time.monotonic() - begun > self._patience:
+            return (Notice("planner", "the planner is slow; the last plan stays", standing=True),)
         return ()
 
     def close(self) -> None:
-        """End the thread."""
-        with self._changed:
-            self._ended = True
-            self._changed.notify()
-        self._thread.join(timeout=2.0)
+        """End the process."""
+        self._ended = True
+        self._line.close()  # which ends it
+        try:
+            self._process.wait(timeout=1.0)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
 
-    def _work(self) -> None:
-        planning = Planning(self._robot)
-        while True:
-            with self._changed:
-                while self._wanted is None and not self._ended:
-                    self._changed.wait()
-                if self._ended:
-                    return
-                request, self._wanted = self._wanted, None
-            assert request is not None
-            self._begun = time.monotonic()
-            try:
-                self._plan = planning.plan(request)
-                self._trouble = ""
-            except Exception as error:  # whatever it is, control goes on with the last plan
-                self._trouble = f"the planner failed and begins anew: {error}"
-                planning = Planning(self._robot)
-                time.sleep(_RESTART_AFTER)
-            finally:
+    def _exchange(self) -> None:
+        """Take what was planned, and hand over what is wanted if the process is free for it."""
+        if self._ended:
+            return
+        try:
+            while self._line.poll():
+                answer = self._line.recv()
                 self._begun = None
+                if isinstance(answer, Plan):
+                    self._plan, self._trouble = answer, ""
+                elif answer is not None:  # None: it is ready
+                    self._trouble = f"the planner failed and begins anew: {answer}"
+            if self._wanted is not None and self._begun is None:
+                self._line.send(self._wanted)
+                self._wanted, self._begun = None, time.monotonic()
+        except (OSError, EOFError, pickle.UnpicklingError):
+            self._start_again()
+
+    def _start_again(self) -> None:
+        self._trouble = "the planner died and is started again; the last plan stays"
+        if time.monotonic() - self._started_at < _RESTART_AFTER:
+            return
+        self._line.close()
+        self._process.kill()
+        self._process.wait()
+        self._start()
 
 
 def moved_back(target: Target, offset: Array) -> Target:

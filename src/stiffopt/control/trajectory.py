@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from typing import Annotated
 
@@ -10,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation, RotationSpline
 
+from stiffopt import lie
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.schema import Items, Schema
@@ -76,8 +77,8 @@ def _kind(target: Target) -> tuple[object, ...]:
 class Course:
     """A trajectory under way: a target for each moment.
 
-    Positions and directions run along cubic splines through the waypoints, orientations along a
-    spline of rotations; at rest at both ends, which are held.
+    Positions, directions and quaternions run along cubic splines through the waypoints, the latter
+    two made unit vectors again; at rest at both ends, which are held.
 
     Parameters
     ----------
@@ -104,8 +105,7 @@ class Course:
         targets = [waypoint.target for waypoint in trajectory.waypoints]
         later = times[0] > 0
         knots = np.array([0.0, *times] if later else times)
-        self._position = self._pointing = None
-        self._orientation: RotationSpline | Rotation | None = None
+        self._position = self._pointing = self._orientation = None
         if first.position is not None:
             rows = [[0.0 if axis is None else axis for axis in t.position or ()] for t in targets]
             self._position = _spline(knots, [list(position), *rows] if later else rows)
@@ -115,11 +115,10 @@ class Course:
             _refuse_opposites(rows)
             self._pointing = _spline(knots, rows)
         if first.orientation is not None:
-            turns = [np.roll(t.orientation, -1) for t in targets if t.orientation is not None]
+            rows = [list(t.orientation or ()) for t in targets]
             if later:
-                turns.insert(0, Rotation.from_matrix(rotation).as_quat())
-            all_turns = Rotation.from_quat(np.array(turns))
-            self._orientation = RotationSpline(knots, all_turns) if len(knots) > 1 else all_turns[0]
+                rows.insert(0, lie.quaternion_from_rotation(rotation).tolist())
+            self._orientation = _spline(knots, _the_short_way(rows))
         self._knots = knots
 
     def at(self, now: float) -> Target:
@@ -136,10 +135,9 @@ class Course:
             direction = self._pointing(t)
             update["pointing"] = tuple((direction / np.linalg.norm(direction)).tolist())
         if self._orientation is not None:
-            spline = self._orientation
-            turn = spline(t) if isinstance(spline, RotationSpline) else spline
-            x, y, z, w = turn.as_quat(canonical=True)
-            update["orientation"] = (float(w), float(x), float(y), float(z))
+            q = self._orientation(t)
+            q = q / (math.copysign(1.0, q[0]) * np.linalg.norm(q))
+            update["orientation"] = tuple(q.tolist())
         return self._first.model_copy(update=update)
 
 
@@ -149,6 +147,19 @@ def _refuse_opposites(directions: list[list[float]]) -> None:
             raise InputError(
                 "two waypoints after each other point in opposite directions; put one between them"
             )
+
+
+def _the_short_way(quaternions: list[list[float]]) -> list[list[float]]:
+    """Quaternions, each with the sign that is nearer to the one before."""
+    rows = [np.array(quaternions[0])]
+    for q in quaternions[1:]:
+        closeness = float(rows[-1] @ np.array(q))
+        if abs(closeness) < 1 + _OPPOSITE:
+            raise InputError(
+                "two waypoints after each other are turned by half a turn; put one between them"
+            )
+        rows.append(math.copysign(1.0, closeness) * np.array(q))
+    return [row.tolist() for row in rows]
 
 
 def _spline(knots: Array, rows: list[list[float]]) -> Callable[[float], Array]:
