@@ -148,20 +148,20 @@ class Allocation:
         are held by a limit.
         """
         nothing = np.zeros(len(last), dtype=bool)
-        given = (jacobian, wanted, reference, last, tip_jacobian)
-        if not all(math.isfinite(float(np.abs(part).sum())) for part in given):
+        with np.errstate(invalid="ignore", over="ignore"):  # it is looked for
+            J = jacobian * (_BAR / _KEPT_NEAR)
+            before = last / _BAR
+            H = J.T @ J + self._identity
+            f = J.T @ (wanted * (-1 / _KEPT_NEAR)) - H @ (reference / _BAR - before)
+            rows = tip_jacobian * _BAR
+            given = float(H.sum()) + float(f.sum()) + float(rows.sum()) + float(before.sum())
+        if not math.isfinite(given):
             return None, nothing
-        J, r, before = jacobian * _BAR, reference / _BAR, last / _BAR
-        scale = 1 / _KEPT_NEAR
-        Js = J * scale
-        H = Js.T @ Js + self._identity
-        f = -(Js.T @ (wanted * scale)) - H @ (r - before)
         lower = np.maximum(self._low - before, -self._step)
         upper = np.minimum(self._high - before, self._step)
         # a limit may have been tightened below the last pressures: then down as fast as may be
         upper = np.maximum(upper, -self._step)
         lower = np.minimum(lower, upper)
-        rows = np.ascontiguousarray(tip_jacobian * _BAR)
         # by as much as it has to come down where a limit was tightened, the tip may move faster
         forced = np.maximum(np.maximum(-upper, lower), 0.0)
         reach = max(tip_step, 1e-9) + np.abs(rows) @ forced

@@ -21,19 +21,20 @@ from stiffopt.control.allocation import Allocation
 from stiffopt.control.closest import LEVER
 from stiffopt.control.estimator import EstimatorSettings, TipEstimator
 from stiffopt.control.gains import Gains
+from stiffopt.control.nearby import NearbyTip
 from stiffopt.control.planner import InlinePlanner, Plan, Planner, ProcessPlanner, Request
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import RegulatorModel
 from stiffopt.control.steering import Move, Notice, Seen, Standing
 from stiffopt.control.trajectory import Course, Trajectory
 from stiffopt.control.vibration import Vibration
-from stiffopt.errors import EquilibriumError, InputError, PressureError, StiffoptError
+from stiffopt.errors import InputError
 from stiffopt.model.compliance import directional_stiffness
 from stiffopt.model.history import History, Memory
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
-from stiffopt.optimise.tip import TipAt, TipModel
+from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
@@ -90,7 +91,6 @@ class Controller:
         self._control, self._safety = control or ControlSettings(), safety or Safety()
         self._period = period
         n = robot.n_pressures
-        self._lowest, self._highest = robot.pressure_min, robot.pressure_max
         self._slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
         kind = self._control.vibration
         self._swings = swings if kind == "auto" else kind == "modelled"
@@ -116,7 +116,8 @@ class Controller:
             limits.low, limits.high, self._slew * period, self._control.solver
         )
         self._planner: Planner = ProcessPlanner(robot) if beside else InlinePlanner(robot)
-        self._tip: TipModel | None = None
+        self._here: NearbyTip | None = None  # the model where the arm is, and along the path
+        self._there: NearbyTip | None = None
         self._serial = 0
         self.begin(0.0)
 
@@ -124,14 +125,15 @@ class Controller:
 
     def check(self) -> None:
         """Compile and try the model; see `Steering.check`."""
-        if self._tip is not None:
+        if self._here is not None:
             return
-        self._tip = TipModel(self.robot)
-        if not self._tip.is_fast and self.robot.is_loaded:
+        here, there = NearbyTip(self.robot), NearbyTip(self.robot)
+        if not here.is_fast and self.robot.is_loaded:
             raise InputError(
                 "the control loop needs a C compiler for an arm under gravity or a load; "
                 "install one (Debian: apt install gcc) or set STIFFOPT_COMPILER"
             )
+        self._here, self._there = here, there
         self.begin(self._now)
 
     def begin(self, now: float) -> None:
@@ -157,8 +159,8 @@ class Controller:
         self._saturated = np.zeros(len(none), dtype=bool)
         self._allocation.limit(self.limits.low, self.limits.high)
         self._at_u: TipAt | None = None
-        if self._tip is not None:
-            self._at_u = self._tip_at(none)
+        if self._here is not None:
+            self._at_u = self._here.at(none)
             self._estimator.advance(now, none, self._at_u)
         self._fresh = True
 
@@ -209,7 +211,8 @@ class Controller:
             self._effective = self._chamber
         else:
             self._effective = self._memory.advance(steps * self._period, self._chamber)
-        self._at_u = self._tip_at(self._effective)
+        here, _ = self._models()
+        self._at_u = here.at(self._effective)
         for step in range(steps):
             moment = now - (steps - 1 - step) * self._period
             self._estimator.advance(moment, self._effective, self._at_u)
@@ -230,7 +233,7 @@ class Controller:
         n = len(self._last_move)
         command, chamber = self._reference.command(omega, self._damping)
         path, offset = self._reference.path[:n], self._reference.path[n:]
-        at = self._tip_at(path)
+        at = self._models()[1].at(path)
         rotation = at.pose[:3, :3]
         linear, angular = rotation @ at.jacobian[:3], rotation @ at.jacobian[3:]
         self._heed(omega)
@@ -244,7 +247,7 @@ class Controller:
             damped = self._mean_share * self._estimator.across(shift) + feedback
             wanted = np.concatenate([wanted, self._weight * damped])
         # what the chambers get beside the command, and the arm beside the chambers
-        beside = self._remembered + np.clip(self._regulators.offset, -_OFF, _OFF)
+        beside = self._remembered + np.minimum(np.maximum(self._regulators.offset, -_OFF), _OFF)
         pressures, held = self._allocation.solve(
             rows, wanted, command - beside, self._last_move, linear,
             self._safety.max_tip_speed * self._period,
@@ -252,7 +255,7 @@ class Controller:
         if pressures is None:
             return Move(self._last_move.copy(), False, self._saturated.copy())
         missing = (rows @ (pressures + beside - command) - wanted)[:3]
-        away = float(np.linalg.norm(missing)) > _SHORT
+        away = float(missing @ missing) > _SHORT**2
         self._saturated = held if away else np.zeros(n, dtype=bool)
         return Move(pressures, True, self._saturated.copy())
 
@@ -424,14 +427,12 @@ class Controller:
         result: Array = self._effective - self._chamber
         return result
 
-    def _tip_at(self, pressures: Array) -> TipAt:
-        if self._tip is None:
-            self._tip = TipModel(self.robot)
-        p = np.minimum(np.maximum(pressures, self._lowest), self._highest)
-        try:
-            return self._tip.at(p)
-        except (EquilibriumError, PressureError) as error:
-            raise StiffoptError(f"the model has no answer: {error}") from error
+    def _models(self) -> tuple[NearbyTip, NearbyTip]:
+        """The model where the arm is, and along the path."""
+        if self._here is None or self._there is None:
+            self.check()
+            return self._models()
+        return self._here, self._there
 
     def _heed(self, omega: float) -> None:
         """Let the offset that is corrected follow the one that is found.

@@ -307,11 +307,12 @@ class TipEstimator:
         offset = gain[2] * across + axial_gain * (surprise - across)
         swing = np.outer(gain[:2], across)
         self._offset = self._offset + offset
-        for past in self._past:
-            if past.time >= sample.time - self._period:  # also what lies just before
-                past.offset = past.offset + offset
-                if self._vibration is not None:
-                    past.swing = past.swing + self._transition(past.time - sample.time) @ swing
+        for past in reversed(self._past):
+            if past.time < sample.time - self._period:  # what lies just before is corrected too
+                break
+            past.offset = past.offset + offset
+            if self._vibration is not None:
+                past.swing = past.swing + self._transition(past.time - sample.time) @ swing
         self._swing = self._past[-1].swing.copy()
         if sample.quaternion is not None:
             self._learn_turn(sample.quaternion, moment)

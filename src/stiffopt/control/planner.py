@@ -336,7 +336,7 @@ class ProcessPlanner:
 
     def _exchange(self) -> None:
         """Take what was planned, and hand over what is wanted if the process is free for it."""
-        if self._ended:
+        if self._ended or (self._begun is None and self._wanted is None):
             return
         try:
             while self._line.poll():
