@@ -363,8 +363,9 @@ def test_another_kind_of_server() -> None:
         assert tracker.read() == ()
 
 
-@pytest.mark.parametrize("sent", [b"", message()[:30], message()[:70]])
-def test_closing_is_prompt_wherever_the_stream_stops(sent: bytes) -> None:
+@pytest.mark.parametrize("length", [0, 30, 70])
+def test_closing_is_prompt_wherever_the_stream_stops(length: int) -> None:
+    sent = message()[:length]
     threads = threading.active_count()
     with connected() as (tracker, server):
         server.send(sent)
