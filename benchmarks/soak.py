@@ -32,8 +32,10 @@ BLOCK = 600.0  # s
 TARGET = 10.0  # s
 SETTLED = 7.0  # s after which a target should have been reached
 FAULT_EVERY, FAULT_LASTS = 60.0, 2.0  # s
-LATCHED = {("supply", "leak"), ("supply", "high"), ("supply", "off"), ("supply", "garbage")}
+LATCHED = {("supply", "high"), ("supply", "off"), ("supply", "garbage")}
 """Faults that the loop must take for one; the others it must ride out, or let the arm down."""
+TOLD = {("supply", "leak")}
+"""A leak of a sixth of the pressure: a fault above 0.9 bar, an alarm below."""
 RIDDEN = {("tracker", "flip"), ("tracker", "missing"), ("tracker", "stuck"), ("tracker", "off")}
 COARSE = {"bending_degree": 2, "shear_degree": 1, "sub_intervals": 3, "step": 0.01}
 
@@ -120,7 +122,7 @@ class Soak:
         wrong: list[str] = []
         fault: tuple[str, str] | None = None
         since, fault_ends, disturbed, goal = clock.now(), 0.0, False, np.zeros(3)
-        latched = False
+        latched = alarmed = False
         while clock.now() < end or fault is not None:
             now = clock.now()
             if now >= next_target and fault is None:
@@ -129,15 +131,17 @@ class Soak:
                 goal, since, disturbed = np.array(target.position), now, False
                 next_target = now + TARGET
             if now >= next_fault and fault is None:
-                pairs = sorted(LATCHED | RIDDEN)
+                pairs = sorted(LATCHED | RIDDEN | TOLD)
                 fault = pairs[int(rng.integers(len(pairs)))]
                 channel = None
                 if fault[0] == "supply" and fault[1] != "off":
                     channel = int(np.argmax(self.rig.world.pressures))
                 self.rig.world.inject(*fault, channel)
-                fault_ends, disturbed, latched = now + FAULT_LASTS, True, False
+                fault_ends, disturbed = now + FAULT_LASTS, True
+                latched = alarmed = False
             snapshot = self.tick()
             latched = latched or snapshot.state is State.FAULT
+            alarmed = alarmed or bool(snapshot.alarms)
             if (snapshot.commanded > self.high * (1 + 1e-9)).any():
                 wrong.append(f"commanded above the limit at {now:.2f} s")
             if snapshot.state is State.FAULT and fault is None:
@@ -148,7 +152,10 @@ class Soak:
                 seen = faults.setdefault("-".join(fault), {"times": 0, "faults": 0})
                 seen["times"] += 1
                 seen["faults"] += latched
-                if latched != (fault in LATCHED):
+                if fault in TOLD:
+                    if not (latched or alarmed):
+                        wrong.append(f"{'-'.join(fault)} was not noticed")
+                elif latched != (fault in LATCHED):
                     wrong.append(f"{'-'.join(fault)} was {'' if latched else 'not '}a fault")
                 if latched and self.rig.world.set_point.any() and fault[1] != "off":
                     wrong.append(f"under pressure in fault after {'-'.join(fault)}")

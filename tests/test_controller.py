@@ -18,7 +18,6 @@ from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Load as TaskLoad
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.rig.config import RigDescription, limits_of, make_rig, slew_of
 from stiffopt.rig.interface import PressureReading
@@ -369,14 +368,13 @@ def test_tasks_that_do_not_suit_change_nothing():
     now = bench.rig.clock.now()
     before = bench.controller.standing(now)
     position = middle(bench)
-    loaded = Task(robot=HANGING, target=Target(position=position), load=TaskLoad(force=(0, 0, 0.1)))
     many = Task(
         robot=HANGING, target=Target(position=position), pressure=PressureRange(max=(BAR,) * 3)
     )
     empty = Task(
         robot=HANGING, target=Target(position=position), pressure=PressureRange(min=2 * BAR)
     )
-    for task, words in ((loaded, "load"), (many, "3"), (empty, "no pressure")):
+    for task, words in ((many, "3"), (empty, "no pressure")):
         with pytest.raises(InputError, match=words):
             bench.controller.set_task(task)
         after = bench.controller.standing(now)

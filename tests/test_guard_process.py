@@ -253,12 +253,12 @@ def test_a_rig_behind_a_guard(guarded: tuple[Rig, GuardLink]) -> None:
     np.testing.assert_allclose(applied.pressures, 3e4)
     np.testing.assert_allclose(applied.reading.pressures, 3e4, atol=2e3)
     assert before < applied.reading.time < now
-    assert now - applied.reading.time < 0.3  # one tick, on a machine that is busy
+    assert now - applied.reading.time < 1.0  # one tick, on a machine that is busy
     samples = tracker.read()
     assert len(samples) > 20
     times = np.array([sample.time for sample in samples])
     assert (np.diff(times) > 0).all()
-    assert before - 0.2 < times[0]
+    assert before - 2.0 < times[0]
     assert times[-1] < samples[-1].received <= now
     assert tracker.age() < 0.5
     np.testing.assert_allclose(samples[-1].position, link.truth()[:3, 3], atol=5e-3)

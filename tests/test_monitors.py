@@ -104,14 +104,45 @@ def test_8_a_regulator_that_saturates_by_a_little_is_flagged_and_then_well() -> 
     np.testing.assert_array_equal(bench.monitor.saturated, [False, False])
 
 
-def test_8_a_regulator_that_saturates_by_much_is_flagged_first_and_then_a_fault() -> None:
+def test_8_a_regulator_that_saturates_by_much_is_flagged_and_no_leak() -> None:
     bench = Regulators()
     bench.saturation[0] = 5e4
-    found, _ = bench.hold(1e5, 1e5, seconds=2.0)
+    assert bench.hold(1e5, 1e5, seconds=5.0)[0] is None
+    np.testing.assert_array_equal(bench.monitor.saturated, [True, False])
+    assert bench.hold(1.2e5, 1e5, seconds=5.0)[0] is None
+    assert bench.hold(4e4, 1e5, seconds=5.0)[0] is None
+    np.testing.assert_array_equal(bench.monitor.saturated, [False, False])
+
+
+@pytest.mark.parametrize("pressure", [0.8e5, 1.0e5, 1.4e5])
+def test_9_at_rest_a_leak_of_a_sixth_is_found_at_lower_pressures_too(pressure: float) -> None:
+    bench = Regulators()
+    bench.hold(pressure, pressure, seconds=1.0)
+    bench.leak[0] = 1 / 0.3
+    found, after = bench.hold(pressure, pressure, seconds=3.0)
     assert found is not None
     assert found.kind == "leak"
-    assert "no more pressure" in found.text
-    assert bench.was_saturated
+    assert found.text.startswith("channel 1")
+    assert after < 1.0
+
+
+def test_9_a_leak_from_the_beginning_is_flagged_and_found_when_its_command_falls() -> None:
+    bench = Regulators()
+    bench.leak[0] = 1 / 0.2
+    assert bench.hold(1.4e5, 1e5, seconds=3.0)[0] is None
+    np.testing.assert_array_equal(bench.monitor.saturated, [True, False])
+    found, _ = bench.hold(1.0e5, 1e5, seconds=3.0)
+    assert found is not None
+    assert found.kind == "leak"
+
+
+def test_10_stuck_high_is_found_at_once_while_nothing_was_commanded() -> None:
+    bench = Regulators()
+    bench.gauge = lambda p: np.array([2e4, p[1]])
+    found, after = bench.hold(0.0, 0.0)
+    assert found is not None
+    assert found.kind == "regulator-stuck"
+    assert after <= 0.05
 
 
 def test_10_a_regulator_that_is_stuck_high() -> None:

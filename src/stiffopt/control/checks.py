@@ -77,7 +77,9 @@ def check_vented_arm(
         yield "tracker: the tip is not seen now; bring the sensor into its field"
         return
     standing = steering.standing(now)
-    modelled = standing.tip_position - standing.disturbance
+    modelled = standing.model_position
+    if modelled is None:
+        modelled = standing.tip_position - standing.disturbance
     off = float(np.linalg.norm(tracker.position - modelled))
     if not off <= _OFF * rig.robot.length:  # NaN is too far as well
         seen, model = (", ".join(f"{1e3 * x:.1f}" for x in p) for p in (tracker.position, modelled))

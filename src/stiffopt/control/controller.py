@@ -25,6 +25,7 @@ from stiffopt.control.nearby import NearbyTip
 from stiffopt.control.planner import InlinePlanner, Plan, Planner, ProcessPlanner, Request
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import RegulatorModel
+from stiffopt.control.state import Severity
 from stiffopt.control.steering import Move, Notice, Seen, Standing
 from stiffopt.control.trajectory import Course, Trajectory
 from stiffopt.control.vibration import Vibration
@@ -49,8 +50,9 @@ _HASTE = 1.2  # rate of the reference of an arm that swings, over its frequency
 _SWINGS = 3.0  # rad of the arm's swing that this takes at least
 _HEED = 0.6  # rate with which a swinging arm's offset is corrected, over its frequency
 _BRISK = 100.0  # 1/s; rate of the reference of an arm that does not swing
+_BELIEVED = 0.5  # of the arm's length; an offset beyond is no model error any more
 _FAR, _TURNED = 5e-3, math.cos(math.radians(5))  # m, and the cosine of an angle
-_OFF = 1e4  # Pa; by which the command makes up for a regulator that is off
+_OFF = 3e3  # Pa; by which the command makes up for a regulator that is off
 _SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
 
 
@@ -227,6 +229,8 @@ class Controller:
             return Move(self._last_move.copy(), True, np.zeros(len(self._last_move), dtype=bool))
         if self._fresh:
             self.resume(now)
+        if self._implausible():
+            return Move(self._last_move.copy(), False, self._saturated.copy())
         omega = self._estimator.omega
         self._reference.rate = min(_BRISK, _HASTE * omega) if self._swings else _BRISK
         self._reference.advance(aim)
@@ -296,6 +300,7 @@ class Controller:
             wrench=self._wrench(estimate.offset, estimate.turn),
             task=self._what(),
             stiffness_unit=self._unit,
+            model_position=estimate.static,
         )
 
     def notices(self) -> tuple[Notice, ...]:
@@ -305,7 +310,19 @@ class Controller:
         if plan is not None and plan.serial == self._serial and not plan.reached:
             text = f"the target cannot be reached: {plan.message}"
             found.append(Notice("unreachable", text, standing=True))
+        if self._implausible():
+            away = 1e3 * float(np.linalg.norm(self._estimator.estimate.offset))
+            text = (
+                f"the tip is seen {away:.0f} mm from where the model has it; check the tracker's "
+                "registration and sensor, the tubes, and that the robot file is this arm's"
+            )
+            found.append(Notice("implausible", text, Severity.ERROR, standing=True))
         return tuple(found)
+
+    def _implausible(self) -> bool:
+        """Whether the arm is so far from its model that it is rather something else."""
+        offset = self._estimator.estimate.offset if self._at_u is not None else np.zeros(3)
+        return float(offset @ offset) > (_BELIEVED * self.robot.length) ** 2
 
     def close(self) -> None:
         """End the planner."""
@@ -316,8 +333,6 @@ class Controller:
     def _accepted(self, task: Task) -> Task:
         """Return a task with this rig's limits of pressure; refuse one that does not suit."""
         description = self.robot.description
-        if task.load is not None:
-            raise InputError("a load is estimated by the daemon; remove 'load' from the task")
         lower, upper = task.pressure_bounds(description)
         if task.pressure.max is not None:
             asked = np.broadcast_to(np.array(task.pressure.max, dtype=float), upper.shape)
@@ -331,7 +346,8 @@ class Controller:
         if (lower > upper).any():
             raise InputError("the task leaves a channel no pressure within the limits of this rig")
         limits = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
-        return task.model_copy(update={"pressure": limits})
+        # of a load, the tip's offset tells how much of it there is
+        return task.model_copy(update={"pressure": limits, "load": None})
 
     def _pursue(self, target: Target) -> None:
         if self._task is None:

@@ -36,6 +36,8 @@ Array = NDArray[np.float64]
 
 _REMEMBERED = 0.4  # s; older samples are of no use
 _SOFT = 0.15  # of the softest direction's compliance; directions with less swing less
+_FROZEN = 2e-3  # m; a tip that the model moves by more cannot be seen where it was
+_GIVEN_UP = 40  # rejected samples in a row after which all begins anew
 _LONGEST_LEAP = 0.05  # s; a tip that jumps and stays there is not believed after any time
 
 
@@ -150,6 +152,8 @@ class TipEstimator:
         self._ticks = 0
         self.sample: PoseSample | None = None
         self._first: PoseSample | None = None
+        self._same: tuple[Array, Array] | None = None  # a position, and the model's when it came
+        self._seen_at, self._refused = -math.inf, 0
         self._noise = s.noise**2
 
     @property
@@ -198,8 +202,9 @@ class TipEstimator:
     def take(self, samples: Sequence[PoseSample]) -> Seen:
         """Learn from samples, each at the time of its capture.
 
-        Those that are older than the newest that was used, or than what is remembered, and those
-        of a tip that was not seen, are left out.
+        Those that are older than the newest that was used, or than what is remembered, those of a
+        tip that was not seen, and those that repeat a pose to the last digit while the arm should
+        have moved, are left out.
         """
         used = rejected = 0
         for sample in samples:
@@ -210,11 +215,17 @@ class TipEstimator:
             moment = self._moment(sample.time)
             if moment is None:
                 continue
+            if self._repeats(sample, moment):
+                continue
             if self._plausible(sample, moment):
                 self._learn(sample, moment)
                 used += 1
             elif self.sample is not None:
                 rejected += 1
+                self._refused += 1
+                if self._refused >= _GIVEN_UP:  # whoever watches has long drawn the conclusion
+                    self.sample = self._first = None
+            self._seen_at = sample.time
         return Seen(used, rejected, self._used_until)
 
     # -- of the swing ---------------------------------------------------------------------------
@@ -279,8 +290,8 @@ class TipEstimator:
             before, self._first = self._first, sample
             return before is not None and self._is_near(sample, before.position, before.time)
         expected = moment.static + moment.swing[0] + moment.offset
-        return self._is_near(sample, self.sample.position, self.sample.time) or self._is_near(
-            sample, expected, self.sample.time
+        return self._is_near(sample, self.sample.position, self._seen_at) or self._is_near(
+            sample, expected, self._seen_at
         )
 
     def _is_near(self, sample: PoseSample, position: Array, since: float) -> bool:
@@ -288,6 +299,13 @@ class TipEstimator:
         elapsed = min(sample.time - since, _LONGEST_LEAP)
         reach = self._settings.max_speed * elapsed + 10 * self._settings.noise
         return float(np.linalg.norm(sample.position - position)) <= reach
+
+    def _repeats(self, sample: PoseSample, moment: _Moment) -> bool:
+        """Whether a tracker says the same again and again while the arm should have moved."""
+        if self._same is None or (sample.position != self._same[0]).any():
+            self._same = sample.position, moment.static
+            return False
+        return float(np.linalg.norm(moment.static - self._same[1])) > _FROZEN
 
     def _learn(self, sample: PoseSample, moment: _Moment) -> None:
         first = not math.isfinite(self._used_until)
@@ -317,7 +335,7 @@ class TipEstimator:
         if sample.quaternion is not None:
             self._learn_turn(sample.quaternion, moment)
         self._used_until = sample.time
-        self.sample = sample
+        self.sample, self._refused = sample, 0
 
     def _learn_turn(self, quaternion: Array, moment: _Moment) -> None:
         seen = lie.rotation_from_quaternion(quaternion)

@@ -33,6 +33,12 @@ class Trouble:
     text: str
 
 
+_STILL = 5e3  # Pa; a command that changes by less than this is at rest
+_SETTLED = 0.5  # s after which a channel at rest has its pressure
+_LEAK = 0.1  # of a pressure that was reached; less than that much less is no leak
+_AT_ONCE = 3  # readings
+
+
 class ExpectedPressure:
     """Where a regulator that works as its settings say would be: dead time, lag, limited rate.
 
@@ -79,10 +85,16 @@ class PressureMonitor:
     `Safety.max_pressure_error`, for `Safety.pressure_error_time`, is a fault: a leak if it is
     below, a regulator stuck if above. What is between the two is a regulator on its way.
 
-    A leak and a regulator whose supply runs out of pressure look alike: both stay below the
-    command. As one cannot tell them apart while nothing moves, both are treated alike: from half
-    of that error on the channel counts as saturated, which is an alarm; beyond the whole of it,
-    for that time, it is a leak and a fault.
+    A leak and a regulator whose supply runs out of pressure both stay below the command. What
+    tells them apart is what the channel has reached since it was armed: a regulator that has no
+    more pressure still reaches that, and a leak takes it away. So below what was commanded, by
+    half of that error, a channel counts as saturated, which is an alarm; below what it is known to
+    reach, it leaks. Where nothing moves, a tenth of the pressure is enough for that, if it is more
+    than half of that error. A channel that leaked from the beginning is known to leak when its
+    command falls.
+
+    While nothing has been commanded since arming, three readings above that error are enough for a
+    regulator that is stuck.
 
     Parameters
     ----------
@@ -113,6 +125,10 @@ class PressureMonitor:
         self._commanded: Array = np.zeros(n)
         self._time, self._oldest = safety.pressure_error_time, safety.command_timeout
         self._tolerance: Array = np.array(most)
+        self._half: Array = 0.5 * most
+        self._reached: Array = np.zeros(n)  # the highest readings since it was armed
+        self._still: tuple[float, Array] = (np.inf, np.zeros(n))  # since when, near what
+        self._idle, self._rising = True, 0  # nothing commanded yet; readings that rise all the same
         self._most = np.stack((most, most, 0.5 * most))  # (3, n): leaks, stuck, saturated
         self._for: Array = np.zeros((3, n))  # s, for how long it was so, less how long it was not
         self._doubtful = False  # whether any of that is not 0
@@ -127,11 +143,16 @@ class PressureMonitor:
         """Take in what the supply is told (n,), in Pa, and when."""
         self._commanded = commanded
         self._expected.tell(time, commanded)
+        if float(np.abs(commanded - self._still[1]).max()) > _STILL or time < self._still[0]:
+            self._still = time, commanded
+        self._idle = self._idle and not commanded.any()
 
     def clear(self) -> None:
         """Forget for how long anything was wrong."""
         self._for[:] = 0.0
         self._doubtful = False
+        self._reached = np.zeros_like(self._reached)
+        self._idle, self._rising = True, 0
         self.saturated = np.zeros_like(self.saturated)
 
     def update(self, now: float, reading: PressureReading) -> Trouble | None:
@@ -141,10 +162,21 @@ class PressureMonitor:
             return trouble
         elapsed = min(self._expected.follow(reading.time), self._time / _LOOKS)
         expected, p = self._expected.pressures, reading.pressures
+        if self._idle and elapsed > 0:
+            self._rising = self._rising + 1 if (p > self._tolerance).any() else 0
+            if self._rising >= _AT_ONCE:
+                return self._stuck(int(np.nanargmax(p - self._tolerance)), p)
         beside = self._beside
-        np.subtract(np.minimum(expected, self._commanded), p, out=beside[0])
+        self._reached = np.fmax(self._reached, p)
+        due = np.minimum(expected, self._commanded)
+        np.subtract(np.minimum(due, self._reached), p, out=beside[0])
         np.subtract(p, np.maximum(expected, self._commanded), out=beside[1])
-        beside[2] = beside[0]
+        np.subtract(due, p, out=beside[2])
+        if reading.time - self._still[0] > _SETTLED:
+            share = np.minimum(self._tolerance, _LEAK * self._reached)
+            self._most[0] = np.maximum(self._half, share)
+        else:
+            self._most[0] = self._tolerance
         wrong = beside > self._most  # NaN, where nothing is measured, is not
         if wrong.any():
             self._for += np.where(wrong, elapsed, -elapsed)
@@ -162,12 +194,7 @@ class PressureMonitor:
     def _found(self, lasting: NDArray[np.bool_], p: Array) -> Trouble | None:
         """Return the trouble where a reading (n,) was wrong for long enough."""
         for channel in np.flatnonzero(lasting[1]):
-            return Trouble(
-                "regulator-stuck",
-                f"channel {channel + 1} reads {_bar(p[channel])}, though "
-                f"{_bar(self._commanded[channel])} was commanded: its regulator is stuck; "
-                "everything is vented",
-            )
+            return self._stuck(int(channel), p)
         for channel in np.flatnonzero(lasting[0]):
             return Trouble(
                 "leak",
@@ -176,6 +203,14 @@ class PressureMonitor:
                 "no more pressure; it is vented with all others",
             )
         return None
+
+    def _stuck(self, channel: int, p: Array) -> Trouble:
+        return Trouble(
+            "regulator-stuck",
+            f"channel {channel + 1} reads {_bar(p[channel])}, though "
+            f"{_bar(self._commanded[channel])} was commanded: its regulator is stuck; "
+            "everything is vented",
+        )
 
     def implausible(self, now: float, reading: PressureReading) -> Trouble | None:
         """Return why a reading cannot be, if it cannot."""

@@ -299,7 +299,7 @@ class ProcessPlanner:
                 start_new_session=True,  # a terminal's Ctrl-C is not for it
             )
         self._line = Connection(ours.detach())
-        self._begun: float | None = time.monotonic()
+        self._begun: float | None = math.inf  # busy with itself until it says that it is ready
         self._started_at = time.monotonic()
         self._line.send(self._robot)
 

@@ -75,7 +75,10 @@ class Notice:
 
 @dataclass(frozen=True)
 class Standing:
-    """How control stands; names, shapes and units are those of `Snapshot`."""
+    """How control stands; names, shapes and units are those of `Snapshot`.
+
+    Beside them, ``model_position`` (3,) is where the model alone has the tip, if that is known.
+    """
 
     plan: Array
     tip_position: Array
@@ -93,6 +96,7 @@ class Standing:
     wrench: Array
     task: str
     stiffness_unit: str = "N/m"
+    model_position: Array | None = None
 
 
 class Steering(Protocol):

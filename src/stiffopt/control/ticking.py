@@ -71,6 +71,8 @@ class Ticking:
         self._unsupervised: tuple[int, ...] = ()
         self._zero: Array = np.zeros(n)
         self.commanded: Array = self._zero
+        self._asked: Array = self._zero
+        self._kept: Array | None = None  # what is held
         self.reading = PressureReading(float("nan"), np.full(n, np.nan))
         self.samples: tuple[PoseSample, ...] = ()
         self.rejected = 0
@@ -248,7 +250,9 @@ class Ticking:
     def _keep(self, now: float) -> None:
         ramp = self._ramp
         if ramp is None:
-            self._command(now, self.commanded)
+            if self._kept is None:  # once: an answer that is late must not move what is held
+                self._kept = np.minimum(self._asked, self.commanded)
+            self._command(now, self._kept)
             return
         share = 1 - (now - ramp.begin) / self._safety.ramp_time
         if not share > 1e-9:
@@ -261,6 +265,7 @@ class Ticking:
     def _command(self, now: float, pressures: Array, *, steered: bool = False) -> bool:
         """Hand pressures (n,) to the outlet; return whether it took them."""
         timeout = self._safety.command_timeout
+        self._asked = pressures
         applied = self.outlet.apply(PressureCommand(pressures, now, timeout))
         self._told(now, applied.pressures)
         self._exchanged = applied.reading
@@ -296,6 +301,7 @@ class Ticking:
             self.events.add(now, f"hold-{kind}", f"pressures are held: {reason}", Severity.WARNING)
         self._holds[kind] = reason
         if self.lifecycle.state is State.ACTIVE:
+            self._kept = None
             self.lifecycle.change(State.HOLDING, reason)
 
     def _resume(self, now: float) -> None:

@@ -125,11 +125,11 @@ class TrackerWatch:
         interval, _ = self.usual
         overdue = self.overdue(now)
         slack = self._period + _JITTER * interval
-        if overdue <= self._safety.tracker_frames * interval + slack:
-            return Sight.SEEN
-        if overdue <= self._safety.tracker_timeout + slack:
+        if overdue > self._safety.tracker_timeout + slack:
+            return Sight.LOST
+        if overdue > self._safety.tracker_frames * interval + slack:
             return Sight.MISSING
-        return Sight.LOST
+        return Sight.SEEN
 
     @property
     def jumping(self) -> bool:

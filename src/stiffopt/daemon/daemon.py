@@ -38,6 +38,7 @@ __all__ = ["Daemon"]
 
 Array = NDArray[np.float64]
 
+_FASTEST = 500.0  # Hz
 _SHAPE = 12  # poses along the arm that Foxglove draws
 _SHARE = 0.02  # of the time, which the control thread needs too
 _TIDY = 10.0  # s between collections of garbage
@@ -91,6 +92,10 @@ class Daemon:
         log_folder: str | os.PathLike[str] | None = None,
     ) -> None:
         self.description = description = load_rig_description(rig)
+        if description.rate > _FASTEST:
+            raise FileError(
+                rig, f"{description.rate:g} Hz is too fast; at most {_FASTEST:g} Hz", key="rate"
+            )
         self.robot = load_robot(robot_path(description.robot, Path(rig).parent))
         self.failure: BaseException | None = None
         self.trouble = ""

@@ -26,6 +26,13 @@ class Guarded(Protocol):
     def alive(self) -> bool:
         """Whether the guard is there."""
 
+    @property
+    def hung(self) -> bool:
+        """Whether the guard is there and does not answer any more."""
+
+    def kill(self) -> None:
+        """End a guard that hangs."""
+
     def open(self) -> None:
         """Start a guard, which connects to the supply and vents it."""
 
@@ -37,7 +44,8 @@ class Keeper:
     """Looks after a running daemon, in a thread of its own.
 
     - A guard process that has ended, which is a fault for the loop, is replaced: the new one
-      connects to the supply and vents it, which nobody else could do then.
+      connects to the supply and vents it, which nobody else could do then. One that hangs is
+      ended before.
     - When the control interface ends, nobody watches any more whether who has control is alive:
       the arm is held.
     - The service manager is told the state.
@@ -86,6 +94,8 @@ class Keeper:
     def look(self) -> None:
         """See to everything once."""
         self._tell()
+        if self._link.hung:
+            self._link.kill()  # it would keep the supply from the one that is to vent it
         if not self._link.alive:
             self._replace_guard()
         if self._serving is not None:

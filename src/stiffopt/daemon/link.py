@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import os
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,7 @@ __all__ = ["GuardLink", "guarded_rig"]
 Array = NDArray[np.float64]
 
 _FRESH = 1e-3  # s, that a command waits for its own answer
+_HUNG = 1.0  # s without any answer, after which it is not waited for any more
 _SILENT = 0.25  # s without an answer to a command, after which something is wrong
 
 
@@ -66,6 +69,7 @@ class GuardLink:
         self._process: GuardProcess | None = None
         self._exchange: Exchange | None = None
         self._told = 0  # trips that were said
+        self._deaf = math.inf  # since when it does not answer
 
     # life ----------------------------------------------------------------------------------------
 
@@ -81,7 +85,7 @@ class GuardLink:
         """
         if self._process is not None:
             return
-        self._told = 0
+        self._told, self._deaf = 0, math.inf
         self._process = GuardProcess(self._rig)
         try:
             self.real_time = self._process.wait_until_ready()
@@ -124,6 +128,16 @@ class GuardLink:
         return self._process is not None and self._process.alive
 
     @property
+    def hung(self) -> bool:
+        """Whether the guard is there and has not answered for so long that it never may."""
+        return self.alive and self._deaf < time.monotonic() - _HUNG
+
+    def kill(self) -> None:
+        """End a guard that hangs, so that another can be started; the kernel takes its devices."""
+        if self._process is not None:
+            self._process.kill()
+
+    @property
     def pid(self) -> int | None:
         """Number of the guard's process, while it is open."""
         return None if self._process is None else self._process.pid
@@ -138,7 +152,7 @@ class GuardLink:
         DeviceError
             The guard had vented by itself and this was not said yet, or the supply fails.
         """
-        answer = self._open_exchange().ask("arm", told=self._told)
+        answer = self._answer("arm", told=self._told)
         if answer.error:
             self._told = answer.trips
             raise DeviceError(answer.error)
@@ -181,7 +195,9 @@ class GuardLink:
         exchange.must_live()
         silence = exchange.silence()
         if newest is None or silence > _SILENT:
+            self._deaf = min(self._deaf, time.monotonic())
             raise DeviceError(f"the guard process has not answered for {silence:.2g} s")
+        self._deaf = math.inf
         return Applied(newest.commanded, _reading(newest), newest.limited, newest.refused)
 
     # simulated rigs ------------------------------------------------------------------------------
@@ -210,9 +226,20 @@ class GuardLink:
 
     def _ask(self, do: str, **about: Any) -> Answer:
         """Return the answer to a request; raise `DeviceError` if it could not be met."""
-        answer = self._open_exchange().ask(do, **about)
+        answer = self._answer(do, **about)
         if answer.error:
             raise DeviceError(answer.error)
+        return answer
+
+    def _answer(self, do: str, **about: Any) -> Answer:
+        """Return the answer to a request, whatever it says; take note if there is none."""
+        exchange = self._open_exchange()
+        try:
+            answer = exchange.ask(do, **about)
+        except DeviceError:
+            self._deaf = min(self._deaf, time.monotonic())
+            raise
+        self._deaf = math.inf
         return answer
 
     def _open_exchange(self) -> Exchange:

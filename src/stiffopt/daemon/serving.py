@@ -84,7 +84,6 @@ class Server:
             access_log=False,
             server_header=False,
             proxy_headers=False,
-            limit_concurrency=_CONNECTIONS,
             timeout_graceful_shutdown=_CLOSING,
         )
         self._server = uvicorn.Server(config)
