@@ -1,5 +1,6 @@
 # `make demo` and `make test` do all their set-up; `make help` lists the rest.
 PYTHON ?= python3
+PARALLEL ?= -n 2 --dist loadfile
 VENV ?= .venv
 DEMO ?= problems/two_segment_stiff_x.yaml
 
@@ -21,7 +22,7 @@ demo: $(VENV)/.installed-plot  ## solve a task and plot the arm
 	@echo "The plot is in out/demo.png."
 
 test: $(VENV)/.installed-dev  ## run the tests (make test ARGS=--long for the long ones too)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## check style, formatting and import layers
 	$(BIN)/ruff check .

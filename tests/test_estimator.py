@@ -7,6 +7,7 @@ state (xi, w, d) of each axis in one vector and matrices in place of what the es
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -341,6 +342,35 @@ def test_jump_is_rejected_and_stays_so():
     assert state(estimator)[6:] == pytest.approx(before[6:], abs=0)
     # and where the tip is expected, it is believed again
     assert estimator.take([sample(now + 0.3, estimator.estimate.position)]).used == 1
+
+
+@pytest.mark.parametrize("jump", [0.02, 0.028, 0.04])
+def test_small_jump_that_stays_is_not_believed_after_a_while(jump):
+    """What is rejected does not make the next one more plausible."""
+    estimator, truth, now = settled(settings=replace(PLAIN, max_speed=0.6))
+    assert estimator.take([sample(now, truth.position)]).used == 1
+    jumped = truth.position + np.array([jump, 0, 0])
+    for k in range(1, 12):
+        time = now + 0.025 * k
+        estimator.advance(time, truth.p, tip_at(truth.p))
+        assert estimator.take([sample(time, jumped)]).rejected == 1
+
+
+def test_frozen_pose_with_a_counting_frame_number_is_as_missing():
+    """While the model moves the tip; at rest a tracker may well say the same twice."""
+    estimator, truth, now = settled()
+    stuck, p = truth.position.copy(), truth.p.copy()
+    used = []
+    for k in range(1, 30):
+        p = p + 500.0
+        estimator.advance(now + k * PERIOD, p, tip_at(p))
+        moved = np.linalg.norm(tip_at(p).pose[:3, 3] - tip_at(truth.p).pose[:3, 3])
+        seen = estimator.take([sample(now + k * PERIOD, stuck, frame=k)])
+        assert seen.rejected == 0
+        used.append(seen.used)
+        assert not (moved > 3e-3 and seen.used)
+    assert used[0] == 1
+    assert used[-1] == 0
 
 
 def test_outliers_among_good_samples_make_no_difference():
