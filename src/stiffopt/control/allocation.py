@@ -154,7 +154,7 @@ class Allocation:
             H = J.T @ J + self._identity
             f = J.T @ (wanted * (-1 / _KEPT_NEAR)) - H @ (reference / _BAR - before)
             rows = tip_jacobian * _BAR
-            given = float(H.sum()) + float(f.sum()) + float(rows.sum()) + float(before.sum())
+            given = float(f @ f) + float(np.vdot(rows, rows))  # what is not finite in H is in f
         if not math.isfinite(given):
             return None, nothing
         lower = np.maximum(self._low - before, -self._step)

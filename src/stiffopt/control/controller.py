@@ -190,8 +190,7 @@ class Controller:
 
     def resume(self, now: float) -> None:
         """Steer again from where the pressures are."""
-        estimate = self._estimator.estimate
-        offset = np.concatenate([estimate.offset, estimate.turn])
+        offset = self._estimator.beside
         self._heeded = offset
         self._reference.begin(np.concatenate([self._last_move + self._remembered, offset]))
         self._fresh = False
@@ -311,7 +310,7 @@ class Controller:
             text = f"the target cannot be reached: {plan.message}"
             found.append(Notice("unreachable", text, standing=True))
         if self._implausible():
-            away = 1e3 * float(np.linalg.norm(self._estimator.estimate.offset))
+            away = 1e3 * float(np.linalg.norm(self._estimator.beside[:3]))
             text = (
                 f"the tip is seen {away:.0f} mm from where the model has it; check the tracker's "
                 "registration and sensor, the tubes, and that the robot file is this arm's"
@@ -321,7 +320,7 @@ class Controller:
 
     def _implausible(self) -> bool:
         """Whether the arm is so far from its model that it is rather something else."""
-        offset = self._estimator.estimate.offset if self._at_u is not None else np.zeros(3)
+        offset = self._estimator.beside[:3]
         return float(offset @ offset) > (_BELIEVED * self.robot.length) ** 2
 
     def close(self) -> None:
@@ -378,8 +377,7 @@ class Controller:
             target = self._course.at(
                 now + self._reference.delay + self._dead_time + 0.5 * self._period
             )
-        estimate = self._estimator.estimate
-        offset = np.concatenate([estimate.offset, estimate.turn])
+        offset = self._estimator.beside
         # The offset depends on the posture too; the posture follows it slowly, the tip at once.
         slowness = max(_UNHURRIED, _SWINGS / self._estimator.omega)
         share = 1.0 if anew else -math.expm1(-_PLAN_EVERY / slowness)
@@ -456,8 +454,7 @@ class Controller:
         For an arm that swings not at once: part of each swing is taken for an offset, and what the
         model has no words for (higher modes) all of it.
         """
-        estimate = self._estimator.estimate
-        found = np.concatenate([estimate.offset, estimate.turn])
+        found = self._estimator.beside
         share = 1.0 if not math.isfinite(omega) else -math.expm1(-_HEED * omega * self._period)
         self._heeded = self._heeded + share * (found - self._heeded)
 

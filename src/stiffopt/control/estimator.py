@@ -165,6 +165,11 @@ class TipEstimator:
         )
 
     @property
+    def beside(self) -> Array:
+        """By what the tip is beside the model (6,): d, and the rotation vector of its turn."""
+        return np.concatenate([self._offset, self._turn])
+
+    @property
     def turn_known(self) -> bool:
         """Whether the tracker tells orientations."""
         return self.sample is not None and self.sample.quaternion is not None

@@ -13,7 +13,7 @@ __all__ = ["NearbyTip"]
 
 Array = NDArray[np.float64]
 
-_NEARBY = 200.0  # Pa; over this the model is linear: the tip to a micrometre
+_NEARBY = 300.0  # Pa; over this the model is linear: the tip to a micrometre
 
 
 class NearbyTip:
