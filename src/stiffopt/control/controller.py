@@ -12,12 +12,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
 from stiffopt.control.allocation import Allocation
+from stiffopt.control.asked import angle_to, distance_to, is_far, kind_of, parts_of, stiffness_of
 from stiffopt.control.closest import LEVER
 from stiffopt.control.estimator import EstimatorSettings, TipEstimator
 from stiffopt.control.gains import Gains
@@ -30,7 +30,6 @@ from stiffopt.control.steering import Move, Notice, Seen, Standing
 from stiffopt.control.trajectory import Course, Trajectory
 from stiffopt.control.vibration import Vibration
 from stiffopt.errors import InputError
-from stiffopt.model.compliance import directional_stiffness
 from stiffopt.model.history import History, Memory
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.target import Target
@@ -51,7 +50,6 @@ _SWINGS = 3.0  # rad of the arm's swing that this takes at least
 _HEED = 0.6  # rate with which a swinging arm's offset is corrected, over its frequency
 _BRISK = 100.0  # 1/s; rate of the reference of an arm that does not swing
 _BELIEVED = 0.5  # of the arm's length; an offset beyond is no model error any more
-_FAR, _TURNED = 5e-3, math.cos(math.radians(5))  # m, and the cosine of an angle
 _OFF = 3e3  # Pa; by which the command makes up for a regulator that is off
 _SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
 
@@ -169,7 +167,7 @@ class Controller:
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Steering.set_task`."""
         self._task, self._target, self._course = self._accepted(task), task.target, None
-        self._measure = _stiffness_of(task)
+        self._measure = stiffness_of(task)
         self._unit = task.measures[0].unit if task.measures else "N/m"
         lower, upper = self._task.pressure_bounds(self.robot.description)
         self._allocation.limit(lower, upper)
@@ -277,7 +275,7 @@ class Controller:
             )  # fmt: skip
         estimate, rotation = self._estimator.estimate, self._estimator.rotation
         target = self._course.at(now) if self._course is not None else self._target
-        position, pointing, quaternion = _parts(target)
+        position, pointing, quaternion = parts_of(target)
         sample, plan = self._estimator.sample, self._plan
         stiffness = math.nan
         if self._measure is not None:
@@ -291,8 +289,8 @@ class Controller:
             target_position=position,
             target_quaternion=quaternion,
             target_pointing=pointing,
-            position_error=_distance(estimate.position, position),
-            angle_error=_angle(rotation, pointing, quaternion),
+            position_error=distance_to(estimate.position, position),
+            angle_error=angle_to(rotation, pointing, quaternion),
             stiffness=stiffness,
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
@@ -352,9 +350,9 @@ class Controller:
         if self._task is None:
             self.set_task(Task(robot=self.robot.description.name, target=target))
             return
-        if self._target is None or _kind(self._target) != _kind(target):
+        if self._target is None or kind_of(self._target) != kind_of(target):
             self._anew()
-        elif _is_far(self._target, target):
+        elif is_far(self._target, target):
             self._search = True
         self._target = target
         self._asked_at = -math.inf
@@ -513,76 +511,3 @@ class Controller:
             force = np.linalg.solve(self._at_u.compliance[:3, :3], rotation.T @ offset)
             wrench = np.concatenate([force, np.zeros(3)])
         return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
-
-
-def _stiffness_of(task: Task) -> Callable[..., float] | None:
-    """Stiffness along the first direction that a task names, by compliance and rotation."""
-    measures = task.measures
-    if not measures:
-        return None
-    measure = measures[0]
-    if measure.boundary == "free":  # NumPy alone is ten times as quick
-        block = slice(0, 3) if measure.kind == "translation" else slice(3, 6)
-        direction, in_base = np.array(measure.direction), measure.frame == "base"
-
-        def along(compliance: Array, rotation: Array) -> float:
-            d = rotation.T @ direction if in_base else direction
-            return float(1 / (d @ compliance[block, block] @ d))
-
-        return along
-    C, R = ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3)
-    value = directional_stiffness(
-        C, R, ca.DM(measure.direction),
-        frame=measure.frame, kind=measure.kind, boundary=measure.boundary,
-    )  # fmt: skip
-    function: Callable[..., float] = ca.Function("stiffness", [C, R], [value])
-    return function
-
-
-def _kind(target: Target) -> tuple[object, ...]:
-    axes = None if target.position is None else tuple(axis is None for axis in target.position)
-    return axes, target.pointing is None, target.orientation is None
-
-
-def _is_far(before: Target, target: Target) -> bool:
-    """Whether another configuration may be better for a target than for the one before."""
-    (here, *directions), (there, *others) = _parts(before), _parts(target)
-    if (
-        here is not None
-        and there is not None
-        and np.linalg.norm(np.nan_to_num(there - here)) > _FAR
-    ):
-        return True
-    turned = [
-        abs(float(a @ b)) < _TURNED
-        for a, b in zip(directions, others, strict=True)
-        if a is not None and b is not None
-    ]
-    return any(turned)
-
-
-def _parts(target: Target | None) -> tuple[Array | None, Array | None, Array | None]:
-    """Position, pointing and orientation of a target."""
-    if target is None:
-        return None, None, None
-    position = None
-    if target.position is not None:
-        position = np.array([np.nan if axis is None else axis for axis in target.position])
-    pointing = None if target.pointing is None else np.array(target.pointing)
-    return position, pointing, None if target.orientation is None else np.array(target.orientation)
-
-
-def _distance(position: Array, target: Array | None) -> float:
-    if target is None:
-        return math.nan
-    away = position - target
-    return float(np.linalg.norm(away[np.isfinite(away)]))
-
-
-def _angle(rotation: Array, pointing: Array | None, quaternion: Array | None) -> float:
-    if pointing is not None:
-        return float(np.arccos(np.clip(rotation[:, 2] @ pointing, -1, 1)))
-    if quaternion is not None:
-        between = rotation.T @ lie.rotation_from_quaternion(quaternion)
-        return float(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1)))
-    return math.nan

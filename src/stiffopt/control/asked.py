@@ -1,0 +1,97 @@
+"""What a task asks of the tip, and by how much a tip misses it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.model.compliance import directional_stiffness
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+
+__all__ = ["angle_to", "distance_to", "is_far", "kind_of", "parts_of", "stiffness_of"]
+
+Array = NDArray[np.float64]
+
+_FAR, _TURNED = 5e-3, math.cos(math.radians(5))  # m, and the cosine of an angle
+
+
+def stiffness_of(task: Task) -> Callable[..., float] | None:
+    """Stiffness along the first direction that a task names, by compliance and rotation."""
+    measures = task.measures
+    if not measures:
+        return None
+    measure = measures[0]
+    if measure.boundary == "free":  # NumPy alone is ten times as quick
+        block = slice(0, 3) if measure.kind == "translation" else slice(3, 6)
+        direction, in_base = np.array(measure.direction), measure.frame == "base"
+
+        def along(compliance: Array, rotation: Array) -> float:
+            d = rotation.T @ direction if in_base else direction
+            return float(1 / (d @ compliance[block, block] @ d))
+
+        return along
+    C, R = ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3)
+    value = directional_stiffness(
+        C, R, ca.DM(measure.direction),
+        frame=measure.frame, kind=measure.kind, boundary=measure.boundary,
+    )  # fmt: skip
+    function: Callable[..., float] = ca.Function("stiffness", [C, R], [value])
+    return function
+
+
+def kind_of(target: Target) -> tuple[object, ...]:
+    """Which parts of a pose a target asks for."""
+    axes = None if target.position is None else tuple(axis is None for axis in target.position)
+    return axes, target.pointing is None, target.orientation is None
+
+
+def is_far(before: Target, target: Target) -> bool:
+    """Whether another configuration may be better for a target than for the one before."""
+    (here, *directions), (there, *others) = parts_of(before), parts_of(target)
+    if (
+        here is not None
+        and there is not None
+        and np.linalg.norm(np.nan_to_num(there - here)) > _FAR
+    ):
+        return True
+    turned = [
+        abs(float(a @ b)) < _TURNED
+        for a, b in zip(directions, others, strict=True)
+        if a is not None and b is not None
+    ]
+    return any(turned)
+
+
+def parts_of(target: Target | None) -> tuple[Array | None, Array | None, Array | None]:
+    """Position, pointing and orientation of a target."""
+    if target is None:
+        return None, None, None
+    position = None
+    if target.position is not None:
+        position = np.array([np.nan if axis is None else axis for axis in target.position])
+    pointing = None if target.pointing is None else np.array(target.pointing)
+    return position, pointing, None if target.orientation is None else np.array(target.orientation)
+
+
+def distance_to(position: Array, target: Array | None) -> float:
+    """Distance of a tip from a position (3,), NaN for free axes, in m; NaN where none is asked."""
+    if target is None:
+        return math.nan
+    away = position - target
+    return float(np.linalg.norm(away[np.isfinite(away)]))
+
+
+def angle_to(rotation: Array, pointing: Array | None, quaternion: Array | None) -> float:
+    """Angle of a tip (3, 3) to a pointing (3,) or quaternion (4,), in rad; NaN: none is asked."""
+    if pointing is not None:
+        return float(np.arccos(np.clip(rotation[:, 2] @ pointing, -1, 1)))
+    if quaternion is not None:
+        between = rotation.T @ lie.rotation_from_quaternion(quaternion)
+        return float(np.arccos(np.clip((np.trace(between) - 1) / 2, -1, 1)))
+    return math.nan
