@@ -357,7 +357,8 @@ def test_any_thread_may_call(guarded: tuple[Rig, GuardLink]) -> None:
     stop.set()
     for thread in threads:
         thread.join(10)
-    assert not failures
+    # a vent waits for nothing, not even for requests that came before it
+    assert all("overtaken" in str(failure) for failure in failures)
     assert min(counts) > 10
     assert slowest < 0.3
 
