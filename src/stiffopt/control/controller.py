@@ -45,6 +45,7 @@ Array = NDArray[np.float64]
 _PLAN_EVERY = 0.05  # s
 _UNHURRIED = 1.0  # s; with which the plan follows the offset
 _EFFORT = 1.0  # of feedback against error; see `Gains`
+_DAMPED = 3.0  # weight of what the swing has of the tip's motion, against the motion itself
 _HASTE = 1.2  # rate of the reference of an arm that swings, over its frequency
 _SWINGS = 3.0  # rad of the arm's swing that this takes at least
 _HEED = 0.6  # rate with which a swinging arm's offset is corrected, over its frequency
@@ -109,7 +110,6 @@ class Controller:
             ),
         )
         self._gains = Gains(period, self._lag, self._damping, _EFFORT) if self._vibration else None
-        self._weight = 3.0
         self._mean_share = float(np.mean(self._vibration.participation)) if self._vibration else 1.0
         self._reference = Reference(period, self._slew, self._lag, dead_time)
         self._allocation = Allocation(
@@ -150,7 +150,7 @@ class Controller:
         self._search = True
         self._planned_offset, self._heeded = np.zeros(6), np.zeros(6)
         self._now = now
-        self._last_move, self._commanded = none.copy(), none.copy()
+        self._last_move = none.copy()
         self._effective, self._chamber = none.copy(), none.copy()
         self._memory = self._history()
         self._regulators.begin(none)
@@ -244,9 +244,9 @@ class Controller:
             modal, feedback = self._damping_rows(linear, path, chamber, shift)
         rows, wanted = self._rows(linear, angular, shift + feedback, turn, rotation)
         if modal is not None:
-            rows = np.concatenate([rows, self._weight * modal])
+            rows = np.concatenate([rows, _DAMPED * modal])
             damped = self._mean_share * self._estimator.across(shift) + feedback
-            wanted = np.concatenate([wanted, self._weight * damped])
+            wanted = np.concatenate([wanted, _DAMPED * damped])
         # what the chambers get beside the command, and the arm beside the chambers
         beside = self._remembered + np.minimum(np.maximum(self._regulators.offset, -_OFF), _OFF)
         pressures, held = self._allocation.solve(
@@ -263,16 +263,8 @@ class Controller:
     def standing(self, now: float) -> Standing:
         """Say how things stand."""
         n = self.robot.n_pressures
-        unknown = np.full(n, np.nan)
         if self._at_u is None:
-            nowhere = np.full(3, np.nan)
-            return Standing(
-                plan=unknown, tip_position=nowhere, tip_quaternion=np.full(4, np.nan),
-                seen_position=nowhere, seen_time=-math.inf, target_position=None,
-                target_quaternion=None, target_pointing=None, position_error=math.nan,
-                angle_error=math.nan, stiffness=math.nan, best_stiffness=math.nan,
-                disturbance=np.zeros(3), wrench=np.zeros(6), task="",
-            )  # fmt: skip
+            return Standing.unknown(n)
         estimate, rotation = self._estimator.estimate, self._estimator.rotation
         target = self._course.at(now) if self._course is not None else self._target
         position, pointing, quaternion = parts_of(target)
@@ -281,7 +273,7 @@ class Controller:
         if self._measure is not None:
             stiffness = float(self._measure(self._at_u.compliance, self._at_u.pose[:3, :3]))
         return Standing(
-            plan=unknown if plan is None else plan.pressures - self._remembered,
+            plan=np.full(n, np.nan) if plan is None else plan.pressures - self._remembered,
             tip_position=estimate.position,
             tip_quaternion=lie.quaternion_from_rotation(rotation),
             seen_position=np.full(3, np.nan) if sample is None else sample.position,

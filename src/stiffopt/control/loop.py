@@ -7,8 +7,6 @@ import threading
 import time
 from collections.abc import Callable
 
-import numpy as np
-
 from stiffopt.control.journal import EventLog
 from stiffopt.control.machine import Machine
 from stiffopt.control.outlet import Outlet
@@ -68,7 +66,7 @@ class ControlLoop:
         self._punctuality = Punctuality(period)
         self._ramp_time = safety.ramp_time
         self.events: EventLog = self._machine.events
-        self._nothing = _nothing_known(outlet.limits.n)
+        self._nothing = Standing.unknown(outlet.limits.n)
         self._snapshot = self._pictured(rig.clock.now())
         self._listeners: list[Callable[[Snapshot], None]] = []
 
@@ -326,25 +324,3 @@ class ControlLoop:
             task=standing.task,
             stiffness_unit=standing.stiffness_unit,
         )
-
-
-def _nothing_known(n: int) -> Standing:
-    """Return how control stands before there is any."""
-    nowhere, nan = np.full(3, np.nan), float("nan")
-    return Standing(
-        plan=np.full(n, np.nan),
-        tip_position=nowhere,
-        tip_quaternion=np.full(4, np.nan),
-        seen_position=nowhere,
-        seen_time=-math.inf,
-        target_position=None,
-        target_quaternion=None,
-        target_pointing=None,
-        position_error=nan,
-        angle_error=nan,
-        stiffness=nan,
-        best_stiffness=nan,
-        disturbance=nowhere,
-        wrench=np.full(6, np.nan),
-        task="",
-    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -97,6 +98,28 @@ class Standing:
     task: str
     stiffness_unit: str = "N/m"
     model_position: Array | None = None
+
+    @classmethod
+    def unknown(cls, n: int) -> Standing:
+        """Return how control of n channels stands before anything is known."""
+        nowhere, nan = np.full(3, np.nan), float("nan")
+        return cls(
+            plan=np.full(n, np.nan),
+            tip_position=nowhere,
+            tip_quaternion=np.full(4, np.nan),
+            seen_position=nowhere,
+            seen_time=-math.inf,
+            target_position=None,
+            target_quaternion=None,
+            target_pointing=None,
+            position_error=nan,
+            angle_error=nan,
+            stiffness=nan,
+            best_stiffness=nan,
+            disturbance=nowhere,
+            wrench=np.full(6, np.nan),
+            task="",
+        )
 
 
 class Steering(Protocol):
