@@ -12,9 +12,9 @@ BAR = 1e5
 SLEW = np.array([5 * BAR, 5 * BAR])
 
 
-def made(period=0.01, lag=0.06, dead_time=0.01, rate=12.0):
-    reference = Reference(period, SLEW, lag, dead_time)
-    reference.rate = rate
+def made(period=0.01, lag=0.06, rate=12.0, omega=10.0, damping=0.04, beside=0):
+    reference = Reference(period, SLEW, lag, damping, beside)
+    reference.rate, reference.omega = rate, omega
     return reference
 
 
@@ -36,12 +36,12 @@ def swung(commands, period, lag, dead_time, omega, damping, fine=1e-3):
 @pytest.mark.parametrize("omega", [6.0, 10.0, 20.0])
 def test_commands_put_the_arm_on_the_path_without_a_swing(period, bound, omega):
     damping, lag, dead_time = 0.04, 0.06, 0.01
-    reference = made(period, lag, dead_time, rate=1.2 * omega)
+    reference = made(period, lag, 1.2 * omega, omega, damping)
     goal = np.array([0.5 * BAR, 0.2 * BAR])
     commands, paths, times = [], [], []
     for k in range(round(40 / omega / period)):
         reference.advance(goal)
-        commands.append(reference.command(omega, damping)[0][0])
+        commands.append(reference.command[0])
         paths.append(reference.path[0])
         times.append(k * period)
     t, tip = swung(np.array(commands), period, lag, dead_time, omega, damping)
@@ -57,22 +57,22 @@ def test_commands_put_the_arm_on_the_path_without_a_swing(period, bound, omega):
 
 def test_chamber_pressures_are_those_without_the_lag():
     omega, damping = 10.0, 0.04
-    reference = made()
+    reference = made(omega=omega, damping=damping)
     for _ in range(12):
         reference.advance(np.full(2, BAR))
-    first, second, _ = reference.derivatives
-    _, chamber = reference.command(omega, damping)
+    _, first, second, _ = reference.motion
     expected = reference.path + 2 * damping / omega * first + second / omega**2
-    assert chamber == pytest.approx(expected, rel=1e-12)
+    assert reference.chamber == pytest.approx(expected, rel=1e-12)
 
 
 def test_arm_that_does_not_swing():
-    reference = made()
+    reference = made(omega=np.inf)
     for _ in range(8):
         reference.advance(np.full(2, BAR))
-    command, chamber = reference.command(np.inf, 0.04)
-    assert chamber == pytest.approx(reference.path, rel=1e-12)
-    assert command == pytest.approx(reference.path + 0.06 * reference.derivatives[0], rel=1e-12)
+    assert reference.chamber == pytest.approx(reference.path, rel=1e-12)
+    assert reference.command == pytest.approx(
+        reference.path + 0.06 * reference.motion[1], rel=1e-12
+    )
 
 
 def test_derivatives_are_those_of_the_path():
@@ -83,7 +83,7 @@ def test_derivatives_are_those_of_the_path():
         goal = np.array([np.sin(3 * k * period), np.cos(2 * k * period) - 1]) * 0.05 * BAR
         reference.advance(goal)
         path.append(reference.path.copy())
-        given.append(np.array(reference.derivatives))
+        given.append(reference.motion[1:].copy())
     path, given = np.array(path), np.array(given)
     for order in range(3):
         path = np.diff(path, axis=0) / period
@@ -110,14 +110,13 @@ def test_slew_is_kept_by_path_and_by_all_channels_together():
 
 
 def test_what_goes_with_the_pressures_is_on_the_same_way():
-    reference = made()
-    reference.begin(np.zeros(3))
+    reference = made(beside=1)
     goal = np.array([1.0 * BAR, 0.5 * BAR, 7e-3])
     for _ in range(40):
         reference.advance(goal)
         share = reference.path / goal
         assert share == pytest.approx(np.full(3, share[0]), abs=1e-12)
-    assert len(reference.command(10.0, 0.04)[0]) == 2
+    assert len(reference.command) == 2
 
 
 @pytest.mark.parametrize("rate", [5.0, 12.0, 40.0])
@@ -138,9 +137,9 @@ def test_begin_is_at_rest():
         reference.advance(np.full(2, BAR))
     reference.begin(values)
     assert np.array_equal(reference.path, values)
-    assert not np.any(reference.derivatives)
+    assert not np.any(reference.motion[1:])
     reference.advance(values)
-    assert reference.command(10.0, 0.04)[0] == pytest.approx(values, rel=1e-12)
+    assert reference.command == pytest.approx(values, rel=1e-12)
 
 
 def test_change_of_rate_leaves_the_path_where_it_is():

@@ -79,7 +79,7 @@ def test_ahead_is_where_the_pressures_are_a_dead_time_later_whatever_comes():
     expected = []
     for k, command in enumerate(given):
         model.advance(command, NAN)
-        expected.append(model.ahead())
+        expected.append(model.ahead)
         if k >= 3:
             assert model.pressures == pytest.approx(expected[k - 3], abs=1e-6)
     # the last three, with other commands than before
@@ -147,6 +147,6 @@ def test_begin_forgets():
         model.advance(command, np.full(2, 0.3 * BAR))
     start = np.array([0.2 * BAR, 0.7 * BAR])
     model.begin(start)
-    assert np.array_equal(model.ahead(), start)
+    assert np.array_equal(model.ahead, start)
     for _ in range(20):
         assert model.advance(start, NAN) == pytest.approx(start, rel=1e-12)

@@ -7,19 +7,25 @@ reference's as that leaves free::
     such that  low <= p <= high,   |p - last| <= slew,   |G (p - last)| <= speed
 
 ``p = last`` fulfils all of it as long as the last pressures are within their limits, which they
-are: there is always an answer.  Everything that goes in and comes out is checked for being finite
-and within the bounds, since what solvers say of themselves cannot be relied on: OSQP answers 2e9
-to a contradiction and NaN for ever after one NaN, DAQP may give NaN with a flag of success.
+are: there is always an answer, though OSQP gives up on one in a thousand of the hardest.
+Everything that goes in and comes out is checked for being finite and within the bounds, since what
+solvers say of themselves cannot be relied on: OSQP answers 2e9 to a contradiction and NaN for ever
+after one NaN, DAQP may give NaN with a flag of success.
 """
 
 from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 
+import casadi as ca
 import daqp
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.control.demand import Demand
+from stiffopt.control.formula import Formula
 
 __all__ = ["SOLVERS", "Allocation", "QuadraticSolver"]
 
@@ -104,74 +110,115 @@ class Allocation:
 
     Parameters
     ----------
+    demand :
+        J, v and G, in symbols.
     low, high :
         What may be commanded (n,), in Pa.
     step :
         Greatest change from tick to tick (n,), in Pa.
+    tip_step :
+        By how much each coordinate of the tip may move from tick to tick, in m.
     solver :
         See `SOLVERS`.
     """
 
-    def __init__(self, low: Array, high: Array, step: Array, solver: str = "daqp") -> None:
-        self.limit(low, high)
-        self._step = step / _BAR
+    def __init__(
+        self,
+        demand: Demand,
+        low: Array,
+        high: Array,
+        step: Array,
+        tip_step: float,
+        solver: str = "daqp",
+    ) -> None:
+        self._program = _program(demand, step / _BAR, tip_step)
+        self._answer = _answer(demand)
         self._solver = SOLVERS[solver](len(low), 3)
-        self._identity = np.eye(len(low))
+        self._nothing = np.zeros(len(low), dtype=bool)
+        self.limit(low, high)
 
     def limit(self, low: Array, high: Array) -> None:
         """Allow these pressures (n,) from now on, in Pa."""
         self._low, self._high = low / _BAR, high / _BAR
 
     def solve(
-        self,
-        jacobian: Array,
-        wanted: Array,
-        reference: Array,
-        last: Array,
-        tip_jacobian: Array,
-        tip_step: float,
-    ) -> tuple[Array | None, NDArray[np.bool_]]:
+        self, demanded: Sequence[ArrayLike], reference: Array, last: Array
+    ) -> tuple[Array | None, NDArray[np.bool_], float]:
         """Answer the program.
 
         Parameters
         ----------
-        jacobian, wanted :
-            J (t, n) per Pa and v (t,), already weighted: all in m.
+        demanded :
+            Inputs of the demand.
         reference, last :
             r and the last pressures (n,), in Pa.
-        tip_jacobian, tip_step :
-            G (3, n) per Pa, and by how much each coordinate of the tip may move, in m.
 
         Returns
         -------
-        Pressures (n,) in Pa, None if there is no answer that can be used; and which channels (n,)
-        are held by a limit.
+        Pressures (n,) in Pa, None if there is no answer that can be used; which channels (n,) are
+        held by a limit; and what the task's rows miss, in m.
         """
-        nothing = np.zeros(len(last), dtype=bool)
-        with np.errstate(invalid="ignore", over="ignore"):  # it is looked for
-            J = jacobian * (_BAR / _KEPT_NEAR)
-            before = last / _BAR
-            H = J.T @ J + self._identity
-            f = J.T @ (wanted * (-1 / _KEPT_NEAR)) - H @ (reference / _BAR - before)
-            rows = tip_jacobian * _BAR
-            given = float(f @ f) + float(np.vdot(rows, rows))  # what is not finite in H is in f
-        if not math.isfinite(given):
-            return None, nothing
-        lower = np.maximum(self._low - before, -self._step)
-        upper = np.minimum(self._high - before, self._step)
-        # a limit may have been tightened below the last pressures: then down as fast as may be
-        upper = np.maximum(upper, -self._step)
-        lower = np.minimum(lower, upper)
-        # by as much as it has to come down where a limit was tightened, the tip may move faster
-        forced = np.maximum(np.maximum(-upper, lower), 0.0)
-        reach = max(tip_step, 1e-9) + np.abs(rows) @ forced
-        low, high = np.concatenate([lower, -reach]), np.concatenate([upper, reach])
-        change = self._solver.solve(H, f, rows, low, high)
+        H, f, G, lower, upper, finite, J, v = self._program(
+            *demanded, reference, last, self._low, self._high
+        )
+        if not math.isfinite(finite[0]):
+            return None, self._nothing, math.nan
+        change = self._solver.solve(H, f, G, lower, upper)
         if change is None or change.shape != last.shape:
-            return None, nothing
-        bounded = np.minimum(np.maximum(change, lower), upper)
-        if not float(np.abs(bounded - change).max()) <= _TRUSTED:  # nor if it is NaN
-            return None, nothing
-        p = before + bounded
-        held = (p <= self._low + _SLACK) | (p >= self._high - _SLACK)
-        return p * _BAR, held
+            return None, self._nothing, math.nan
+        p, held, missing, beyond = self._answer(
+            change, lower, upper, J, v, reference, last, self._low, self._high
+        )
+        if not beyond[0] <= _TRUSTED**2:  # nor if it is NaN
+            return None, self._nothing, math.nan
+        return p, held > 0, float(missing[0])
+
+
+def _program(demand: Demand, step: Array, tip_step: float) -> Formula:
+    """The program in terms of the change of pressures; in bar, and scaled.
+
+    Gives H (n, n), f (n,), G (3, n), the bounds (n + 3,), a number that is finite only if all that
+    went in is (what is not so in H is in f), and J and v.
+    """
+    J, v, n = demand.rows, demand.values, len(step)
+    reference, last = ca.SX.sym("reference", n), ca.SX.sym("last", n)
+    least, most = ca.SX.sym("least", n), ca.SX.sym("most", n)
+    scaled, before, G, reach = (
+        J * (_BAR / _KEPT_NEAR),
+        last / _BAR,
+        demand.linear * _BAR,
+        ca.DM(step),
+    )
+    H = scaled.T @ scaled + ca.SX.eye(n)
+    f = scaled.T @ (v / -_KEPT_NEAR) - H @ (reference / _BAR - before)
+    # a limit may have been tightened below the last pressures: then down as fast as may be
+    upper = ca.fmax(ca.fmin(most - before, reach), -reach)
+    lower = ca.fmin(ca.fmax(least - before, -reach), upper)
+    # by as much as it has to come down where a limit was tightened, the tip may move faster
+    forced = ca.fmax(ca.fmax(-upper, lower), 0)
+    moves = max(tip_step, 1e-9) + ca.fabs(G) @ forced
+    finite = ca.sumsqr(f) + ca.sumsqr(G)
+    inputs = [*demand.inputs, reference, last, least, most]
+    return Formula(inputs, [
+        H, f, G, ca.vertcat(lower, -moves), ca.vertcat(upper, moves), finite, J, v,
+    ])  # fmt: skip
+
+
+def _answer(demand: Demand) -> Formula:
+    """What a change of the pressures (n,), in bar, comes to.
+
+    Gives pressures (n,) in Pa, 1 where a limit holds them (n,), what the task's rows miss, in m,
+    and the square of how far the change is beyond its bounds, in bar^2.
+    """
+    t, n = demand.rows.shape
+    change, low, high = ca.SX.sym("change", n), ca.SX.sym("low", n + 3), ca.SX.sym("high", n + 3)
+    J, v = ca.SX.sym("J", t, n), ca.SX.sym("v", t)
+    reference, last = ca.SX.sym("reference", n), ca.SX.sym("last", n)
+    least, most = ca.SX.sym("least", n), ca.SX.sym("most", n)
+    bounded = ca.fmin(ca.fmax(change, low[:n]), high[:n])
+    p = last / _BAR + bounded
+    held = ca.logic_or(p <= least + _SLACK, p >= most - _SLACK)
+    missing = (J @ (p * _BAR - reference) - v)[: demand.task_rows]
+    beyond = ca.sumsqr(change - bounded)
+    inputs = [change, low, high, J, v, reference, last, least, most]
+    return Formula(inputs, [p * _BAR, held, ca.norm_2(missing), beyond])

@@ -15,10 +15,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt import lie
 from stiffopt.control.allocation import Allocation
 from stiffopt.control.asked import angle_to, distance_to, is_far, kind_of, parts_of, stiffness_of
-from stiffopt.control.closest import LEVER
+from stiffopt.control.demand import demand, parts_asked
 from stiffopt.control.estimator import EstimatorSettings, TipEstimator
 from stiffopt.control.gains import Gains
 from stiffopt.control.nearby import NearbyTip
@@ -45,7 +44,6 @@ Array = NDArray[np.float64]
 _PLAN_EVERY = 0.05  # s
 _UNHURRIED = 1.0  # s; with which the plan follows the offset
 _EFFORT = 1.0  # of feedback against error; see `Gains`
-_DAMPED = 3.0  # weight of what the swing has of the tip's motion, against the motion itself
 _HASTE = 1.2  # rate of the reference of an arm that swings, over its frequency
 _SWINGS = 3.0  # rad of the arm's swing that this takes at least
 _HEED = 0.6  # rate with which a swinging arm's offset is corrected, over its frequency
@@ -95,6 +93,7 @@ class Controller:
         self._slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
         kind = self._control.vibration
         self._swings = swings if kind == "auto" else kind == "modelled"
+        self._farthest = _BELIEVED * robot.length
         self._vibration = Vibration.of(robot.description) if self._swings else None
         lag, dead_time = self._regulation()
         self._lag, self._dead_time = float(np.mean(lag)), dead_time
@@ -102,6 +101,7 @@ class Controller:
         self._damping = self._control.damping
         self._estimator = TipEstimator(
             period,
+            n,
             self._vibration,
             EstimatorSettings(
                 noise=self._control.tracker_noise,
@@ -110,10 +110,14 @@ class Controller:
             ),
         )
         self._gains = Gains(period, self._lag, self._damping, _EFFORT) if self._vibration else None
-        self._mean_share = float(np.mean(self._vibration.participation)) if self._vibration else 1.0
-        self._reference = Reference(period, self._slew, self._lag, dead_time)
+        self._reference = Reference(period, self._slew, self._lag, self._damping, beside=6)
         self._allocation = Allocation(
-            limits.low, limits.high, self._slew * period, self._control.solver
+            demand(n, self._vibration, self._damping, dead_time),
+            limits.low,
+            limits.high,
+            self._slew * period,
+            self._safety.max_tip_speed * period,
+            self._control.solver,
         )
         self._planner: Planner = ProcessPlanner(robot) if beside else InlinePlanner(robot)
         self._here: NearbyTip | None = None  # the model where the arm is, and along the path
@@ -142,6 +146,7 @@ class Controller:
         self._serial += 1
         self._task: Task | None = None
         self._target: Target | None = None
+        self._asked = np.zeros(5)  # what of a pose
         self._course: Course | None = None
         self._plan: Plan | None = None
         self._measure: Callable[..., float] | None = None
@@ -167,6 +172,7 @@ class Controller:
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Steering.set_task`."""
         self._task, self._target, self._course = self._accepted(task), task.target, None
+        self._asked = parts_asked(task.target)
         self._measure = stiffness_of(task)
         self._unit = task.measures[0].unit if task.measures else "N/m"
         lower, upper = self._task.pressure_bounds(self.robot.description)
@@ -180,9 +186,8 @@ class Controller:
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory; see `Steering.follow`."""
-        course = Course(
-            trajectory, now, self._estimator.estimate.position, self._estimator.rotation
-        )
+        estimate = self._estimator.estimate
+        course = Course(trajectory, now, estimate.position, estimate.rotation)
         self._pursue(course.at(now))
         self._course = course
 
@@ -228,36 +233,23 @@ class Controller:
             self.resume(now)
         if self._implausible():
             return Move(self._last_move.copy(), False, self._saturated.copy())
-        omega = self._estimator.omega
-        self._reference.rate = min(_BRISK, _HASTE * omega) if self._swings else _BRISK
-        self._reference.advance(aim)
-        n = len(self._last_move)
-        command, chamber = self._reference.command(omega, self._damping)
-        path, offset = self._reference.path[:n], self._reference.path[n:]
-        at = self._models()[1].at(path)
-        rotation = at.pose[:3, :3]
-        linear, angular = rotation @ at.jacobian[:3], rotation @ at.jacobian[3:]
+        reference, omega, n = self._reference, self._estimator.omega, len(self._last_move)
+        reference.rate = min(_BRISK, _HASTE * omega) if self._swings else _BRISK
+        reference.omega = omega
+        reference.advance(aim)
+        at = self._models()[1].at(reference.path[:n])
         self._heed(omega)
-        shift, turn = offset[:3] - self._heeded[:3], offset[3:] - self._heeded[3:]
-        modal, feedback = None, np.zeros(3)
-        if self._gains is not None and math.isfinite(omega):
-            modal, feedback = self._damping_rows(linear, path, chamber, shift)
-        rows, wanted = self._rows(linear, angular, shift + feedback, turn, rotation)
-        if modal is not None:
-            rows = np.concatenate([rows, _DAMPED * modal])
-            damped = self._mean_share * self._estimator.across(shift) + feedback
-            wanted = np.concatenate([wanted, _DAMPED * damped])
+        correction = reference.path[n:] - self._heeded
         # what the chambers get beside the command, and the arm beside the chambers
         beside = self._remembered + np.minimum(np.maximum(self._regulators.offset, -_OFF), _OFF)
-        pressures, held = self._allocation.solve(
-            rows, wanted, command - beside, self._last_move, linear,
-            self._safety.max_tip_speed * self._period,
-        )  # fmt: skip
+        pressures, held, missing = self._allocation.solve(
+            (at.pose, at.jacobian, self._asked, correction, *self._swing()),
+            reference.command - beside,
+            self._last_move,
+        )
         if pressures is None:
             return Move(self._last_move.copy(), False, self._saturated.copy())
-        missing = (rows @ (pressures + beside - command) - wanted)[:3]
-        away = float(missing @ missing) > _SHORT**2
-        self._saturated = held if away else np.zeros(n, dtype=bool)
+        self._saturated = held if missing > _SHORT else np.zeros(n, dtype=bool)
         return Move(pressures, True, self._saturated.copy())
 
     def standing(self, now: float) -> Standing:
@@ -265,7 +257,7 @@ class Controller:
         n = self.robot.n_pressures
         if self._at_u is None:
             return Standing.unknown(n)
-        estimate, rotation = self._estimator.estimate, self._estimator.rotation
+        estimate = self._estimator.estimate
         target = self._course.at(now) if self._course is not None else self._target
         position, pointing, quaternion = parts_of(target)
         sample, plan = self._estimator.sample, self._plan
@@ -275,14 +267,14 @@ class Controller:
         return Standing(
             plan=np.full(n, np.nan) if plan is None else plan.pressures - self._remembered,
             tip_position=estimate.position,
-            tip_quaternion=lie.quaternion_from_rotation(rotation),
+            tip_quaternion=estimate.quaternion,
             seen_position=np.full(3, np.nan) if sample is None else sample.position,
             seen_time=-math.inf if sample is None else sample.time,
             target_position=position,
             target_quaternion=quaternion,
             target_pointing=pointing,
             position_error=distance_to(estimate.position, position),
-            angle_error=angle_to(rotation, pointing, quaternion),
+            angle_error=angle_to(estimate.rotation, pointing, quaternion),
             stiffness=stiffness,
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
@@ -311,7 +303,7 @@ class Controller:
     def _implausible(self) -> bool:
         """Whether the arm is so far from its model that it is rather something else."""
         offset = self._estimator.beside[:3]
-        return float(offset @ offset) > (_BELIEVED * self.robot.length) ** 2
+        return float(offset @ offset) > self._farthest**2
 
     def close(self) -> None:
         """End the planner."""
@@ -346,7 +338,7 @@ class Controller:
             self._anew()
         elif is_far(self._target, target):
             self._search = True
-        self._target = target
+        self._target, self._asked = target, parts_asked(target)
         self._asked_at = -math.inf
 
     def _anew(self) -> None:
@@ -448,49 +440,17 @@ class Controller:
         share = 1.0 if not math.isfinite(omega) else -math.expm1(-_HEED * omega * self._period)
         self._heeded = self._heeded + share * (found - self._heeded)
 
-    def _damping_rows(
-        self, linear: Array, path: Array, chamber: Array, correction: Array
-    ) -> tuple[Array, Array]:
-        """Jacobian (3, n) of what the swing has of the tip's motion, and feedback (3,) that damps.
-
-        Channels of different segments excite the swing differently for the same motion of the tip;
-        at the limits, a motion of the tip alone may do so the wrong way round.
-        """
-        estimator = self._estimator
-        assert self._gains is not None
-        assert self._vibration is not None
-        share = self._vibration.participation
-        modal = estimator.across_matrix @ (linear * share)
-        ahead = self._regulators.ahead() + self._remembered
-        swing = estimator.ahead(self._dead_time)
-        home = self._mean_share * estimator.across(correction)
-        sigma = modal @ (ahead - chamber) - home
-        tip = modal @ (ahead - path) + swing[0] - home
-        speed = swing[1] - modal @ self._reference.derivatives[0][: len(path)]
-        gain = self._gains.at(estimator.omega)
-        feedback: Array = -(gain[0] * sigma + gain[1] * tip + gain[2] * speed)
-        return modal, feedback
-
-    def _rows(
-        self, linear: Array, angular: Array, shift: Array, turn: Array, rotation: Array
-    ) -> tuple[Array, Array]:
-        """What the task asks of the tip: J (t, n) and v (t,), in m."""
-        target = self._target
-        if target is None:
-            return linear, np.zeros(3)
-        rows, wanted = [], []
-        if target.position is not None:
-            asked = np.array([axis is not None for axis in target.position])
-            rows.append(linear[asked])
-            wanted.append(shift[asked])
-        if target.pointing is not None:
-            across = np.eye(3) - np.outer(rotation[:, 2], rotation[:, 2])
-            rows.append(LEVER * across @ angular)
-            wanted.append(LEVER * across @ turn)
-        if target.orientation is not None:
-            rows.append(LEVER * angular)
-            wanted.append(LEVER * turn)
-        return np.concatenate(rows), np.concatenate(wanted)
+    def _swing(self) -> tuple[ArrayLike, ...]:
+        """What `demand` wants to know of an arm that swings."""
+        if self._gains is None:
+            return ()
+        estimator, motion = self._estimator, self._reference.motion
+        n = len(self._last_move)
+        return (
+            estimator.swing, estimator.across_matrix, estimator.omega,
+            self._gains.at(estimator.omega), self._regulators.ahead + self._remembered,
+            self._reference.chamber, motion[0, :n], motion[1, :n],
+        )  # fmt: skip
 
     def _wrench(self, offset: Array, turn: Array) -> Array:
         """Force and moment (6,), base axes, that would move the tip by an offset."""

@@ -8,10 +8,12 @@ offset d that changes slowly (model error, payload, creep), plus a swing xi in t
 where s_v is the part of the static motion that the first bending mode has (see `Vibration`) and w
 the speed of that mode.  The tip's orientation has an offset of its own, and turns with the swing.
 
-A Kalman filter on xi, w and d takes samples at the time of their capture: the difference is taken
-from what was thought of that moment, and what it teaches is carried on to the present, which for a
-linear model is the same as to run everything again from there.  How far the model may be off
-depends on how far it has moved: the noise that drives d and xi grows with the way of s.
+The swing is the sum of one that the pressures drive, from rest, and of a free one that samples
+teach.  A Kalman filter on xi, w and d takes samples at the time of their capture: the difference is
+taken from what the driven swing was then, with the free one brought back to that moment, and what
+it teaches is carried on to the present, which for a linear model is the same as to run everything
+again from there.  How far the model may be off depends on how far it has moved: the noise that
+drives d and xi grows with the way of s.  `tip_filter` has the formulas.
 """
 
 from __future__ import annotations
@@ -20,11 +22,12 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt import lie
+from stiffopt.control import tip_filter
 from stiffopt.control.steering import Seen
 from stiffopt.control.vibration import Vibration
 from stiffopt.optimise.tip import TipAt
@@ -38,6 +41,7 @@ _REMEMBERED = 0.4  # s; older samples are of no use
 _SOFT = 0.15  # of the softest direction's compliance; directions with less swing less
 _FROZEN = 2e-3  # m; a tip that the model moves by more cannot be seen where it was
 _GIVEN_UP = 40  # rejected samples in a row after which all begins anew
+_UNTURNED = (1.0, 0.0, 0.0, 0.0)
 _LONGEST_LEAP = 0.05  # s; a tip that jumps and stays there is not believed after any time
 
 
@@ -69,15 +73,13 @@ class EstimatorSettings:
     damping: float = 0.04
 
 
-@dataclass
-class _Moment:
-    """What was thought of a moment; later corrected by samples that were captured before."""
+class _Moment(NamedTuple):
+    """What the pressures alone have done to the tip."""
 
     time: float
     static: Array  # (3,)
-    rotation: Array  # (3, 3), without offset
-    swing: Array  # (2, 3): xi, w
-    offset: Array  # (3,)
+    rotation: Array  # (3, 3)
+    driven: Array  # (2, 3): xi, w
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,7 @@ class TipEstimate:
     offset : (3,) d, in m.
     turn : (3,) rotation vector of the orientation's offset, base axes.
     swing, speed : (3,) xi and w, in m and m/s.
+    rotation, quaternion : (3, 3) and (4,), w first, of the tip in the base.
     """
 
     static: Array
@@ -97,6 +100,8 @@ class TipEstimate:
     turn: Array
     swing: Array
     speed: Array
+    rotation: Array
+    quaternion: Array
 
     @property
     def position(self) -> Array:
@@ -112,6 +117,8 @@ class TipEstimator:
     ----------
     period :
         Of the steps, in s.
+    n :
+        Number of channels.
     vibration :
         The arm's first bending mode, or None for an arm that does not swing.
     settings :
@@ -123,86 +130,85 @@ class TipEstimator:
         Angular frequency of the swing, in rad/s; infinite while it is not known.
     across_matrix : ndarray
         What of a vector (3, 3) is in the directions in which the tip is soft.
+    beside : ndarray
+        By what the tip is beside the model (6,): d, and the rotation vector of its turn.
     sample : PoseSample or None
         The last that was used.
     """
 
     def __init__(
-        self, period: float, vibration: Vibration | None, settings: EstimatorSettings
+        self, period: float, n: int, vibration: Vibration | None, settings: EstimatorSettings
     ) -> None:
         self._period, self._vibration, self._settings = period, vibration, settings
         self._past: deque[_Moment] = deque(maxlen=max(4, round(_REMEMBERED / period)))
+        self._predict = tip_filter.prediction(vibration, n, settings.damping)
+        self._correct = tip_filter.correction(settings, vibration is not None)
+        self._orient = tip_filter.orientation()
         self.omega = math.inf
+        self._times = np.array([1.0, period])  # omega, and of a step
         self.begin()
 
     def begin(self) -> None:
         """Start anew, with an arm at rest."""
-        s = self._settings
         self._past.clear()
-        self._swing, self._offset, self._turn = np.zeros((2, 3)), np.zeros(3), np.zeros(3)
+        self._free = np.zeros((2, 3))
+        self._offset, self._turn = np.zeros(3), np.zeros(3)
+        self.beside = np.zeros(6)
         self.across_matrix = np.diag([1.0, 1.0, 0.0])
         self._lean: Array = np.zeros((3, 3))  # turn of the tip per swing
         self._pressures: Array | None = None
         wide = (0.1, 0.05, 0.1) if self._vibration is not None else (0.0, 0.0, 0.1)
-        self._lateral = np.diag(np.square(wide))  # covariance of xi, w, d in the soft plane
-        self._axial = wide[2] ** 2
-        self._angular = 0.5**2
-        self._way = self._way_of_swing = 0.0
+        self._covariance = np.diag(np.square(wide))  # of xi, w, d in the soft plane
+        self._variances = np.array([wide[2] ** 2, 0.5**2])  # of d along the stiff axis, and of turn
+        self._ways = np.zeros(2)  # of the model's tip, and of what drives the swing
         self._used_until = -math.inf
         self._ticks = 0
         self.sample: PoseSample | None = None
         self._first: PoseSample | None = None
         self._same: tuple[Array, Array] | None = None  # a position, and the model's when it came
         self._seen_at, self._refused = -math.inf, 0
-        self._noise = s.noise**2
 
     @property
     def estimate(self) -> TipEstimate:
         """Where the tip is now."""
-        now = self._past[-1]
+        now, swing = self._past[-1], self.swing
+        rotation, quaternion = self._orient(self._turn, self._lean, swing[0], now.rotation)
         return TipEstimate(
-            now.static, self._offset, self._turn, self._swing[0].copy(), self._swing[1].copy()
+            now.static, self._offset, self._turn, swing[0], swing[1], rotation, quaternion
         )
 
     @property
-    def beside(self) -> Array:
-        """By what the tip is beside the model (6,): d, and the rotation vector of its turn."""
-        return np.concatenate([self._offset, self._turn])
+    def swing(self) -> Array:
+        """Swing and its speed (2, 3), in m and m/s."""
+        result: Array = self._past[-1].driven + self._free
+        return result
 
     @property
     def turn_known(self) -> bool:
         """Whether the tracker tells orientations."""
         return self.sample is not None and self.sample.quaternion is not None
 
-    @property
-    def rotation(self) -> Array:
-        """Orientation of the tip now (3, 3), in the base."""
-        turn = self._turn + self._lean @ self._swing[0]
-        result: Array = lie.rotation_from_quaternion(_quaternion(turn)) @ self._past[-1].rotation
-        return result
-
     def advance(self, now: float, pressures: Array, tip: TipAt) -> None:
         """Take a step, at whose end the chambers have pressures (n,), and the model this tip."""
-        rotation, static = tip.pose[:3, :3], tip.pose[:3, 3].copy()
-        if self._past:
-            moved = static - self._past[-1].static
-            self._way += float(np.linalg.norm(moved))
-            if self._vibration is not None and self._pressures is not None:
-                self._look_at_mode(tip)
-                change = self._vibration.participation * (pressures - self._pressures)
-                input_ = self.across(rotation @ (tip.jacobian[:3] @ change))
-                self._way_of_swing += float(np.linalg.norm(input_))
-                swing = self._swing
-                swing[0] -= 0.5 * input_
-                swing = self._transition(self._period) @ swing
-                swing[0] -= 0.5 * input_
-                self._swing = swing
+        if self._vibration is not None:
+            self._look_at_mode(tip)
+        rotation = tip.pose[:3, :3]
+        if self._pressures is None:
+            self._past.append(_Moment(now, tip.pose[:3, 3].copy(), rotation, np.zeros((2, 3))))
+        else:
+            last = self._past[-1]
+            static, driven, self._free, ways = self._predict(
+                tip.pose, tip.jacobian, last.static, last.driven, self._free, self.across_matrix,
+                pressures - self._pressures, self._times,
+            )  # fmt: skip
+            self._ways += ways
+            self._past.append(_Moment(now, static, rotation, driven))
         self._pressures = pressures.copy()
-        self._past.append(_Moment(now, static, rotation, self._swing.copy(), self._offset.copy()))
 
     def ahead(self, duration: float) -> Array:
         """Swing and its speed (2, 3) after a duration in s, if the pressures stay."""
-        return self._transition(duration) @ self._swing
+        result: Array = self._transition(duration) @ self.swing
+        return result
 
     def take(self, samples: Sequence[PoseSample]) -> Seen:
         """Learn from samples, each at the time of its capture.
@@ -247,6 +253,7 @@ class TipEstimator:
         share = np.minimum(1.0, softness / (_SOFT * softness[2]))
         self.across_matrix = axes * share @ axes.T
         self.omega = self._vibration.frequency(2 / float(softness[1] + softness[2]))
+        self._times[0] = self.omega
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
         self._lean = turning @ axes[:, 1:] @ np.diag(1 / softness[1:]) @ axes[:, 1:].T
 
@@ -256,20 +263,16 @@ class TipEstimator:
         return result
 
     def _transition(self, duration: float) -> Array:
-        """What a duration in s does to xi and w (2, 2), while the pressures stay."""
-        omega = self.omega
-        if not math.isfinite(omega):
+        """What a duration in s does to the free swing (2, 2)."""
+        if not math.isfinite(self.omega):
             return np.eye(2)
-        zeta = self._settings.damping
-        fast = omega * math.sqrt(1 - zeta**2)
-        decay = math.exp(-zeta * omega * duration)
-        c, s = decay * math.cos(fast * duration), decay * math.sin(fast * duration) / fast
-        return np.array([[c + zeta * omega * s, s], [-(omega**2) * s, c - zeta * omega * s]])
+        F: Array = np.array(tip_filter.transition(self.omega, self._settings.damping, duration))
+        return F
 
     # -- of the samples -------------------------------------------------------------------------
 
     def _moment(self, time: float) -> _Moment | None:
-        """What was thought of a moment, between two steps; None if it is out of memory."""
+        """What was at a moment, between two steps; None if it is out of memory."""
         past = self._past
         if time < past[0].time:
             return None
@@ -285,8 +288,7 @@ class TipEstimator:
             time,
             before.static + share * (after.static - before.static),
             before.rotation if share < 0.5 else after.rotation,
-            before.swing + share * (after.swing - before.swing),
-            self._offset,
+            before.driven + share * (after.driven - before.driven),
         )
 
     def _plausible(self, sample: PoseSample, moment: _Moment) -> bool:
@@ -294,90 +296,38 @@ class TipEstimator:
         if self.sample is None:  # two must agree before the first is believed
             before, self._first = self._first, sample
             return before is not None and self._is_near(sample, before.position, before.time)
-        expected = moment.static + moment.swing[0] + moment.offset
-        return self._is_near(sample, self.sample.position, self._seen_at) or self._is_near(
-            sample, expected, self._seen_at
-        )
+        if self._is_near(sample, self.sample.position, self._seen_at):
+            return True
+        free = self._transition(moment.time - self._past[-1].time) @ self._free
+        expected = moment.static + moment.driven[0] + free[0] + self._offset
+        return self._is_near(sample, expected, self._seen_at)
 
     def _is_near(self, sample: PoseSample, position: Array, since: float) -> bool:
         """Whether a tip that was at a position (3,) can be where the sample has it."""
         elapsed = min(sample.time - since, _LONGEST_LEAP)
         reach = self._settings.max_speed * elapsed + 10 * self._settings.noise
-        return float(np.linalg.norm(sample.position - position)) <= reach
+        return math.dist(sample.position, position) <= reach
 
     def _repeats(self, sample: PoseSample, moment: _Moment) -> bool:
         """Whether a tracker says the same again and again while the arm should have moved."""
         if self._same is None or (sample.position != self._same[0]).any():
             self._same = sample.position, moment.static
             return False
-        return float(np.linalg.norm(moment.static - self._same[1])) > _FROZEN
+        return math.dist(moment.static, self._same[1]) > _FROZEN
 
     def _learn(self, sample: PoseSample, moment: _Moment) -> None:
         first = not math.isfinite(self._used_until)
         elapsed = 0.0 if first else sample.time - self._used_until
-        self._widen(elapsed, moment)
-        surprise = sample.position - (moment.static + moment.swing[0] + moment.offset)
-        # in the soft plane: xi, w and d; along the stiff axis: d alone
-        row = np.array([1.0, 0.0, 1.0])
-        if self._vibration is None:
-            row[0] = 0.0
-        spread = self._lateral @ row
-        gain = spread / (float(row @ spread) + self._noise)
-        self._lateral = self._lateral - np.outer(gain, spread)
-        axial_gain = self._axial / (self._axial + self._noise)
-        self._axial *= 1 - axial_gain
-        across = self.across(surprise) if self._vibration is not None else surprise
-        offset = gain[2] * across + axial_gain * (surprise - across)
-        swing = np.outer(gain[:2], across)
-        self._offset = self._offset + offset
-        for past in reversed(self._past):
-            if past.time < sample.time - self._period:  # what lies just before is corrected too
-                break
-            past.offset = past.offset + offset
-            if self._vibration is not None:
-                past.swing = past.swing + self._transition(past.time - sample.time) @ swing
-        self._swing = self._past[-1].swing.copy()
-        if sample.quaternion is not None:
-            self._learn_turn(sample.quaternion, moment)
+        age = self._past[-1].time - moment.time
+        told = sample.quaternion is not None
+        self._free, offset, turn, self._covariance, self._variances = self._correct(
+            moment.static, moment.rotation, moment.driven, self._free, self._offset, self._turn,
+            self.across_matrix, self._lean, self._covariance, self._variances,
+            (age, elapsed, self.omega), self._ways, sample.position,
+            sample.quaternion if told else _UNTURNED, told,
+        )  # fmt: skip
+        self.beside = np.concatenate([offset, turn])
+        self._offset, self._turn = self.beside[:3], self.beside[3:]
+        self._ways = np.zeros(2)
         self._used_until = sample.time
         self.sample, self._refused = sample, 0
-
-    def _learn_turn(self, quaternion: Array, moment: _Moment) -> None:
-        seen = lie.rotation_from_quaternion(quaternion)
-        turn = self._turn + self._lean @ moment.swing[0]
-        thought = lie.rotation_from_quaternion(_quaternion(turn)) @ moment.rotation
-        error = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(seen @ thought.T))
-        gain = self._angular / (self._angular + self._settings.angular_noise**2)
-        self._angular *= 1 - gain
-        self._turn = self._turn + gain * error
-
-    def _widen(self, elapsed: float, moment: _Moment) -> None:
-        """Let certainty fade over the time since the last sample, and the way gone since then."""
-        s = self._settings
-        way = (s.model_error * self._way) ** 2
-        drift = s.drift**2 * elapsed + way
-        self._axial += drift
-        length = max(1e-3, float(np.linalg.norm(moment.static)))
-        self._angular += s.angular_drift**2 * elapsed + way / length**2 * 4
-        if self._vibration is None:
-            self._lateral[2, 2] += drift
-        else:
-            omega = self.omega if math.isfinite(self.omega) else 0.0
-            F = np.eye(3)
-            F[:2, :2] = self._transition(elapsed)
-            P = F @ self._lateral @ F.T
-            own = s.model_error * self._way_of_swing
-            detuned = s.frequency_error * omega**2 * elapsed * np.linalg.norm(moment.swing[0])
-            P[0, 0] += own**2
-            P[1, 1] += s.agitation**2 * elapsed + (omega * own) ** 2 + float(detuned) ** 2
-            P[2, 2] += drift
-            self._lateral = 0.5 * (P + P.T)
-        self._way = self._way_of_swing = 0.0
-
-
-def _quaternion(turn: Array) -> Array:
-    """Quaternion (4,) of a rotation vector (3,)."""
-    angle = float(np.linalg.norm(turn))
-    half = 0.5 * angle
-    share = math.sin(half) / angle if angle > 1e-12 else 0.5
-    return np.array([math.cos(half), *(share * turn)])

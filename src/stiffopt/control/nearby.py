@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.formula import Formula
 from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.tip import TipAt, TipModel
@@ -13,7 +15,7 @@ __all__ = ["NearbyTip"]
 
 Array = NDArray[np.float64]
 
-_NEARBY = 300.0  # Pa; over this the model is linear: the tip to a micrometre
+_NEARBY = 600.0  # Pa, in all; over this the model is linear: the tip to a few micrometres
 
 
 class NearbyTip:
@@ -29,8 +31,9 @@ class NearbyTip:
 
     def __init__(self, robot: Manipulator) -> None:
         self._model = TipModel(robot)
-        self._lowest, self._highest = robot.pressure_min, robot.pressure_max
-        self._last: tuple[Array, TipAt, Array] | None = None
+        self._moved = _moved(robot.pressure_min, robot.pressure_max)
+        self._last: TipAt | None = None
+        self._there = np.full(robot.n_pressures, np.inf)  # its pressures
 
     @property
     def is_fast(self) -> bool:
@@ -45,17 +48,32 @@ class NearbyTip:
         StiffoptError
             The model has none.
         """
-        p = np.minimum(np.maximum(pressures, self._lowest), self._highest)
-        if self._last is not None:
-            there, tip, linear = self._last
-            away = p - there
-            if max(away.max(), -away.min()) < _NEARBY:
-                pose = tip.pose.copy()
-                pose[:3, 3] += linear @ away
-                return tip._replace(pose=pose)
+        last = self._last
+        if last is None:
+            p, _, _ = self._moved(pressures, self._there, np.eye(4), np.zeros((6, len(pressures))))
+        else:
+            p, away, pose = self._moved(pressures, self._there, last.pose, last.jacobian)
+            if away[0] < _NEARBY:
+                return TipAt(pose, last.jacobian, last.compliance)
         try:
-            tip = self._model.at(p)
+            self._last = self._model.at(p)
         except (EquilibriumError, PressureError) as error:
             raise StiffoptError(f"the model has no answer: {error}") from error
-        self._last = p, tip, tip.pose[:3, :3] @ tip.jacobian[:3]
-        return tip
+        self._there = p
+        return self._last
+
+
+def _moved(lowest: Array, highest: Array) -> Formula:
+    """Pressures (n,) within limits, how far they are from others, and the pose there.
+
+    From pressures, and what pressures (n,), pose (4, 4) and Jacobian (6, n) were before.
+    """
+    n = len(lowest)
+    pressures, there = ca.SX.sym("pressures", n), ca.SX.sym("there", n)
+    pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
+    within = ca.fmin(ca.fmax(pressures, ca.DM(lowest)), ca.DM(highest))
+    p = ca.if_else(ca.fabs(pressures) < np.inf, within, np.nan)
+    away = p - there
+    moved = ca.SX(pose)
+    moved[:3, 3] += pose[:3, :3] @ (jacobian[:3, :] @ away)
+    return Formula([pressures, there, pose, jacobian], [p, ca.norm_2(away), moved])

@@ -7,10 +7,13 @@ is off by a little is taken for where it is, not for where it should be.
 
 from __future__ import annotations
 
-from collections import deque
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.control.formula import Formula
 
 __all__ = ["RegulatorModel"]
 
@@ -36,27 +39,25 @@ class RegulatorModel:
     ----------
     pressures : ndarray
         (n,) now, in Pa.
+    ahead : ndarray
+        (n,) a dead time from now, which no further command can change, in Pa.
     offset : ndarray
         (n,) by which the pressures end beside the commands, in Pa.
     """
 
     def __init__(self, period: float, lag: ArrayLike, dead_time: float, slew: Array) -> None:
         n = len(slew)
-        self._period = period
         lags = np.broadcast_to(np.asarray(lag, dtype=float), n)
-        self._share = 1 - np.exp(-period / np.maximum(lags, 1e-6))
-        self._most = slew * period
-        self._delay = round(dead_time / period)
-        self._trust, self._learn = min(1.0, _TRUST * period), _LEARN * period**2
-        self.pressures: Array = np.zeros(n)
-        self.offset: Array = np.zeros(n)
-        self._sent: deque[Array] = deque()
+        share = 1 - np.exp(-period / np.maximum(lags, 1e-6))
+        self._depth = round(dead_time / period) + 1
+        self._step = _step(share, slew * period, self._depth, period)
         self.begin(np.zeros(n))
 
     def begin(self, pressures: Array) -> None:
         """Start anew, settled at pressures (n,)."""
         self.pressures, self.offset = pressures.copy(), np.zeros_like(pressures)
-        self._sent = deque([pressures.copy()] * (self._delay + 1), maxlen=self._delay + 1)
+        self.ahead = self.pressures
+        self._sent = np.tile(pressures, (self._depth, 1))  # the next to arrive comes first
 
     def advance(self, commanded: Array, reading: Array) -> Array:
         """Take a step in which (n,) was commanded, at whose end (n,) is read; NaN: not measured.
@@ -65,22 +66,30 @@ class RegulatorModel:
         -------
         Pressures (n,) now, in Pa.
         """
-        self._sent.append(commanded)
-        x = self._stepped(self.pressures, self._sent[0])
-        error = reading - x
-        error[~np.isfinite(error)] = 0.0
-        self.offset = self.offset + self._learn * error / self._share
-        self.pressures = x + self._trust * error
+        sent = self._sent
+        sent[:-1] = sent[1:]
+        sent[-1] = commanded
+        self.pressures, self.offset, self.ahead = self._step(
+            self.pressures, self.offset, sent, reading
+        )
         return self.pressures
 
-    def ahead(self) -> Array:
-        """Pressures (n,) a dead time from now, which no further command can change."""
-        x = self.pressures
-        for sent in list(self._sent)[1:]:
-            x = self._stepped(x, sent)
-        return x
 
-    def _stepped(self, x: Array, command: Array) -> Array:
-        change = self._share * (command + self.offset - x)
-        result: Array = x + np.minimum(np.maximum(change, -self._most), self._most)
-        return result
+def _step(share: Array, most: Array, depth: int, period: float) -> Formula:
+    """Pressures, offset and pressures ahead (n,) each, from those, commands (depth, n), reading."""
+    n = len(share)
+    x, offset, reading = ca.SX.sym("x", n), ca.SX.sym("offset", n), ca.SX.sym("reading", n)
+    sent = ca.SX.sym("sent", depth, n)
+
+    def moved(x: Any, offset: Any, command: Any) -> Any:
+        change = ca.DM(share) * (command.T + offset - x)
+        return x + ca.fmin(ca.fmax(change, -ca.DM(most)), ca.DM(most))
+
+    now = moved(x, offset, sent[0, :])
+    error = ca.if_else(ca.fabs(reading) < np.inf, reading - now, 0)  # NaN is not less
+    offset_after = offset + _LEARN * period**2 * error / ca.DM(share)
+    now = now + min(1.0, _TRUST * period) * error
+    ahead = now
+    for k in range(1, depth):
+        ahead = moved(ahead, offset_after, sent[k, :])
+    return Formula([x, offset, sent, reading], [now, offset_after, ahead])

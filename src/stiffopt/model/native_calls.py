@@ -128,8 +128,8 @@ class InterpretedFunction(BatchFunction):
     def __init__(self, function: ca.Function) -> None:
         super().__init__(Signature.of(function))
         self._function = function
-        self._single = _Buffer(function, 1)
-        self._blocks: dict[int, _Buffer] = {}
+        self._single = Buffer(function, 1)
+        self._blocks: dict[int, Buffer] = {}
         self._lock = threading.Lock()
 
     def __call__(self, *arguments: Any) -> list[Array]:
@@ -152,7 +152,7 @@ class InterpretedFunction(BatchFunction):
         with self._lock:
             size = _BLOCK if count >= _BLOCK else _SMALL_BLOCK
             if size not in self._blocks:
-                self._blocks[size] = _Buffer(self._function, size)
+                self._blocks[size] = Buffer(self._function, size)
             block = self._blocks[size]
             shapes = self.signature.inputs
             for start in range(0, count, size):
@@ -169,7 +169,7 @@ class InterpretedFunction(BatchFunction):
                     output[start : start + rows] = result[:rows]
 
 
-class _Buffer:
+class Buffer:
     """A CasADi function, mapped over a number of rows, with memory of its own.
 
     Attributes

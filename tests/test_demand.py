@@ -1,0 +1,102 @@
+"""What a tick asks of the tip, against the same in plain NumPy and a swing in fine steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from stiffopt import Target, lie
+from stiffopt.control.closest import LEVER
+from stiffopt.control.demand import demand, parts_asked
+from stiffopt.control.formula import Formula
+from stiffopt.control.vibration import Vibration
+
+N, DAMPING, DEAD_TIME = 6, 0.04, 0.013
+ARM = Vibration(0.04, np.array([0.9, 0.9, 0.9, 0.6, 0.7, 0.6]))
+TARGETS = {
+    "position": Target(position=(0.01, 0.0, 0.2)),
+    "height": Target(position=(None, None, 0.2)),
+    "pointing": Target(position=(0.01, 0.0, 0.2), pointing=(0.0, 0.0, 1.0)),
+    "pose": Target(position=(0.01, 0.0, 0.2), orientation=(1.0, 0.0, 0.0, 0.0)),
+}
+
+
+def drawn(seed):
+    """A tip and what is known of it, at random."""
+    rng = np.random.default_rng(seed)
+    pose = np.array(lie.exp(np.concatenate([rng.normal(size=3) * 0.1, rng.normal(size=3) * 0.5])))
+    jacobian = rng.normal(size=(6, N)) * np.repeat([3e-7, 3e-6], 3)[:, None]
+    correction = rng.normal(size=6) * np.repeat([1e-3, 1e-2], 3)
+    root = rng.normal(size=(3, 3))
+    swing = (
+        rng.normal(size=(2, 3)) * [[1e-3], [1e-2]], root @ root.T / 4, 9.0,
+        rng.uniform(0, 1, 3), *(rng.uniform(0, 1e5, N) for _ in range(3)), rng.normal(size=N) * 1e5,
+    )  # fmt: skip
+    return pose, jacobian, correction, swing
+
+
+def evaluated(system, *values):
+    return Formula(system.inputs, [system.rows, system.values, system.linear])(*values)
+
+
+def task(pose, jacobian, correction, target, feedback):
+    """Rows and values that a target asks for, one after the other."""
+    R = pose[:3, :3]
+    linear, angular = R @ jacobian[:3], R @ jacobian[3:]
+    shift, turn = correction[:3] + feedback, correction[3:]
+    rows, values = [], []
+    for k in range(3):
+        if target.position[k] is not None:
+            rows.append(linear[k])
+            values.append(shift[k])
+    if target.pointing is not None:
+        z = R[:, 2]
+        for k in range(3):
+            rows.append(LEVER * (angular[k] - z[k] * (z @ angular)))
+            values.append(LEVER * (turn[k] - z[k] * (z @ turn)))
+    if target.orientation is not None:
+        rows += list(LEVER * angular)
+        values += list(LEVER * turn)
+    return np.array(rows), np.array(values)
+
+
+@pytest.mark.parametrize("name", list(TARGETS))
+@pytest.mark.parametrize("swings", [True, False])
+def test_rows_are_those_of_the_task(name, swings):
+    target, system = TARGETS[name], demand(N, ARM if swings else None, DAMPING, DEAD_TIME)
+    pose, jacobian, correction, swing = drawn(3)
+    if swings:  # without feedback
+        swing = (*swing[:3], np.zeros(3), *swing[4:])
+    given = (pose, jacobian, parts_asked(target), correction, *(swing if swings else ()))
+    rows, values, linear = evaluated(system, *given)
+    expected, wanted = task(pose, jacobian, correction, target, np.zeros(3))
+    rows, values = rows[: system.task_rows], values[: system.task_rows]
+    used = np.abs(rows).sum(axis=1) > 0
+    assert rows[used] == pytest.approx(expected, rel=1e-12)
+    assert values[used] == pytest.approx(wanted, rel=1e-9, abs=1e-15)
+    assert not values[~used].any()
+    assert linear == pytest.approx(pose[:3, :3] @ jacobian[:3], rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_feedback_of_an_arm_that_swings(seed):
+    target, system = TARGETS["position"], demand(N, ARM, DAMPING, DEAD_TIME)
+    pose, jacobian, correction, swing = drawn(seed)
+    now, across, omega, gains, ahead, chamber, path, rate = swing
+    given = (pose, jacobian, parts_asked(target), correction, *swing)
+    rows, values, linear = evaluated(system, *given)
+    own = across @ linear @ np.diag(ARM.participation)  # of the mode
+    home = ARM.participation.mean() * across @ correction[:3]
+    free = np.array([[0, 1], [-(omega**2), -2 * DAMPING * omega]])
+    later = expm(DEAD_TIME * free) @ now
+    sigma = own @ (ahead - chamber) - home
+    tip, speed = own @ (ahead - path) + later[0] - home, later[1] - own @ rate
+    feedback = -(gains[0] * sigma + gains[1] * tip + gains[2] * speed)
+    expected, wanted = task(pose, jacobian, correction, target, feedback)
+    assert rows[:3] == pytest.approx(expected, rel=1e-12)
+    assert values[:3] == pytest.approx(wanted, rel=1e-9)
+    weight = np.linalg.norm(rows[9:]) / np.linalg.norm(own)
+    assert weight > 1
+    assert rows[9:] == pytest.approx(weight * own, rel=1e-9)
+    assert values[9:] == pytest.approx(weight * (home + feedback), rel=1e-9)

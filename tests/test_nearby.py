@@ -1,0 +1,57 @@
+"""The tip near pressures that were evaluated before, against the model itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stiffopt import load_robot
+from stiffopt.control.nearby import NearbyTip
+from stiffopt.errors import StiffoptError
+
+
+@pytest.fixture(scope="module")
+def robot():
+    return load_robot("stiff-flop-2")
+
+
+def test_a_walk_of_small_and_large_steps_is_the_models(robot):
+    nearby, rng = NearbyTip(robot), np.random.default_rng(2)
+    p = 0.4 * robot.pressure_max
+    evaluated = set()
+    for k in range(200):
+        p = p + rng.normal(size=len(p)) * (100.0 if k % 20 else 5e3)
+        tip = nearby.at(p)
+        evaluated.add(id(tip.jacobian))
+        assert tip.pose[:3, 3] == pytest.approx(robot.tip_pose(p)[:3, 3], abs=4e-6)
+        assert tip.jacobian == pytest.approx(
+            robot.tip_jacobian(p), abs=0.02 * np.abs(tip.jacobian).max()
+        )
+    assert len(evaluated) < 100
+
+
+def test_what_was_returned_does_not_change(robot):
+    nearby, p = NearbyTip(robot), 0.4 * robot.pressure_max
+    tips = [nearby.at(p + 50.0 * k) for k in range(4)]
+    kept = [tip.pose.copy() for tip in tips]
+    nearby.at(p + 1e4)
+    for tip, pose in zip(tips, kept, strict=True):
+        assert np.array_equal(tip.pose, pose)
+
+
+def test_pressures_beyond_the_limits_count_as_those_at_them(robot):
+    nearby, p = NearbyTip(robot), robot.pressure_max.copy()
+    assert nearby.at(p + 1e4).pose == pytest.approx(robot.tip_pose(p), abs=1e-9)
+    below = robot.pressure_min - 50.0
+    assert nearby.at(below).pose == pytest.approx(robot.tip_pose(robot.pressure_min), abs=1e-9)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_has_no_tip_and_does_no_harm(robot, bad):
+    nearby, p = NearbyTip(robot), 0.4 * robot.pressure_max
+    before = nearby.at(p).pose
+    spoilt = p.copy()
+    spoilt[1] = bad
+    with pytest.raises(StiffoptError):
+        nearby.at(spoilt)
+    assert nearby.at(p).pose == pytest.approx(before, abs=1e-12)
