@@ -122,6 +122,26 @@ def test_late_and_jittered_samples_give_truth_without_noise():
     assert estimator.omega == pytest.approx(OMEGA, rel=1e-9)
 
 
+def test_ticks_that_come_late_give_truth_too():
+    """A loop that takes half as long again as it should, and now and then ten times."""
+    estimator, truth = TipEstimator(PERIOD, 2, SWINGING, PLAIN), Truth()
+    rng, now, due, waiting, errors = np.random.default_rng(5), 0.0, 0.025, [], []
+    while now < 7.0:
+        duration = truth.STEP * round((100 if rng.uniform() < 0.01 else 15) + rng.integers(-4, 5))
+        now += duration
+        truth.run(pressures(now / PERIOD), duration)
+        while due <= now:
+            waiting.append(sample(due, truth.positions[round(due / truth.STEP)]))
+            due += 0.025
+        estimator.advance(now, truth.p, tip_at(truth.p))
+        arrived = [s for s in waiting if s.time + 0.025 <= now]
+        waiting = [s for s in waiting if s.time + 0.025 > now]
+        estimator.take(arrived)
+        errors.append(estimator.estimate.position - truth.position)
+    assert np.abs(truth.eta[0]).max() > 1e-4
+    assert np.quantile(np.abs(errors[-200:]).max(axis=1), 0.9) < 1e-5
+
+
 def test_errors_are_as_small_as_the_theory_allows():
     """Noise and drift as assumed: unbiased, and with the deviation of the Kalman filter."""
     settings = PLAIN

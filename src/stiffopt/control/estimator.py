@@ -145,7 +145,7 @@ class TipEstimator:
         self._correct = tip_filter.correction(settings, vibration is not None)
         self._orient = tip_filter.orientation()
         self.omega = math.inf
-        self._times = np.array([1.0, period])  # omega, and of a step
+        self._times = np.array([1.0, period])  # omega, and since the step before
         self.begin()
 
     def begin(self) -> None:
@@ -197,6 +197,7 @@ class TipEstimator:
             self._past.append(_Moment(now, tip.pose[:3, 3].copy(), rotation, np.zeros((2, 3))))
         else:
             last = self._past[-1]
+            self._times[1] = now - last.time  # which for a loop that is late is no period
             static, driven, self._free, ways = self._predict(
                 tip.pose, tip.jacobian, last.static, last.driven, self._free, self.across_matrix,
                 pressures - self._pressures, self._times,

@@ -28,7 +28,7 @@ def prediction(vibration: Vibration | None, n: int, damping: float) -> Formula:
 
     Takes the pose (4, 4) and Jacobian (6, n) of the model's tip, the place (3,) where it was, the
     swing that the pressures drive and the free one (2, 3) each, what is soft (3, 3), the change of
-    the pressures (n,), and (omega, period).  Gives the place (3,), both swings, and the ways (2,)
+    the pressures (n,), and (omega, duration).  Gives the place (3,), both swings, and the ways (2,)
     of place and swing.
     """
     pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
