@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -212,3 +214,161 @@ def test_the_last_clamp(low: float, high: float, given: float, expected: float) 
 def test_limits_that_make_no_sense_are_refused(low: ArrayLike, high: ArrayLike) -> None:
     with pytest.raises(InputError):
         PressureLimits(np.asarray(low), np.asarray(high))
+
+
+# What each tick does: plain arrays take a shorter way, with the same outcome ----------------------
+
+BOUNDS = [(0.0, 1.5e5), (-6e4, 1e5), (3e4, 1e5), (-6e4, -1e4), (2e4, 2e4), (-0.0, 0.0)]
+
+
+def telling_values(low: float, high: float) -> list[float]:
+    slack = 1e-6 * (high - low)
+    inside, outside = -slack, slack
+    bounds = [
+        value
+        for bound, out in ((low, -1.0), (high, 1.0))
+        for value in (
+            bound,
+            np.nextafter(bound, out * np.inf),
+            np.nextafter(bound, -out * np.inf),
+            bound + out * 0.5 * inside,
+            bound + out * 0.5 * outside,
+            bound + out * 2 * outside,
+            bound + out * 1e3,
+            bound + out * 1e12,
+        )
+    ]
+    special = [0.0, -0.0, 5e-324, -5e-324, np.nan, np.inf, -np.inf, 0.5 * (low + high)]
+    return [float(value) for value in bounds + special]
+
+
+def outcome(limits: PressureLimits, pressures: ArrayLike) -> str | list[str]:
+    """What `check` says, or what it returns, to the last bit."""
+    try:
+        checked = limits.check(pressures)
+    except CommandError as error:
+        return str(error)
+    assert type(checked) is np.ndarray
+    assert checked.dtype == np.float64
+    assert checked.flags.writeable
+    assert not np.shares_memory(checked, np.asarray(pressures))
+    return [value.hex() for value in checked.tolist()]
+
+
+def clamped(value: float, low: float, high: float) -> float:
+    if value == 0 or not np.isfinite(value):
+        return 0.0
+    return min(max(value, low), high)
+
+
+@pytest.mark.parametrize(("low", "high"), BOUNDS)
+def test_an_array_is_refused_or_taken_just_as_a_list_is(low: float, high: float) -> None:
+    limits = PressureLimits(np.array([low, low]), np.array([high, high]))
+    values, slack = telling_values(low, high), 1e-6 * (high - low)
+    for pair in itertools.product(values, values):
+        found = outcome(limits, np.array(pair))
+        assert found == outcome(limits, list(pair)), pair
+        allowed = all(v == 0 or low - slack <= v <= high + slack for v in pair)
+        assert allowed == isinstance(found, list), pair
+        if allowed:
+            assert found == [(clamped(v, low, high) + 0.0).hex() for v in pair]
+
+
+@pytest.mark.parametrize(("low", "high"), BOUNDS)
+def test_the_last_clamp_to_the_last_bit(low: float, high: float) -> None:
+    limits = PressureLimits(np.array([low, low]), np.array([high, high]))
+    values = telling_values(low, high)
+    for pair in itertools.product(values, values):
+        given = np.array(pair)
+        found = limits.clamp(given)
+        assert [v.hex() for v in found.tolist()] == [
+            (clamped(v, low, high) + 0.0).hex() for v in pair
+        ], pair
+        assert not np.shares_memory(found, given)
+
+
+class Liar(np.ndarray):
+    """Looks harmless when it is asked."""
+
+    def __add__(self, other: object) -> NDArray[np.float64]:  # type: ignore[override]
+        return np.zeros(2)
+
+    def tolist(self) -> list[float]:
+        return [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    "pressures",
+    [
+        np.array([1, 2]),
+        np.array([1, 2], dtype=np.uint8),
+        np.array([1e3, 2e3], dtype=np.float32),
+        np.array([1e3, 2e3], dtype=">f8"),
+        np.array([1e3, 9.0, 2e3, 9.0])[::2],
+        np.array([3e5, 2e3]).view(Liar),
+        np.array([1e3, 2e3]).view(Liar),
+        np.array([1e3, 2e3], dtype=complex),
+        np.array([True, False]),
+        np.array(["1", "2"]),
+        np.array(1e3),
+        np.array([]),
+        np.array([1e3]),
+        np.array([1e3, 2e3, 3e3]),
+        np.array([[1e3, 2e3]]),
+        np.array([[1e3], [2e3]]),
+        np.float64(1e3),
+    ],
+)
+def test_what_is_no_plain_array_is_looked_at_for_what_it_is(pressures: NDArray[Any]) -> None:
+    limits = PressureLimits(np.zeros(2), np.full(2, 1.5e5))
+    plain = np.ndarray.tolist(pressures) if isinstance(pressures, Liar) else pressures.tolist()
+    assert outcome(limits, pressures) == outcome(limits, plain)
+
+
+def test_an_array_of_objects_is_no_pressure() -> None:
+    limits = PressureLimits(np.zeros(2), np.full(2, 1.5e5))
+    with pytest.raises(CommandError, match="expected one pressure in Pa"):
+        limits.check(np.array([1e3, 2e3], dtype=object))
+
+
+def test_what_was_checked_cannot_be_changed_afterwards() -> None:
+    limits = PressureLimits(np.zeros(2), np.full(2, 1.5e5))
+    given = np.array([1e3, 2e3])
+    checked, last = limits.check(given), limits.clamp(given)
+    given[:] = 1e12
+    assert checked.tolist() == last.tolist() == [1e3, 2e3]
+
+
+class AtOnce(Recorded):
+    """Writes and reads in one exchange."""
+
+    def _exchange(self, pressures: NDArray[np.float64]) -> ArrayLike:
+        self._write(pressures)
+        return self.wire
+
+
+@pytest.mark.parametrize("kind", [Recorded, AtOnce])
+@pytest.mark.parametrize("method", ["command", "exchange"])
+def test_whatever_was_checked_is_clamped_before_the_driver(
+    kind: type[Recorded], method: str
+) -> None:
+    supply = kind()
+    supply.open()
+    for junk in ([np.nan, np.inf], [1e12, -1e12], [1.5e5 + 0.1, -0.1]):
+        supply._checked = lambda _, junk=junk: np.array(junk)  # type: ignore[method-assign, misc]
+        getattr(supply, method)(SOME)
+        assert ((supply.wire >= 0) & (supply.wire <= 1.5e5)).all()
+        assert supply.wire.tolist() == supply.commanded.tolist()
+    supply.close()
+
+
+@pytest.mark.parametrize("method", ["command", "exchange"])
+def test_a_vented_supply_takes_zeros_alone(supply: Recorded, method: str) -> None:
+    supply.vent()
+    for nothing in (np.zeros(2), np.array([-0.0, 0.0]), [0, 0]):
+        getattr(supply, method)(nothing)
+    for something in (SOME, np.array([0.0, 5e-324]), [0.0, 1.0]):
+        with pytest.raises(CommandError, match="vented"):
+            getattr(supply, method)(something)
+    assert not supply.wire.any()
+    supply.close()

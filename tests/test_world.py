@@ -98,6 +98,26 @@ def test_readings_are_rounded_and_noisy() -> None:
         assert p.mean(axis=0) == pytest.approx(1e5, abs=20)
 
 
+def test_an_exchange_is_a_command_and_a_reading() -> None:
+    noisy = {"noise": 150.0, "resolution": 50.0, "ripple": 100.0}
+    with make(noisy) as one, make(noisy) as other:
+        for p in ([1.23e4, 0, 5e3], [8e4, 2e4, 0], [0, 0, 0]):
+            for rig in (one, other):
+                rig.clock.sleep(0.05)
+            found = one.supply.exchange(p)
+            other.supply.command(p)
+            expected = other.supply.read()
+            assert found.time == expected.time
+            np.testing.assert_array_equal(found.pressures, expected.pressures)
+            np.testing.assert_array_equal(one.world.set_point, other.world.set_point)
+            np.testing.assert_array_equal(one.supply.commanded, p)
+        one.world.inject("supply", "off")
+        for p in ([1e4, 0, 0], [0, 0, 0]):
+            with pytest.raises(DeviceError, match="does not answer"):
+                one.supply.exchange(p)
+        one.world.inject("supply", "ok")
+
+
 def test_the_watchdog_vents_when_commands_stop() -> None:
     with make({"watchdog": 0.2, "lag": 0.01, "slew": 1e9, "dead_time": 0.0}) as rig:
         for _ in range(10):

@@ -20,12 +20,13 @@ import numpy as np
 
 Array = Any  # an ndarray, or a casadi SX, MX or DM
 
+_CASADI = (ca.SX, ca.MX, ca.DM)
 _SERIES_BELOW = 1.0  # squared angle below which the power series replace the closed forms
 _TERMS = 11
 
 
 def _is_casadi(x: Array) -> bool:
-    return isinstance(x, ca.SX | ca.MX | ca.DM)
+    return isinstance(x, _CASADI)
 
 
 def _blocks(rows: list[list[Array]]) -> Array:

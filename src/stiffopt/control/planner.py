@@ -13,13 +13,14 @@ process beside the control loop (`ProcessPlanner`), which is started again when 
 from __future__ import annotations
 
 import math
+import os
 import pickle
 import socket
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
+from contextlib import suppress
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
@@ -27,13 +28,14 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.control.closest import closest
+from stiffopt.control.planner_line import PlannerLine
+from stiffopt.control.plans import Plan, Request
 from stiffopt.control.steering import Notice
 from stiffopt.errors import StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target, Tolerance
-from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipModel
 
 __all__ = [
@@ -56,50 +58,6 @@ _FAR_PER_METRE = 2e7  # Pa/m; the same for each metre that the target has moved
 _PATIENCE = 20  # plans
 _EXACT = Tolerance(position=1e-5, angle=1e-3)
 _RESTART_AFTER = 1.0  # s
-
-
-@dataclass(frozen=True)
-class Request:
-    """What to plan for.
-
-    Attributes
-    ----------
-    serial : counts tasks; a plan for an older one is of no use.
-    task : what is asked.
-    target : where, instead of the task's own target.
-    offset : (6,) of the tip from the model, in m and rad (rotation vector), base axes.
-    anew : whether all configurations are to be searched, as for a new target.
-    """
-
-    serial: int
-    task: Task
-    target: Target
-    offset: Array
-    anew: bool = False
-
-
-@dataclass(frozen=True)
-class Plan:
-    """Pressures for a target.
-
-    Attributes
-    ----------
-    serial : of the request.
-    pressures : (n,), in Pa.
-    offset : (6,) that they count with.
-    target : that they are for.
-    reached : whether the model reaches it.
-    stiffness : of the task's first direction; NaN where it names none.
-    message : why it is not reached.
-    """
-
-    serial: int
-    pressures: Array
-    offset: Array
-    target: Target
-    reached: bool
-    stiffness: float
-    message: str
 
 
 class Planning:
@@ -298,10 +256,11 @@ class ProcessPlanner:
                 pass_fds=(theirs.fileno(),),
                 start_new_session=True,  # a terminal's Ctrl-C is not for it
             )
-        self._line = Connection(ours.detach())
+        _let_it_yield(self._process.pid)
+        self._line = PlannerLine(ours.detach())
         self._begun: float | None = math.inf  # busy with itself until it says that it is ready
         self._started_at = time.monotonic()
-        self._line.send(self._robot)
+        self._line.begin(self._robot)
 
     def ask(self, request: Request) -> None:
         """Want a plan."""
@@ -339,15 +298,15 @@ class ProcessPlanner:
         if self._ended or (self._begun is None and self._wanted is None):
             return
         try:
-            while self._line.poll():
-                answer = self._line.recv()
+            while self._line.has_answer():
+                answer = self._line.receive()
                 self._begun = None
                 if isinstance(answer, Plan):
                     self._plan, self._trouble = answer, ""
                 elif answer is not None:  # None: it is ready
                     self._trouble = f"the planner failed and begins anew: {answer}"
             if self._wanted is not None and self._begun is None:
-                self._line.send(self._wanted)
+                self._line.ask(self._wanted)
                 self._wanted, self._begun = None, time.monotonic()
         except (OSError, EOFError, pickle.UnpicklingError):
             self._start_again()
@@ -360,6 +319,17 @@ class ProcessPlanner:
         self._process.kill()
         self._process.wait()
         self._start()
+
+
+def _let_it_yield(process: int) -> None:
+    """Let a process not interrupt whoever wakes it, where the system can be told so.
+
+    It is woken by each request, and would plan at once, for milliseconds, on the very processor on
+    which the control loop is in the middle of a tick. It also loses the loop's real-time priority,
+    which it has got if the loop itself started it.
+    """
+    with suppress(AttributeError, OSError):
+        os.sched_setscheduler(process, os.SCHED_BATCH, os.sched_param(0))
 
 
 def moved_back(target: Target, offset: Array) -> Target:

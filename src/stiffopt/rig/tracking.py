@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass
 
@@ -46,7 +47,7 @@ class PoseSample:
     @property
     def visible(self) -> bool:
         """Whether the tool was seen."""
-        return bool(np.isfinite(self.position).all())
+        return all(map(math.isfinite, self.position))
 
 
 @dataclass(frozen=True)
@@ -139,11 +140,11 @@ class PoseTracker(Device):
         received = self.clock.now() if raw.received is None else raw.received
         position = np.array(raw.position, dtype=float).reshape(-1)
         quaternion = None
-        seen = position.shape == (3,) and bool(np.isfinite(position).all())
+        seen = position.shape == (3,) and all(map(math.isfinite, position.tolist()))
         if raw.quaternion is not None:
             quaternion = np.array(raw.quaternion, dtype=float).reshape(-1)
-            norm = float(np.linalg.norm(quaternion)) if quaternion.shape == (4,) else np.nan
-            seen = seen and bool(abs(norm - 1) <= _NORM_SLACK)  # NaN is not seen either
+            norm = math.hypot(*quaternion.tolist()) if quaternion.shape == (4,) else math.nan
+            seen = seen and abs(norm - 1) <= _NORM_SLACK  # NaN is not seen either
             quaternion = quaternion / norm if seen else None
         if not seen:
             nowhere = np.full(3, np.nan)

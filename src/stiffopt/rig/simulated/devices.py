@@ -66,6 +66,10 @@ class SimulatedSupply(PressureSupply):
         self._answer()
         return self._world.measured()
 
+    def _exchange(self, pressures: Array) -> ArrayLike:
+        self._write(pressures)
+        return self._world.measured()
+
     def _dump(self, *, open_valve: bool) -> None:
         if self.has_dump_valve:  # the valve is wired past the supply, which may be off
             with suppress(SimulationError):

@@ -182,7 +182,7 @@ class World:
         with self.lock:
             p = np.array(pressures, dtype=float)
             if self.supply.resolution > 0:
-                p = np.round(p / self.supply.resolution) * self.supply.resolution
+                p = np.rint(p / self.supply.resolution) * self.supply.resolution
             if self.faults["supply"] != "off":  # what does not answer does not hear either
                 self._commanded_at = self.time
                 self.set_point[:] = p
@@ -199,7 +199,7 @@ class World:
         with self.lock:
             p = self.pressures + self.supply.noise * self._gauge.standard_normal(self._n)
             if self.supply.resolution > 0:
-                p = np.round(p / self.supply.resolution) * self.supply.resolution
+                p = np.rint(p / self.supply.resolution) * self.supply.resolution
             for channel, fault in self._faulty.items():
                 if fault == "garbage":
                     p[channel] = np.nan if self._gauge.random() < 0.5 else 9.9e9

@@ -1,0 +1,185 @@
+"""The line to the planner's process: what arrives is what was sent, and nothing is sent twice."""
+
+from __future__ import annotations
+
+import math
+import os
+import pickle
+import select
+import socket
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stiffopt as so
+from stiffopt.control import planner as planner_module
+from stiffopt.control.planner import ProcessPlanner
+from stiffopt.control.planner_line import PlannerLine, PlanningLine
+from stiffopt.control.plans import Plan, Request
+from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+
+ROBOT = "stiff-flop-1"
+OFFSET = np.array([1e-3, -2e-3, 0.1 + 0.2, -0.0, 5e-324, 1 / 3])
+
+
+def task(x: float = 0.01) -> Task:
+    goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
+    return Task(robot=ROBOT, target=Target(position=(x, 0.0, None)), stiffness=goal)
+
+
+class Ends:
+    def __init__(self) -> None:
+        one, other = socket.socketpair()
+        self.ours, self.theirs = PlannerLine(one.detach()), PlanningLine(other.detach())
+
+    def passes(self, request: Request) -> Request:
+        self.ours.ask(request)
+        return self.theirs.request()
+
+    def close(self) -> None:
+        self.ours.close()
+        self.theirs._connection.close()
+
+
+@pytest.fixture
+def ends() -> Iterator[Ends]:
+    ends = Ends()
+    yield ends
+    ends.close()
+
+
+def assert_same(one: Request, other: Request) -> None:
+    assert (one.serial, one.task, one.target, one.anew) == (
+        other.serial, other.task, other.target, other.anew,
+    )  # fmt: skip
+    assert one.offset.dtype == other.offset.dtype == np.float64
+    assert one.offset.tobytes() == other.offset.tobytes()
+
+
+def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
+    first, second = task(), task(0.02)
+    asked = Request(1, first, first.target, OFFSET)
+    elsewhere: dict[str, Any] = {"target": Target(pointing=(0.0, 0.0, 1.0))}
+    for changes in (
+        {},
+        {},
+        {"anew": True},
+        {"offset": 2 * OFFSET},
+        {"anew": False},
+        elsewhere,
+        {"serial": 2, "task": second},
+        {"task": first},  # under the same number
+        {"target": None},  # nothing that anyone asks
+        {"serial": 10**12, "target": first.target},
+    ):
+        asked = replace(asked, **changes)
+        assert_same(ends.passes(asked), asked)
+
+
+def test_an_offset_that_was_changed_in_place_is_sent(ends: Ends) -> None:
+    the_task, offset = task(), OFFSET.copy()
+    asked = Request(1, the_task, the_task.target, offset)
+    ends.passes(asked)
+    offset += 1.0
+    assert ends.passes(asked).offset.tolist() == (OFFSET + 1.0).tolist()
+
+
+def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
+    the_task = task()
+    first = Request(1, the_task, the_task.target, OFFSET)
+    sent: list[bytes] = []
+
+    def news(line: PlannerLine, request: Request) -> set[str]:
+        send = line._connection.send_bytes
+        line._connection.send_bytes = lambda data: (sent.append(data), send(data))  # type: ignore[method-assign, assignment, func-returns-value]
+        line.ask(request)
+        del line._connection.send_bytes
+        return set(pickle.loads(sent.pop()))
+
+    everything = {"serial", "task", "target", "offset", "anew"}
+    assert news(ends.ours, first) == everything
+    assert news(ends.ours, replace(first, offset=0 * OFFSET)) == {"offset"}
+    other = Ends()
+    assert news(other.ours, first) == everything
+    other.close()
+
+
+def test_plans_arrive_as_they_were(ends: Ends) -> None:
+    the_task = task()
+    request = Request(4, the_task, the_task.target, OFFSET)
+    for reached, stiffness, message in ((True, 123.4, ""), (False, math.nan, "it is far")):
+        known = ends.passes(request)
+        pressures = np.array([1e5 / 3, 0.0, -0.0])
+        plan = Plan(4, pressures, known.offset, known.target, reached, stiffness, message)
+        ends.theirs.answer(plan)
+        found = ends.ours.receive()
+        assert isinstance(found, Plan)
+        assert found.pressures.tobytes() == pressures.tobytes()
+        assert found.offset.tobytes() == OFFSET.tobytes()
+        assert found.target is request.target
+        assert (found.serial, found.reached, found.message) == (4, reached, message)
+        assert found.stiffness == pytest.approx(stiffness, abs=0, nan_ok=True)
+
+
+@pytest.mark.parametrize("poll", [True, False])
+def test_it_says_whether_there_is_an_answer(monkeypatch: pytest.MonkeyPatch, poll: bool) -> None:
+    if not poll:
+        monkeypatch.delattr(select, "poll", raising=False)
+    ends = Ends()
+    assert not ends.ours.has_answer()
+    ends.theirs.answer(None)
+    ends.theirs.answer("no luck")
+    assert ends.ours.has_answer()
+    assert ends.ours.receive() is None
+    assert ends.ours.has_answer()
+    assert ends.ours.receive() == "no luck"
+    assert not ends.ours.has_answer()
+    ends.theirs._connection.close()
+    assert ends.ours.has_answer()
+    with pytest.raises((EOFError, ConnectionError)):
+        ends.ours.receive()
+    with pytest.raises(OSError, match=r"."):
+        ends.ours.ask(Request(1, task(), task().target, OFFSET))
+    ends.ours.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="the system has no SCHED_BATCH")
+@pytest.mark.parametrize("real_time", [False, True])
+def test_the_process_yields_whoever_starts_it(real_time: bool) -> None:
+    robot = so.load_robot(ROBOT)
+    policies: list[int] = []
+
+    def start() -> None:
+        if real_time:
+            try:
+                os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+            except PermissionError:
+                return
+        planner = ProcessPlanner(robot)
+        policies.append(os.sched_getscheduler(planner._process.pid))
+        planner.close()
+
+    thread = threading.Thread(target=start)  # its policy ends with it
+    thread.start()
+    thread.join(60)
+    if not policies:
+        pytest.skip("real-time priorities are not permitted")
+    assert policies == [os.SCHED_BATCH]
+
+
+def test_a_system_that_cannot_be_told_to_yield_is_no_failure(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
+    planner_module._let_it_yield(os.getpid())
+    monkeypatch.delattr(os, "sched_setscheduler")
+    planner_module._let_it_yield(os.getpid())
