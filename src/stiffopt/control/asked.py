@@ -10,15 +10,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.errors import InputError
 from stiffopt.model.compliance import directional_stiffness
+from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Task
+from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.rig.interface import PressureLimits
 
-__all__ = ["angle_to", "distance_to", "is_far", "kind_of", "parts_of", "stiffness_of"]
+__all__ = [
+    "angle_to",
+    "distance_to",
+    "is_far",
+    "kind_of",
+    "parts_of",
+    "stiffness_of",
+    "within_limits",
+]
 
 Array = NDArray[np.float64]
 
 _FAR, _TURNED = 5e-3, math.cos(math.radians(5))  # m, and the cosine of an angle
+
+
+def within_limits(task: Task, robot: Manipulator, limits: PressureLimits) -> Task:
+    """Return a task with a rig's limits of pressure.
+
+    Raises
+    ------
+    InputError
+        It asks for more than the rig may give, or leaves a channel no pressure.
+    """
+    description = robot.description
+    lower, upper = task.pressure_bounds(description)
+    if task.pressure.max is not None:
+        asked = np.broadcast_to(np.array(task.pressure.max, dtype=float), upper.shape)
+        for index in np.flatnonzero(asked > limits.high * (1 + 1e-6)):
+            raise InputError(
+                f"the task asks for up to {asked[index] * 1e-5:g} bar; "
+                f"{description.channel_name(int(index))} may have "
+                f"{limits.high[index] * 1e-5:g} bar on this rig"
+            )
+    lower, upper = np.maximum(lower, limits.low), np.minimum(upper, limits.high)
+    if (lower > upper).any():
+        raise InputError("the task leaves a channel no pressure within the limits of this rig")
+    pressure = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
+    # of a load, the tip's offset tells how much of it there is
+    return task.model_copy(update={"pressure": pressure, "load": None})
 
 
 def stiffness_of(task: Task) -> Callable[..., float] | None:

@@ -16,7 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
-from stiffopt.control.asked import angle_to, distance_to, is_far, kind_of, parts_of, stiffness_of
+from stiffopt.control.asked import (
+    angle_to,
+    distance_to,
+    is_far,
+    kind_of,
+    parts_of,
+    stiffness_of,
+    within_limits,
+)
+from stiffopt.control.believed import memory_of, regulation_of, wrench_at
 from stiffopt.control.demand import demand, parts_asked
 from stiffopt.control.estimator import EstimatorSettings, TipEstimator
 from stiffopt.control.gains import Gains
@@ -29,10 +38,9 @@ from stiffopt.control.steering import Move, Notice, Seen, Standing
 from stiffopt.control.trajectory import Course, Trajectory
 from stiffopt.control.vibration import Vibration
 from stiffopt.errors import InputError
-from stiffopt.model.history import History, Memory
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
@@ -95,7 +103,7 @@ class Controller:
         self._swings = swings if kind == "auto" else kind == "modelled"
         self._farthest = _BELIEVED * robot.length
         self._vibration = Vibration.of(robot.description) if self._swings else None
-        lag, dead_time = self._regulation()
+        lag, dead_time = regulation_of(robot.description, self._control)
         self._lag, self._dead_time = float(np.mean(lag)), dead_time
         self._regulators = RegulatorModel(period, lag, dead_time, self._slew)
         self._damping = self._control.damping
@@ -157,7 +165,7 @@ class Controller:
         self._now = now
         self._last_move = none.copy()
         self._effective, self._chamber = none.copy(), none.copy()
-        self._memory = self._history()
+        self._memory = memory_of(self.robot.description)
         self._regulators.begin(none)
         self._estimator.begin()
         self._reference.begin(np.concatenate([none, np.zeros(6)]))
@@ -171,7 +179,8 @@ class Controller:
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Steering.set_task`."""
-        self._task, self._target, self._course = self._accepted(task), task.target, None
+        self._task = within_limits(task, self.robot, self.limits)
+        self._target, self._course = task.target, None
         self._asked = parts_asked(task.target)
         self._measure = stiffness_of(task)
         self._unit = task.measures[0].unit if task.measures else "N/m"
@@ -278,7 +287,9 @@ class Controller:
             stiffness=stiffness,
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
-            wrench=self._wrench(estimate.offset, estimate.turn),
+            wrench=wrench_at(
+                self._at_u, estimate.offset, estimate.turn if self._estimator.turn_known else None
+            ),
             task=self._what(),
             stiffness_unit=self._unit,
             model_position=estimate.static,
@@ -310,25 +321,6 @@ class Controller:
         self._planner.close()
 
     # -- what is asked --------------------------------------------------------------------------
-
-    def _accepted(self, task: Task) -> Task:
-        """Return a task with this rig's limits of pressure; refuse one that does not suit."""
-        description = self.robot.description
-        lower, upper = task.pressure_bounds(description)
-        if task.pressure.max is not None:
-            asked = np.broadcast_to(np.array(task.pressure.max, dtype=float), upper.shape)
-            for index in np.flatnonzero(asked > self.limits.high * (1 + 1e-6)):
-                raise InputError(
-                    f"the task asks for up to {asked[index] * 1e-5:g} bar; "
-                    f"{description.channel_name(int(index))} may have "
-                    f"{self.limits.high[index] * 1e-5:g} bar on this rig"
-                )
-        lower, upper = np.maximum(lower, self.limits.low), np.minimum(upper, self.limits.high)
-        if (lower > upper).any():
-            raise InputError("the task leaves a channel no pressure within the limits of this rig")
-        limits = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
-        # of a load, the tip's offset tells how much of it there is
-        return task.model_copy(update={"pressure": limits, "load": None})
 
     def _pursue(self, target: Target) -> None:
         if self._task is None:
@@ -390,33 +382,6 @@ class Controller:
     def _none(self) -> Array:
         return np.zeros(self.robot.n_pressures)
 
-    def _regulation(self) -> tuple[Array, float]:
-        """Lags (n,) and dead time: of the regulators, or of a robot file that knows the arm's."""
-        control = self._control
-        lags, dead = [], control.regulator_dead_time
-        for segment in self.robot.description.segments:
-            history = segment.history
-            own = history is not None and history.lag > 0
-            lags += [history.lag if own and history else control.regulator_lag] * segment.n_channels
-            if own and history is not None:
-                dead = history.dead_time or dead
-        return np.array(lags), dead
-
-    def _history(self) -> Memory | None:
-        """Play and creep of the arm, from rest; lags are the regulators' business here."""
-        found: list[History | None] = []
-        places: list[int] = []
-        for segment in self.robot.description.segments:
-            history = segment.history
-            if history is not None:
-                update = {"lag": 0.0, "lag_falling": 0.0, "dead_time": 0.0}
-                history = history.model_copy(update=update)
-            found += [history] * segment.n_channels
-            places += list(range(segment.n_channels))
-        if not any(history is not None and history.parts for history in found):
-            return None
-        return Memory(found, places)
-
     @property
     def _remembered(self) -> Array:
         """By how much the pressures that act differ from those in the chambers (n,)."""
@@ -451,15 +416,3 @@ class Controller:
             self._gains.at(estimator.omega), self._regulators.ahead + self._remembered,
             self._reference.chamber, motion[0, :n], motion[1, :n],
         )  # fmt: skip
-
-    def _wrench(self, offset: Array, turn: Array) -> Array:
-        """Force and moment (6,), base axes, that would move the tip by an offset."""
-        assert self._at_u is not None
-        rotation = self._at_u.pose[:3, :3]
-        if self._estimator.turn_known:
-            motion = np.concatenate([rotation.T @ offset, rotation.T @ turn])
-            wrench = np.linalg.solve(self._at_u.compliance, motion)
-        else:  # a force alone
-            force = np.linalg.solve(self._at_u.compliance[:3, :3], rotation.T @ offset)
-            wrench = np.concatenate([force, np.zeros(3)])
-        return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
