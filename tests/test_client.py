@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,8 +21,10 @@ from websockets.sync.client import ClientConnection, connect
 from fake_loop import FakeLoop
 from stiffopt.control.state import Alarm, Severity, State, Timing
 from stiffopt.control.trajectory import Trajectory, Waypoint
+from stiffopt.daemon import connections
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.client_stream import ClientStream
+from stiffopt.daemon.connections import MAX_CONNECTIONS
 from stiffopt.daemon.messages import MAX_MESSAGE
 from stiffopt.daemon.reports import StateReport
 from stiffopt.daemon.service import create_app
@@ -65,6 +67,85 @@ def eventually(condition: Callable[[], bool], timeout: float = 15.0) -> None:
     while not condition():
         assert time.monotonic() < end, "this did not come about in time"
         time.sleep(0.01)
+
+
+# Connections --------------------------------------------------------------------------------------
+
+
+def open_files() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_connections_that_idle_or_dribble_keep_nobody_away_and_use_up_nothing(
+    loop: FakeLoop, server: Server
+) -> None:
+    asks = b"POST /v1/vent HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer " + TOKEN.encode()
+    says = [b"", b"GET /v1/sta", asks + b"\r\nContent-Length: 9\r\n\r\n{"]
+    before = open_files()
+    with Client(server.url, TOKEN, name="planner") as client, ExitStack() as idle:
+        client.take_control()
+        for k in range(3 * MAX_CONNECTIONS):
+            other = idle.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
+            other.sendall(says[k % len(says)])
+        with Client(server.url, TOKEN) as late:
+            late.vent()
+        ends_of_ours = 3 * MAX_CONNECTIONS + 2
+        eventually(lambda: open_files() - before <= ends_of_ours + MAX_CONNECTIONS + 2)
+        assert loop.names[-1] == "vent"
+        other.sendall(b"       }")
+        last = other.recv(100)
+        assert last.startswith(b"HTTP/1.1 200")  # the newest were not dropped
+    eventually(lambda: open_files() <= before + 3)
+
+
+def test_streams_outlive_a_crowd(server: Server) -> None:
+    with ExitStack() as stack, Client(server.url, TOKEN) as client:
+        client.take_control()
+        stream = stack.enter_context(client.stream(rate=50))
+        first = stream.state()
+        for _ in range(2 * MAX_CONNECTIONS):
+            stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
+        for _ in range(20):
+            assert stream.state().time == first.time
+
+
+def test_a_connection_on_which_nothing_is_answered_is_closed(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "PATIENCE", 0.2)
+    for said in (b"", b"GET /v1/sta"):
+        with socket.create_connection(("127.0.0.1", server.port), 10) as silent:
+            silent.sendall(said)
+            with suppress(ConnectionResetError):
+                assert silent.recv(100) == b""
+
+
+def test_where_all_are_being_answered_the_newest_has_to_go(
+    loop: FakeLoop, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 2)
+    free = threading.Event()
+    waiting: list[str] = []
+
+    def gate(name: str) -> None:
+        waiting.append(name)
+        free.wait(20)
+
+    loop.gate = gate
+    asks = b"POST /v1/vent HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer " + TOKEN.encode()
+    with ExitStack() as stack:
+        busy = []
+        address = "127.0.0.1", server.port
+        for _ in range(2):
+            busy.append(stack.enter_context(socket.create_connection(address, 20)))
+            busy[-1].sendall(asks + b"\r\n\r\n")
+        eventually(lambda: len(waiting) == 2)
+        late = stack.enter_context(socket.create_connection(address, 10))
+        with suppress(ConnectionResetError):
+            assert late.recv(100) == b""
+        free.set()
+        for each in busy:
+            assert each.recv(100).startswith(b"HTTP/1.1 200")
 
 
 # Reading and commands -----------------------------------------------------------------------------

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import logging
 import os
 import re
 import shutil
 import signal
+import socket
 import stat
+import subprocess
+import sys
 import threading
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from examples import blocks
-from fake_loop import FakeLoop
+from fake_loop import FakeLoop, ManualClock
 from running import ONE, TWO, patient_rig, wait_for, with_simulator
-from stiffopt.control.state import Snapshot, State
+from stiffopt.control.journal import EventLog
+from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon.client import Client
+from stiffopt.daemon.connections import MAX_CONNECTIONS
 from stiffopt.daemon.daemon import Daemon
 from stiffopt.daemon.keeper import Keeper
+from stiffopt.daemon.logged import LogEvents
 from stiffopt.daemon.notify import ServiceManager
 from stiffopt.daemon.secret import Secret
 from stiffopt.errors import CommandError, DeviceError, FileError, InputError
@@ -182,6 +192,23 @@ def test_a_task_is_for_this_arm(daemon: tuple[Daemon, Client], tmp_path: Path) -
         made.read_task(tmp_path / "two.yaml")
 
 
+def test_a_crowd_that_connects_and_says_nothing_does_not_touch_control(
+    daemon: tuple[Daemon, Client],
+) -> None:
+    made, client = daemon
+    armed(client)
+    port = int(str(made.url).rpartition(":")[2])
+    before, files = made.loop.snapshot(), len(os.listdir("/proc/self/fd"))
+    with ExitStack() as crowd:
+        for _ in range(200):
+            crowd.enter_context(socket.create_connection(("127.0.0.1", port), 10))
+        wait_for(lambda: made.loop.snapshot().timing.ticks > before.timing.ticks + 100)
+        assert client.state().state is before.state is State.ACTIVE
+        wait_for(lambda: len(os.listdir("/proc/self/fd")) < files + 200 + MAX_CONNECTIONS + 10)
+        assert not made.ended
+    wait_for(lambda: len(os.listdir("/proc/self/fd")) < files + 10)
+
+
 def test_it_is_started_once(daemon: tuple[Daemon, Client]) -> None:
     with pytest.raises(InputError, match="started once"):
         daemon[0].start()
@@ -320,6 +347,38 @@ def test_the_unit_restarts_vented_and_lets_the_pressures_down() -> None:
     assert "RestrictRealtime" not in unit
 
 
+# what is logged ----------------------------------------------------------------------------------
+
+
+def test_what_libraries_log_becomes_events_and_never_a_flood() -> None:
+    events, now = EventLog(), [0.0]
+    loop: Any = SimpleNamespace(events=events, rig=SimpleNamespace(clock=ManualClock()))
+    handler = LogEvents(loop, lambda: now[0])
+    handler.attach()
+    try:
+        ours, theirs = logging.getLogger("stiffopt.x"), logging.getLogger("uvicorn.error")
+        for moment in range(300):
+            now[0] = moment * 0.01
+            theirs.warning("Invalid HTTP request received from %d.", moment)
+        try:
+            raise KeyError("oh")
+        except KeyError:
+            ours.exception("it failed\nat this")
+        logging.getLogger("foxglove.websocket.server").error("handshake failed " + 9000 * "x")
+        theirs.info("all is well")
+    finally:
+        handler.detach()
+    theirs.critical("nobody hears")
+    told = events.since(0)[0]
+    assert [event.text for event in told[:3]] == [
+        f"Invalid HTTP request received from {moment}." for moment in (0, 100, 200)
+    ]
+    assert re.fullmatch(r"it failed \(KeyError: 'oh', test_daemon\.py:\d+\)", told[3].text)
+    assert (told[3].severity, told[3].time) == (Severity.ERROR, 100.0)
+    assert (told[4].severity, len(told[4].text)) == (Severity.WARNING, 300)
+    assert len(told) == 5
+
+
 # the token ---------------------------------------------------------------------------------------
 
 
@@ -336,13 +395,65 @@ def test_a_drawn_token_is_for_this_user_alone(
     assert secret.path == path
     assert path.read_text().strip() == secret.token
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert os.listdir(path.parent) == [path.name]
+    assert sorted(os.listdir(path.parent)) == [".my-rig.token.lock", path.name]
     other = Secret(ServiceSettings(), tmp_path / "runs", "my-rig")
     assert other.token != secret.token
     other.remove()  # not its own
     assert path.exists()
     secret.remove()
-    assert not path.exists()
+    assert not os.listdir(path.parent)
+
+
+def test_a_second_daemon_leaves_the_token_of_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    first, second = (Secret(ServiceSettings(), tmp_path, "my-rig") for _ in range(2))
+    first.write()
+    assert first.path is not None
+    with pytest.raises(FileError, match=r"another daemon .* log\.folder or service\.token_file"):
+        second.write()
+    second.remove()
+    assert first.path.read_text().strip() == first.token
+    elsewhere = Secret(ServiceSettings(token_file=str(tmp_path / "b.token")), tmp_path, "my-rig")
+    elsewhere.write()
+    elsewhere.remove()
+    first.remove()
+    second.write()
+    assert first.path.read_text().strip() == second.token
+    second.remove()
+
+
+def test_the_token_of_a_killed_daemon_is_in_nobody_s_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    code = (
+        "import os, sys; from stiffopt.daemon.secret import Secret\n"
+        "from stiffopt.rig.settings import ServiceSettings\n"
+        "secret = Secret(ServiceSettings(), sys.argv[1], 'my-rig'); secret.write(); os._exit(9)"
+    )
+    assert subprocess.run([sys.executable, "-c", code, str(tmp_path)]).returncode == 9
+    assert (tmp_path / "my-rig.token").exists()
+    secret = Secret(ServiceSettings(), tmp_path, "my-rig")
+    secret.write()
+    assert (tmp_path / "my-rig.token").read_text().strip() == secret.token
+    secret.remove()
+
+
+def test_where_nothing_can_be_locked_the_token_is_written_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks available")
+
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    monkeypatch.setattr(fcntl, "flock", fail)
+    secret = Secret(ServiceSettings(), tmp_path, "my-rig")
+    secret.write()
+    assert secret.path is not None
+    assert secret.path.read_text().strip() == secret.token
+    secret.remove()
 
 
 def test_a_token_may_come_from_the_environment(

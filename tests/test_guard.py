@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import io
+import json
 import math
 import pickle
 import runpy
@@ -95,7 +96,8 @@ class FakeOutlet:
         self._do("apply")
         self.commands.append(command)
         self.pressures = command.pressures
-        return Applied(self.pressures, self._reading(), limited=command.pressures[0] > 5e4)
+        much = bool(command.pressures[0] > 5e4)
+        return Applied(self.pressures, self._reading(), limited=much, force_limited=much)
 
     def read(self) -> PressureReading:
         self._do("read")
@@ -110,6 +112,7 @@ class FakeChannel:
 
     def __init__(self, clock: Clock) -> None:
         self.closed = False
+        self.broken = 0
         self.coming: list[Message] = []
         self.sent: list[Message] = []
         self.waits: list[float] = []
@@ -185,7 +188,8 @@ def test_a_command_is_passed_on_and_answered() -> None:
     (command,) = scene.outlet.commands
     assert command.time == pytest.approx(100.0)  # on the rig's clock
     assert command.valid_for == 0.1
-    assert (answer.sequence, answer.armed, answer.limited) == (2, True, True)
+    assert (answer.sequence, answer.armed) == (2, True)
+    assert (answer.limited, answer.force_limited) == (True, True)
     assert answer.commanded.tolist() == [6e4, 6e4]
     assert answer.measured.tolist() == [6e4 + 1, 6e4 + 1]
     assert answer.time == pytest.approx(907.0)  # on everybody's
@@ -315,6 +319,69 @@ def test_a_command_that_was_sent_at_no_time_trips(sent: float) -> None:
     assert scene.outlet.did == ["vent"]
 
 
+# what makes no sense -----------------------------------------------------------------------------
+
+
+def wired() -> tuple[Scene, socket.socket]:
+    """A guard with a channel of its own, and the other end of that."""
+    scene = Scene()
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    theirs.settimeout(5)
+    scene.channel = channel = Channel(ours)  # type: ignore[assignment]
+    scene.guard._channel = channel  # type: ignore[assignment]
+    return scene, theirs
+
+
+def test_messages_that_make_no_sense_are_refused_and_counted_and_feed_nobody(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    scene, loop = wired()
+    deep = b"R[1, " + 30000 * b"["
+    junk = [deep, b'R["x", "read", {}]', b'R[-1, "arm", {}]', b"", b"C", b"Q" * 9]
+
+    def heard() -> list[Answer]:
+        scene.guard.step()
+        answers = [unpack(loop.recv(1 << 16))]
+        return [a for a in answers if isinstance(a, Answer)]
+
+    with loop:
+        loop.send(scene.request("arm").pack())
+        assert heard()[0].armed
+        for packet in junk:
+            loop.send(packet)
+            loop.send(scene.command().pack())
+            (answer,) = heard()
+            assert answer.armed
+            assert not answer.error
+        assert answer.broken == len(junk)
+        assert "vent" not in scene.outlet.did
+        said = capsys.readouterr().err.splitlines()
+        assert said[0] == "stiffopt guard: messages refused so far that make no sense: 1"
+        assert len(said) == 3  # of 1, 2 and 4: it is not a word for each
+        began = scene.clock.time
+        while "vent" not in scene.outlet.did:
+            assert scene.clock.time < began + 2 * TIMEOUT
+            scene.clock.time += 5e-3
+            loop.send(deep)
+            scene.guard.step()
+        assert scene.clock.time > began + TIMEOUT
+        scene.channel.close()
+
+
+def test_what_is_answered_fits_into_a_packet() -> None:
+    scene, loop = wired()
+    with loop:
+        word = 20_000 * "\N{SNOWMAN}"  # 3 bytes each here, and 6 in the answer
+        loop.send(b"R" + json.dumps([7, word, {}], ensure_ascii=False).encode())
+        scene.guard.step()
+        answer = unpack(loop.recv(1 << 16))
+        assert isinstance(answer, Answer)
+        assert answer.sequence == 7
+        assert answer.error.startswith("the guard does not know")
+        assert not scene.channel.closed
+        scene.channel.close()
+
+
 # arming and venting ------------------------------------------------------------------------------
 
 
@@ -408,6 +475,21 @@ def test_a_trip_that_cannot_vent_does_not_say_that_it_did(
     scene.clock.time += 1.0
     scene.step()
     assert f"vented: {SILENT}" not in capsys.readouterr().err
+
+
+def test_a_guard_of_a_service_speaks_json(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene(as_json=True).pressed()
+    scene.outlet.fail["vent"] = [DeviceError("no \N{SNOWMAN}")]
+    scene.clock.time += 1.0
+    scene.step()
+    for _ in range(9):
+        scene.step()
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert [(line["level"], line["kind"], line["text"]) for line in lines] == [
+        ("error", "guard", "COULD NOT VENT, and tries again: no \N{SNOWMAN}"),
+        ("warning", "guard", "vented after all"),
+    ]
+    assert all(line["time"].endswith("Z") for line in lines)
 
 
 # other requests ----------------------------------------------------------------------------------
@@ -585,10 +667,10 @@ class Process:
             raise self.error
         return Owned(self.outlet, TIMEOUT)
 
-    def run(self, *messages: Message) -> tuple[int, list[Message]]:
+    def run(self, *messages: Message, more: Sequence[str] = ()) -> tuple[int, list[Message]]:
         for message in messages:
             assert self.channel.send(message)
-        code = main([str(self._descriptor)])
+        code = main([str(self._descriptor), *more])
         said = self.channel.receive()
         self.channel.close()
         return code, said
@@ -620,6 +702,16 @@ def test_the_process_opens_guards_and_ends(process: Process) -> None:
     assert armed.armed
     assert not closed.armed
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+
+
+@pytest.mark.parametrize("more", [(), ("json",)])
+def test_the_process_says_what_it_has_to_say_as_it_is_told(
+    process: Process, more: Sequence[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    process.outlet.fail["close"] = [DeviceError("no answer")]
+    assert process.run(Request(1, "close"), more=more)[0] == 1
+    said = capsys.readouterr().err
+    assert (json.loads(said)["level"] == "error") if more else said.startswith("stiffopt guard: ")
 
 
 def test_the_process_leaves_at_sigterm(process: Process, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -725,7 +817,7 @@ def test_of_a_real_rig_only_the_supply_is_owned() -> None:
     "message",
     [
         CommandFrame(3, 1.0, 2.0, 0.5, np.array([1e5, np.nan])),
-        Answer(4, np.array([1.0, 2.0]), np.array([3.0, np.nan]), 5.0, True, True, 6),
+        Answer(4, np.array([1.0, 2.0]), np.array([3.0, np.nan]), 5.0, True, True, True, 6, 7),
         Answer(4, np.zeros(9), np.ones(9), 5.0, tripped="a", refused="b", error="µ", value=[[1.5]]),
         Request(5, "inject", {"device": "supply", "channel": None}),
         Word("ready", {"real_time": "yes"}),
@@ -749,21 +841,61 @@ def _plain(message: Any) -> Any:
 
 @pytest.mark.parametrize(
     "packet",
-    [b"", b"X", b"C", b"C123", b"A12", b"R", b"R[1]", b"R5", b"W{}", b"P123", b"R\xff",
+    [b"X", b"C", b"C123", b"A12", b"R", b"R[1]", b"R5", b"W{}", b"P123", b"R\xff", b"",
+     b'R["1", "read", {}]', b'R[null, "read", {}]', b'R[-1, "read", {}]', b'R[1.0, "read", {}]',
+     b'R[true, "read", {}]', b'R[18446744073709551616, "read", {}]', b'R[NaN, "read", {}]',
+     b'R[1, ["read"], {}]', b'R[1, "read", []]', b'R[1, "read", {}, 2]', b'W["ready", 1]',
+     b"W[1, {}]", b"R" + 30000 * b"[", b"R" + 30000 * b'{"a":', b"W" + 30000 * b"[",
+     b"R[" + 9000 * b"1" + b', "read", {}]', b"P" + np.full(10, np.inf).tobytes(),
      Answer(1, np.zeros(2), np.zeros(2), 0.0).pack()[:-3],
      CommandFrame(1, 0.0, 0.0, 0.0, np.zeros(2)).pack()[:-3]],
 )  # fmt: skip
 def test_a_broken_packet_is_no_message(packet: bytes) -> None:
     with pytest.raises(ValueError):  # noqa: PT011  # of struct, json, numpy or ours
         unpack(packet)
-    if packet:
-        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with theirs:
-            channel = Channel(ours)
-            theirs.send(packet)
-            theirs.send(Word("ready").pack())
-            assert channel.receive(1.0) == [Word("ready")]
-            channel.close()
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        channel = Channel(ours)
+        theirs.send(packet)
+        theirs.send(Word("ready").pack())
+        assert channel.receive(1.0) == [Word("ready")]
+        assert channel.broken == 1
+        assert not channel.closed
+        channel.close()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_comes_is_a_message_or_left_out(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    good = [
+        Request(5, "arm", {"told": 0}).pack(),
+        Word("ready").pack(),
+        Poses((sample(3),)).pack(),
+        CommandFrame(1, 0.0, 0.0, 0.0, np.zeros(2)).pack(),
+        Answer(1, np.zeros(2), np.zeros(2), 0.0).pack(),
+    ]
+    for _ in range(3000):
+        packet = bytearray(good[draw.integers(len(good))])
+        for place in draw.integers(len(packet), size=draw.integers(1, 4)):
+            packet[place] = draw.integers(256)
+        with suppress(ValueError):
+            unpack(bytes(packet[: draw.integers(1, len(packet) + 1)]))
+
+
+def test_who_sends_without_end_keeps_nobody_from_the_rest() -> None:
+    class Endless:
+        def setblocking(self, _: bool) -> None:
+            pass
+
+        def fileno(self) -> int:
+            return 0
+
+        def recv(self, _: int) -> bytes:
+            return b"X"
+
+    channel = Channel(Endless())  # type: ignore[arg-type]
+    assert channel.receive() == []
+    assert channel.broken == 1000
 
 
 def test_a_channel_that_nobody_reads_waits_for_nothing() -> None:

@@ -182,7 +182,7 @@ def test_an_exception_of_the_steering_is_a_fault_and_vents(call: str) -> None:
             raise ZeroDivisionError("oh")
 
     lab.steering.accident = fail
-    lab.until(State.FAULT, within=0.2)
+    lab.until(State.FAULT, within=0.4)
     assert lab.loop.snapshot().reason == "unexpected ZeroDivisionError: oh"
     assert lab.is_vented()
     assert lab.kinds.count("internal") == 1

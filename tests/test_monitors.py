@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from stiffopt.control.expected_pressure import Regulation
 from stiffopt.control.monitors import PressureMonitor, Trouble
 from stiffopt.control.steering import Seen
-from stiffopt.control.tracker_watch import ENOUGH, Sight, TrackerWatch
+from stiffopt.control.tracker_watch import BACK, ENOUGH, Sight, TrackerWatch
+from stiffopt.model.history import History
+from stiffopt.model.robot_files import load_description
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
@@ -24,10 +27,12 @@ SAFETY = Safety()
 class Regulators:
     """Two regulators that follow, and the monitor that looks at them."""
 
-    def __init__(self, *, lag: float = 0.06, dead: int = 1, slew: float = 5e5, **control: float):
-        settings = ControlSettings(**control)  # type: ignore[arg-type]
+    def __init__(
+        self, *, lag: float = 0.06, dead: int = 1, slew: float = 5e5, believed: Any = 0.06
+    ):
+        regulation = Regulation(np.broadcast_to(believed, 2), 0.01)
         limits = PressureLimits(np.zeros(2), np.full(2, 1.5e5))
-        self.monitor = PressureMonitor(limits, SAFETY, settings, slew)
+        self.monitor = PressureMonitor(limits, SAFETY, regulation, slew)
         self.lag, self.slew = lag, slew
         self.waiting = [np.zeros(2)] * (dead + 1)
         self.t, self.p = 0.0, np.zeros(2)
@@ -134,6 +139,92 @@ def test_9_a_leak_from_the_beginning_is_flagged_and_found_when_its_command_falls
     found, _ = bench.hold(1.0e5, 1e5, seconds=3.0)
     assert found is not None
     assert found.kind == "leak"
+
+
+@pytest.mark.parametrize("then", [1.35e5, 1.45e5, 1.05e5])
+@pytest.mark.parametrize("leak", [1 / 0.3, 1 / 0.2])
+def test_9_a_leak_from_the_beginning_is_found_when_its_command_changes(
+    leak: float, then: float
+) -> None:
+    bench = Regulators(slew=2e6)
+    bench.leak[0] = leak
+    assert bench.hold(1.2e5, 1e5, seconds=3.0)[0] is None
+    np.testing.assert_array_equal(bench.monitor.saturated, [True, False])
+    found, after = bench.hold(then, 1e5, seconds=3.0)
+    assert found is not None
+    assert found.kind == "leak"
+    assert found.text.startswith("channel 1")
+    assert after < 1.5
+
+
+def test_9_a_tube_that_is_off_from_the_beginning_is_found_where_the_line_has_pressure() -> None:
+    bench = Regulators()
+    bench.leak[0] = 1 / 0.02
+    assert bench.hold(1e5, 2e4, seconds=5.0)[0] is None  # for all we know it has none
+    found, after = bench.hold(1e5, 8e4, seconds=5.0)
+    assert found is not None
+    assert found.kind == "leak"
+    assert found.text.startswith("channel 1")
+    assert 1.0 < after < 2.5
+
+
+def test_8_a_line_without_pressure_is_no_leak() -> None:
+    bench = Regulators()
+    bench.saturation[:] = 5e3
+    assert bench.hold(1e5, 1e5, seconds=5.0)[0] is None
+    assert bench.hold(1.4e5, 0.2e5, seconds=5.0)[0] is None
+    assert bench.monitor.saturated[0]
+
+
+def test_9_a_leak_from_the_beginning_is_found_when_its_command_creeps() -> None:
+    bench = Regulators()
+    bench.leak[0] = 1 / 0.2
+    pressures = [1.0e5 + 3e3 * k for k in range(12)]
+    assert any(bench.hold(p, 1e5, seconds=1.0)[0] is not None for p in pressures)
+
+
+@pytest.mark.parametrize("lag", [0.03, 0.06, 0.15])
+def test_8_a_regulator_that_saturates_is_no_leak_whatever_it_is_told(lag: float) -> None:
+    bench = Regulators(lag=lag)
+    bench.saturation[0] = 6e4
+    bench.gauge = lambda p: p + np.array([1e3 * math.sin(7 * bench.t), 0.0])  # the line is restless
+    for pressure in (1e5, 1.4e5, 1.1e5, 0.9e5, 1.3e5, 0.4e5, 0.8e5, 1.4e5, 0.0, 1e5, 1.2e5):
+        assert bench.hold(pressure, 1e5, seconds=2.0)[0] is None
+        assert bench.monitor.saturated[0] == (pressure > 7e4)
+
+
+def test_8_what_was_short_and_well_again_is_not_remembered() -> None:
+    bench = Regulators()
+    bench.saturation[0] = 6e4
+    assert bench.hold(8e4, 1e5, seconds=2.0)[0] is None
+    assert bench.hold(4e4, 1e5, seconds=2.0)[0] is None
+    bench.saturation[0] = 9e4
+    assert bench.hold(1.2e5, 1e5, seconds=2.0)[0] is None  # the line is better now
+    np.testing.assert_array_equal(bench.monitor.saturated, [True, False])
+
+
+@pytest.mark.parametrize("falling", [0.0, 0.8])
+def test_9_10_arms_that_are_slow_by_their_robot_file_are_neither_leaking_nor_stuck(
+    falling: float,
+) -> None:
+    robot = load_description("stiff-flop-2")
+    first, second = robot.segments
+    history = History(lag=0.5, lag_falling=falling, dead_time=0.05)
+    slow = robot.model_copy(
+        update={"segments": (first.model_copy(update={"history": history}), second)}
+    )
+    control = ControlSettings(regulator_lag=0.06, regulator_dead_time=0.02)
+    regulation = Regulation.slowest(slow, control, 6)
+    np.testing.assert_array_equal(regulation.lag, 3 * [max(0.5, falling)] + 3 * [0.06])
+    assert regulation.dead_time == 0.05
+    np.testing.assert_array_equal(Regulation.slowest(robot, control, 6).lag, 0.06)
+    np.testing.assert_array_equal(Regulation.slowest(slow, control, 2).lag, 0.06)
+
+    bench = Regulators(lag=max(0.5, falling), dead=5, believed=regulation.lag[:2])
+    for _ in range(3):
+        assert bench.hold(1.2e5, 1.2e5, seconds=3.0)[0] is None
+        assert bench.hold(0.0, 0.0, seconds=3.0)[0] is None
+    assert not bench.was_saturated
 
 
 def test_10_stuck_high_is_found_at_once_while_nothing_was_commanded() -> None:
@@ -312,6 +403,30 @@ def test_1_fewer_missing_frames_do_not_matter(missing: int) -> None:
             assert watched.tick(**NOTHING) is Sight.SEEN
         while watched.frame < frame + missing + 3:
             assert watched.tick() is Sight.SEEN
+
+
+@pytest.mark.parametrize("bad", [4, 5, 9])
+def test_1_one_good_frame_now_and_then_is_not_back_and_not_lost(bad: int) -> None:
+    watched = Watched().ready()
+    watched.until(Sight.MISSING, **NAN)
+    for _ in range(400):
+        good = watched.frame % (bad + 1) == 0
+        assert watched.tick(**({} if good else NAN)) is Sight.MISSING
+
+
+@pytest.mark.parametrize("bad", [0, 1, 2])
+def test_1_it_is_back_after_a_run_without_three_missing_frames(bad: int) -> None:
+    watched = Watched().ready()
+    watched.until(Sight.MISSING, **NAN)
+    good = 0
+    while True:
+        frame, is_good = watched.frame, watched.frame % (bad + 1) == 0
+        sight = watched.tick(**({} if is_good else NAN))
+        good += is_good and watched.frame > frame
+        if sight is Sight.SEEN:
+            break
+        assert good < BACK
+    assert good == BACK
 
 
 @pytest.mark.parametrize(("interval", "latency"), [(0.002, 0.001), (0.01, 0.0), (0.1, 0.3)])

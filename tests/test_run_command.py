@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import signal
@@ -240,6 +241,9 @@ def test_the_lab_is_driven_over_its_protocols_and_vented_whatever_happens(
             run.popen.kill()
             run.wait()
             wait_for(lambda: pressures().max() < 0.05, 5)
+            told = [json.loads(line) for line in run.err]  # also what the guard says
+            assert [line["kind"] for line in told] == ["guard"]
+            assert "the process of the control loop has ended" in told[0]["text"]
 
 
 # what is shown -----------------------------------------------------------------------------------

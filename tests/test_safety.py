@@ -329,6 +329,36 @@ def test_25_without_a_rate_it_does_not_arm() -> None:
     assert not bench.supply.armed
 
 
+@pytest.mark.parametrize("low", [0.0, -2e4, 1.9e4])
+def test_arrays_and_lists_come_to_the_same(low: float) -> None:
+    rng = np.random.default_rng(5)
+    arrays, lists = Bench(low).armed(), Bench(low).armed()
+    edges = [low, -0.0, 0.0, math.nan, math.inf, -math.inf, -1e3, 1e12, 1.0e5, 1.5e5, 1.2e5, 0.05]
+    for _ in range(400):
+        asked = rng.uniform(low, 1.2e5, 3)
+        for channel in np.flatnonzero(rng.random(3) < 0.2):
+            asked[channel] = rng.choice(edges)
+        found = []
+        for bench, given in ((arrays, asked), (lists, asked.tolist())):
+            bench.clock.t += 0.01
+            found.append(bench.gate.apply(PressureCommand(given, bench.clock.t)))
+        one, other = found
+        assert (one.limited, one.refused) == (other.limited, other.refused)
+        np.testing.assert_array_equal(one.pressures, other.pressures)
+        np.testing.assert_array_equal(arrays.supply.commanded, lists.supply.commanded)
+        assert one.limited == (not one.refused and bool((one.pressures != asked).any()))
+
+
+def test_a_command_that_is_changed_after_it_was_given_changes_nothing() -> None:
+    bench = Bench().armed()
+    asked = np.array([1e3, 5e2, 0.0])
+    bench.clock.t += 0.01
+    applied = bench.gate.apply(PressureCommand(asked, bench.clock.t))
+    asked[:] = 1e12
+    assert applied.pressures.tolist() == bench.supply.written[-1].tolist() == [1e3, 5e2, 0.0]
+    assert bench.ask(1e3, 5e2, 0.0).pressures.tolist() == [1e3, 5e2, 0.0]
+
+
 def test_its_limits_are_the_tighter_ones() -> None:
     bench = Bench(safety=Safety(max_pressure=(2e5, 9e4, 1e4))).armed()
     np.testing.assert_array_equal(bench.gate.limits.high, [1.5e5, 9e4, 1e4])

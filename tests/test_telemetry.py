@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -342,8 +343,37 @@ def test_foxglove_sees_the_topics_with_their_schemas(tmp_path: Path) -> None:
         assert channels[topic]["schemaName"] == name
 
 
+def test_whoever_connects_to_foxglove_may_look_and_not_touch_and_only_from_here() -> None:
+    """Pages of any site on this machine may look: that is how Foxglove itself connects."""
+    from websockets.sync.client import connect
+
+    made = telemetry(FakeLoop(), None, settings=ServiceSettings(foxglove_port=0))
+    made.start()
+    try:
+        listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
+        bound = {
+            place.partition(":")[0] for place in listening if place.endswith(f":{made.port:04X}")
+        }
+        assert bound == {"0100007F"}  # 127.0.0.1, and no other
+        with connect(
+            f"ws://127.0.0.1:{made.port}",
+            subprotocols=["foxglove.sdk.v1"],  # type: ignore[list-item]
+            origin="https://app.foxglove.dev",  # type: ignore[arg-type]
+            close_timeout=1,
+        ) as client:
+            told = json.loads(client.recv(timeout=10))
+            assert told["op"] == "serverInfo"
+            assert told["capabilities"] == []
+            channel = {"id": 1, "topic": "/target", "encoding": "json", "schemaName": "x"}
+            client.send(json.dumps({"op": "advertise", "channels": [channel]}))
+            while (told := json.loads(client.recv(timeout=10)))["op"] != "status":
+                pass
+            assert "does not support clientPublish" in told["message"]
+    finally:
+        made.stop()
+
+
 def test_a_port_that_is_taken_is_an_alarm(tmp_path: Path) -> None:
-    import socket
 
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

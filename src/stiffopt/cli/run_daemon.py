@@ -92,8 +92,14 @@ def _run(rig: str, name: str, options: Options, seconds: float, signals: _Signal
     _favour()
     from stiffopt.daemon.daemon import Daemon
 
-    daemon = Daemon(rig, service=options.service, log_folder=options.log_folder)
-    watch = _Watch(daemon, _display(options.style, daemon), signals)
+    style = _style(options.style)
+    daemon = Daemon(
+        rig,
+        service=options.service,
+        log_folder=options.log_folder,
+        json_lines=style == "json",
+    )
+    watch = _Watch(daemon, _display(style, daemon), signals)
     refused = ""
     with _warnings_shown(watch.display):
         try:
@@ -223,14 +229,21 @@ class _Signals:
             raise KeyboardInterrupt
 
 
+def _style(asked: str) -> str:
+    """Return ``live``, ``plain`` or ``json``."""
+    if asked != "auto":
+        return asked
+    return "live" if sys.stdout is not None and sys.stdout.isatty() else "json"
+
+
 def _display(style: str, daemon: Daemon) -> Display:
-    if style == "auto" and sys.stdout is not None and sys.stdout.isatty():
+    if style == "live":
         from stiffopt.cli.run_status import LiveStatus
 
         robot = daemon.robot.description
         names = [robot.channel_name(k) for k in range(robot.n_pressures)]
         return LiveStatus(daemon.description.name, names)
-    return Lines(as_json=style != "plain")
+    return Lines(as_json=style == "json")
 
 
 @contextmanager

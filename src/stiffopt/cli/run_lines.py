@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import select
 import sys
@@ -13,6 +12,7 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from stiffopt.control.state import Event, Severity, Snapshot, State
+from stiffopt.daemon.lines import json_line
 from stiffopt.errors import printable
 
 __all__ = ["Display", "Facts", "Lines"]
@@ -112,9 +112,7 @@ class Lines:
         text = text[:_LONGEST]
         stamp = datetime.fromtimestamp(time.time() - (self._now() - moment), UTC)
         if self._as_json:
-            when = stamp.isoformat(timespec="milliseconds").replace("+00:00", "Z")
-            told = {"time": when, "level": level, "kind": kind, "text": text, **more}
-            line = json.dumps(told, ensure_ascii=True)
+            line = json_line(level, kind, text, stamp, **more)
         else:
             mark = "" if level == "info" else f"{level.upper()}: "
             clock = stamp.astimezone().strftime("%H:%M:%S")

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.control.expected_pressure import ExpectedPressure, Regulation
+from stiffopt.control.shortage import Shortage
 from stiffopt.rig.interface import PressureLimits, PressureReading
-from stiffopt.rig.settings import ControlSettings, Safety
+from stiffopt.rig.settings import Safety
 
 __all__ = ["PressureMonitor", "Trouble"]
 
 Array = NDArray[np.float64]
 
-_TOLD = 1000  # commands that a dead time may hold back
 _LOOKS = 3  # readings, at least, that it takes to find a regulator wrong, however long a pause
 
 
@@ -39,43 +39,6 @@ _LEAK = 0.1  # of a pressure that was reached; less than that much less is no le
 _AT_ONCE = 3  # readings
 
 
-class ExpectedPressure:
-    """Where a regulator that works as its settings say would be: dead time, lag, limited rate.
-
-    Readings do not correct it, unlike the estimator's model: it is what they are held against.
-    """
-
-    def __init__(self, n: int, control: ControlSettings, slew: Array) -> None:
-        self.pressures: Array = np.zeros(n)
-        self._lag, self._dead_time = control.regulator_lag, control.regulator_dead_time
-        self._slew = slew
-        self._told: deque[tuple[float, Array]] = deque([(-np.inf, np.zeros(n))], maxlen=_TOLD)
-        self._time = -np.inf
-
-    def tell(self, time: float, commanded: Array) -> None:
-        """Take in that something else is commanded (n,) from a moment on."""
-        self._told.append((time, commanded))
-
-    def follow(self, time: float) -> float:
-        """Go on to a moment, and return by how much that is later than the last one, in s."""
-        if np.isinf(self._time):
-            self._time = time
-        elapsed = time - self._time
-        if not elapsed > 0:
-            return 0.0
-        acting = time - 0.5 * elapsed - self._dead_time  # midway, as if it were so all the while
-        told = self._told
-        while len(told) > 1 and told[1][0] <= acting:
-            told.popleft()
-        change = told[0][1] - self.pressures
-        if self._lag > 0:
-            change = change * -np.expm1(-elapsed / self._lag)
-        reach = self._slew * elapsed
-        self.pressures = self.pressures + np.minimum(np.maximum(change, -reach), reach)
-        self._time = time
-        return elapsed
-
-
 class PressureMonitor:
     """Holds the readings of n channels against what was commanded.
 
@@ -90,8 +53,8 @@ class PressureMonitor:
     more pressure still reaches that, and a leak takes it away. So below what was commanded, by
     half of that error, a channel counts as saturated, which is an alarm; below what it is known to
     reach, it leaks. Where nothing moves, a tenth of the pressure is enough for that, if it is more
-    than half of that error. A channel that leaked from the beginning is known to leak when its
-    command falls.
+    than half of that error. A channel that leaked from the beginning is saturated until its
+    command changes: what it gives then tells, see `Shortage`.
 
     While nothing has been commanded since arming, three readings above that error are enough for a
     regulator that is stuck.
@@ -102,7 +65,7 @@ class PressureMonitor:
         Of the commands.
     safety :
         What is too much.
-    control :
+    regulation :
         How regulators follow.
     slew :
         Greatest rate of change of a pressure, one value or (n,), in Pa/s.
@@ -116,17 +79,18 @@ class PressureMonitor:
     """
 
     def __init__(
-        self, limits: PressureLimits, safety: Safety, control: ControlSettings, slew: ArrayLike
+        self, limits: PressureLimits, safety: Safety, regulation: Regulation, slew: ArrayLike
     ) -> None:
         n = limits.n
         most = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
         self.saturated: NDArray[np.bool_] = np.zeros(n, dtype=bool)
-        self._expected = ExpectedPressure(n, control, np.broadcast_to(slew, n).astype(float))
+        self._expected = ExpectedPressure(regulation, np.broadcast_to(slew, n).astype(float))
         self._commanded: Array = np.zeros(n)
         self._time, self._oldest = safety.pressure_error_time, safety.command_timeout
         self._tolerance: Array = np.array(most)
         self._half: Array = 0.5 * most
         self._reached: Array = np.zeros(n)  # the highest readings since it was armed
+        self._shortage = Shortage(self._tolerance, safety.pressure_error_time)
         self._still: tuple[float, Array] = (np.inf, np.zeros(n))  # since when, near what
         self._idle, self._rising = True, 0  # nothing commanded yet; readings that rise all the same
         self._most = np.stack((most, most, 0.5 * most))  # (3, n): leaks, stuck, saturated
@@ -152,6 +116,7 @@ class PressureMonitor:
         self._for[:] = 0.0
         self._doubtful = False
         self._reached = np.zeros_like(self._reached)
+        self._shortage.clear()
         self._idle, self._rising = True, 0
         self.saturated = np.zeros_like(self.saturated)
 
@@ -172,7 +137,8 @@ class PressureMonitor:
         np.subtract(np.minimum(due, self._reached), p, out=beside[0])
         np.subtract(p, np.maximum(expected, self._commanded), out=beside[1])
         np.subtract(due, p, out=beside[2])
-        if reading.time - self._still[0] > _SETTLED:
+        at_rest = reading.time - self._still[0] > _SETTLED
+        if at_rest:
             share = np.minimum(self._tolerance, _LEAK * self._reached)
             self._most[0] = np.maximum(self._half, share)
         else:
@@ -189,6 +155,7 @@ class PressureMonitor:
         self._doubtful = bool(self._for.any())
         lasting = self._for >= self._time * (1 - 1e-9)
         self.saturated = lasting[2] | (self.saturated & (self._for[2] > 0))
+        lasting[0] |= self._shortage.leaks(elapsed, self.saturated, due, p, at_rest=at_rest)
         return self._found(lasting, p)
 
     def _found(self, lasting: NDArray[np.bool_], p: Array) -> Trouble | None:

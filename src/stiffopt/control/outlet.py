@@ -29,12 +29,15 @@ class Applied:
         Whether it was asked for a faster change, or a greater force, than may be.
     refused : str
         Why nothing new was written; empty where something was.
+    force_limited : bool
+        Whether it was shortened for the total force.
     """
 
     pressures: Array
     reading: PressureReading
     limited: bool = False
     refused: str = ""
+    force_limited: bool = False
 
 
 class Outlet(Protocol):

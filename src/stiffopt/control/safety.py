@@ -211,7 +211,8 @@ class SafetyGate:
             except CommandError as error:
                 return self._refused(str(error))
             self._valid_at = now
-            ramp = self._within_force(self._within_rate(asked, now))
+            near = self._within_rate(asked, now)
+            ramp = self._within_force(near)
             before, self._written_at = self._ramp, now
             self._ramp = np.minimum(ramp, before)  # should it fail: no more than this is there
             told = self._writable(ramp)
@@ -224,7 +225,8 @@ class SafetyGate:
                     self._forget(now)
                 return self._refused(str(error))
             self._ramp, self._told = ramp, told
-            return Applied(told, reading, limited=bool((told != asked).any()))
+            limited = told.tolist() != asked.tolist()
+            return Applied(told, reading, limited, force_limited=ramp is not near)
 
     def _checked(self, command: PressureCommand, now: float) -> Array:
         """Return the pressures (n,) of a command that may be carried out; refuse all others."""
@@ -235,13 +237,7 @@ class SafetyGate:
             raise CommandError(f"the command is from the future, by {-age:.3g} s")
         if not age <= min(command.valid_for, self._timeout):  # NaN is too old as well
             raise CommandError(f"the command has expired; it is {age:.3g} s old")
-        asked = command.pressures
-        low, high = self.limits.low, self.limits.high
-        if isinstance(asked, np.ndarray) and asked.dtype == low.dtype and asked.shape == low.shape:
-            within = (asked >= low) & (asked <= high)  # NaN is not
-            if within.all():
-                return asked.copy()
-        return self.limits.check(asked)  # which knows what to say
+        return self.limits.check(command.pressures)
 
     def _within_rate(self, asked: Array, now: float) -> Array:
         """Return what is nearest to `asked` (n,) that can be reached by now."""

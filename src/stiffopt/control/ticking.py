@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.expected_pressure import Regulation
 from stiffopt.control.journal import Alarms, EventLog
 from stiffopt.control.lifecycle import Lifecycle
 from stiffopt.control.monitors import PressureMonitor, Trouble
@@ -23,6 +24,7 @@ __all__ = ["Ticking"]
 
 Array = NDArray[np.float64]
 
+_CALM = 0.5  # s without a command that was too much, after which that is no alarm any more
 _UNSOUND = 3  # moves in a row that are no answer, after which the pressures are held
 
 
@@ -63,9 +65,10 @@ class Ticking:
         self.events = EventLog()
         self.alarms = Alarms(self.events)
         control = ControlSettings() if rig.settings is None else rig.settings.control
-        self._pressures = PressureMonitor(outlet.limits, safety, control, rig.slew)
-        self._tracker = TrackerWatch(safety, period)
         n = outlet.limits.n
+        regulation = Regulation.slowest(rig.robot, control, n)
+        self._pressures = PressureMonitor(outlet.limits, safety, regulation, rig.slew)
+        self._tracker = TrackerWatch(safety, period)
         self._none: NDArray[np.bool_] = np.zeros(n, dtype=bool)
         self._flagged = self._pressures.saturated
         self._unsupervised: tuple[int, ...] = ()
@@ -83,6 +86,7 @@ class Ticking:
         self._vented = True
         self._trouble: Trouble | None = None
         self._unsound = 0
+        self._forced = -np.inf  # when a command was last shortened for the total force
         self._noticed: frozenset[str] = frozenset()
         self._last = self._clock.now()
 
@@ -143,6 +147,7 @@ class Ticking:
             self._vented = True
             self._told(now, self._zero)
             self.alarms.clear(now, "not-vented")
+            self.alarms.clear(now, "force-limit")
         self._exchanged = None
         self._unsound = 0
         self.saturated = self._none
@@ -279,7 +284,17 @@ class Ticking:
             return False
         if applied.limited:
             self.saturated = self.saturated | (applied.pressures != pressures)
+        self._warn_of_force(now, applied.force_limited)
         return True
+
+    def _warn_of_force(self, now: float, limited: bool) -> None:
+        """Let it be an alarm that commands are shortened, until for a while none was."""
+        if limited:
+            self._forced = now
+            text = "commands are shortened: more would be above safety.max_force, the total force"
+            self.alarms.set(now, "force-limit", text)
+        elif now - self._forced > _CALM:
+            self.alarms.clear(now, "force-limit")
 
     def _listen(self, now: float) -> None:
         """Make alarms and events of what the steering has to say."""

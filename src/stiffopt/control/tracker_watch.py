@@ -13,13 +13,15 @@ from stiffopt.control.steering import Seen
 from stiffopt.rig.interface import PoseSample
 from stiffopt.rig.settings import Safety
 
-__all__ = ["Sight", "TrackerWatch"]
+__all__ = ["BACK", "ENOUGH", "Sight", "TrackerWatch"]
 
 Array = NDArray[np.float64]
 
 _KEPT = 24  # samples from which the usual interval and latency are learned
 ENOUGH = 8
 """Samples without which neither is known."""
+BACK = 8
+"""Ticks with new samples, none of them missing for too long, after which the tip is seen again."""
 _JITTER = 0.25  # share of an interval by which a sample may be late
 
 
@@ -38,6 +40,10 @@ class TrackerWatch:
     visible, rejected, out of order, or of the same frame again. How old samples usually are, and
     how far apart, is learned until the loop is armed; a sample is overdue by its age beyond that.
 
+    A tip that was missing is seen again only after `BACK` ticks with new samples, in which it was
+    not missing: one good sample now and then must not make the loop steer now and then. It is lost
+    when there was no good sample for the timeout, not even one now and then.
+
     Parameters
     ----------
     safety :
@@ -54,6 +60,7 @@ class TrackerWatch:
     def __init__(self, safety: Safety, period: float) -> None:
         self._safety, self._period = safety, period
         self.jumps = 0
+        self._back = BACK  # ticks with new samples since the tip was missing
         self._frame: int | None = None
         self._reported = self._latest = -np.inf
         self.usual = safety.tracker_timeout / safety.tracker_frames, 0.0
@@ -108,13 +115,18 @@ class TrackerWatch:
         """Take in what became of the samples of a tick."""
         if self._latest == -np.inf:
             self._latest = now  # it is given some time before it is missing
+        is_new = False
         if seen.used:
             self.jumps = 0
-            if seen.latest > self._reported:
+            if is_new := seen.latest > self._reported:
                 self._reported = seen.latest
                 self._latest = min(seen.latest, now)  # none is from the future
         elif seen.rejected:
             self.jumps += seen.rejected
+        if self._by_age(now) is not Sight.SEEN:
+            self._back = 0
+        elif is_new:
+            self._back += 1
 
     def overdue(self, now: float) -> float:
         """Age of the newest sample that was used beyond the usual, in s."""
@@ -122,6 +134,11 @@ class TrackerWatch:
 
     def sight(self, now: float) -> Sight:
         """Say whether the tip is seen."""
+        sight = self._by_age(now)
+        return Sight.MISSING if sight is Sight.SEEN and self._back < BACK else sight
+
+    def _by_age(self, now: float) -> Sight:
+        """Say the same of the newest sample alone."""
         interval, _ = self.usual
         overdue = self.overdue(now)
         slack = self._period + _JITTER * interval

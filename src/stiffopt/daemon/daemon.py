@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import threading
 import time
@@ -21,6 +20,7 @@ from stiffopt.control.realtime import real_time, tidy
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon.keeper import Keeper
 from stiffopt.daemon.link import guarded_rig
+from stiffopt.daemon.logged import LogEvents
 from stiffopt.daemon.notify import ServiceManager
 from stiffopt.daemon.secret import Secret
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
@@ -62,6 +62,8 @@ class Daemon:
         Whether ports are opened: the control interface, and Foxglove.
     log_folder :
         Where recordings go; None: where the rig file says.
+    json_lines :
+        Whether the guard, too, speaks JSON on stderr.
 
     Attributes
     ----------
@@ -90,6 +92,7 @@ class Daemon:
         *,
         service: bool = True,
         log_folder: str | os.PathLike[str] | None = None,
+        json_lines: bool = False,
     ) -> None:
         self.description = description = load_rig_description(rig)
         if description.rate > _FASTEST:
@@ -101,7 +104,7 @@ class Daemon:
         self.trouble = ""
         self._folder = os.fspath(log_folder or description.log.folder)
         self._manager = ServiceManager()
-        guarded, self.link = guarded_rig(description, self.robot.description)
+        guarded, self.link = guarded_rig(description, self.robot.description, json_lines=json_lines)
         self._clock = guarded.clock
         period = 1 / description.rate
         controller = Controller(
@@ -129,7 +132,7 @@ class Daemon:
         self._stopping = threading.Event()
         self._control: threading.Thread | None = None
         self._tidied = 0.0
-        self._log = _EventHandler(self.loop)
+        self._log = LogEvents(self.loop)
         self._started = self._stopped = False
 
     # what there is -------------------------------------------------------------------------------
@@ -182,7 +185,7 @@ class Daemon:
             raise InputError("a daemon is started once; make another one")
         self._started = True
         try:
-            logging.getLogger("stiffopt").addHandler(self._log)
+            self._log.attach()
             if self._server is not None:
                 self._listen()
             self._manager.status("connecting to the rig")
@@ -286,7 +289,7 @@ class Daemon:
         if self._server is not None:
             self._server.stop()
             self._secret.remove()
-        logging.getLogger("stiffopt").removeHandler(self._log)
+        self._log.detach()
         self._manager.close()
         return state
 
@@ -401,21 +404,6 @@ class _Shape:
             ended = time.monotonic()
             self._due = ended + (ended - now) / _SHARE
         return self._last
-
-
-class _EventHandler(logging.Handler):
-    """Makes events of what parts of the daemon log."""
-
-    def __init__(self, loop: ControlLoop) -> None:
-        super().__init__(logging.WARNING)
-        self._loop = loop
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Append an event."""
-        error = record.exc_info[1] if record.exc_info else None
-        text = record.getMessage() + (f" ({type(error).__name__}: {error})" if error else "")
-        severity = Severity.ERROR if record.levelno >= logging.ERROR else Severity.WARNING
-        self._loop.events.add(self._loop.rig.clock.now(), "service", text, severity)
 
 
 def _swings(description: RigDescription) -> bool:

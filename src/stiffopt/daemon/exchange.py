@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import threading
 import time
 from collections import deque
@@ -21,6 +22,7 @@ _SLICE = 0.02  # s; no thread keeps others from receiving for longer
 _AGAIN = 1e-3  # s, until a request is sent again that could not be sent
 _RESOLUTION = 1e-3  # s, of waiting for the channel
 _KEPT = 4096  # samples that nobody has taken; the oldest go first
+_log = logging.getLogger(__name__)
 
 
 class Exchange:
@@ -48,6 +50,7 @@ class Exchange:
         self._unanswered: deque[tuple[int, float]] = deque()  # commands, and when they were sent
         self._answered = 0  # number of the newest command or request that was
         self._poses: deque[PoseSample] = deque(maxlen=_KEPT)
+        self._broken = 0  # messages that the guard could not understand
 
     def send(self, command: PressureCommand, wait: float) -> None:
         """Send a command, and wait for its answer for up to `wait` s.
@@ -136,6 +139,9 @@ class Exchange:
             self._poses.extend(message.samples)
         if isinstance(message, Answer):
             self.newest = message
+            if message.broken != self._broken:
+                self._broken = message.broken
+                _log.warning("the guard could not understand %d messages so far", message.broken)
             self._answered = max(self._answered, message.sequence)  # 0: it was not asked
             while self._unanswered and self._unanswered[0][0] <= message.sequence:
                 self._unanswered.popleft()

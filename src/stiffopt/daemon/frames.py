@@ -11,7 +11,6 @@ import math
 import select
 import socket
 import struct
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,7 +25,9 @@ Array = NDArray[np.float64]
 
 _LARGEST = 1 << 16  # bytes of a packet
 _COMMAND = struct.Struct("<cQddd")
-_ANSWER = struct.Struct("<cQQ??dH")
+_ANSWER = struct.Struct("<cQQQ???dH")
+_AT_ONCE = 1000  # packets: whoever sends without end must not keep the other from all else
+_NUMBERS = 1 << 64
 _POSE = 10  # numbers: time, received, frame, position, quaternion
 
 
@@ -64,7 +65,9 @@ class Answer:
     commanded : what the supply has been told (n,), in Pa.
     measured, time : pressures (n,), in Pa, and when they were read; NaN where unknown.
     armed, limited : whether commands are taken, and whether this one was limited.
+    force_limited : whether it was limited for the total force.
     trips : how often the guard has tripped so far.
+    broken : packets so far that the guard could not understand.
     tripped : why it is tripped now; empty where it is not.
     refused : why the command was not passed on; empty where it was.
     error : what the supply or the guard could not do; empty where it could.
@@ -77,7 +80,9 @@ class Answer:
     time: float
     armed: bool = False
     limited: bool = False
+    force_limited: bool = False
     trips: int = 0
+    broken: int = 0
     tripped: str = ""
     refused: str = ""
     error: str = ""
@@ -89,8 +94,10 @@ class Answer:
             b"A",
             self.sequence,
             self.trips,
+            self.broken,
             self.armed,
             self.limited,
+            self.force_limited,
             self.time,
             len(self.commanded),
         )
@@ -174,15 +181,36 @@ def unpack(packet: bytes) -> Message:
             case b"A":
                 return _answer(packet)
             case b"R":
-                return Request(*json.loads(packet[1:]))
+                sequence, do, about = json.loads(packet[1:])
+                return Request(_number(sequence), _text(do), _named(about))
             case b"W":
-                return Word(*json.loads(packet[1:]))
+                kind, about = json.loads(packet[1:])
+                return Word(_text(kind), _named(about))
             case b"P":
                 rows = _numbers(packet[1:]).reshape(-1, _POSE)
                 return Poses(tuple(_pose(row) for row in rows))
-    except (struct.error, TypeError) as error:
+    except (struct.error, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f"a broken packet: {error}") from None
     raise ValueError(f"a packet of unknown kind: {packet[:1]!r}")
+
+
+def _number(given: Any) -> int:
+    """Return what can be sent back as the number of a message."""
+    if type(given) is not int or not 0 <= given < _NUMBERS:
+        raise ValueError("the number of a message is a whole one of 64 bits")
+    return given
+
+
+def _text(given: Any) -> str:
+    if not isinstance(given, str):
+        raise ValueError("expected a word")
+    return given
+
+
+def _named(given: Any) -> dict[str, Any]:
+    if not isinstance(given, dict):
+        raise ValueError("expected things with names")
+    return given
 
 
 def _numbers(packed: bytes) -> Array:
@@ -190,11 +218,12 @@ def _numbers(packed: bytes) -> Array:
 
 
 def _answer(packet: bytes) -> Answer:
-    _, sequence, trips, armed, limited, time, n = _ANSWER.unpack_from(packet)
+    _, sequence, trips, broken, armed, limited, forced, time, n = _ANSWER.unpack_from(packet)
     end = _ANSWER.size + 16 * n
     numbers = _numbers(packet[_ANSWER.size : end]).reshape(2, n)
     tail = json.loads(packet[end:]) if len(packet) > end else ("", "", "", None)
-    return Answer(sequence, numbers[0], numbers[1], time, armed, limited, trips, *tail)
+    known = (sequence, numbers[0], numbers[1], time, armed, limited, forced, trips, broken)
+    return Answer(*known, *tail)
 
 
 def _pose(row: Array) -> PoseSample:
@@ -214,14 +243,16 @@ class Channel:
     Attributes
     ----------
     closed : whether the other end is gone, or this one was closed.
+    broken : packets that were no messages, and were left out.
     """
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
         self._end.setblocking(False)
         self._poll = select.poll()
-        self._poll.register(end, select.POLLIN)
+        self._poll.register(end, select.POLLIN | select.POLLRDHUP)
         self.closed = False
+        self.broken = 0
 
     def send(self, message: Message) -> bool:
         """Send a message; say whether it could be, which it cannot where nobody takes any."""
@@ -242,27 +273,31 @@ class Channel:
         messages: list[Message] = []
         if not self.closed and wait > 0:
             self._poll.poll(math.ceil(wait * 1e3))
-        while not self.closed:
+        for _ in range(_AT_ONCE):
+            if self.closed:
+                break
             try:
                 packet = self._end.recv(_LARGEST)
             except BlockingIOError:
                 break
             except OSError:
-                packet = b""
-            if not packet:
                 self.closed = True
                 break
-            messages.extend(_understood(packet))
+            if not packet and self._hung_up():
+                self.closed = True
+                break
+            try:
+                messages.append(unpack(packet))
+            except ValueError:
+                self.broken += 1
         return messages
+
+    def _hung_up(self) -> bool:
+        """Say whether nothing more can come: an empty packet reads like the end."""
+        gone = select.POLLHUP | select.POLLRDHUP | select.POLLERR | select.POLLNVAL
+        return any(events & gone for _, events in self._poll.poll(0))
 
     def close(self) -> None:
         """Let the other end know that nothing more comes."""
         self.closed = True
         self._end.close()
-
-
-def _understood(packet: bytes) -> Iterable[Message]:
-    try:
-        return (unpack(packet),)
-    except ValueError:
-        return ()

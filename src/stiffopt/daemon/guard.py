@@ -29,6 +29,7 @@ from stiffopt.control.outlet import Applied, Outlet
 from stiffopt.control.realtime import real_time
 from stiffopt.daemon.frames import Answer, Channel, CommandFrame, Message, Poses, Request, Word
 from stiffopt.daemon.hosted import Hosted, Owned, owned
+from stiffopt.daemon.lines import JSON, json_line
 from stiffopt.errors import CommandError, DeviceError, SlowWarning, StiffoptError
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading
 
@@ -45,6 +46,7 @@ _ATTEMPTS = 20  # to vent before the process ends all the same
 _TIDY = 10.0  # s between collections of garbage while nothing is under pressure
 _ASKED = "asked to"
 _POSES = 200  # samples in a packet
+_LONGEST = 500  # characters of a text: what is told must fit into a packet
 
 
 class Guard:
@@ -66,6 +68,8 @@ class Guard:
         Moment 0 of the rig's own clock on it, in s.
     hosted :
         The rest of a simulated rig.
+    as_json :
+        Whether what it has to say on stderr is JSON lines; else words for people.
     """
 
     def __init__(
@@ -78,6 +82,7 @@ class Guard:
         pause: Callable[[float], None] = time.sleep,
         epoch: float = 0.0,
         hosted: Hosted | None = None,
+        as_json: bool = False,
     ) -> None:
         self._outlet = outlet
         self._channel = channel
@@ -87,6 +92,7 @@ class Guard:
         self._pause = pause
         self._epoch = epoch
         self._hosted = hosted
+        self._as_json = as_json
         n = outlet.limits.n
         self._commanded = np.zeros(n)
         self._reading = PressureReading(np.nan, np.full(n, np.nan))
@@ -96,6 +102,7 @@ class Guard:
         self._tripped = ""
         self._leaving = ""
         self._tidied = clock()
+        self._broken_told = 0.5  # packets; twice as many are worth another word
 
     def leave(self, reason: str) -> None:
         """Vent and come to an end soon; for handlers of signals."""
@@ -116,6 +123,8 @@ class Guard:
     def step(self) -> None:
         """Take in what has come, or wait a little for it, and do what has to be done unasked."""
         self._take(self._channel.receive(self._patience()))
+        if self._channel.broken >= 2 * self._broken_told:
+            self._tell_of_broken()
         if self._channel.closed and not self._leaving:
             self._leaving = "the process of the control loop has ended"
         self._look_at_the_time()
@@ -223,14 +232,19 @@ class Guard:
             raise DeviceError(f"the guard does not know '{word}'; only a simulated rig might")
         return self._hosted.ask(word, about)
 
+    def _tell_of_broken(self) -> None:
+        """Say that messages were refused; nothing was done for them, and they feed nobody."""
+        self._broken_told = self._channel.broken
+        self._say(f"messages refused so far that make no sense: {self._broken_told}")
+
     # what is done --------------------------------------------------------------------------------
 
     def _trip(self, reason: str) -> None:
         """Vent, and stay vented until a loop that knows of it arms again."""
-        self._tripped = reason
+        self._tripped = reason[:_LONGEST]
         self._trips += 1
         if not self._vent():
-            _say(f"vented: {reason}")
+            self._say(f"vented: {reason}")
         self._answer(0)
 
     def _vent(self) -> str:
@@ -240,11 +254,11 @@ class Guard:
             self._outlet.vent()
         except Exception as error:
             if self._to_vent is None:
-                _say(f"COULD NOT VENT, and tries again: {_told(error)}")
+                self._say(f"COULD NOT VENT, and tries again: {_told(error)}", "error")
             self._to_vent = self._clock() + _AGAIN
             return _told(error)
         if self._to_vent is not None:
-            _say("vented after all")
+            self._say("vented after all")
         self._to_vent = None
         self._commanded = np.zeros_like(self._commanded)
         return ""
@@ -259,10 +273,12 @@ class Guard:
             self._reading.time + self._epoch,
             armed=self._due is not None,
             limited=applied is not None and applied.limited,
+            force_limited=applied is not None and applied.force_limited,
             trips=self._trips,
+            broken=self._channel.broken,
             tripped=self._tripped,
-            refused="" if applied is None else applied.refused,
-            error=error,
+            refused="" if applied is None else applied.refused[:_LONGEST],
+            error=error[:_LONGEST],
             value=value,
         )
         self._channel.send(answer)  # a loop that is stopped takes none: the newest then is lost
@@ -284,14 +300,20 @@ class Guard:
             self._pause(_AGAIN)
             failure = self._vent()
         if surprised and not failure:
-            _say(f"vented: {self._leaving}")
+            self._say(f"vented: {self._leaving}")
         try:
             self._outlet.close()
         except Exception as error:
             failure = failure or _told(error)
         if failure:
-            _say(f"THE SUPPLY COULD NOT BE VENTED: {failure}; cut its power or open its valve")
+            text = f"THE SUPPLY COULD NOT BE VENTED: {failure}; cut its power or open its valve"
+            self._say(text, "error")
         return 1 if failure else 0
+
+    def _say(self, text: str, level: str = "warning") -> None:
+        line = json_line(level, "guard", text) if self._as_json else f"stiffopt guard: {text}"
+        with suppress(OSError, ValueError):  # whoever listened is gone; to vent matters, not this
+            print(line, file=sys.stderr, flush=True)
 
 
 def _told(error: BaseException) -> str:
@@ -304,23 +326,20 @@ def _later(sample: PoseSample, epoch: float) -> PoseSample:
     return PoseSample(*times, sample.frame, sample.position, sample.quaternion)
 
 
-def _say(text: str) -> None:
-    with suppress(OSError, ValueError):  # whoever listened is gone; to vent matters, not to say it
-        print(f"stiffopt guard: {text}", file=sys.stderr, flush=True)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the guard process and return its exit code: 0 if the supply is vented at the end.
 
     Parameters
     ----------
     arguments :
-        The number of the inherited end of the socket; by default that of the command line. The
-        rig comes pickled on standard input, from the process that started this one.
+        The number of the inherited end of the socket, and ``json`` if it shall speak so; by default
+        those of the command line. The rig comes pickled on standard input, from the process that
+        started this one.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop ramps down; it says when it is over
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # until there is something to vent
-    descriptor = int((sys.argv[1:] if arguments is None else arguments)[0])
+    given = sys.argv[1:] if arguments is None else arguments
+    descriptor, as_json = int(given[0]), JSON in given[1:]
     with closing(Channel(socket.socket(fileno=descriptor))) as channel:
         try:
             supply = _opened(channel)
@@ -328,7 +347,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             channel.send(Word("failed", {"kind": type(error).__name__, "args": _plain(error)}))
             return 1
         guard = Guard(
-            supply.outlet, channel, supply.timeout, epoch=supply.epoch, hosted=supply.hosted
+            supply.outlet,
+            channel,
+            supply.timeout,
+            epoch=supply.epoch,
+            hosted=supply.hosted,
+            as_json=as_json,
         )
         signal.signal(signal.SIGTERM, lambda *_: guard.leave("SIGTERM"))
         with real_time(PRIORITY) as granted:

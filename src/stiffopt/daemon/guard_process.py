@@ -11,6 +11,7 @@ import warnings
 from contextlib import suppress
 
 from stiffopt.daemon.frames import Channel, Word
+from stiffopt.daemon.lines import JSON
 from stiffopt.errors import DeviceError, MissingExtraError, SlowWarning
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.config import RigDescription
@@ -29,6 +30,8 @@ class GuardProcess:
     ----------
     rig :
         Whose supply it shall own, and its robot.
+    json_lines :
+        Whether it shall speak JSON on stderr.
 
     Attributes
     ----------
@@ -36,12 +39,15 @@ class GuardProcess:
     pid : its number.
     """
 
-    def __init__(self, rig: tuple[RigDescription, RobotDescription]) -> None:
+    def __init__(
+        self, rig: tuple[RigDescription, RobotDescription], *, json_lines: bool = False
+    ) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
+            command = [sys.executable, "-P", "-m", "stiffopt.daemon.guard", str(theirs.fileno())]
             # in a session of its own: Ctrl-C and Ctrl-Z on the terminal are not for the guard
             self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "stiffopt.daemon.guard", str(theirs.fileno())],
+                command + [JSON] * json_lines,
                 stdin=subprocess.PIPE,
                 pass_fds=(theirs.fileno(),),
                 start_new_session=True,

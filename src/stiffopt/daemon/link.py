@@ -54,6 +54,8 @@ class GuardLink:
         The rig.
     limits :
         What may be commanded.
+    json_lines :
+        Whether the guard speaks JSON on stderr; else for people.
 
     Attributes
     ----------
@@ -61,11 +63,17 @@ class GuardLink:
     """
 
     def __init__(
-        self, description: RigDescription, robot: RobotDescription, limits: PressureLimits
+        self,
+        description: RigDescription,
+        robot: RobotDescription,
+        limits: PressureLimits,
+        *,
+        json_lines: bool = False,
     ) -> None:
         self.limits = limits
         self.real_time = ""
         self._rig = (description, robot)
+        self._json_lines = json_lines
         self._process: GuardProcess | None = None
         self._exchange: Exchange | None = None
         self._told = 0  # trips that were said
@@ -86,7 +94,7 @@ class GuardLink:
         if self._process is not None:
             return
         self._told, self._deaf = 0, math.inf
-        self._process = GuardProcess(self._rig)
+        self._process = GuardProcess(self._rig, json_lines=self._json_lines)
         try:
             self.real_time = self._process.wait_until_ready()
             self._exchange = Exchange(self._process.channel)
@@ -198,7 +206,13 @@ class GuardLink:
             self._deaf = min(self._deaf, time.monotonic())
             raise DeviceError(f"the guard process has not answered for {silence:.2g} s")
         self._deaf = math.inf
-        return Applied(newest.commanded, _reading(newest), newest.limited, newest.refused)
+        return Applied(
+            newest.commanded,
+            _reading(newest),
+            newest.limited,
+            newest.refused,
+            newest.force_limited,
+        )
 
     # simulated rigs ------------------------------------------------------------------------------
 
@@ -253,7 +267,10 @@ def _reading(answer: Answer) -> PressureReading:
 
 
 def guarded_rig(
-    rig: str | os.PathLike[str] | RigDescription, robot: RobotDescription | None = None
+    rig: str | os.PathLike[str] | RigDescription,
+    robot: RobotDescription | None = None,
+    *,
+    json_lines: bool = False,
 ) -> tuple[Rig, GuardLink]:
     """Return a rig in real time whose supply a guard process owns, and the link to that.
 
@@ -266,6 +283,8 @@ def guarded_rig(
         A rig file, or its content.
     robot :
         Of the rig; needed if its content is given.
+    json_lines :
+        Whether the guard speaks JSON on stderr.
 
     Raises
     ------
@@ -286,11 +305,12 @@ def guarded_rig(
     clock: Clock = SystemClock()
     tracker: PoseTracker | None
     if description.supply.driver == "simulated":
-        link = GuardLink(description, robot, limits_of(description, robot))
+        limits = limits_of(description, robot)
+        link = GuardLink(description, robot, limits, json_lines=json_lines)
         tracker = None if description.tracker is None else ForwardedTracker(link)
     else:
         real = make_rig(description.model_copy(update={"probe": None}), robot)
-        link = GuardLink(description, robot, real.supply.limits)
+        link = GuardLink(description, robot, real.supply.limits, json_lines=json_lines)
         tracker, clock = real.tracker, real.clock
     supply, slew = GuardedSupply(link), slew_of(description, robot)
     return Rig(robot, supply, tracker, clock=clock, slew=slew, settings=description), link

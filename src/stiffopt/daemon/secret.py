@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import secrets
 from contextlib import suppress
@@ -15,6 +16,9 @@ __all__ = ["Secret"]
 
 class Secret:
     """A token, and the file in which a drawn one can be read by this user alone.
+
+    The file is one daemon's for as long as that lives: a lock beside it, which the kernel releases
+    however a process ends, keeps a second one from putting its token in the place of the first's.
 
     Parameters
     ----------
@@ -39,6 +43,7 @@ class Secret:
         self.path: Path | None = None
         if not given:
             self.path = Path(settings.token_file or Path(folder) / f"{name}.token")
+        self._lock: int | None = None  # an open file
 
     def write(self) -> None:
         """Write the file, in the place of what is there; nobody else can read it at any moment.
@@ -46,13 +51,14 @@ class Secret:
         Raises
         ------
         FileError
-            It cannot be written.
+            It cannot be written, or is that of another daemon, which runs.
         """
         if self.path is None:
             return
         fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._take(self.path)
             with suppress(FileNotFoundError):
                 fresh.unlink()
             descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -67,6 +73,25 @@ class Secret:
                 self.path, f"the token cannot be kept there: {reason}; see service.token_file"
             ) from None
 
+    def _take(self, path: Path) -> None:
+        """Lock the file of the token against other daemons."""
+        if self._lock is not None:
+            return
+        lock = os.open(_lock_of(path), os.O_RDWR | os.O_CREAT, 0o600)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(lock)
+            raise FileError(
+                path,
+                "holds the token of another daemon of a rig of this name, which is running; end "
+                "that one, or give this one another log.folder or service.token_file",
+            ) from None
+        except OSError:  # a file system without locks: nothing is to be known of others there
+            os.close(lock)
+            return
+        self._lock = lock
+
     def remove(self) -> None:
         """Remove the file, if it is still that of this token."""
         if self.path is None:
@@ -74,3 +99,12 @@ class Secret:
         with suppress(OSError, ValueError):
             if self.path.read_text(encoding="ascii").strip() == self.token:
                 self.path.unlink()
+        if self._lock is not None:
+            with suppress(OSError):
+                _lock_of(self.path).unlink()
+            os.close(self._lock)
+            self._lock = None
+
+
+def _lock_of(path: Path) -> Path:
+    return path.with_name(f".{path.name}.lock")

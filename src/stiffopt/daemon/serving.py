@@ -14,7 +14,8 @@ from stiffopt.errors import InputError, MissingExtraError, ServiceError
 __all__ = ["Server"]
 
 _STARTING = 10.0  # s
-_CONNECTIONS = 128
+_CONNECTIONS = 128  # that have not been accepted yet
+_IDLE = 10  # s; longer than clients keep a connection that they do not use
 _CLOSING = 2  # s for requests that are being answered when the server stops
 _log = logging.getLogger(__name__)
 
@@ -70,10 +71,14 @@ class Server:
             import websockets  # noqa: F401  # which uvicorn needs for the stream
         except ModuleNotFoundError as error:
             raise MissingExtraError(error.name or "uvicorn", "daemon") from error
+        from stiffopt.daemon.connections import BoundedProtocol
+
         listening = self._listen()
         self._port = int(listening.getsockname()[1])
         config = uvicorn.Config(
             self._app,
+            http=BoundedProtocol,
+            timeout_keep_alive=_IDLE,
             ws="websockets-sansio",
             ws_max_size=8 * MAX_MESSAGE,  # what is longer ends the connection
             ws_max_queue=4,
