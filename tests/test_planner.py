@@ -16,7 +16,7 @@ from stiffopt.control.planner import InlinePlanner, Planning, ProcessPlanner, Re
 from stiffopt.errors import StiffoptError
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Task
+from stiffopt.optimise.task import PressureRange, Task
 
 ROBOT = "stiff-flop-1"
 BAR = 1e5
@@ -38,6 +38,7 @@ def request(robot, serial=1, offset=(0,) * 6, p=PRESSURES, **changes):
     target = Target(position=(float(position[0]), float(position[1]), None))
     goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
     task = Task(robot=ROBOT, target=target, stiffness=goal)
+    changes.setdefault("beside", np.zeros(3))
     return Request(serial, task, target, np.array(offset, dtype=float), **changes)
 
 
@@ -129,10 +130,45 @@ def test_small_changes_of_the_offset_change_the_plan_little(robot):
         assert np.abs(again.pressures - first.pressures).max() < 0.05 * BAR * k
 
 
+@pytest.mark.usefixtures("compiled")
+@pytest.mark.parametrize("off", [-0.4, 0.2])
+def test_plans_leave_what_is_beside_the_commands_within_the_limits(off):
+    """Of an arm that creeps, say: what acts is not what is commanded, and only that has limits."""
+    arm = so.load_robot("stiff-flop-2-hanging")
+    position = arm.tip_pose(0.5 * arm.pressure_max)[:3, 3]
+    goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
+    task = Task(
+        robot="stiff-flop-2-hanging", target=Target(position=tuple(position)), stiffness=goal
+    )
+    free = Planning(arm).plan(Request(1, task, task.target, np.zeros(6), np.zeros(6)))
+    beside = np.full(6, off * BAR)
+    planning = Planning(arm)
+    plan = planning.plan(Request(1, task, task.target, np.zeros(6), beside))
+    command = plan.pressures - beside
+    assert plan.reached
+    assert np.all(command >= arm.pressure_min - 1)
+    assert np.all(command <= arm.pressure_max + 1)
+    assert np.all(plan.pressures >= arm.pressure_min - 1)
+    assert np.all(plan.pressures <= arm.pressure_max + 1)
+    # the stiffest within these limits, by a solver that was made for them
+    lower = np.maximum(arm.pressure_min, arm.pressure_min + beside)
+    upper = np.minimum(arm.pressure_max, arm.pressure_max + beside)
+    tighter = task.model_copy(
+        update={"pressure": PressureRange(min=tuple(lower), max=tuple(upper))}
+    )
+    own = so.PressureSolver(arm, tighter).solve()
+    assert plan.stiffness == pytest.approx(own.stiffness, rel=5e-3)
+    assert plan.stiffness < free.stiffness * (1 - 1e-3)
+    # and next to the plan before, as in the loop
+    again = planning.plan(Request(1, task, task.target, np.zeros(6), 1.1 * beside))
+    assert np.all(again.pressures - 1.1 * beside <= arm.pressure_max + 1)
+    assert np.all(again.pressures - 1.1 * beside >= arm.pressure_min - 1)
+
+
 def test_target_that_cannot_be_reached_has_a_plan_that_says_why(robot):
     asked = request(robot)
     far = asked.target.model_copy(update={"position": (0.2, 0.0, None)})
-    plan = Planning(robot).plan(Request(1, asked.task, far, np.zeros(6)))
+    plan = Planning(robot).plan(Request(1, asked.task, far, np.zeros(6), np.zeros(3)))
     assert not plan.reached
     assert "away" in plan.message
     assert np.isfinite(plan.pressures).all()

@@ -26,6 +26,7 @@ from stiffopt.optimise.task import Task
 
 ROBOT = "stiff-flop-1"
 OFFSET = np.array([1e-3, -2e-3, 0.1 + 0.2, -0.0, 5e-324, 1 / 3])
+BESIDE = np.array([1e3, -2e3, 0.1])
 
 
 def task(x: float = 0.01) -> Task:
@@ -60,17 +61,19 @@ def assert_same(one: Request, other: Request) -> None:
     )  # fmt: skip
     assert one.offset.dtype == other.offset.dtype == np.float64
     assert one.offset.tobytes() == other.offset.tobytes()
+    assert one.beside.tobytes() == other.beside.tobytes()
 
 
 def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
     first, second = task(), task(0.02)
-    asked = Request(1, first, first.target, OFFSET)
+    asked = Request(1, first, first.target, OFFSET, BESIDE)
     elsewhere: dict[str, Any] = {"target": Target(pointing=(0.0, 0.0, 1.0))}
     for changes in (
         {},
         {},
         {"anew": True},
         {"offset": 2 * OFFSET},
+        {"beside": 2 * BESIDE},
         {"anew": False},
         elsewhere,
         {"serial": 2, "task": second},
@@ -84,7 +87,7 @@ def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
 
 def test_an_offset_that_was_changed_in_place_is_sent(ends: Ends) -> None:
     the_task, offset = task(), OFFSET.copy()
-    asked = Request(1, the_task, the_task.target, offset)
+    asked = Request(1, the_task, the_task.target, offset, BESIDE)
     ends.passes(asked)
     offset += 1.0
     assert ends.passes(asked).offset.tolist() == (OFFSET + 1.0).tolist()
@@ -92,7 +95,7 @@ def test_an_offset_that_was_changed_in_place_is_sent(ends: Ends) -> None:
 
 def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
     the_task = task()
-    first = Request(1, the_task, the_task.target, OFFSET)
+    first = Request(1, the_task, the_task.target, OFFSET, BESIDE)
     sent: list[bytes] = []
 
     def news(line: PlannerLine, request: Request) -> set[str]:
@@ -102,9 +105,9 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
         del line._connection.send_bytes
         return set(pickle.loads(sent.pop()))
 
-    everything = {"serial", "task", "target", "offset", "anew"}
+    everything = {"serial", "task", "target", "offset", "beside", "anew"}
     assert news(ends.ours, first) == everything
-    assert news(ends.ours, replace(first, offset=0 * OFFSET)) == {"offset"}
+    assert news(ends.ours, replace(first, offset=0 * OFFSET)) == {"offset", "beside"}
     other = Ends()
     assert news(other.ours, first) == everything
     other.close()
@@ -112,7 +115,7 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
 
 def test_plans_arrive_as_they_were(ends: Ends) -> None:
     the_task = task()
-    request = Request(4, the_task, the_task.target, OFFSET)
+    request = Request(4, the_task, the_task.target, OFFSET, BESIDE)
     for reached, stiffness, message in ((True, 123.4, ""), (False, math.nan, "it is far")):
         known = ends.passes(request)
         pressures = np.array([1e5 / 3, 0.0, -0.0])
@@ -145,7 +148,7 @@ def test_it_says_whether_there_is_an_answer(monkeypatch: pytest.MonkeyPatch, pol
     with pytest.raises((EOFError, ConnectionError)):
         ends.ours.receive()
     with pytest.raises(OSError, match=r"."):
-        ends.ours.ask(Request(1, task(), task().target, OFFSET))
+        ends.ours.ask(Request(1, task(), task().target, OFFSET, BESIDE))
     ends.ours.close()
 
 

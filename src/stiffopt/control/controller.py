@@ -250,7 +250,7 @@ class Controller:
         self._heed(omega)
         correction = reference.path[n:] - self._heeded
         # what the chambers get beside the command, and the arm beside the chambers
-        beside = self._remembered + np.minimum(np.maximum(self._regulators.offset, -_OFF), _OFF)
+        beside = self._beside
         pressures, held, missing = self._allocation.solve(
             (at.pose, at.jacobian, self._asked, correction, *self._swing()),
             reference.command - beside,
@@ -358,7 +358,7 @@ class Controller:
         self._planned_offset = self._planned_offset + share * (offset - self._planned_offset)
         self._planner.ask(
             Request(
-                self._serial, self._task, target, self._planned_offset.copy(),
+                self._serial, self._task, target, self._planned_offset.copy(), self._beside,
                 anew,
             )
         )  # fmt: skip
@@ -386,6 +386,13 @@ class Controller:
     def _remembered(self) -> Array:
         """By how much the pressures that act differ from those in the chambers (n,)."""
         result: Array = self._effective - self._chamber
+        return result
+
+    @property
+    def _beside(self) -> Array:
+        """By how much the pressures that act will differ from those that are commanded (n,)."""
+        off = np.minimum(np.maximum(self._regulators.offset, -_OFF), _OFF)
+        result: Array = self._remembered + off
         return result
 
     def _models(self) -> tuple[NearbyTip, NearbyTip]:

@@ -93,6 +93,7 @@ class Planning:
             self._is_compiled = self._solver.is_compiled
             self._serial, self._last = request.serial, None
         target = moved_back(request.target, request.offset)
+        self._limits = self._left(request.beside)
         last = self._last
         if last is None or request.anew:
             self._searched_at, self._advantage, self._misses = request.offset, _CLEARLY, 0
@@ -109,6 +110,15 @@ class Planning:
         else:
             self._last = self._closest(request, target)
         return self._last
+
+    def _left(self, beside: Array) -> tuple[Array, Array]:
+        """Limits (n,) each, of pressures that act: those for which there are commands.
+
+        What is beside the commands never widens them; the model ends there.
+        """
+        lower, upper = self._solver.task.pressure_bounds(self._robot.description)
+        left = np.maximum(lower, lower + beside), np.minimum(upper, upper + beside)
+        return (lower, upper) if (left[0] > left[1]).any() else left
 
     def _next_to(self, last: Plan, target: Target) -> PressureSolution | None:
         """The optimum next to the last plan; another one only if that is not to be had for long."""
@@ -149,15 +159,16 @@ class Planning:
     def _solved(self, target: Target, guess: Array | None) -> PressureSolution | None:
         """Answer of the optimiser; None if it has none that holds, soon."""
         if self._is_compiled:
-            return self._solver.solve_at_once(target, guess)
+            return self._solver.solve_at_once(target, guess, self._limits)
         solution = self._solver.solve(target, guess)
         return solution if solution.found else None
 
     def _closest(self, request: Request, target: Target) -> Plan:
         """Plan for a target that is out of reach, or whose stiffness cannot be had there."""
-        bounds = self._solver.task.pressure_bounds(self._robot.description)
-        start = 0.5 * (bounds[0] + bounds[1]) if self._last is None else self._last.pressures
-        pressures, away, turned = closest(self._tip, target, bounds, start)
+        start = 0.5 * (self._limits[0] + self._limits[1])
+        if self._last is not None:
+            start = np.clip(self._last.pressures, *self._limits)
+        pressures, away, turned = closest(self._tip, target, self._limits, start)
         tolerance = request.task.target.tolerance
         if away <= tolerance.position and turned <= tolerance.angle:
             message = "the pose can be reached, but not with the stiffness that is asked for"

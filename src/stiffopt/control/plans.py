@@ -25,6 +25,7 @@ class Request:
     task : what is asked.
     target : where, instead of the task's own target.
     offset : (6,) of the tip from the model, in m and rad (rotation vector), base axes.
+    beside : (n,), by which the pressures that act differ from those that are commanded, in Pa.
     anew : whether all configurations are to be searched, as for a new target.
     """
 
@@ -32,6 +33,7 @@ class Request:
     task: Task
     target: Target
     offset: Array
+    beside: Array
     anew: bool = False
 
 

@@ -193,6 +193,10 @@ class FastSolver:
             row[self._near.stop + 1 :] = guess
         return row
 
+    def limit(self, row: Vector, lower: Vector, upper: Vector) -> None:
+        """Have the row of a task keep other limits (n,), in Pa, within those it was made for."""
+        row[self._radii.stop : self._radii.stop + 2 * len(lower)] = np.concatenate([lower, upper])
+
     def solve(self, row: Vector) -> Answer | None:
         """Answer to one task; None if the general method is needed."""
         numbers = np.empty(self._answer_width)

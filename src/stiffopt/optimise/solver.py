@@ -89,11 +89,19 @@ class PressureSolver:
         return solution
 
     def solve_at_once(
-        self, target: Target | None = None, guess: ArrayLike | None = None
+        self,
+        target: Target | None = None,
+        guess: ArrayLike | None = None,
+        limits: tuple[Vector, Vector] | None = None,
     ) -> PressureSolution | None:
         """Solve by the compiled search alone, in a millisecond or so; for control loops.
 
-        Parameters as for `solve`.
+        Parameters
+        ----------
+        target, guess :
+            As for `solve`.
+        limits : two (n,), optional
+            Lowest and highest pressures in Pa, within those of the task.
 
         Returns
         -------
@@ -101,19 +109,25 @@ class PressureSolver:
         go on by its general method, which may take minutes for an arm under gravity.
         """
         task = self.task if target is None else self.task.model_copy(update={"target": target})
-        return self._compiled(task, self._checked(guess))
+        return self._compiled(task, self._checked(guess), limits)
 
     @property
     def is_compiled(self) -> bool:
         """Whether there is compiled code for the task; compiles it."""
         return self._fast(self.task, None) is not None
 
-    def _compiled(self, task: Task, guess: Vector | None) -> PressureSolution | None:
+    def _compiled(
+        self, task: Task, guess: Vector | None, limits: tuple[Vector, Vector] | None = None
+    ) -> PressureSolution | None:
         """Answer of the compiled solver, if there is one that holds."""
+        if limits is not None and guess is not None:
+            guess = np.clip(guess, *limits)
         fast = self._fast(task, guess)
         if fast is None:
             return None
         solver, row, program = fast
+        if limits is not None:
+            solver.limit(row, *limits)
         return self._accepted(task, program, solver.solve(row))
 
     def _fast(self, task: Task, guess: Vector | None) -> tuple[FastSolver, Vector, Program] | None:
