@@ -48,7 +48,7 @@ class Case:
         J, v, G = ca.SX.sym("J", t, n), ca.SX.sym("v", t), ca.SX.sym("G", 3, n)
         low = self.low if low is None else low
         high = self.high if high is None else high
-        system = Demand([J, v, G], J, v, G, t)
+        system = Demand([J, v, G], [J, G], J, v, G, t)
         return Allocation(system, low, high, self.step, tip_step, solver)
 
     def answer(self, allocation):
@@ -81,7 +81,7 @@ class Case:
 
 @SOLVER
 @pytest.mark.parametrize("kind", ["full", "tall", "none", "zero", "rank 1", "huge", "tiny"])
-@pytest.mark.parametrize("n", [3, 6, 9])
+@pytest.mark.parametrize("n", [1, 3, 6, 9])
 def test_least_squares_within_bounds(solver, kind, n):
     for seed in range(4):
         case = Case(seed, n, kind)

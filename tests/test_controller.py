@@ -423,3 +423,22 @@ def test_stays_stable_with_wrong_models(case):
     position = bench.settled((0.5, 0.7, 0.4, 0.3, 0.4, 0.5), duration=4.0)
     errors = bench.run(1.0, position)
     assert errors.max() < 3e-3
+
+
+@pytest.mark.parametrize("dynamics", ["quasi-static", "full"])
+def test_arm_of_one_channel(tmp_path, dynamics):
+    """It can only lengthen, and goes to a height."""
+    (segment,) = load_description(ONE).segments
+    alone = {"channels": ((1, 2, 3, 4, 5, 6),)}
+    robot = load_description(ONE).model_copy(
+        update={"name": "alone", "segments": (segment.model_copy(update=alone),)}
+    )
+    path = tmp_path / "alone.yaml"
+    so.save_robot(path, robot)
+    bench = Bench(str(path), dynamics)
+    assert bench.n == 1
+    height = float(bench.pose_at(np.array([0.8 * BAR]))[2, 3])
+    target = Target(position=(None, None, height))
+    bench.controller.set_task(Task(robot=str(path), target=target))
+    errors = bench.run(5.0, (np.nan, np.nan, height))
+    assert errors[-100:].mean() < 3e-4

@@ -37,7 +37,8 @@ def drawn(seed):
 
 
 def evaluated(system, *values):
-    return Formula(system.inputs, [system.rows, system.values, system.linear])(*values)
+    outputs = [system.rows, system.values, system.linear]
+    return Formula(system.inputs, outputs, [*system.matrices, system.rows, system.linear])(*values)
 
 
 def task(pose, jacobian, correction, target, feedback):

@@ -195,6 +195,24 @@ def test_arm_that_does_not_swing():
     assert estimator.omega == math.inf
 
 
+@pytest.mark.parametrize("softness", [np.inf, -1.0, 1e30])
+def test_an_arm_that_has_no_stiffness_left_does_no_harm(softness):
+    """About to buckle, say; an omega of 0 would be for ever after."""
+    estimator, truth, now = settled()
+    limp = tip_at(truth.p)._replace(compliance=np.diag([softness] * 3 + [1.0] * 3))
+    if not np.isfinite(softness):
+        limp = tip_at(truth.p)._replace(compliance=np.diag([1e300, 1e300, 1.0, 1, 1, 1]))
+    for k in range(1, 12):
+        estimator.advance(now + k * PERIOD, truth.p, limp)
+        estimator.take([sample(now + k * PERIOD, truth.position)])
+    assert estimator.omega > 0
+    assert np.isfinite(state(estimator)).all()
+    for k in range(12, 80):
+        estimator.advance(now + k * PERIOD, truth.p, tip_at(truth.p))
+        estimator.take([sample(now + k * PERIOD, truth.position)])
+    assert estimator.estimate.position == pytest.approx(truth.position, abs=1e-3)
+
+
 # -- against a filter that is run again ---------------------------------------------------------
 
 

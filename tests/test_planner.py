@@ -218,13 +218,31 @@ def test_asking_does_not_wait_and_the_newest_counts(robot, beside):
 
 def test_slow_planner_is_an_alarm_until_it_answers(robot, beside):
     planner = beside(patience=0.01)
-    wait_for(lambda: ready(planner))
-    os.kill(planner._process.pid, signal.SIGSTOP)
     planner.ask(request(robot))
-    wait_for(lambda: planner.notices())
+    wait_for(lambda: planner.latest() is not None)
+    os.kill(planner._process.pid, signal.SIGSTOP)
+    planner.ask(request(robot, p=0.9 * PRESSURES))
+    wait_for(planner.notices)
     (notice,) = planner.notices()
     assert notice.standing
     assert "slow" in notice.text
+    os.kill(planner._process.pid, signal.SIGCONT)
+    wait_for(lambda: ready(planner))
+    assert planner.notices() == ()
+
+
+def test_a_new_task_that_takes_its_time_is_said_to_do_so(robot, beside):
+    """Nothing is wrong, but the arm does not move, and somebody waits."""
+    planner = beside()
+    wait_for(lambda: ready(planner))
+    os.kill(planner._process.pid, signal.SIGSTOP)
+    planner.ask(request(robot))
+    assert planner.notices() == ()
+    wait_for(planner.notices)
+    (notice,) = planner.notices()
+    assert notice.kind == "preparing"
+    assert notice.standing
+    assert "compiled" in notice.text
     os.kill(planner._process.pid, signal.SIGCONT)
     wait_for(lambda: planner.latest() is not None)
     assert planner.notices() == ()

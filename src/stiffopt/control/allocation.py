@@ -199,9 +199,8 @@ def _program(demand: Demand, step: Array, tip_step: float) -> Formula:
     moves = max(tip_step, 1e-9) + ca.fabs(G) @ forced
     finite = ca.sumsqr(f) + ca.sumsqr(G)
     inputs = [*demand.inputs, reference, last, least, most]
-    return Formula(inputs, [
-        H, f, G, ca.vertcat(lower, -moves), ca.vertcat(upper, moves), finite, J, v,
-    ])  # fmt: skip
+    outputs = [H, f, G, ca.vertcat(lower, -moves), ca.vertcat(upper, moves), finite, J, v]
+    return Formula(inputs, outputs, [*demand.matrices, H, G, J])
 
 
 def _answer(demand: Demand) -> Formula:
@@ -221,4 +220,4 @@ def _answer(demand: Demand) -> Formula:
     missing = (J @ (p * _BAR - reference) - v)[: demand.task_rows]
     beyond = ca.sumsqr(change - bounded)
     inputs = [change, low, high, J, v, reference, last, least, most]
-    return Formula(inputs, [p * _BAR, held, ca.norm_2(missing), beyond])
+    return Formula(inputs, [p * _BAR, held, ca.norm_2(missing), beyond], [J])

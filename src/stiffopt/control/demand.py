@@ -43,6 +43,8 @@ class Demand:
     ----------
     inputs : list
         Symbols; see `demand`.
+    matrices : list
+        Those of them that have a column for each channel.
     rows, values : J (t, n), v (t,)
     task_rows : int
         How many of the first rows are the task's.
@@ -50,6 +52,7 @@ class Demand:
     """
 
     inputs: list[Symbols]
+    matrices: list[Symbols]
     rows: Symbols
     values: Symbols
     linear: Symbols
@@ -112,4 +115,4 @@ def demand(
     task = [position @ linear, pointing * (sideways @ angular), orientation * angular]
     values = [position @ shift, pointing * (sideways @ turn), orientation * turn]
     rows = ca.vertcat(*task, *modal)
-    return Demand(inputs, rows, ca.vertcat(*values, *damped), linear, 9)
+    return Demand(inputs, [jacobian], rows, ca.vertcat(*values, *damped), linear, 9)

@@ -39,6 +39,7 @@ Array = NDArray[np.float64]
 
 _REMEMBERED = 0.4  # s; older samples are of no use
 _SOFT = 0.15  # of the softest direction's compliance; directions with less swing less
+_SLOWEST = 0.5  # rad/s; an arm about to buckle swings no slower, as far as the filter is concerned
 _FROZEN = 2e-3  # m; a tip that the model moves by more cannot be seen where it was
 _GIVEN_UP = 40  # rejected samples in a row after which all begins anew
 _UNTURNED = (1.0, 0.0, 0.0, 0.0)
@@ -253,7 +254,8 @@ class TipEstimator:
         # of a strongly bent arm, no direction is stiff altogether
         share = np.minimum(1.0, softness / (_SOFT * softness[2]))
         self.across_matrix = axes * share @ axes.T
-        self.omega = self._vibration.frequency(2 / float(softness[1] + softness[2]))
+        omega = self._vibration.frequency(2 / float(softness[1] + softness[2]))
+        self.omega = max(_SLOWEST, omega)
         self._times[0] = self.omega
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
         self._lean = turning @ axes[:, 1:] @ np.diag(1 / softness[1:]) @ axes[:, 1:].T

@@ -29,14 +29,24 @@ class Formula:
     ----------
     inputs, outputs :
         Symbols, and expressions of them.
+    matrices :
+        Those of them that stay matrices with a single column: with a column for each channel, say.
     """
 
-    def __init__(self, inputs: Sequence[Any], outputs: Sequence[Any]) -> None:
+    def __init__(
+        self, inputs: Sequence[Any], outputs: Sequence[Any], matrices: Sequence[Any] = ()
+    ) -> None:
         dense = ca.cse([ca.densify(output) for output in outputs])
         self._buffer = Buffer(ca.Function("formula", list(inputs), dense), 1)
-        self._targets, self._evaluate = self._buffer.targets, self._buffer.evaluate
+        self._evaluate = self._buffer.evaluate
+        own = {id(matrix) for matrix in matrices}
+        self._targets = [
+            target[:, None] if id(symbol) in own and target.ndim == 1 else target
+            for symbol, target in zip(inputs, self._buffer.targets, strict=True)
+        ]
         self._results = [
-            result[:, 0] if result.shape[1] == 1 else result for result in self._buffer.results
+            result[:, 0] if result.shape[1] == 1 and id(expression) not in own else result
+            for expression, result in zip(outputs, self._buffer.results, strict=True)
         ]
 
     def __call__(self, *arguments: Any) -> list[Array]:

@@ -76,4 +76,5 @@ def _moved(lowest: Array, highest: Array) -> Formula:
     away = p - there
     moved = ca.SX(pose)
     moved[:3, 3] += pose[:3, :3] @ (jacobian[:3, :] @ away)
-    return Formula([pressures, there, pose, jacobian], [p, ca.norm_2(away), moved])
+    outputs = [p, ca.norm_2(away), moved]
+    return Formula([pressures, there, pose, jacobian], outputs, [jacobian])

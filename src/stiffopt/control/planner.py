@@ -30,6 +30,7 @@ from stiffopt import lie
 from stiffopt.control.closest import closest
 from stiffopt.control.planner_line import PlannerLine
 from stiffopt.control.plans import Plan, Request
+from stiffopt.control.state import Severity
 from stiffopt.control.steering import Notice
 from stiffopt.errors import StiffoptError
 from stiffopt.model.manipulator import Manipulator
@@ -58,6 +59,7 @@ _FAR_PER_METRE = 2e7  # Pa/m; the same for each metre that the target has moved
 _PATIENCE = 20  # plans
 _EXACT = Tolerance(position=1e-5, angle=1e-3)
 _RESTART_AFTER = 1.0  # s
+_PREPARES = 0.5  # s; a new task that takes longer is worth a word
 
 
 class Planning:
@@ -249,6 +251,7 @@ class ProcessPlanner:
     def __init__(self, robot: Manipulator, patience: float = 5.0) -> None:
         self._robot, self._patience = robot, patience
         self._wanted: Request | None = None
+        self._serial = -1  # of what was asked last
         self._plan: Plan | None = None
         self._trouble, self._ended = "", False
         self._start()
@@ -290,7 +293,14 @@ class ProcessPlanner:
         begun = self._begun
         if self._trouble:
             return (Notice("planner", self._trouble, standing=True),)
-        if begun is not None and time.monotonic() - begun > self._patience:
+        elapsed = 0.0 if begun is None else time.monotonic() - begun
+        if elapsed > _PREPARES and (self._plan is None or self._plan.serial != self._serial):
+            text = (
+                "the optimiser prepares for a new task; the first of a kind is compiled, which "
+                "takes seconds, and until then the pressures stay"
+            )
+            return (Notice("preparing", text, Severity.INFO, standing=True),)
+        if elapsed > self._patience:
             return (Notice("planner", "the planner is slow; the last plan stays", standing=True),)
         return ()
 
@@ -318,6 +328,7 @@ class ProcessPlanner:
                     self._trouble = f"the planner failed and begins anew: {answer}"
             if self._wanted is not None and self._begun is None:
                 self._line.ask(self._wanted)
+                self._serial = self._wanted.serial
                 self._wanted, self._begun = None, time.monotonic()
         except (OSError, EOFError, pickle.UnpicklingError):
             self._start_again()

@@ -132,4 +132,5 @@ def _step(most: Array, beside: int) -> Formula:
     motion = differences @ after
     pressures = motion[:, :n].T
     inputs = [levels, plan, transition, differences, command, chamber]
-    return Formula(inputs, [after, motion, pressures @ command, pressures @ chamber])
+    outputs = [after, motion, pressures @ command, pressures @ chamber]
+    return Formula(inputs, outputs, [levels, after, motion])

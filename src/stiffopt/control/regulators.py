@@ -92,4 +92,4 @@ def _step(share: Array, most: Array, depth: int, period: float) -> Formula:
     ahead = now
     for k in range(1, depth):
         ahead = moved(ahead, offset_after, sent[k, :])
-    return Formula([x, offset, sent, reading], [now, offset_after, ahead])
+    return Formula([x, offset, sent, reading], [now, offset_after, ahead], [sent])

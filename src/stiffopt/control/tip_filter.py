@@ -47,7 +47,7 @@ def prediction(vibration: Vibration | None, n: int, damping: float) -> Formula:
         driven_after, free_after = F @ (driven - half) - half, F @ free
     ways = ca.vertcat(ca.norm_2(place - before), ca.norm_2(moved))
     inputs = [pose, jacobian, before, driven, free, across, change, times]
-    return Formula(inputs, [place, driven_after, free_after, ways])
+    return Formula(inputs, [place, driven_after, free_after, ways], [jacobian])
 
 
 def correction(settings: Any, swings: bool) -> Formula:
