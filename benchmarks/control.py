@@ -4,11 +4,13 @@
 
 Each case is another arm (see `control_cases.py`), another start and other targets, and all
 controllers get the same. The controllers see the rig through the interface of every rig; the truth
-is seen by who judges alone. Prints a table, side by side; with ``--calibrated`` the robot file has
-the arm's true values (for what of them it has words), with ``--payload`` the tip carries more than
-it says, with ``--loop`` the whole control loop with its safety gate runs and not the steering
-alone, with ``--paths`` figures-of-eight are followed instead of targets reached. ``--tune`` tries
-the gains of plain integral feedback (take other seeds for it).
+is seen by who judges alone. Prints a table, side by side. ``--robot-file`` says which file they
+get: the nominal one; one that stiffopt's own calibration made of a recording of that arm (some
+minutes an arm; ``--keep`` keeps it, so that a run can be taken up again); or one with the arm's
+true values, for what of them it has words. With ``--payload`` the tip carries more than it says,
+with ``--loop`` the whole control loop with its safety gate runs and not the steering alone, with
+``--paths`` figures-of-eight are followed instead of targets reached. ``--tune`` tries the gains of
+plain integral feedback (take other seeds for it).
 
 What the figures are: settling to 1 mm, for good, over the ideal: the settling time of an open-loop
 step with the arm's own pressures, without inertia, creep and hysteresis ("drawn": random ones;
@@ -24,18 +26,22 @@ import json
 import multiprocessing
 import sys
 from collections.abc import Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from control_baselines import CONTROLLERS, GRID, Gains, IntegralFeedback, MakeSteering
-from control_cases import DYNAMICS, draw_case, draw_path
+from control_calibration import with_calibrated_file
+from control_cases import DYNAMICS, Case, draw_case, draw_path, with_true_file
 from control_runs import Follow, Step, run_case, run_path
 
+ROBOT_FILES = ("nominal", "calibrated", "true")
 STEADY_BAR = {"quasi-static": 1e-4, "full": 3e-4}
 PATH_BAR = {"quasi-static": 1.0, "full": 1.5}  # mm
 
@@ -47,12 +53,13 @@ def one_case(
     dynamics: Sequence[str],
     targets: int,
     payload: float,
-    calibrated: bool,
+    robot_file: str,
+    keep: Path | None,
     paths: bool,
     in_loop: bool,
 ) -> list[Step | Follow]:
     """All that one arm has to show."""
-    case = draw_case(seed, 1 if paths else targets, payload, calibrated)
+    case = with_file(draw_case(seed, 1 if paths else targets, payload), robot_file, keep)
     found: list[Step | Follow] = []
     path = draw_path(case) if paths else None
     for kind in dynamics:
@@ -62,6 +69,14 @@ def one_case(
             else:
                 found += run_case(case, name, CONTROLLERS[name], kind, in_loop)
     return found
+
+
+def with_file(case: Case, robot_file: str, keep: Path | None) -> Case:
+    """The case whose controller gets one of `ROBOT_FILES`; a calibrated one is kept in a folder."""
+    if robot_file == "calibrated":
+        with nullcontext(keep) if keep else TemporaryDirectory() as folder:
+            return with_calibrated_file(case, Path(folder))
+    return with_true_file(case) if robot_file == "true" else case
 
 
 def in_processes(work: Any, seeds: Sequence[int], jobs: int) -> Iterable[Any]:
@@ -229,7 +244,8 @@ def main() -> int:
     parser.add_argument("--dynamics", nargs="+", choices=DYNAMICS, default=list(DYNAMICS))
     parser.add_argument("--controller", nargs="+", choices=names, default=names)
     parser.add_argument("--payload", type=float, default=0.0, help="unknown mass at the tip, kg")
-    parser.add_argument("--calibrated", action="store_true", help="with the true values")
+    parser.add_argument("--robot-file", choices=ROBOT_FILES, default=ROBOT_FILES[0])
+    parser.add_argument("--keep", type=Path, help="keep calibrated files here and use them again")
     parser.add_argument("--paths", action="store_true", help="figures-of-eight, not targets")
     parser.add_argument("--loop", action="store_true", help="in the whole control loop")
     parser.add_argument("--tune", action="store_true", help="gains of plain integral feedback")
@@ -244,7 +260,7 @@ def main() -> int:
     else:
         work = partial(
             one_case, **common, controllers=given.controller, payload=given.payload,
-            calibrated=given.calibrated, paths=given.paths, in_loop=given.loop,
+            robot_file=given.robot_file, keep=given.keep, paths=given.paths, in_loop=given.loop,
         )  # fmt: skip
     found: list[Any] = []
     for part in in_processes(work, seeds, given.jobs):

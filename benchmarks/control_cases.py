@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from stiffopt.model.description import RobotDescription
     from stiffopt.optimise.target import Target
     from stiffopt.optimise.task import Task
+    from stiffopt.registration import Registration
     from stiffopt.rig.config import RigDescription
     from stiffopt.rig.simulated.rig import SimulatedRig
     from stiffopt.rig.simulated.settings import PlantSettings
@@ -75,7 +76,7 @@ class Case:
     robot : what the simulated arm was made from.
     truth : what the model says with the arm's true values.
     aims : targets, in order.
-    calibrated : whether the controller gets a robot file with the true values.
+    believed : the robot file that the controller gets; it never knows of a payload.
     """
 
     seed: int
@@ -83,22 +84,31 @@ class Case:
     robot: RobotDescription
     truth: Truth
     aims: tuple[Aim, ...]
-    calibrated: bool = False
+    believed: RobotDescription
 
     @property
-    def believed(self) -> RobotDescription:
-        """The robot file that the controller gets; it never knows of a payload."""
-        if not self.calibrated:
-            return self.robot
-        update = {"tip_mass": self.robot.tip_mass}
-        return self.truth.model.description.model_copy(update=update)
+    def registration(self) -> Registration:
+        """Where that file has the nominal base frame."""
+        from stiffopt.registration import Registration
+
+        recordings = self.believed.recordings
+        return Registration() if recordings is None else recordings.registration
+
+    @property
+    def point(self) -> Array:
+        """What that file calls the tip, as a frame (4, 4) in that of the arm's true tip.
+
+        A calibration of poses alone hardly tells where on the arm's end the sensor is; what it
+        calls the tip is the point that is asked to go somewhere.
+        """
+        return self.registration.tip_in_sensor.transform()
 
     def target(self, position: Array) -> Target:
         """A place in the nominal base frame as a target in the base frame of that file."""
         from stiffopt import Target
 
-        here = self.truth.in_own_base(position) if self.calibrated else position
-        return Target(position=tuple(here.tolist()))
+        here = self.registration.tracker_in_base.transform() @ [*position, 1.0]
+        return Target(position=tuple(here[:3].tolist()))
 
     def arm(self) -> Arm:
         """The arm beside any rig."""
@@ -108,9 +118,8 @@ class Case:
         """To go there and be stiff in a direction of the nominal base frame."""
         from stiffopt import StiffnessGoal, StiffnessMeasure, Task
 
-        axis = np.array(DIRECTIONS[kind])
-        if self.calibrated:
-            axis = self.truth.base[:3, :3].T @ axis
+        turn = self.registration.tracker_in_base.transform()[:3, :3]
+        axis = turn @ DIRECTIONS[kind]
         goal = StiffnessGoal(maximise=StiffnessMeasure(direction=tuple(axis.tolist())))
         return Task(robot=self.robot.name, target=self.target(position), stiffness=goal)
 
@@ -120,21 +129,24 @@ class Case:
 
         plant = self.description.plant.model_copy(update={"dynamics": dynamics})
         rig: Any = make_rig(self.description.model_copy(update={"plant": plant}), self.robot)
-        if self.calibrated:
-            known = self.believed.recordings.registration
-            rig.tracker.registration = rig.tracker.registration.then(known)
+        rig.tracker.registration = rig.tracker.registration.then(self.registration)
         return rig
 
 
-def draw_case(seed: int, targets: int = 3, payload: float = 0.0, calibrated: bool = False) -> Case:
-    """Draw an arm and targets for it.
+def with_true_file(case: Case) -> Case:
+    """The case whose controller gets a robot file with the true values, where it has words."""
+    update = {"tip_mass": case.robot.tip_mass}
+    return replace(case, believed=case.truth.model.description.model_copy(update=update))
+
+
+def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
+    """Draw an arm and targets for it; the controller gets the nominal robot file.
 
     Parameters
     ----------
     seed : all is drawn from it, also noise.
     targets : how many; their directions take turns, the first one changes with the seed.
     payload : mass at the tip that nobody knows of, beside the 20 g of the robot file, in kg.
-    calibrated : see `Case`.
     """
     from stiffopt.model.robot_files import load_description
     from stiffopt.rig.config import load_rig_description
@@ -154,7 +166,7 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0, calibrated: boo
         kind = kinds[(seed + k) % len(kinds)]
         stiffest = arm.stiffest(position, DIRECTIONS[kind], drawn, rng)
         aims.append(Aim(position, kind, drawn, stiffest, np.nan, np.nan))
-    case = Case(seed, rig, robot, truth, tuple(aims), calibrated)
+    case = Case(seed, rig, robot, truth, tuple(aims), robot)
     drawn = ideal_times(case, [aim.drawn for aim in aims])
     stiffest = ideal_times(case, [aim.stiffest for aim in aims])
     timed = [

@@ -120,10 +120,13 @@ class Trace:
 
 
 class Run:
-    """A steering at a rig, tick by tick, with nothing between it and the supply."""
+    """A steering at a rig, tick by tick, with nothing between it and the supply.
 
-    def __init__(self, rig: SimulatedRig, steering: Steering) -> None:
-        self.rig, self._steering = rig, steering
+    `point` is what is looked at, a frame (4, 4) in that of the tip.
+    """
+
+    def __init__(self, rig: SimulatedRig, steering: Steering, point: Array) -> None:
+        self.rig, self._steering, self._point = rig, steering, point
 
     def start(self) -> None:
         """Connect and arm."""
@@ -135,6 +138,10 @@ class Run:
         self._reading = rig.supply.read()
         self._count = round(rig.clock.now() / PERIOD)
         self._steering.begin(rig.clock.now())
+
+    def tip(self) -> Array:
+        """Where that point is (3,)."""
+        return np.array((self.rig.world.plant.tip_pose() @ self._point)[:3, 3])
 
     def set_task(self, task: Task) -> None:
         """Pursue a task."""
@@ -155,7 +162,7 @@ class Run:
             self._count += 1
             rig.clock.sleep_until(self._count * PERIOD)
             rows.append((
-                rig.clock.now() - begin, rig.world.plant.tip_pose()[:3, 3], rig.supply.commanded,
+                rig.clock.now() - begin, self.tip(), rig.supply.commanded,
                 rig.world.pressures.copy(), saturated, sound, took,
             ))  # fmt: skip
         return Trace(*map(np.array, zip(*rows, strict=True)))
@@ -177,11 +184,11 @@ class Run:
 class LoopRun(Run):
     """The same in the control loop, with the safety gate in front of the supply."""
 
-    def __init__(self, rig: SimulatedRig, steering: Steering) -> None:
+    def __init__(self, rig: SimulatedRig, steering: Steering, point: Array) -> None:
         from stiffopt.control.loop import ControlLoop
         from stiffopt.control.safety import SafetyGate
 
-        super().__init__(rig, steering)
+        super().__init__(rig, steering, point)
         safety = rig.settings.safety
         gate = SafetyGate(
             rig.supply, slew=rig.slew, safety=safety, force_per_pressure=None, clock=rig.clock,
@@ -220,15 +227,14 @@ class LoopRun(Run):
 
 
 @contextmanager
-def _started(
-    case: Case, make: MakeSteering, dynamics: str, in_loop: bool
-) -> Iterator[tuple[SimulatedRig, Run]]:
-    """Context with a rig and a steering that steers it."""
+def _started(case: Case, make: MakeSteering, dynamics: str, in_loop: bool) -> Iterator[Run]:
+    """Context with a steering that steers a rig."""
     rig = case.rig(dynamics)
-    run = (LoopRun if in_loop else Run)(rig, make(rig, case.believed, dynamics))
+    steering = make(rig, case.believed, dynamics)
+    run = (LoopRun if in_loop else Run)(rig, steering, case.point)
     try:
         run.start()
-        yield rig, run
+        yield run
     finally:
         run.close()
 
@@ -243,8 +249,8 @@ def run_case(
     """Go from target to target."""
     rng = np.random.default_rng([case.seed, 9])
     steps = []
-    with _started(case, make, dynamics, in_loop) as (rig, run):
-        before = np.array(rig.world.plant.tip_pose()[:3, 3])
+    with _started(case, make, dynamics, in_loop) as run:
+        before = run.tip()
         last = np.zeros(case.robot.n_pressures)
         for k, aim in enumerate(case.aims):
             run.set_task(case.task(aim.position, aim.kind))
@@ -324,7 +330,7 @@ def run_path(
         Waypoint(time=time, target=case.target(place))
         for time, place in zip(path.times.tolist(), path.positions, strict=True)
     ]
-    with _started(case, make, dynamics, in_loop) as (_, run):
+    with _started(case, make, dynamics, in_loop) as run:
         run.set_task(case.task(path.positions[0], "axial"))
         run.go(SETTLE_FIRST)
         run.follow(Trajectory(waypoints=points))

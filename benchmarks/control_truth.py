@@ -66,10 +66,6 @@ class Truth:
         with _passing_cache():  # nobody needs the code of this very arm again
             self._tip = TipModel(self.model)
 
-    def in_own_base(self, position: Array) -> Array:
-        """A place (3,) in the arm's own base frame."""
-        return self.base[:3, :3].T @ (position - self.base[:3, 3])
-
     def position(self, pressures: Array) -> Array:
         """Tip (3,)."""
         return self._place(pressures)[0]

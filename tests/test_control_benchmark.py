@@ -1,7 +1,9 @@
 """The benchmark of the closed loop: its cases, its judgement and its baselines, in short form."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,9 +14,12 @@ import stiffopt.rig.simulated.rig  # noqa: F401 - its code is kept where it alwa
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import control
+import control_calibration
 import control_runs
 from control_baselines import CONTROLLERS, Gains, IntegralFeedback
-from control_cases import DIRECTIONS, STEPS, draw_case, draw_path
+from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, with_true_file
+from stiffopt.model.description import Recordings
+from stiffopt.registration import Placement, Registration
 
 
 @pytest.fixture(autouse=True)
@@ -73,3 +78,60 @@ def test_a_path_has_the_right_speed():
     spread = np.linalg.norm(path.positions[:, None] - path.positions[None], axis=2).max()
     assert spread == pytest.approx(0.040, rel=0.05)
     assert path.at(np.array([1e9]))[0] == pytest.approx(path.positions[-1])
+
+
+def test_a_robot_file_with_another_base_gets_targets_and_poses_in_that_base():
+    nominal = draw_case(3, targets=1)
+    case = with_true_file(nominal)
+    place, axis = case.aims[0].position, DIRECTIONS["lateral"]
+    base = case.description.plant.mismatch.base.transform()
+    here = base[:3, :3].T @ (place - base[:3, 3])
+    assert case.target(place).position == pytest.approx(here, abs=1e-9)
+    assert nominal.target(place).position == pytest.approx(place, abs=1e-12)
+    (goal,) = case.task(place, "lateral").stiffness.maximise
+    assert goal.direction == pytest.approx(base[:3, :3].T @ axis, abs=1e-9)
+    with nominal.rig("quasi-static") as rig:
+        rig.clock.sleep(1.0)
+        tip = rig.world.plant.tip_pose()[:3, 3]
+        (*_, seen) = rig.tracker.read()
+    assert seen.position == pytest.approx(tip, abs=5e-4)  # noise
+    with case.rig("quasi-static") as rig:
+        rig.clock.sleep(1.0)
+        (*_, seen) = rig.tracker.read()
+    assert seen.position == pytest.approx(case.target(tip).position, abs=5e-4)
+    assert np.linalg.norm(seen.position - tip) > 2e-3
+
+
+def test_what_a_file_calls_the_tip_is_what_goes_to_the_target():
+    nominal = draw_case(3, targets=1)
+    off = Placement(position=(4e-3, 0.0, 0.0))
+    recordings = Recordings(registration=Registration(tip_in_sensor=off))
+    case = replace(nominal, believed=nominal.robot.model_copy(update={"recordings": recordings}))
+    (step,) = control_runs.run_case(case, "stiffopt", CONTROLLERS["stiffopt"], "quasi-static")
+    assert step.steady < 3e-4
+
+
+def test_a_calibrated_file_comes_from_a_recording_without_the_run_s_noise_and_is_kept(
+    tmp_path, monkeypatch
+):
+    case = draw_case(3, targets=1, payload=0.01)
+    asked = []
+
+    def recorded(rig, robot, sizes, folder):
+        asked.append(rig.plant)
+        return ["log"]
+
+    def calibrate(robot, logs, settings):
+        assert (robot, logs) == (case.robot, ["log"])
+        return SimpleNamespace(robot=robot.model_copy(update={"tip_mass": 0.021}))
+
+    monkeypatch.setattr(control_calibration, "recorded", recorded)
+    monkeypatch.setattr("stiffopt.calibrate", calibrate)
+    for _ in range(2):
+        known = control.with_file(case, "calibrated", tmp_path)
+        assert known.believed == case.robot.model_copy(update={"tip_mass": 0.021})
+    (plant,) = asked  # once
+    assert plant.mismatch == case.description.plant.mismatch
+    assert (plant.dynamics, plant.payload) == ("full", 0.0)
+    assert plant.seed != case.description.plant.seed
+    assert control.with_file(case, "nominal", None) is case
