@@ -12,7 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import stiffopt as so
-from stiffopt.control.planner import InlinePlanner, Planning, ProcessPlanner, Request, moved_back
+from stiffopt.control.planner import InlinePlanner, ProcessPlanner
+from stiffopt.control.planning import Planning, moved_back
+from stiffopt.control.plans import Request
 from stiffopt.errors import StiffoptError
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target

@@ -30,7 +30,8 @@ from stiffopt.control.demand import demand, parts_asked
 from stiffopt.control.estimator import EstimatorSettings, TipEstimator
 from stiffopt.control.gains import Gains
 from stiffopt.control.nearby import NearbyTip
-from stiffopt.control.planner import InlinePlanner, Plan, Planner, ProcessPlanner, Request
+from stiffopt.control.planner import InlinePlanner, Planner, ProcessPlanner
+from stiffopt.control.plans import Plan, Request
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import RegulatorModel
 from stiffopt.control.state import Severity

@@ -6,8 +6,8 @@ import os
 import sys
 from contextlib import suppress
 
-from stiffopt.control.planner import Planning
 from stiffopt.control.planner_line import PlanningLine
+from stiffopt.control.planning import Planning
 
 __all__ = ["main"]
 
