@@ -30,6 +30,19 @@ def test_a_walk_of_small_and_large_steps_is_the_models(robot):
     assert len(evaluated) < 100
 
 
+def test_the_jacobian_is_nearly_the_same_a_little_further_away(robot):
+    """What the class says of itself."""
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        p = rng.uniform(0.1, 0.9, robot.n_pressures) * robot.pressure_max
+        step = rng.normal(size=len(p))
+        nearby = NearbyTip(robot, 3e3)
+        here, there = nearby.at(p), nearby.at(p + 2.9e3 * step / np.linalg.norm(step))
+        assert there.jacobian is here.jacobian
+        true = robot.tip_jacobian(p + 2.9e3 * step / np.linalg.norm(step))
+        assert np.abs(there.jacobian - true).max() < 0.05 * np.abs(true).max()
+
+
 def test_what_was_returned_does_not_change(robot):
     nearby, p = NearbyTip(robot), 0.4 * robot.pressure_max
     tips = [nearby.at(p + 50.0 * k) for k in range(4)]

@@ -59,6 +59,7 @@ _HEED = 0.6  # rate with which a swinging arm's offset is corrected, over its fr
 _BRISK = 100.0  # 1/s; rate of the reference of an arm that does not swing
 _BELIEVED = 0.5  # of the arm's length; an offset beyond is no model error any more
 _OFF = 3e3  # Pa; by which the command makes up for a regulator that is off
+_ALIKE = 3e3  # Pa; along the path only the model's derivatives are of interest
 _SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
 
 
@@ -140,7 +141,7 @@ class Controller:
         """Compile and try the model; see `Steering.check`."""
         if self._here is not None:
             return
-        here, there = NearbyTip(self.robot), NearbyTip(self.robot)
+        here, there = NearbyTip(self.robot), NearbyTip(self.robot, _ALIKE)
         if not here.is_fast and self.robot.is_loaded:
             raise InputError(
                 "the control loop needs a C compiler for an arm under gravity or a load; "

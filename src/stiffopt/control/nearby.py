@@ -15,8 +15,6 @@ __all__ = ["NearbyTip"]
 
 Array = NDArray[np.float64]
 
-_NEARBY = 600.0  # Pa, in all; over this the model is linear: the tip to a few micrometres
-
 
 class NearbyTip:
     """Evaluates the model where pressures have changed, else what is linear about it.
@@ -27,10 +25,15 @@ class NearbyTip:
     ----------
     robot :
         The arm.
+    nearby :
+        Over which the model is taken for linear, in Pa, as the norm of all channels' changes. Over
+        600 Pa the tip is so to a few micrometres, over 3 kPa the Jacobian is the same to a few
+        hundredths.
     """
 
-    def __init__(self, robot: Manipulator) -> None:
+    def __init__(self, robot: Manipulator, nearby: float = 600.0) -> None:
         self._model = TipModel(robot)
+        self._nearby = nearby
         self._moved = _moved(robot.pressure_min, robot.pressure_max)
         self._last: TipAt | None = None
         self._there = np.full(robot.n_pressures, np.inf)  # its pressures
@@ -53,7 +56,7 @@ class NearbyTip:
             p, _, _ = self._moved(pressures, self._there, np.eye(4), np.zeros((6, len(pressures))))
         else:
             p, away, pose = self._moved(pressures, self._there, last.pose, last.jacobian)
-            if away[0] < _NEARBY:
+            if away[0] < self._nearby:
                 return TipAt(pose, last.jacobian, last.compliance)
         try:
             self._last = self._model.at(p)
