@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -126,3 +127,16 @@ class FakeSteering:
 
     def close(self) -> None:
         self.closed = True
+
+
+class Hang:
+    """An accident: one call of a steering waits until `go_on` is set; `begun` says when."""
+
+    def __init__(self, call: str) -> None:
+        self.call = call
+        self.begun, self.go_on = threading.Event(), threading.Event()
+
+    def __call__(self, call: str) -> None:
+        if call == self.call:
+            self.begun.set()
+            self.go_on.wait(10)

@@ -379,6 +379,32 @@ def test_what_libraries_log_becomes_events_and_never_a_flood() -> None:
     assert len(told) == 5
 
 
+def test_what_cannot_be_put_into_words_does_not_hurt_who_logs_it() -> None:
+    events = EventLog()
+    loop: Any = SimpleNamespace(events=events, rig=SimpleNamespace(clock=ManualClock()))
+
+    class OddError(Exception):
+        def __str__(self) -> str:
+            raise RuntimeError("no words")
+
+    odd = logging.LogRecord("uvicorn.error", logging.ERROR, "a.py", 9, "it is", (), None)
+    odd.exc_info = (OddError, OddError(), None)
+    handler = LogEvents(loop)
+    for record in (
+        logging.LogRecord("uvicorn.error", logging.WARNING, "/b/a.py", 7, "%d", ("x",), None),
+        logging.LogRecord("stiffopt.x", logging.ERROR, "/b/a.py", 8, "%d %d", (1,), None),
+        odd,
+    ):
+        handler.handle(record)
+    assert [event.text for event in events.since(0)[0]] == [
+        "what was logged in a.py:7 cannot be shown (TypeError)",
+        "what was logged in a.py:8 cannot be shown (TypeError)",
+        "what was logged in a.py:9 cannot be shown (RuntimeError)",
+    ]
+    loop.events = None  # nor what else may be wrong
+    handler.handle(logging.LogRecord("stiffopt.x", logging.ERROR, "a.py", 1, "late", (), None))
+
+
 # the token ---------------------------------------------------------------------------------------
 
 
@@ -401,7 +427,7 @@ def test_a_drawn_token_is_for_this_user_alone(
     other.remove()  # not its own
     assert path.exists()
     secret.remove()
-    assert not os.listdir(path.parent)
+    assert os.listdir(path.parent) == [".my-rig.token.lock"]
 
 
 def test_a_second_daemon_leaves_the_token_of_the_first(
@@ -422,6 +448,42 @@ def test_a_second_daemon_leaves_the_token_of_the_first(
     second.write()
     assert first.path.read_text().strip() == second.token
     second.remove()
+
+
+def test_whoever_opened_the_lock_before_it_was_released_keeps_others_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    first, third = (Secret(ServiceSettings(), tmp_path, "my-rig") for _ in range(2))
+    first.write()
+    with (tmp_path / ".my-rig.token.lock").open("r+") as second:  # as one does that starts just now
+        first.remove()
+        fcntl.flock(second, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with pytest.raises(FileError, match="another daemon"):
+            third.write()
+    third.write()
+    third.remove()
+
+
+def test_a_lock_of_another_user_is_named_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    lock, opened = tmp_path / ".my-rig.token.lock", os.open
+
+    def denied(path: Any, *rest: Any) -> int:  # as for another user: root may open everything
+        if Path(path) == lock:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return opened(path, *rest)
+
+    monkeypatch.setattr(os, "open", denied)
+    secret = Secret(ServiceSettings(), tmp_path, "my-rig")
+    with pytest.raises(FileError, match=r"token cannot be kept there: permission denied"):
+        secret.write()  # a folder in which nothing can be written
+    lock.write_text("")
+    with pytest.raises(FileError, match=r"another user, .* remove this file, .*token_file") as told:
+        secret.write()
+    assert told.value.path == str(lock)
 
 
 def test_the_token_of_a_killed_daemon_is_in_nobody_s_way(

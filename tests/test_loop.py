@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import pytest
 
+from fake_control import Hang
 from simulated_loop import PERIOD, TASK, Lab
 from stiffopt.control.journal import Alarms, EventLog
 from stiffopt.control.lifecycle import Lifecycle
 from stiffopt.control.loop import ControlLoop
+from stiffopt.control.requests import Asker, asked_by
 from stiffopt.control.state import Severity, State
 from stiffopt.control.timing import LatenessHistogram, Punctuality
 from stiffopt.control.trajectory import Trajectory, Waypoint
@@ -333,6 +335,126 @@ def test_requests_that_wait_when_the_loop_ends_are_refused() -> None:
         one.join(60)
         assert not one.is_alive()
     assert len(refused) == 4
+
+
+@pytest.mark.parametrize("served", [True, False])
+def test_while_it_is_configured_nothing_waits_and_a_vent_is_done(served: bool) -> None:
+    lab = Lab(ready=False)
+    lab.steering.accident = compiling = Hang("check")
+    with running(lab) if served else nullcontext():
+        while served and lab.loop.snapshot().timing.ticks < 5:
+            pass
+        starting = threading.Thread(target=lab.loop.configure)
+        starting.start()
+        assert compiling.begun.wait(30)
+        told: list[str] = []
+        for request in (
+            lab.loop.arm,
+            lab.loop.disarm,
+            lab.loop.reset,
+            lab.loop.hold,
+            lambda: lab.loop.set_task(TASK),
+            lab.loop.configure,
+        ):
+            told.append(refusal(request))
+        lab.world.inject("supply", "off")
+        assert "cannot be told to vent now (the simulated supply" in refusal(lab.loop.vent)
+        lab.world.inject("supply", "ok")
+        lab.loop.vent()
+        assert starting.is_alive()
+        compiling.go_on.set()
+        starting.join(30)
+        assert lab.state is State.INACTIVE
+        assert all("while unconfigured: it is still starting" in text for text in told)
+    assert "armed" not in lab.kinds
+    assert lab.steering.calls == ["begin"]
+
+
+def test_a_vent_before_the_supply_is_connected_says_so() -> None:
+    lab = Lab(ready=False)
+    assert lab.rig.tracker is not None
+    connect, told = lab.rig.tracker.open, []
+
+    def slowly() -> None:
+        told.append(refusal(lab.loop.vent))
+        connect()
+
+    lab.rig.tracker.open = slowly  # type: ignore[method-assign]
+    lab.loop.configure()
+    assert lab.state is State.INACTIVE
+    assert told[0].endswith("is not open); it is vented when it is connected")
+
+
+def refusal(request: Callable[[], None]) -> str:
+    with pytest.raises(CommandError) as refused:
+        request()
+    return str(refused.value)
+
+
+@pytest.mark.parametrize("served", [True, False])
+def test_what_was_given_up_is_not_done_later(served: bool) -> None:
+    lab = Lab()
+    lab.steering.accident = busy = Hang("set_task")
+    with running(lab) if served else nullcontext():
+        while served and lab.loop.snapshot().timing.ticks < 5:
+            pass
+        first, second, patient = Asker(), Asker(), Asker()
+        told: dict[Asker, str] = {}
+
+        def ask(asker: Asker, request: Callable[[], None]) -> None:
+            with asked_by(asker):
+                try:
+                    request()
+                except CommandError as error:
+                    told[asker] = str(error)
+
+        threads = [threading.Thread(target=ask, args=(first, lambda: lab.loop.set_task(TASK)))]
+        threads[0].start()
+        assert busy.begun.wait(30)
+        for asker, request in (
+            (second, lambda: lab.loop.set_target(TASK.target)),
+            (patient, lambda: lab.loop.hold("late")),
+        ):
+            threads.append(threading.Thread(target=ask, args=(asker, request)))
+            threads[-1].start()
+        assert not first.give_up()  # it was begun
+        assert second.give_up()
+        threads[1].join(10)
+        assert not threads[1].is_alive()  # nor does anything wait for it
+        busy.go_on.set()
+        for thread in threads:
+            thread.join(30)
+        assert told == {second: "nobody waits for this any more; it is not done"}
+        assert lab.loop.snapshot().reason == "late"
+    assert lab.steering.calls.count("set_task") == 1
+    assert "set_target" not in lab.steering.calls
+
+
+def test_nothing_is_begun_by_one_who_gave_up_before() -> None:
+    lab, asker = Lab(), Asker()
+    assert asker.give_up()
+    with asked_by(asker), pytest.raises(CommandError, match="it is not done"):
+        lab.loop.set_target(TASK.target)
+    assert "set_target" not in lab.steering.calls
+    lab.loop.set_target(TASK.target)  # of somebody else
+
+
+def test_an_arming_whose_checks_take_too_long_moves_nothing() -> None:
+    lab, asker = Lab(ready=False), Asker()
+    lab.loop.configure()
+    lab.ticks(60)
+
+    def give_up(call: str) -> None:
+        if call == "check":
+            asker.give_up()
+
+    lab.steering.accident = give_up
+    with asked_by(asker), pytest.raises(CommandError, match="longer than anybody waited"):
+        lab.loop.arm()
+    assert lab.state is State.INACTIVE
+    assert not lab.gate.armed
+    lab.loop.arm()
+    assert lab.gate.armed
 
 
 def test_ticks_come_at_absolute_times_and_missed_ones_are_left_out() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -25,29 +26,43 @@ SAFETY = Safety()
 
 
 class Regulators:
-    """Two regulators that follow, and the monitor that looks at them."""
+    """Regulators on one line that follow, and the monitor that looks at them."""
 
     def __init__(
-        self, *, lag: float = 0.06, dead: int = 1, slew: float = 5e5, believed: Any = 0.06
+        self,
+        *,
+        n: int = 2,
+        lag: Any = 0.06,
+        falling: Any = None,
+        dead: int = 1,
+        slew: float = 5e5,
+        believed: Any = 0.06,
+        believed_falling: Any = None,
+        dead_time: float = 0.01,
     ):
-        regulation = Regulation(np.broadcast_to(believed, 2), 0.01)
-        limits = PressureLimits(np.zeros(2), np.full(2, 1.5e5))
+        lags = np.broadcast_to(believed, n)
+        down = lags if believed_falling is None else np.broadcast_to(believed_falling, n)
+        limits = PressureLimits(np.zeros(n), np.full(n, 1.5e5))
+        regulation = Regulation(lags, down, dead_time)
         self.monitor = PressureMonitor(limits, SAFETY, regulation, slew)
-        self.lag, self.slew = lag, slew
-        self.waiting = [np.zeros(2)] * (dead + 1)
-        self.t, self.p = 0.0, np.zeros(2)
-        self.saturation = np.full(2, np.inf)
-        self.leak = np.zeros(2)
-        self.gauge = lambda p: p
+        self.rising, self.falling = lag, lag if falling is None else falling
+        self.slew = slew
+        self.waiting = [np.zeros(n)] * (dead + 1)
+        self.t, self.p = 0.0, np.zeros(n)
+        self.saturation = np.full(n, np.inf)
+        self.line: Callable[[float], float] = lambda t: math.inf
+        self.leak = np.zeros(n)
+        self.gauge: Callable[[Array], Array] = lambda p: p
         self.was_saturated = False
 
     def step(self, commanded: Array) -> Trouble | None:
         self.t += PERIOD
         self.waiting.append(commanded)
-        wanted = np.minimum(self.waiting.pop(0), self.saturation)
+        wanted = np.minimum(self.waiting.pop(0), np.minimum(self.saturation, self.line(self.t)))
         for _ in range(10):
             h = PERIOD / 10
-            change = (wanted - self.p) * (1 - math.exp(-h / self.lag)) if self.lag else wanted
+            lag = np.where(wanted > self.p, self.rising, self.falling)
+            change = (wanted - self.p) * (1 - np.exp(-h / lag))
             self.p = self.p + np.clip(change, -self.slew * h, self.slew * h)
             self.p = self.p - self.leak * h * self.p
         found = self.monitor.update(self.t, PressureReading(self.t, self.gauge(self.p)))
@@ -168,6 +183,110 @@ def test_9_a_tube_that_is_off_from_the_beginning_is_found_where_the_line_has_pre
     assert 1.0 < after < 2.5
 
 
+@pytest.mark.parametrize("moving", [[5e4, 0.0], [0.0, 3e4], [5e4, 3e4]])
+def test_9_a_tube_that_is_off_from_the_beginning_is_found_while_commands_move(
+    moving: list[float],
+) -> None:
+    bench = Regulators()
+    bench.leak[0] = 1 / 0.02
+    for k in range(1000):
+        wave = math.sin(2 * math.pi * k * PERIOD / 4)
+        found = bench.step(np.array([9e4, 9e4]) + wave * np.array(moving))
+        if found is not None:
+            break
+    assert found is not None
+    assert found.kind == "leak"
+    assert found.text.startswith("channel 1")
+    assert 1.0 < bench.t < 3.0
+
+
+def test_9_a_leak_from_the_beginning_is_found_while_other_commands_move() -> None:
+    bench = Regulators()
+    bench.leak[0] = 1 / 0.2
+
+    def run(pressure: float) -> Trouble | None:
+        for _ in range(300):
+            other = 9e4 + 3e4 * math.sin(2 * math.pi * bench.t / 4)
+            if (found := bench.step(np.array([pressure, other]))) is not None:
+                return found
+        return None
+
+    assert run(1.2e5) is None
+    found = run(1.4e5)
+    assert found is not None
+    assert found.kind == "leak"
+    assert found.text.startswith("channel 1")
+
+
+@pytest.mark.parametrize(
+    ("commands", "line", "swing"), [([1.4e5, 1.4e5], 1.175e5, 0.125e5), ([1e5, 1.2e5], 0.95e5, 1e4)]
+)
+def test_8_a_line_that_sags_under_several_channels_is_flagged_and_no_leak(
+    commands: list[float], line: float, swing: float
+) -> None:
+    bench = Regulators()
+    bench.line = lambda t: line + swing * math.sin(2 * math.pi * t / 10)  # a compressor
+    assert bench.hold(*commands, seconds=8.5)[0] is None  # at the lowest pressure of the line
+    np.testing.assert_array_equal(bench.monitor.saturated, [True, True])
+    assert bench.hold(*commands, seconds=21.5)[0] is None
+    # what the line has now is known for a channel that is at its end alone, too
+    sagged = float(bench.line(bench.t))
+    bench.line = lambda t: sagged
+    bench.hold(*commands, seconds=1.0)
+    assert bench.hold(commands[0], 5e4, seconds=3.0)[0] is None
+    assert bench.hold(*commands, seconds=3.0)[0] is None
+
+
+@pytest.mark.parametrize("cycle", [4.0, 10.0])
+def test_8_commands_that_change_on_a_line_that_sags_find_no_leak(cycle: float) -> None:
+    bench = Regulators()
+    bench.line = lambda t: 1.0e5 + 1.5e4 * math.sin(2 * math.pi * t / cycle)
+    for pressure in (1.3e5, 1.4e5, 1.35e5, 1.25e5, 1.4e5, 1.3e5, 1.45e5):
+        assert bench.hold(pressure, pressure, seconds=1.7)[0] is None
+
+
+def test_9_one_channel_alone_that_falls_is_a_leak_even_where_the_line_sags() -> None:
+    bench = Regulators()
+    bench.line = lambda t: 1.175e5 + 0.125e5 * math.sin(2 * math.pi * t / 10)
+    found, _ = bench.hold(1.4e5, 5e4, seconds=30.0)  # nobody can tell, so it is vented
+    assert found is not None
+    assert found.kind == "leak"
+
+
+def test_9_a_channel_that_leaks_beside_others_at_the_end_of_a_line_is_found() -> None:
+    bench = Regulators(n=3)
+    bench.line = lambda t: 1.1e5 - 0.005e5 * t
+    assert bench.hold(1.4e5, 1.4e5, 1.4e5, seconds=5.0)[0] is None
+    bench.leak[2] = 1 / 0.2
+    found, after = bench.hold(1.4e5, 1.4e5, 1.4e5, seconds=3.0)
+    assert found is not None
+    assert found.kind == "leak"
+    assert found.text.startswith("channel 3")
+    assert after < 1.0
+
+
+def test_9_a_channel_that_leaks_after_the_line_has_recovered_is_found() -> None:
+    bench = Regulators()
+    bench.line = lambda t: 1.4e5 if not 3 < t < 6 else 1.0e5
+    assert bench.hold(1.3e5, 1.3e5, seconds=9.0)[0] is None
+    assert bench.was_saturated
+    bench.leak[1] = 1 / 0.3
+    found, after = bench.hold(1.3e5, 1.3e5, seconds=3.0)
+    assert found is not None
+    assert found.kind == "leak"
+    assert after < 1.0
+
+
+def test_9_a_line_that_loses_most_of_its_pressure_is_a_fault() -> None:
+    bench = Regulators()
+    bench.line = lambda t: max(0.0, 1.2e5 - 0.1e5 * t)
+    found, after = bench.hold(1.1e5, 1.1e5, seconds=20.0)
+    assert found is not None
+    assert found.kind == "leak"
+    assert bench.p[0] == pytest.approx(0.5 * 1.1e5, abs=6e3)
+    assert after > 6.0
+
+
 def test_8_a_line_without_pressure_is_no_leak() -> None:
     bench = Regulators()
     bench.saturation[:] = 5e3
@@ -215,15 +334,69 @@ def test_9_10_arms_that_are_slow_by_their_robot_file_are_neither_leaking_nor_stu
     )
     control = ControlSettings(regulator_lag=0.06, regulator_dead_time=0.02)
     regulation = Regulation.slowest(slow, control, 6)
-    np.testing.assert_array_equal(regulation.lag, 3 * [max(0.5, falling)] + 3 * [0.06])
+    np.testing.assert_array_equal(regulation.lag, 3 * [0.5] + 3 * [0.06])
+    np.testing.assert_array_equal(regulation.lag_falling, 3 * [falling or 0.5] + 3 * [0.06])
     assert regulation.dead_time == 0.05
     np.testing.assert_array_equal(Regulation.slowest(robot, control, 6).lag, 0.06)
     np.testing.assert_array_equal(Regulation.slowest(slow, control, 2).lag, 0.06)
 
-    bench = Regulators(lag=max(0.5, falling), dead=5, believed=regulation.lag[:2])
+    bench = Regulators(
+        lag=0.5,
+        falling=falling or 0.5,
+        dead=5,
+        believed=regulation.lag[:2],
+        believed_falling=regulation.lag_falling[:2],
+        dead_time=0.05,
+    )
     for _ in range(3):
         assert bench.hold(1.2e5, 1.2e5, seconds=3.0)[0] is None
         assert bench.hold(0.0, 0.0, seconds=3.0)[0] is None
+    assert not bench.was_saturated
+
+
+@pytest.mark.parametrize(("lag", "falling"), [(0.06, 0.5), (0.5, 0.06), (0.3, 0.8), (1.0, 0.06)])
+@pytest.mark.parametrize("frequency", [0.3, 1.0, 2.0])
+def test_9_10_regulators_that_rise_and_fall_unequally_are_well(
+    lag: float, falling: float, frequency: float
+) -> None:
+    bench = Regulators(lag=lag, falling=falling, believed=lag, believed_falling=falling)
+    for k in range(800):
+        high = (frequency * k * PERIOD) % 1 < 0.5
+        assert bench.step(np.array([1.2e5 if high else 1e4, 5e4])) is None
+
+
+def test_9_10_a_short_pulse_and_a_short_dip_are_neither_stuck_nor_leaking() -> None:
+    bench = Regulators(lag=0.06, falling=1.0, believed=0.06, believed_falling=1.0)
+    for pressure, seconds in ((0.0, 1.0), (1e5, 0.4), (0.0, 3.0)):
+        assert bench.hold(pressure, 0.0, seconds=seconds)[0] is None
+    bench = Regulators(lag=0.5, falling=0.06, believed=0.5, believed_falling=0.06)
+    for pressure, seconds in ((1e5, 4.0), (0.0, 0.4), (1e5, 4.0)):
+        assert bench.hold(pressure, 5e4, seconds=seconds)[0] is None
+    assert not bench.was_saturated
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_9_10_no_regulator_that_is_fast_enough_is_ever_wrong(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    believed, falling = draw.uniform(0.02, 1.0, (2, 6))
+    dead_time = float(draw.uniform(0.01, 0.1))
+    bench = Regulators(
+        n=6,
+        lag=believed * draw.uniform(0.05, 1, 6),
+        falling=falling * draw.uniform(0.05, 1, 6),
+        dead=int(draw.integers(0, int(dead_time / PERIOD))),
+        believed=believed,
+        believed_falling=falling,
+        dead_time=dead_time,
+    )
+    commanded = np.zeros(6)
+    for _ in range(1500):
+        jump = draw.random(6) < 0.03
+        commanded = np.where(jump, draw.uniform(0, 1.4e5, 6), commanded)
+        commanded = np.clip(commanded + draw.normal(0, 5e2, 6), 0, 1.5e5)
+        assert bench.step(commanded) is None
+        p, expected = bench.p, bench.monitor._expected
+        assert ((expected.lowest < p + 1) & (p < expected.highest + 1)).all()
     assert not bench.was_saturated
 
 
@@ -436,6 +609,26 @@ def test_1_other_trackers_have_other_frames(interval: float, latency: float) -> 
         assert watched.tick() is Sight.SEEN
     gone = watched.until(Sight.MISSING, **NOTHING)
     assert 3 * interval < gone < 3.25 * interval + 3.1 * PERIOD
+
+
+@pytest.mark.parametrize("interval", [1 / 6, 0.2, 0.3, 0.4])
+def test_1_a_slow_tracker_is_missing_at_the_timeout_and_lost_after_it(interval: float) -> None:
+    watched = Watched(interval).ready()
+    for _ in range(300):
+        assert watched.tick() is Sight.SEEN
+    begin = watched.latest + watched.latency
+    sights = [watched.tick(**NOTHING) for _ in range(200)]
+    first = sights.index(Sight.MISSING)
+    assert Sight.LOST not in sights[:first]
+    assert sights.index(Sight.LOST) > first
+    missing = watched.t - PERIOD * (len(sights) - 1 - first) - begin
+    assert missing <= SAFETY.tracker_timeout + 2 * PERIOD
+
+
+def test_1_a_tracker_slower_than_the_timeout_never_sees_the_tip() -> None:
+    watched = Watched(0.8).ready()
+    sights = {watched.tick() for _ in range(500)}
+    assert Sight.SEEN not in sights
 
 
 def test_7_samples_that_come_too_late_are_as_good_as_none() -> None:

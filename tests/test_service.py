@@ -13,7 +13,9 @@ import httpx
 import numpy as np
 import pytest
 
+from fake_control import Hang
 from fake_loop import FakeLoop, ManualClock
+from running import wait_for
 from simulated_loop import Lab
 from stiffopt.control.state import Alarm, State
 from stiffopt.daemon.messages import MAX_WAYPOINTS
@@ -479,6 +481,66 @@ def test_a_loop_that_does_not_answer_is_given_up_but_may_still_be_vented() -> No
         refused(answer, 503, "did not answer within 0.05 s")
     refused(busy, 503, "too much to do")
     assert vented.status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "call"),
+    [
+        ("target", TARGET, "set_target"),
+        ("task", {"target": {"position_m": [0.0, 0.0, 0.1]}}, "set_task"),
+    ],
+)
+def test_what_the_loop_has_not_begun_in_time_it_never_does_but_it_vents(
+    path: str, body: Any, call: str
+) -> None:
+    lab = Lab()
+    api = Api(lab.loop, robot=lab.rig.robot, patience=0.05)
+    api.take()
+    lab.steering.accident = busy = Hang("move")
+    stop = threading.Event()
+    loop = threading.Thread(target=lab.loop.run, args=(stop,))
+    loop.start()
+    assert busy.begun.wait(30)
+    try:
+        refused(api("POST", f"/v1/{path}", body), 503, "0.05 s; it will not do this any more")
+        refused(api("POST", "/v1/vent"), 503, "0.05 s; this is done as soon as it can be")
+        busy.go_on.set()
+        wait_for(lambda: lab.state is State.INACTIVE)
+    finally:
+        busy.go_on.set()
+        stop.set()
+        loop.join(60)
+    assert call not in lab.steering.calls
+    told = [event.text for event in lab.loop.events.since(0)[0]]
+    assert "vented: a client asked for it" in told
+
+
+def test_of_what_was_begun_the_outcome_is_not_known() -> None:
+    lab = Lab()
+    api = Api(lab.loop, robot=lab.rig.robot, patience=0.05)
+    api.take()
+    lab.steering.accident = slow = Hang("set_target")
+    refused(api("POST", "/v1/target", TARGET), 503, "whether it will still do this is not known")
+    slow.go_on.set()
+    wait_for(lambda: "set_target" in lab.steering.calls)
+
+
+def test_a_daemon_that_starts_answers_at_once() -> None:
+    lab = Lab(ready=False)
+    api = Api(lab.loop, robot=lab.rig.robot, patience=5.0)
+    api.take()
+    lab.steering.accident = compiling = Hang("check")
+    starting = threading.Thread(target=lab.loop.configure)
+    starting.start()
+    try:
+        assert compiling.begun.wait(30)
+        for path, body in (("arm", None), ("target", TARGET), ("hold", None)):
+            refused(api("POST", f"/v1/{path}", body), 409, "still starting")
+        assert api("POST", "/v1/vent").json() == {"state": "unconfigured", "reason": ""}
+    finally:
+        compiling.go_on.set()
+        starting.join(60)
+    assert lab.kinds == ["configured"]  # and nothing that was asked for before
 
 
 # Losing control -----------------------------------------------------------------------------------

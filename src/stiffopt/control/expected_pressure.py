@@ -1,4 +1,4 @@
-"""Where the pressures should be, by what was commanded and how regulators follow."""
+"""Where the pressures can be, by what was commanded and how regulators follow."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ class Regulation:
 
     Attributes
     ----------
-    lag : time constant of each channel (n,), in s.
+    lag, lag_falling : time constants of each channel (n,) while its pressure rises and falls, in s.
     dead_time : until a command has any effect, in s.
     """
 
     lag: Array
+    lag_falling: Array
     dead_time: float
 
     @classmethod
@@ -39,41 +40,50 @@ class Regulation:
         A channel that is expected later than it comes is not wrong, one that is expected too early
         would be. Where the robot has another number of channels the rig's numbers alone count.
         """
-        lags, dead_time = [], control.regulator_dead_time
+        lag, dead_time = control.regulator_lag, control.regulator_dead_time
+        if sum(segment.n_channels for segment in robot.segments) != n:
+            return cls(np.full(n, lag), np.full(n, lag), dead_time)
+        rising, falling = [], []
         for segment in robot.segments:
-            history, slowest = segment.history, control.regulator_lag
-            if history is not None:
-                slowest = max(slowest, history.lag, history.lag_falling)
+            up = down = lag
+            if (history := segment.history) is not None:
+                up = max(lag, history.lag)
+                down = max(lag, history.lag_falling or history.lag)
                 dead_time = max(dead_time, history.dead_time)
-            lags += [slowest] * segment.n_channels
-        if len(lags) != n:
-            return cls(np.full(n, control.regulator_lag), control.regulator_dead_time)
-        return cls(np.array(lags), dead_time)
+            rising += [up] * segment.n_channels
+            falling += [down] * segment.n_channels
+        return cls(np.array(rising), np.array(falling), dead_time)
 
 
 class ExpectedPressure:
-    """Where a regulator that works as it should would be: dead time, lag, limited rate.
+    """Between which pressures regulators are that work as they should.
 
-    Readings do not correct it, unlike the estimator's model: it is what they are held against.
+    How slowly they follow at most is known: dead time, lag, limited rate. They may be faster, each
+    one otherwise, and faster up than down. So the lowest pressure rises as slowly as may be and
+    falls at once, and the highest rises at once and falls slowly. Every regulator that is no slower
+    is between the two, whatever it is told.
+
+    Readings do not correct them, unlike the estimator's model: they are what readings are held
+    against.
 
     Parameters
     ----------
     regulation :
-        How regulators follow.
+        How slowly regulators follow.
     slew :
-        Greatest rate of change (n,), in Pa/s.
+        Rate of change (n,) that they can do at least, in Pa/s.
 
     Attributes
     ----------
-    pressures : ndarray
-        Where they are now (n,), in Pa.
+    lowest, highest : ndarray
+        Between which they are now (n,), in Pa.
     """
 
     def __init__(self, regulation: Regulation, slew: Array) -> None:
         n = len(regulation.lag)
-        self.pressures: Array = np.zeros(n)
-        lag, at_once = regulation.lag, regulation.lag <= 0
-        self._rate: Array = np.where(at_once, np.inf, 1 / np.where(at_once, 1.0, lag))
+        self.lowest: Array = np.zeros(n)
+        self.highest: Array = np.zeros(n)
+        self._up, self._down = _rates(regulation.lag), _rates(regulation.lag_falling)
         self._dead_time = regulation.dead_time
         self._slew = slew
         self._told: deque[tuple[float, Array]] = deque([(-np.inf, np.zeros(n))], maxlen=_TOLD)
@@ -90,12 +100,21 @@ class ExpectedPressure:
         elapsed = time - self._time
         if not elapsed > 0:
             return 0.0
-        acting = time - 0.5 * elapsed - self._dead_time  # midway, as if it were so all the while
-        told = self._told
+        told, acting = self._told, self._time - self._dead_time
         while len(told) > 1 and told[1][0] <= acting:
             told.popleft()
-        change = (told[0][1] - self.pressures) * -np.expm1(-elapsed * self._rate)
+        # any of these may have acted meanwhile
+        commands = np.array([commanded for _, commanded in told])
+        least, most = np.minimum.reduce(commands), np.maximum.reduce(commands)
         reach = self._slew * elapsed
-        self.pressures = self.pressures + np.minimum(np.maximum(change, -reach), reach)
+        rise = np.minimum((least - self.lowest) * -np.expm1(-elapsed * self._up), reach)
+        self.lowest = np.minimum(self.lowest + rise, least)
+        fall = np.minimum((self.highest - most) * -np.expm1(-elapsed * self._down), reach)
+        self.highest = np.maximum(self.highest - fall, most)
         self._time = time
         return elapsed
+
+
+def _rates(lag: Array) -> Array:
+    at_once = lag <= 0
+    return np.where(at_once, np.inf, 1 / np.where(at_once, 1.0, lag))

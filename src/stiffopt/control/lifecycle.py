@@ -30,7 +30,7 @@ _ALLOWED = {
 }
 
 _ADVICE = {
-    State.UNCONFIGURED: "configure first",
+    State.UNCONFIGURED: "configure first, or wait until that is done",
     State.INACTIVE: "it is vented; arm first",
     State.ACTIVE: "disarm first",
     State.HOLDING: "disarm first",

@@ -10,12 +10,12 @@ from collections.abc import Callable
 from stiffopt.control.journal import EventLog
 from stiffopt.control.machine import Machine
 from stiffopt.control.outlet import Outlet
-from stiffopt.control.requests import Requests
+from stiffopt.control.requests import Requests, asking
 from stiffopt.control.state import Snapshot, State
 from stiffopt.control.steering import Standing, Steering
 from stiffopt.control.timing import Punctuality
 from stiffopt.control.trajectory import Trajectory
-from stiffopt.errors import InputError
+from stiffopt.errors import CommandError, InputError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.rig.interface import Rig
@@ -24,6 +24,10 @@ from stiffopt.rig.settings import Safety
 __all__ = ["ControlLoop"]
 
 _LAST_TRIES = 0.5  # s after the ramp in which a supply that cannot be vented is tried again
+_STARTING = (
+    "not while unconfigured: it is still starting, connects to the rig and checks it, which takes "
+    "up to a minute or so; ask again when the state is inactive"
+)
 
 
 class ControlLoop:
@@ -33,7 +37,8 @@ class ControlLoop:
     it steer. Whatever goes wrong either holds the pressures or is a fault, which vents and lasts
     until `reset`. Requests may come from any thread: the control thread carries them out in its
     next tick, or the caller at once while the loop does not run. They return when that is done, or
-    raise `InputError` with the reason; nothing has changed then.
+    raise `InputError` with the reason; nothing has changed then. While it is configured for the
+    first time, which may take long, nothing waits: all is refused at once, but `vent` is done.
 
     Parameters
     ----------
@@ -63,6 +68,7 @@ class ControlLoop:
         self.period = period
         self._machine = Machine(rig, steering, outlet, safety, period)
         self._requests = Requests()
+        self._configuring = False
         self._punctuality = Punctuality(period)
         self._ramp_time = safety.ramp_time
         self.events: EventLog = self._machine.events
@@ -80,7 +86,12 @@ class ControlLoop:
         InputError
             A check failed; the text begins with its name. There may be several.
         """
-        self._ask(self._machine.configure)
+        self._check_started()
+        self._configuring = True
+        try:
+            self._carry_out(self._machine.configure)
+        finally:
+            self._configuring = False
 
     def arm(self) -> None:
         """Check the vented arm, then steer: it stays as it is until there is a task.
@@ -92,7 +103,8 @@ class ControlLoop:
         InputError
             A check failed; the text begins with its name. There may be several.
         """
-        self._ask(self._machine.arm)
+        asker = asking()  # checks may take long
+        self._ask(lambda now: self._machine.arm(now, lambda: asker.gone))
 
     def disarm(self) -> None:
         """Begin to let the pressures down; after `Safety.ramp_time` it is vented and inactive.
@@ -150,9 +162,12 @@ class ControlLoop:
         Raises
         ------
         InputError
-            The supply does not take it. If it was configured it is in fault then, and tries again
-            in each tick.
+            The supply does not take it, or is not connected yet: that vents it. If it was
+            configured it is in fault then, and tries again in each tick.
         """
+        if self._starting:  # the supply itself can be told: nothing else commands it yet
+            self._machine.vent_beside()
+            return
         self._ask(lambda now: self._machine.vent(now, reason))
 
     def reset(self) -> None:
@@ -184,14 +199,27 @@ class ControlLoop:
         """
         self._listeners.append(listener)
 
+    @property
+    def _starting(self) -> bool:
+        return self._configuring and self._machine.lifecycle.state is State.UNCONFIGURED
+
+    def _check_started(self) -> None:
+        """Refuse what would wait until all is connected, and come as a surprise then."""
+        if self._starting:
+            raise CommandError(_STARTING)
+
     def _ask(self, request: Callable[[float], None]) -> None:
-        def carry_out() -> None:
+        self._check_started()
+        self._carry_out(request)
+
+    def _carry_out(self, request: Callable[[float], None]) -> None:
+        def carry() -> None:
             try:
                 self._machine.carry_out(request)
             finally:
                 self._snapshot = self._pictured(self.rig.clock.now())
 
-        self._requests.make(carry_out)
+        self._requests.make(carry)
 
     # Time ----------------------------------------------------------------------------------------
 

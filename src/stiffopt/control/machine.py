@@ -58,8 +58,8 @@ class Machine(Ticking):
             self.lifecycle.change(State.INACTIVE)
             self.events.add(now, "configured", "everything answers; vented")
 
-    def arm(self, now: float) -> None:
-        """Check, and take commands; see `ControlLoop.arm`."""
+    def arm(self, now: float, unwanted: Callable[[], bool] = lambda: False) -> None:
+        """Check, and take commands unless nobody wants that any more; see `ControlLoop.arm`."""
         self.lifecycle.permit("arm")
         reading = self.outlet.read()
         problems = [
@@ -70,6 +70,8 @@ class Machine(Ticking):
         ]
         if problems:
             raise CommandError("; ".join(problems))
+        if unwanted():
+            raise CommandError("the checks took longer than anybody waited; arm again")
         now = self._clock.now()  # checks may take their time
         self._vented = False
         try:
@@ -140,6 +142,16 @@ class Machine(Ticking):
             self._end(now, reason)
             if not self._vented:
                 raise CommandError(self.lifecycle.reason)
+
+    def vent_beside(self) -> None:
+        """Vent while another thread configures, which nothing of this disturbs."""
+        try:
+            self.outlet.vent()
+        except StiffoptError as error:
+            raise CommandError(
+                f"it is still starting, and the supply cannot be told to vent now ({error}); it is "
+                "vented when it is connected"
+            ) from error
 
     def shut(self, now: float) -> None:
         """Vent for good, trying more than once."""

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.expected_pressure import ExpectedPressure, Regulation
 from stiffopt.control.shortage import Shortage
+from stiffopt.control.supply_line import SupplyLine
 from stiffopt.rig.interface import PressureLimits, PressureReading
 from stiffopt.rig.settings import Safety
 
@@ -44,17 +45,21 @@ class PressureMonitor:
 
     A reading that is not finite in a channel that was measured before, or that no gauge of this
     supply can show, is a fault at once, and so are readings that do not come any more. A reading
-    that is beside both the command and where a good regulator would be by now, by more than
+    that is where no good regulator would be by now, see `ExpectedPressure`, by more than
     `Safety.max_pressure_error`, for `Safety.pressure_error_time`, is a fault: a leak if it is
-    below, a regulator stuck if above. What is between the two is a regulator on its way.
+    below, a regulator stuck if above.
 
     A leak and a regulator whose supply runs out of pressure both stay below the command. What
     tells them apart is what the channel has reached since it was armed: a regulator that has no
     more pressure still reaches that, and a leak takes it away. So below what was commanded, by
     half of that error, a channel counts as saturated, which is an alarm; below what it is known to
-    reach, it leaks. Where nothing moves, a tenth of the pressure is enough for that, if it is more
-    than half of that error. A channel that leaked from the beginning is saturated until its
+    reach, it leaks. Where its command is at rest, a tenth of the pressure is enough for that, if it
+    is more than half of that error. A channel that leaked from the beginning is saturated until its
     command changes: what it gives then tells, see `Shortage`.
+
+    Several channels that fall together, of which none reads more, are at the end of a line that
+    sags, and saturated, see `SupplyLine`. One alone that falls below what it has reached may be
+    that too, but nobody can tell: it counts as leaking.
 
     While nothing has been commanded since arming, three readings above that error are enough for a
     regulator that is stuck.
@@ -91,9 +96,12 @@ class PressureMonitor:
         self._half: Array = 0.5 * most
         self._reached: Array = np.zeros(n)  # the highest readings since it was armed
         self._shortage = Shortage(self._tolerance, safety.pressure_error_time)
-        self._still: tuple[float, Array] = (np.inf, np.zeros(n))  # since when, near what
+        self._line = SupplyLine(self._half)
+        self._still: Array = np.full(n, np.inf)  # since when each command is near what it was
+        self._near: Array = np.zeros(n)
         self._idle, self._rising = True, 0  # nothing commanded yet; readings that rise all the same
         self._most = np.stack((most, most, 0.5 * most))  # (3, n): leaks, stuck, saturated
+        self._least = np.stack((0.5 * most, most, 0.5 * most))  # that this can be
         self._for: Array = np.zeros((3, n))  # s, for how long it was so, less how long it was not
         self._doubtful = False  # whether any of that is not 0
         self._beside: Array = np.zeros((3, n))
@@ -107,8 +115,10 @@ class PressureMonitor:
         """Take in what the supply is told (n,), in Pa, and when."""
         self._commanded = commanded
         self._expected.tell(time, commanded)
-        if float(np.abs(commanded - self._still[1]).max()) > _STILL or time < self._still[0]:
-            self._still = time, commanded
+        moved = (np.abs(commanded - self._near) > _STILL) | (time < self._still)
+        if moved.any():
+            self._still = np.where(moved, time, self._still)
+            self._near = np.where(moved, commanded, self._near)
         self._idle = self._idle and not commanded.any()
 
     def clear(self) -> None:
@@ -117,6 +127,7 @@ class PressureMonitor:
         self._doubtful = False
         self._reached = np.zeros_like(self._reached)
         self._shortage.clear()
+        self._line.clear()
         self._idle, self._rising = True, 0
         self.saturated = np.zeros_like(self.saturated)
 
@@ -126,27 +137,27 @@ class PressureMonitor:
         if trouble is not None:
             return trouble
         elapsed = min(self._expected.follow(reading.time), self._time / _LOOKS)
-        expected, p = self._expected.pressures, reading.pressures
+        due, p = self._expected.lowest, reading.pressures
         if self._idle and elapsed > 0:
             self._rising = self._rising + 1 if (p > self._tolerance).any() else 0
             if self._rising >= _AT_ONCE:
                 return self._stuck(int(np.nanargmax(p - self._tolerance)), p)
         beside = self._beside
         self._reached = np.fmax(self._reached, p)
-        due = np.minimum(expected, self._commanded)
         np.subtract(np.minimum(due, self._reached), p, out=beside[0])
-        np.subtract(p, np.maximum(expected, self._commanded), out=beside[1])
+        np.subtract(p, self._expected.highest, out=beside[1])
         np.subtract(due, p, out=beside[2])
-        at_rest = reading.time - self._still[0] > _SETTLED
-        if at_rest:
-            share = np.minimum(self._tolerance, _LEAK * self._reached)
-            self._most[0] = np.maximum(self._half, share)
-        else:
-            self._most[0] = self._tolerance
-        wrong = beside > self._most  # NaN, where nothing is measured, is not
+        suspect = bool((beside > self._least).any())  # NaN, where nothing is measured, is not
+        if not (suspect or self._doubtful or self._line.known):
+            return None
+        sagging = self._line.look(beside[2], p, self._reached)
+        np.minimum(beside[0], self._line.pressure - p, out=beside[0])
+        at_rest = reading.time - self._still > _SETTLED
+        share = np.maximum(self._half, np.minimum(self._tolerance, _LEAK * self._reached))
+        self._most[0] = np.where(at_rest, share, self._tolerance)
+        wrong = beside > self._most
         if wrong.any():
             self._for += np.where(wrong, elapsed, -elapsed)
-            self._doubtful = True
         elif self._doubtful:
             self._for -= elapsed
         else:
@@ -155,7 +166,8 @@ class PressureMonitor:
         self._doubtful = bool(self._for.any())
         lasting = self._for >= self._time * (1 - 1e-9)
         self.saturated = lasting[2] | (self.saturated & (self._for[2] > 0))
-        lasting[0] |= self._shortage.leaks(elapsed, self.saturated, due, p, at_rest=at_rest)
+        short = self.saturated & ~sagging
+        lasting[0] |= self._shortage.leaks(elapsed, short, due, p, at_rest)
         return self._found(lasting, p)
 
     def _found(self, lasting: NDArray[np.bool_], p: Array) -> Trouble | None:

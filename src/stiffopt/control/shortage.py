@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 _CHANGE = 1e4  # Pa, by which a command must have changed to learn anything from it
 _SHARE = 0.5  # of what a leak in proportion to the pressure would give
 _NOTHING, _MUCH = 0.25, 0.5  # of what is due
-_NOTHING_FOR = 1.0  # s, beside all else
+_NOTHING_FOR = 1.0  # s, at least
 
 
 class Shortage:
@@ -27,8 +27,8 @@ class Shortage:
 
     A tube that is off gives nothing whatever it is told, as a line without pressure does. A channel
     that has less than a quarter of what is due, while another one has twice as much at least, is
-    taken for leaking. In between, a leak that takes all that its regulator can deliver cannot be
-    told from a line that has no more.
+    taken for leaking, whether commands move or not. In between, a leak that takes all that its
+    regulator can deliver cannot be told from a line that has no more.
 
     Parameters
     ----------
@@ -56,8 +56,7 @@ class Shortage:
         short: NDArray[np.bool_],
         due: Array,
         reading: Array,
-        *,
-        at_rest: bool,
+        at_rest: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
         """Return which channels (n,) leak for certain.
 
@@ -66,23 +65,22 @@ class Shortage:
         elapsed :
             Since the last reading, in s.
         short :
-            Channels (n,) that have been below what is due for long enough.
+            Channels (n,) that have been below what is due for long enough, without those of which
+            it is known why.
         due, reading :
             Pressures (n,) that there should be, and are, in Pa.
         at_rest :
-            Whether the commands are; while they move there is nothing to be learned.
+            Channels (n,) whose command is; of those that move it tells nothing what they give.
         """
         self._due[~short] = self._gave[~short] = np.nan
-        if not at_rest:
-            self._for[:] = 0.0
-            return np.zeros_like(short)
-        first = short & np.isnan(self._due)
+        first = short & at_rest & np.isnan(self._due)
         self._due[first], self._gave[first] = due[first], reading[first]
         change = due - self._due
         gives = np.sign(change) * (reading - self._gave)
         proportional = np.abs(change) * self._gave / np.maximum(self._due, 1.0)
         follows = (
-            (np.abs(change) >= _CHANGE)
+            at_rest
+            & (np.abs(change) >= _CHANGE)
             & (gives > np.maximum(0.5 * self._tolerance, _SHARE * proportional))
             & (due - reading > self._tolerance)
         )  # NaN, where nothing is remembered or measured, is not

@@ -44,6 +44,10 @@ class TrackerWatch:
     not missing: one good sample now and then must not make the loop steer now and then. It is lost
     when there was no good sample for the timeout, not even one now and then.
 
+    Of a tracker so slow that the frames which may be missing last longer than the timeout, the tip
+    is missing at the timeout, and lost only after that. One whose frames are further apart than the
+    timeout never sees it.
+
     Parameters
     ----------
     safety :
@@ -142,9 +146,11 @@ class TrackerWatch:
         interval, _ = self.usual
         overdue = self.overdue(now)
         slack = self._period + _JITTER * interval
-        if overdue > self._safety.tracker_timeout + slack:
+        timeout = self._safety.tracker_timeout
+        if overdue > timeout + slack:
             return Sight.LOST
-        if overdue > self._safety.tracker_frames * interval + slack:
+        # lost comes after missing by the slack at least, in which there is a tick
+        if overdue > min(self._safety.tracker_frames * interval + slack, timeout):
             return Sight.MISSING
         return Sight.SEEN
 

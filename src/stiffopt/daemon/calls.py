@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Protocol
 
+from stiffopt.control.requests import Asker, asked_by
 from stiffopt.control.state import Event, Snapshot
 from stiffopt.control.trajectory import Trajectory
 from stiffopt.daemon.refusals import RefusedError
@@ -30,7 +31,8 @@ class Commanded(Protocol):
     """What the service needs of a `ControlLoop`; see there.
 
     The commands return when they are done, or raise `CommandError` or `InputError` and change
-    nothing. `snapshot` and `events` return at once.
+    nothing; one that its `Asker` has given up is not begun any more. `snapshot` and `events` return
+    at once.
     """
 
     @property
@@ -71,14 +73,20 @@ class LoopCalls:
     Parameters
     ----------
     patience :
-        Seconds after which a call is given up; the loop may still do it.
+        Seconds after which a call is given up; what has not been begun then is not done.
     """
 
     def __init__(self, patience: float) -> None:
         self._patience = patience
         self._running = 0
 
-    async def __call__(self, function: Callable[..., Any], *args: Any, urgent: bool = False) -> Any:
+    async def __call__(
+        self,
+        function: Callable[..., Any],
+        *args: Any,
+        urgent: bool = False,
+        lasting: bool = False,
+    ) -> Any:
         """Return what the function returns.
 
         Parameters
@@ -87,6 +95,8 @@ class LoopCalls:
             What to call.
         urgent :
             Call it however many calls are already waiting: what makes the arm safer.
+        lasting :
+            Have it done however late, also when nobody waits for it any more.
 
         Raises
         ------
@@ -95,18 +105,24 @@ class LoopCalls:
         """
         if self._running >= _WAITING and not urgent:
             raise RefusedError(503, "busy", "the control loop has too much to do; try again")
-        answer = start(function, *args)
+        asker = Asker()
+        answer = start(function, *args, asker=None if lasting else asker)
         self._running += 1
         answer.add_done_callback(self._ended)
-        done, _ = await asyncio.wait([answer], timeout=self._patience)
-        if not done:
-            raise RefusedError(
-                503,
-                "no-answer",
-                f"the control loop did not answer within {self._patience:g} s; whether it will "
-                "still do this is not known: look at the state, or vent",
-            )
-        return answer.result()
+        try:
+            await asyncio.wait([answer], timeout=self._patience)
+        finally:  # also where the client has gone
+            never = not answer.done() and asker.give_up()
+        if answer.done():
+            return answer.result()
+        if lasting:
+            outcome = "this is done as soon as it can be"
+        elif never:
+            outcome = "it will not do this any more; look at the state, and ask again"
+        else:
+            outcome = "whether it will still do this is not known: look at the state, or vent"
+        late = f"the control loop did not answer within {self._patience:g} s"
+        raise RefusedError(503, "no-answer", f"{late}; {outcome}")
 
     def _ended(self, answer: asyncio.Future[Any]) -> None:
         self._running -= 1
@@ -114,8 +130,18 @@ class LoopCalls:
             answer.exception()  # also of calls that were given up: that it was looked at
 
 
-def start(function: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
-    """Call a function in a thread of its own, which does not keep the process from ending."""
+def start(
+    function: Callable[..., Any], *args: Any, asker: Asker | None = None
+) -> asyncio.Future[Any]:
+    """Call a function in a thread of its own, which does not keep the process from ending.
+
+    Parameters
+    ----------
+    function, args :
+        What to call.
+    asker :
+        Who asks, and may give it up; None: it is done however late.
+    """
     events = asyncio.get_running_loop()
     answer: asyncio.Future[Any] = events.create_future()
 
@@ -130,7 +156,8 @@ def start(function: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
     def work() -> None:
         result, error = None, None
         try:
-            result = function(*args)
+            with asked_by(asker or Asker()):
+                result = function(*args)
         except Exception as raised:
             error = raised
         with suppress(RuntimeError):  # the service has ended meanwhile

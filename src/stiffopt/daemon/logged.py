@@ -6,6 +6,7 @@ import logging
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from stiffopt.control.loop import ControlLoop
@@ -49,20 +50,33 @@ class LogEvents(logging.Handler):
             logging.getLogger(name).removeHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Append an event."""
+        """Append an event; what is wrong with a record must not hurt whoever logs."""
+        with suppress(Exception):
+            self._tell(record)
+
+    def _tell(self, record: logging.LogRecord) -> None:
         place, now = (record.name, record.pathname, record.lineno), self._clock()
         if now - self._heard.get(place, -_QUIET) < _QUIET:
             return
         self._heard[place] = now
-        text = record.getMessage().splitlines() or [""]
         ours = record.name.partition(".")[0] == _OURS
         bad = ours and record.levelno >= logging.ERROR
         self._loop.events.add(
             self._loop.rig.clock.now(),
             "service",
-            text[0][:_LONGEST] + _where(record),
+            _text(record),
             Severity.ERROR if bad else Severity.WARNING,
         )
+
+
+def _text(record: logging.LogRecord) -> str:
+    """Return what is told of a record, also of one whose arguments do not fit."""
+    try:
+        lines = record.getMessage().splitlines() or [""]
+        return lines[0][:_LONGEST] + _where(record)
+    except Exception as error:
+        place = f"{Path(record.pathname).name}:{record.lineno}"
+        return f"what was logged in {place} cannot be shown ({type(error).__name__})"
 
 
 def _where(record: logging.LogRecord) -> str:

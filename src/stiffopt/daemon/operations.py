@@ -158,8 +158,8 @@ class Operations:
         return await self._forgetting(identity, self.loop.reset)
 
     async def vent(self) -> DoneReport:
-        """Vent at once, whoever has control."""
-        await self._asked(self.loop.vent, "a client asked for it", urgent=True)
+        """Vent at once, whoever has control; rather late than never."""
+        await self._asked(self.loop.vent, "a client asked for it", urgent=True, lasting=True)
         self._task = None
         return self._done()
 
@@ -172,16 +172,15 @@ class Operations:
     async def set_task(self, identity: str | None, given: Any) -> DoneReport:
         """Pursue a task, given as the JSON of a `TaskRequest`."""
 
-        def read() -> Task:
+        def pursue() -> Task:
             snapshot = self.loop.snapshot()
             task = task_of(given, self.robot.name)
             check_pressures(task, snapshot.low, snapshot.high)
+            self.loop.set_task(task)
             return task
 
         with self._control(identity):
-            task = await self._asked(read)
-            await self._asked(self.loop.set_task, task)
-            self._task = task
+            self._task = await self._asked(pursue)
         return self._done()
 
     async def command(
@@ -192,7 +191,7 @@ class Operations:
         That is made in another thread, as it may take long; the others must be heard meanwhile.
         """
         with self._control(identity):
-            await self._asked(function, await self._asked(what))
+            await self._asked(lambda: function(what()))
         return self._done()
 
     async def _forgetting(self, identity: str | None, function: Callable[[], None]) -> DoneReport:
@@ -202,9 +201,9 @@ class Operations:
             self._task = None
         return self._done()
 
-    async def _asked(self, function: Callable[..., Any], *args: Any, urgent: bool = False) -> Any:
+    async def _asked(self, function: Callable[..., Any], *args: Any, **how: bool) -> Any:
         with _as_refusals():
-            return await self._call(function, *args, urgent=urgent)
+            return await self._call(function, *args, **how)
 
     def _done(self) -> DoneReport:
         snapshot = self.loop.snapshot()

@@ -19,6 +19,7 @@ class Secret:
 
     The file is one daemon's for as long as that lives: a lock beside it, which the kernel releases
     however a process ends, keeps a second one from putting its token in the place of the first's.
+    The lock's file stays: whoever had just opened it would else lock what nobody sees any more.
 
     Parameters
     ----------
@@ -77,7 +78,17 @@ class Secret:
         """Lock the file of the token against other daemons."""
         if self._lock is not None:
             return
-        lock = os.open(_lock_of(path), os.O_RDWR | os.O_CREAT, 0o600)
+        place = path.with_name(f".{path.name}.lock")
+        try:
+            lock = os.open(place, os.O_RDWR | os.O_CREAT, 0o600)
+        except PermissionError:
+            if not place.exists():  # nothing can be written in this folder
+                raise
+            raise FileError(
+                place,
+                "this lock of the token belongs to another user, whose daemon may be running; if "
+                "it is not, remove this file, else give another log.folder or service.token_file",
+            ) from None
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -100,11 +111,5 @@ class Secret:
             if self.path.read_text(encoding="ascii").strip() == self.token:
                 self.path.unlink()
         if self._lock is not None:
-            with suppress(OSError):
-                _lock_of(self.path).unlink()
             os.close(self._lock)
             self._lock = None
-
-
-def _lock_of(path: Path) -> Path:
-    return path.with_name(f".{path.name}.lock")

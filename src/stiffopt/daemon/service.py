@@ -63,7 +63,7 @@ _WHY = {
     409: "You do not have control, or the control loop refuses this now.",
     413: "The request is too long.",
     422: "The request makes no sense.",
-    503: "The control loop does not answer; whether it will still do this is not known.",
+    503: "The control loop does not answer; the message says whether it may still do this.",
 }
 _ABOUT = """What there is to ask of a soft arm's control loop.
 
