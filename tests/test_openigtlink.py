@@ -250,7 +250,7 @@ def test_times_are_of_capture_whatever_the_sender_thinks_it_is(offset: float) ->
         samples = next_samples(tracker, 12)
     spent = np.array([sample.received - sample.time for sample in samples])
     times = np.array([sample.time for sample in samples])
-    assert times - times[0] == pytest.approx(captures, abs=0.01)
+    assert times - times[0] == pytest.approx(captures, abs=0.02)  # busy machines
     assert spent.min() >= latency - 1e-9
     assert spent[[4, 8]] == pytest.approx(latency + 0.06, abs=0.02)
 
