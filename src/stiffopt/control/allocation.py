@@ -183,12 +183,8 @@ def _program(demand: Demand, step: Array, tip_step: float) -> Formula:
     J, v, n = demand.rows, demand.values, len(step)
     reference, last = ca.SX.sym("reference", n), ca.SX.sym("last", n)
     least, most = ca.SX.sym("least", n), ca.SX.sym("most", n)
-    scaled, before, G, reach = (
-        J * (_BAR / _KEPT_NEAR),
-        last / _BAR,
-        demand.linear * _BAR,
-        ca.DM(step),
-    )
+    scaled, G = J * (_BAR / _KEPT_NEAR), demand.linear * _BAR
+    before, reach = last / _BAR, ca.DM(step)
     H = scaled.T @ scaled + ca.SX.eye(n)
     f = scaled.T @ (v / -_KEPT_NEAR) - H @ (reference / _BAR - before)
     # a limit may have been tightened below the last pressures: then down as fast as may be

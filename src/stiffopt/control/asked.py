@@ -21,7 +21,6 @@ __all__ = [
     "angle_to",
     "distance_to",
     "is_far",
-    "kind_of",
     "parts_of",
     "stiffness_of",
     "within_limits",
@@ -80,12 +79,6 @@ def stiffness_of(task: Task) -> Callable[..., float] | None:
     )  # fmt: skip
     function: Callable[..., float] = ca.Function("stiffness", [C, R], [value])
     return function
-
-
-def kind_of(target: Target) -> tuple[object, ...]:
-    """Which parts of a pose a target asks for."""
-    axes = None if target.position is None else tuple(axis is None for axis in target.position)
-    return axes, target.pointing is None, target.orientation is None
 
 
 def is_far(before: Target, target: Target) -> bool:

@@ -20,7 +20,6 @@ from stiffopt.control.asked import (
     angle_to,
     distance_to,
     is_far,
-    kind_of,
     parts_of,
     stiffness_of,
     within_limits,
@@ -251,11 +250,9 @@ class Controller:
         at = self._models()[1].at(reference.path[:n])
         self._heed(omega)
         correction = reference.path[n:] - self._heeded
-        # what the chambers get beside the command, and the arm beside the chambers
-        beside = self._beside
         pressures, held, missing = self._allocation.solve(
             (at.pose, at.jacobian, self._asked, correction, *self._swing()),
-            reference.command - beside,
+            reference.command - self._beside,
             self._last_move,
         )
         if pressures is None:
@@ -328,11 +325,12 @@ class Controller:
         if self._task is None:
             self.set_task(Task(robot=self.robot.description.name, target=target))
             return
-        if self._target is None or kind_of(self._target) != kind_of(target):
+        asked = parts_asked(target)
+        if self._target is None or (asked != self._asked).any():
             self._anew()
         elif is_far(self._target, target):
             self._search = True
-        self._target, self._asked = target, parts_asked(target)
+        self._target, self._asked = target, asked
         self._asked_at = -math.inf
 
     def _anew(self) -> None:
@@ -392,7 +390,10 @@ class Controller:
 
     @property
     def _beside(self) -> Array:
-        """By how much the pressures that act will differ from those that are commanded (n,)."""
+        """By how much the pressures that act will differ from those that are commanded (n,).
+
+        That is what the chambers get beside the command, and the arm beside the chambers.
+        """
         off = np.minimum(np.maximum(self._regulators.offset, -_OFF), _OFF)
         result: Array = self._remembered + off
         return result

@@ -153,8 +153,8 @@ class TipEstimator:
         """Start anew, with an arm at rest."""
         self._past.clear()
         self._free = np.zeros((2, 3))
-        self._offset, self._turn = np.zeros(3), np.zeros(3)
         self.beside = np.zeros(6)
+        self._offset, self._turn = self.beside[:3], self.beside[3:]
         self.across_matrix = np.diag([1.0, 1.0, 0.0])
         self._lean: Array = np.zeros((3, 3))  # turn of the tip per swing
         self._pressures: Array | None = None
@@ -207,11 +207,6 @@ class TipEstimator:
             self._past.append(_Moment(now, static, rotation, driven))
         self._pressures = pressures.copy()
 
-    def ahead(self, duration: float) -> Array:
-        """Swing and its speed (2, 3) after a duration in s, if the pressures stay."""
-        result: Array = self._transition(duration) @ self.swing
-        return result
-
     def take(self, samples: Sequence[PoseSample]) -> Seen:
         """Learn from samples, each at the time of its capture.
 
@@ -259,11 +254,6 @@ class TipEstimator:
         self._times[0] = self.omega
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
         self._lean = turning @ axes[:, 1:] @ np.diag(1 / softness[1:]) @ axes[:, 1:].T
-
-    def across(self, vector: Array) -> Array:
-        """Part of a vector (3,) in the directions in which the tip is soft."""
-        result: Array = self.across_matrix @ vector
-        return result
 
     def _transition(self, duration: float) -> Array:
         """What a duration in s does to the free swing (2, 2)."""
