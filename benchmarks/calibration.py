@@ -266,7 +266,7 @@ def opened(
 
     `robot` is what the simulated arm is made from, so it is always the file as it was.
     """
-    from stiffopt.rig.config import make_rig
+    from stiffopt.rig.assembly import make_rig
 
     rig: Any = make_rig(description, robot)
     with rig:

@@ -125,7 +125,7 @@ class Case:
 
     def rig(self, dynamics: str) -> SimulatedRig:
         """The rig, not opened; its tracker is corrected as the controller's robot file says."""
-        from stiffopt.rig.config import make_rig
+        from stiffopt.rig.assembly import make_rig
 
         plant = self.description.plant.model_copy(update={"dynamics": dynamics})
         rig: Any = make_rig(self.description.model_copy(update={"plant": plant}), self.robot)
@@ -287,7 +287,7 @@ def _places(arm: Arm, count: int, rng: np.random.Generator) -> list[tuple[Array,
 def ideal_times(case: Case, pressures: list[Array]) -> list[float]:
     """Settling times of steps to these pressures, commanded at once, from rest at 0 Pa, in s."""
     from calibration import settling_time
-    from stiffopt.rig.config import make_rig
+    from stiffopt.rig.assembly import make_rig
 
     supply = case.description.supply.model_copy(update={"ripple": 0.0})
     update = {"plant": without_memory(case.description.plant), "supply": supply, "tracker": None}

@@ -186,7 +186,7 @@ class LoopRun(Run):
 
     def __init__(self, rig: SimulatedRig, steering: Steering, point: Array) -> None:
         from stiffopt.control.loop import ControlLoop
-        from stiffopt.control.safety import SafetyGate
+        from stiffopt.safety.gate import SafetyGate
 
         super().__init__(rig, steering, point)
         safety = rig.settings.safety

@@ -48,8 +48,9 @@ class Soak:
         from stiffopt import StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
         from stiffopt.control.controller import Controller
         from stiffopt.control.loop import ControlLoop
-        from stiffopt.control.safety import SafetyGate
-        from stiffopt.rig.config import RigDescription, load_rig_description, make_rig
+        from stiffopt.rig.assembly import make_rig
+        from stiffopt.rig.config import RigDescription, load_rig_description
+        from stiffopt.safety.gate import SafetyGate
 
         told = load_rig_description(RIG).model_dump(exclude_unset=True)
         told["plant"].update(dynamics="quasi-static", faults=True, seed=seed, discretisation=COARSE)

@@ -52,9 +52,10 @@ def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.nd
     """Times of ticks in us, and the quadratic programs."""
     from stiffopt import StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
     from stiffopt.control.controller import Controller
-    from stiffopt.control.safety import SafetyGate
-    from stiffopt.rig.config import load_rig_description, make_rig
+    from stiffopt.rig.assembly import make_rig
+    from stiffopt.rig.config import load_rig_description
     from stiffopt.rig.interface import PressureCommand
+    from stiffopt.safety.gate import SafetyGate
 
     description = load_rig_description(RIG)
     robot = load_robot(description.robot)

@@ -13,10 +13,10 @@ import time
 
 import numpy as np
 
-from stiffopt.control.realtime import real_time
-from stiffopt.daemon.link import guarded_rig
 from stiffopt.errors import DeviceError
 from stiffopt.rig.interface import PressureCommand
+from stiffopt.safety.link import guarded_rig
+from stiffopt.safety.realtime import real_time
 
 PERIOD, RISE, PRESSURE = 0.01, 15, 0.4e5  # s, ticks, Pa
 

@@ -152,7 +152,7 @@ def guard_of(pid: int) -> int:
         found = []
         for task in Path(f"/proc/{pid}/task").iterdir():
             found += [int(child) for child in (task / "children").read_text().split()]
-        return [c for c in found if b"stiffopt.daemon.guard" in _command(c)]
+        return [c for c in found if b"stiffopt.safety.guard" in _command(c)]
 
     (guard,) = wait_for(children)
     return int(guard)

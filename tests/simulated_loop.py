@@ -8,13 +8,14 @@ import numpy as np
 
 from fake_control import FakeSteering
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.safety import SafetyGate
 from stiffopt.control.state import Snapshot, State
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
-from stiffopt.rig.config import RigDescription, make_rig
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription
 from stiffopt.rig.simulated.rig import SimulatedRig
+from stiffopt.safety.gate import SafetyGate
 
 PERIOD = 0.01
 TASK = Task(robot="stiff-flop-1", target=Target(position=(0.0, 0.0, 0.1)))

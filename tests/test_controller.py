@@ -19,7 +19,8 @@ from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
-from stiffopt.rig.config import RigDescription, limits_of, make_rig, slew_of
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription, limits_of, slew_of
 from stiffopt.rig.interface import PressureReading
 from stiffopt.rig.settings import ControlSettings
 from stiffopt.rig.simulated.plant import Plant

@@ -42,7 +42,8 @@ from stiffopt.experiments.kinematics_result import read_recordings
 from stiffopt.experiments.points import PointsFile
 from stiffopt.experiments.slope import Line, combine, fit_line, fit_lines, student_t
 from stiffopt.logs import Log, read_log, read_mcap_log, read_stiffness_table
-from stiffopt.rig.config import load_rig_description, make_rig
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.interface import PressureLimits, Rig
 
 GOLDEN = {  # bar: stiffness along x, y, z in N/m; reference/paper-notes.md
@@ -832,7 +833,7 @@ def test_the_figure_of_stiffness_shows_what_there_is(
 def test_on_the_simulated_rig(tmp_path: Path) -> None:
     """Another arm than the model's, with inertia, creep, hysteresis and noise: but not far off."""
     pytest.importorskip("numba")
-    from stiffopt.rig.config import open_rig
+    from stiffopt.safety.rigs import open_rig
 
     path = Path(__file__).resolve().parent.parent / "rig" / "sim.yaml"
     kinematics = KinematicsSettings(channels=3, repetitions=2, poses=6)

@@ -21,10 +21,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stiffopt.control.outlet import Applied
-from stiffopt.daemon import guard as guard_module
-from stiffopt.daemon import hosted
-from stiffopt.daemon.frames import (
+from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError, SlowWarning
+from stiffopt.model.robot_files import load_description
+from stiffopt.rig.config import load_rig_description
+from stiffopt.rig.interface import (
+    PoseSample,
+    PressureCommand,
+    PressureLimits,
+    PressureReading,
+)
+from stiffopt.safety import guard as guard_module
+from stiffopt.safety import hosted
+from stiffopt.safety.frames import (
     Answer,
     Channel,
     CommandFrame,
@@ -34,17 +42,10 @@ from stiffopt.daemon.frames import (
     Word,
     unpack,
 )
-from stiffopt.daemon.guard import FIRST_COMMAND, Guard, main
-from stiffopt.daemon.hosted import Owned, SimulatedRest, owned
-from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError, SlowWarning
-from stiffopt.model.robot_files import load_description
-from stiffopt.rig.config import load_rig_description, open_rig
-from stiffopt.rig.interface import (
-    PoseSample,
-    PressureCommand,
-    PressureLimits,
-    PressureReading,
-)
+from stiffopt.safety.guard import FIRST_COMMAND, Guard, main
+from stiffopt.safety.hosted import Owned, SimulatedRest, owned
+from stiffopt.safety.outlet import Applied
+from stiffopt.safety.rigs import open_rig
 
 TIMEOUT = 0.05
 SILENT = "no command had come for 50 ms"

@@ -18,9 +18,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stiffopt.control.outlet import Applied
-from stiffopt.daemon import exchange, guard_process
-from stiffopt.daemon.link import GuardLink, guarded_rig
 from stiffopt.errors import DeviceError, InputError, MissingExtraError, SlowWarning
 from stiffopt.files import save_file
 from stiffopt.model.robot_files import load_description
@@ -28,6 +25,9 @@ from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.interface import PressureCommand, Rig
 from stiffopt.rig.lab.virtual import VirtualLab
 from stiffopt.rig.simulated.settings import PlantSettings
+from stiffopt.safety import exchange, guard_process
+from stiffopt.safety.link import GuardLink, guarded_rig
+from stiffopt.safety.outlet import Applied
 
 HERE = Path(__file__).parent
 RIGS = HERE.parent / "rig"
@@ -442,7 +442,7 @@ def test_content_of_a_rig_file_needs_its_robot() -> None:
 
 STUB = """
 import socket, sys, time
-from stiffopt.daemon.frames import Word
+from stiffopt.safety.frames import Word
 end = socket.socket(fileno=int(sys.argv[1]))
 {}
 """

@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from fake_control import FakeSteering
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.safety import SafetyGate
 from stiffopt.control.state import State
 from stiffopt.control.steering import Move, Notice, Seen, Standing
 from stiffopt.control.trajectory import Trajectory, Waypoint
@@ -34,6 +33,7 @@ from stiffopt.rig.interface import (
     Rig,
 )
 from stiffopt.rig.settings import Safety
+from stiffopt.safety.gate import SafetyGate
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stiffopt.control.expected_pressure import Regulation
-from stiffopt.control.monitors import PressureMonitor, Trouble
 from stiffopt.control.steering import Seen
 from stiffopt.control.tracker_watch import BACK, ENOUGH, Sight, TrackerWatch
 from stiffopt.model.history import History
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
+from stiffopt.safety.expected_pressure import Regulation
+from stiffopt.safety.monitors import PressureMonitor, Trouble
 
 Array = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from stiffopt.control import realtime
-from stiffopt.control.realtime import RealTimeReport, real_time, tidy
+from stiffopt.safety import realtime
+from stiffopt.safety.realtime import RealTimeReport, real_time, tidy
 
 LIMITS = (65536, 65536)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.control.safety import SafetyGate
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.interface import Clock, PressureCommand, PressureLimits, PressureSupply
 from stiffopt.rig.settings import Safety
+from stiffopt.safety.gate import SafetyGate
 
 Array = NDArray[np.float64]
 

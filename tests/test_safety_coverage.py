@@ -14,8 +14,8 @@ pytest.importorskip("coverage", reason="coverage is not installed; it is part of
 
 ROOT = Path(__file__).parents[1]
 GUARDING = {
-    "control/safety.py": ("tests/test_safety.py",),
-    "daemon/guard.py": ("tests/test_guard.py",),
+    "safety/gate.py": ("tests/test_safety.py",),
+    "safety/guard.py": ("tests/test_guard.py",),
 }
 """Files that must be covered to the last line, and the tests that do so."""
 

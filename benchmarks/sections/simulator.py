@@ -30,7 +30,8 @@ def section(sizes: Settings) -> Section:
 
 def _speed(name: str, dynamics: str, step: float, sizes: Settings) -> float:
     from stiffopt.model.robot_files import load_description
-    from stiffopt.rig.config import RigDescription, make_rig
+    from stiffopt.rig.assembly import make_rig
+    from stiffopt.rig.config import RigDescription
 
     description = RigDescription(
         robot=name,

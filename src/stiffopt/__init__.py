@@ -46,8 +46,8 @@ if TYPE_CHECKING:
     from stiffopt.optimise.solver import PressureSolver, solve_batch, solve_pressure
     from stiffopt.optimise.target import Target, Tolerance
     from stiffopt.optimise.task import Load, Task, load_task
-    from stiffopt.rig.config import open_rig
     from stiffopt.rig.interface import Observation, PoseSample, PressureCommand, Rig
+    from stiffopt.safety.rigs import open_rig
     from stiffopt.workspace import WorkspaceMap, map_workspace, open_workspace_map
 
 __version__ = "0.1.0"
@@ -143,7 +143,7 @@ _NAMES = {
     "stiffopt.optimise.solver": ("PressureSolver", "solve_batch", "solve_pressure"),
     "stiffopt.optimise.target": ("Target", "Tolerance"),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
-    "stiffopt.rig.config": ("open_rig",),
+    "stiffopt.safety.rigs": ("open_rig",),
     "stiffopt.rig.interface": ("Observation", "PoseSample", "PressureCommand", "Rig"),
     "stiffopt.workspace": ("WorkspaceMap", "map_workspace", "open_workspace_map"),
 }
@@ -162,6 +162,7 @@ _MODULES = (
     "model",
     "optimise",
     "rig",
+    "safety",
     "schema",
     "units",
     "workspace",

@@ -169,7 +169,8 @@ def _check_that_somebody_is_there(rig: Rig) -> None:
 
 def _rig(path: str) -> tuple[Rig, str, float, str]:
     """The rig of a file, its name, its rate and its log folder."""
-    from stiffopt.rig.config import load_rig_description, open_rig
+    from stiffopt.rig.config import load_rig_description
+    from stiffopt.safety.rigs import open_rig
 
     description = load_rig_description(path)
     return open_rig(path), description.name, description.rate, description.log.folder

@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from stiffopt.control.state import Event, Severity, Snapshot, State
-from stiffopt.daemon.lines import json_line
 from stiffopt.errors import printable
+from stiffopt.safety.lines import json_line
 
 __all__ = ["Display", "Facts", "Lines"]
 

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from stiffopt.control.monitors import PressureMonitor
-from stiffopt.control.outlet import Outlet
 from stiffopt.control.steering import Steering
 from stiffopt.control.tracker_watch import ENOUGH, Sight, TrackerWatch
 from stiffopt.errors import InputError
 from stiffopt.rig.interface import PressureReading, Rig
+from stiffopt.safety.monitors import PressureMonitor
+from stiffopt.safety.outlet import Outlet
 
 __all__ = ["check_rig", "check_vented_arm"]
 

@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 from stiffopt.control.journal import EventLog
 from stiffopt.control.machine import Machine
-from stiffopt.control.outlet import Outlet
 from stiffopt.control.requests import Requests, asking
 from stiffopt.control.state import Snapshot, State
 from stiffopt.control.steering import Standing, Steering
@@ -20,6 +19,7 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import Safety
+from stiffopt.safety.outlet import Outlet
 
 __all__ = ["ControlLoop"]
 

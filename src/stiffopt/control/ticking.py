@@ -8,17 +8,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.expected_pressure import Regulation
 from stiffopt.control.journal import Alarms, EventLog
 from stiffopt.control.lifecycle import Lifecycle
-from stiffopt.control.monitors import PressureMonitor, Trouble
-from stiffopt.control.outlet import Outlet
 from stiffopt.control.state import Severity, State
 from stiffopt.control.steering import Steering
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.errors import DeviceError
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig
 from stiffopt.rig.settings import ControlSettings, Safety
+from stiffopt.safety.expected_pressure import Regulation
+from stiffopt.safety.monitors import PressureMonitor, Trouble
+from stiffopt.safety.outlet import Outlet
 
 __all__ = ["Ticking"]
 

@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 from stiffopt.control.controller import Controller
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.realtime import real_time, tidy
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon.keeper import Keeper
-from stiffopt.daemon.link import guarded_rig
 from stiffopt.daemon.logged import LogEvents
 from stiffopt.daemon.notify import ServiceManager
 from stiffopt.daemon.secret import Secret
@@ -29,6 +27,8 @@ from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.rig.config import RigDescription, load_rig_description
+from stiffopt.safety.link import guarded_rig
+from stiffopt.safety.realtime import real_time, tidy
 
 if TYPE_CHECKING:
     from stiffopt.daemon.serving import Server

@@ -21,7 +21,7 @@ from stiffopt.rig.drivers.modbus import ModbusSettings
 from stiffopt.rig.drivers.nidaq import NidaqSettings
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.drivers.probe import ProbeSettings
-from stiffopt.rig.interface import PressureLimits, Rig, SystemClock
+from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.settings import ControlSettings, LogSettings, Safety, ServiceSettings
 from stiffopt.rig.simulated.mismatch import check_mismatch
 from stiffopt.rig.simulated.settings import (
@@ -40,8 +40,7 @@ __all__ = [
     "Safety",
     "limits_of",
     "load_rig_description",
-    "make_rig",
-    "open_rig",
+    "registration_of",
     "slew_of",
 ]
 
@@ -231,7 +230,7 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
     plant, tracker = description.plant or PlantSettings(), description.tracker
     if tracker is not None:
         try:
-            _registration(tracker, robot)
+            registration_of(tracker, robot)
         except InputError as error:
             raise _MisfitError(str(error), "tracker", "calibrated") from None
     if isinstance(tracker, SimulatedTrackerSettings):
@@ -283,57 +282,7 @@ def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.
     return slew
 
 
-def open_rig(path: str | os.PathLike[str], *, real_time: bool = False) -> Rig:
-    """Return the rig that a rig file describes; nothing is connected before `Rig.open`.
-
-    Parameters
-    ----------
-    path :
-        The rig file.
-    real_time :
-        Whether time passes by itself on a simulated rig; otherwise it passes while one sleeps on
-        the rig's clock. Real devices always run in real time.
-
-    Raises
-    ------
-    FileError
-        A file is wrong.
-    MissingExtraError
-        The simulator is asked for and numba is not installed.
-    """
-    description = load_rig_description(path)
-    robot = load_description(description.robot, base=Path(path).parent)
-    return make_rig(description, robot, real_time=real_time)
-
-
-def make_rig(
-    description: RigDescription, robot: RobotDescription, *, real_time: bool = False
-) -> Rig:
-    """Return the rig of a description; see `open_rig`."""
-    limits, slew = limits_of(description, robot), slew_of(description, robot)
-    supply, tracker, probe = description.supply, description.tracker, description.probe
-    registration = None if tracker is None else _registration(tracker, robot)
-    if isinstance(supply, SimulatedSupplySettings):
-        from stiffopt.rig.simulated.rig import simulated_rig  # here: numba takes its time
-
-        rig: Rig = simulated_rig(description, robot, limits, slew, real_time=real_time)
-    else:
-        clock = SystemClock()
-        rig = Rig(
-            robot,
-            supply.device(limits, clock),
-            None if tracker is None else _real(tracker).device(clock),
-            None if probe is None else _real(probe).device(clock),
-            clock=clock,
-            slew=slew,
-            settings=description,
-        )
-    if rig.tracker is not None and registration is not None:
-        rig.tracker.registration = registration
-    return rig
-
-
-def _registration(tracker: Any, robot: RobotDescription) -> Registration:
+def registration_of(tracker: Any, robot: RobotDescription) -> Registration:
     """What makes a tracker's readings poses of the tip in the base frame.
 
     Raises
@@ -358,9 +307,3 @@ def _registration(tracker: Any, robot: RobotDescription) -> Registration:
             "of this rig"
         )
     return given.then(recordings.registration)
-
-
-def _real(settings: Any) -> Any:
-    if settings.driver == "simulated":
-        raise InputError("a real supply cannot be combined with simulated devices")
-    return settings

@@ -10,11 +10,11 @@ import time
 import warnings
 from contextlib import suppress
 
-from stiffopt.daemon.frames import Channel, Word
-from stiffopt.daemon.lines import JSON
 from stiffopt.errors import DeviceError, MissingExtraError, SlowWarning
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.config import RigDescription
+from stiffopt.safety.frames import Channel, Word
+from stiffopt.safety.lines import JSON
 
 __all__ = ["GuardProcess"]
 
@@ -24,7 +24,7 @@ _SLICE = 0.05  # s
 
 
 class GuardProcess:
-    """A process that runs `stiffopt.daemon.guard.main`, from its start on.
+    """A process that runs `stiffopt.safety.guard.main`, from its start on.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class GuardProcess:
     ) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         with theirs:
-            command = [sys.executable, "-P", "-m", "stiffopt.daemon.guard", str(theirs.fileno())]
+            command = [sys.executable, "-P", "-m", "stiffopt.safety.guard", str(theirs.fileno())]
             # in a session of its own: Ctrl-C and Ctrl-Z on the terminal are not for the guard
             self._process = subprocess.Popen(
                 command + [JSON] * json_lines,

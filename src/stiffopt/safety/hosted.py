@@ -7,12 +7,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from stiffopt.control.outlet import Outlet
-from stiffopt.control.safety import SafetyGate
 from stiffopt.errors import DeviceError
 from stiffopt.model.description import RobotDescription
-from stiffopt.rig.config import RigDescription, make_rig
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription
 from stiffopt.rig.interface import PoseSample, Rig
+from stiffopt.safety.gate import SafetyGate
+from stiffopt.safety.outlet import Outlet
 
 __all__ = ["Hosted", "Owned", "SimulatedRest", "owned"]
 

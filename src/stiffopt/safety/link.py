@@ -12,15 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.outlet import Applied
-from stiffopt.daemon.exchange import Exchange
-from stiffopt.daemon.frames import Answer
-from stiffopt.daemon.guard_process import GuardProcess
-from stiffopt.daemon.guarded import ForwardedTracker, GuardedSupply
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
-from stiffopt.rig.config import RigDescription, limits_of, load_rig_description, make_rig, slew_of
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription, limits_of, load_rig_description, slew_of
 from stiffopt.rig.interface import (
     Clock,
     PoseSample,
@@ -31,6 +27,11 @@ from stiffopt.rig.interface import (
     Rig,
     SystemClock,
 )
+from stiffopt.safety.exchange import Exchange
+from stiffopt.safety.frames import Answer
+from stiffopt.safety.guard_process import GuardProcess
+from stiffopt.safety.guarded import ForwardedTracker, GuardedSupply
+from stiffopt.safety.outlet import Applied
 
 __all__ = ["GuardLink", "guarded_rig"]
 
@@ -42,7 +43,7 @@ _SILENT = 0.25  # s without an answer to a command, after which something is wro
 
 
 class GuardLink:
-    """Commands a supply that a guard process owns; see `stiffopt.daemon.guard`.
+    """Commands a supply that a guard process owns; see `stiffopt.safety.guard`.
 
     It is an `Outlet` whose times are those of `time.monotonic`. Any thread may call any method.
     When the guard has vented by itself, `apply` and `arm` say so by a `DeviceError`; `arm` works

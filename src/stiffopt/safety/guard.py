@@ -1,6 +1,6 @@
 """The guard: a process of its own that owns the supply, and vents when the loop falls silent.
 
-Started by `stiffopt.daemon.link.GuardLink`. The control loop sends its commands here; they go
+Started by `stiffopt.safety.link.GuardLink`. The control loop sends its commands here; they go
 through the safety gate to the supply at once. When none has come for the guard's timeout, because
 the loop was killed or stopped or hangs, or when the loop's process is gone, the guard vents. Then
 it is *tripped*: it takes no command until it is armed by a loop that has been told of the trip.
@@ -25,13 +25,13 @@ from typing import Any
 
 import numpy as np
 
-from stiffopt.control.outlet import Applied, Outlet
-from stiffopt.control.realtime import real_time
-from stiffopt.daemon.frames import Answer, Channel, CommandFrame, Message, Poses, Request, Word
-from stiffopt.daemon.hosted import Hosted, Owned, owned
-from stiffopt.daemon.lines import JSON, json_line
 from stiffopt.errors import CommandError, DeviceError, SlowWarning, StiffoptError
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading
+from stiffopt.safety.frames import Answer, Channel, CommandFrame, Message, Poses, Request, Word
+from stiffopt.safety.hosted import Hosted, Owned, owned
+from stiffopt.safety.lines import JSON, json_line
+from stiffopt.safety.outlet import Applied, Outlet
+from stiffopt.safety.realtime import real_time
 
 __all__ = ["FIRST_COMMAND", "Guard", "main"]
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.control.expected_pressure import ExpectedPressure, Regulation
-from stiffopt.control.shortage import Shortage
-from stiffopt.control.supply_line import SupplyLine
 from stiffopt.rig.interface import PressureLimits, PressureReading
 from stiffopt.rig.settings import Safety
+from stiffopt.safety.expected_pressure import ExpectedPressure, Regulation
+from stiffopt.safety.shortage import Shortage
+from stiffopt.safety.supply_line import SupplyLine
 
 __all__ = ["PressureMonitor", "Trouble"]
 

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 class Link(Protocol):
-    """What these devices use of a `stiffopt.daemon.link.GuardLink`."""
+    """What these devices use of a `stiffopt.safety.link.GuardLink`."""
 
     limits: PressureLimits
 

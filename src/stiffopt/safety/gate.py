@@ -7,7 +7,6 @@ import threading
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.control.outlet import Applied
 from stiffopt.errors import CommandError, InputError
 from stiffopt.rig.interface import (
     Clock,
@@ -17,6 +16,7 @@ from stiffopt.rig.interface import (
     PressureSupply,
 )
 from stiffopt.rig.settings import Safety
+from stiffopt.safety.outlet import Applied
 
 __all__ = ["SafetyGate"]
 

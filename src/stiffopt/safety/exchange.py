@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from stiffopt.daemon.frames import Answer, Channel, CommandFrame, Message, Poses, Request
 from stiffopt.errors import DeviceError
 from stiffopt.rig.interface import PoseSample, PressureCommand
+from stiffopt.safety.frames import Answer, Channel, CommandFrame, Message, Poses, Request
 
 __all__ = ["Exchange"]
 
