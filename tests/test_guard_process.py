@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stiffopt.errors import DeviceError, InputError, MissingExtraError, SlowWarning
+from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError, SlowWarning
 from stiffopt.files import save_file
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.config import load_rig_description
@@ -317,11 +317,8 @@ def test_the_stand_in_for_the_supply(guarded: tuple[Rig, GuardLink]) -> None:
     rig, link = guarded
     link.arm()
     feed(rig, link, 0.3)
-    with pytest.raises(InputError):
-        rig.command(np.full(rig.supply.n, 1e4))  # not armed, and it never should be
-    rig.supply.arm()
-    with pytest.raises(DeviceError, match="through its link"):
-        rig.command(np.full(rig.supply.n, 1e4))
+    with pytest.raises(CommandError, match="commands of another kind"):
+        rig.command(np.full(rig.supply.n, 1e4))  # a stream has been begun
     rig.vent()
     wait_for(lambda: (rig.observe().pressure.pressures < 5e3).all(), 3.0)
 
@@ -374,11 +371,11 @@ def test_a_killed_guard_is_noticed(doomed: tuple[Rig, GuardLink]) -> None:
     os.kill(link.pid, signal.SIGKILL)
     with pytest.raises(DeviceError, match="the guard process has ended"):
         feed(rig, link, 2.0)
-    for act in (link.vent, link.read, link.arm):
+    for act in (link.read, link.arm):
         with pytest.raises(DeviceError, match="the guard process has ended"):
             act()
-    with pytest.raises(DeviceError, match="the supply may not be vented"):
-        link.close()
+    link.vent()  # a simulated arm is gone with its guard
+    link.close()
     with pytest.raises(DeviceError, match="open the link"):
         link.vent()
     link.close()  # once is enough

@@ -26,7 +26,7 @@ from stiffopt.files import read_file
 from stiffopt.rig.drivers.modbus import ModbusSettings, ModbusSupply
 from stiffopt.rig.drivers.modbus_line import ModbusLine, Tcp
 from stiffopt.rig.drivers.modbus_registers import Point, Scale
-from stiffopt.rig.interface import PressureLimits
+from stiffopt.rig.interface import Clock, PressureLimits
 from stiffopt.rig.lab.modbus_peer import ModbusPeer
 from stiffopt.schema import Schema
 
@@ -53,9 +53,21 @@ def device() -> Iterator[HandmadeDevice]:
     made.close()
 
 
+class StandingClock(Clock):
+    """Time does not pass, so that nobody looks whether others command the device."""
+
+    t = 1.0
+
+    def now(self) -> float:
+        return self.t
+
+    def sleep_until(self, moment: float) -> None:
+        self.t = max(self.t, moment)
+
+
 @contextmanager
 def opened(device: HandmadeDevice, **changes: Any) -> Iterator[ModbusSupply]:
-    supply = settings(device.port, **changes).device(LIMITS)
+    supply = settings(device.port, **changes).device(LIMITS, StandingClock())
     with supply:
         supply.arm()
         device.requests.clear()
@@ -284,7 +296,7 @@ def test_what_is_on_the_wire_is_within_both_limits(
     limits = PressureLimits(np.array([low]), np.array([high]))
     given = settings(device.port, channels=[{"setpoint": 0, "reading": 1}], scale=scale)
     given = given.model_copy(update={"table": "holding"})
-    with given.device(limits) as supply:
+    with given.device(limits, StandingClock()) as supply:
         supply.arm()
         for write, size in ((supply.command, 5), (supply.exchange, 9)):
             device.requests.clear()
@@ -851,8 +863,24 @@ def test_peer_has_a_watchdog() -> None:
             commands = len(bench.commands)
             time.sleep(0.1)
             assert len(bench.commands) == commands
+            with pytest.raises(DeviceError, match="has the device's watchdog run out"):
+                supply.command(P)
+            supply.vent()
+            supply.arm()
             supply.command(P)
             assert bench.pressures.all()
+
+
+@pytest.mark.parametrize("table", ["input", "holding"])
+def test_a_foreign_set_point_is_a_fault(device: HandmadeDevice, table: str) -> None:
+    with opened(device, table=table) as supply:
+        for _ in range(20):
+            supply.clock.sleep(0.01)
+            supply.exchange(P)
+        device.holding[0x801] += 1  # another program writes to it
+        supply.clock.sleep(0.05)
+        with pytest.raises(DeviceError, match="does another program write to it"):
+            supply.exchange(P)
 
 
 def test_peer_without_a_watchdog_keeps_pressures() -> None:

@@ -178,9 +178,9 @@ def test_limits_are_the_tightest_of_all() -> None:
     assert list(made.device(LIMITS).limits.high) == [1e5, 1.5e5]
     with pytest.raises(CommandError, match=r"channel 1: 1.2 bar is out of range"):
         made.device(LIMITS).limits.check([1.2e5, 1.2e5])
-    with pytest.raises(InputError, match="channel 1: no pressure"):
+    with pytest.raises(InputError, match="channel 1: its limits leave no pressure"):
         settings(channels=channels(min="1.6 bar")).device(LIMITS)
-    with pytest.raises(InputError, match=r"2 channels, the robot 3"):
+    with pytest.raises(InputError, match=r"there are 2 channels, but limits for 3"):
         settings().device(PressureLimits(np.zeros(3), np.ones(3)))
 
 

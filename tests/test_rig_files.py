@@ -55,7 +55,7 @@ def test_every_simulated_rig_runs(path: Path) -> None:
         rig.clock.sleep(0.5)
         before = tracker.latest
         rig.supply.arm()
-        rig.command(np.linspace(0, 8e4, rig.supply.n))
+        rig.command(np.linspace(0, 8e4, rig.supply.n), valid_for=3.0)
         rig.clock.sleep(2.0)
         observation = rig.observe()
         assert observation.pressure.pressures == pytest.approx(
@@ -295,7 +295,8 @@ def test_a_missing_extra_says_what_to_install(
 ) -> None:
     text = GOOD.replace("supply: {driver: simulated}\ntracker: {driver: simulated}\n", MODBUS)
     text = text.replace("{setpoint: 1}]", "{setpoint: 1}, {setpoint: 2}]")
-    rig = open_rig(written(tmp_path, text))
+    path = written(tmp_path, text)
+    rig = make_rig(load_rig_description(path), load_description("stiff-flop-1"))
     for name in [name for name in sys.modules if name.split(".")[0] == "pymodbus"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pymodbus", None)

@@ -40,6 +40,9 @@ class Supply(PressureSupply):
         self.written: list[Array] = []
         self.dead = ""
 
+    endpoints = ()  # nothing that others could command too
+    has_watchdog = True
+
     def _open(self) -> None: ...
     def _close(self) -> None: ...
 

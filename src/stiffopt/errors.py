@@ -100,6 +100,10 @@ class DeviceError(StiffoptError):
     """A device of the rig cannot be reached, does not answer or answers nonsense."""
 
 
+class GuardTripped(DeviceError):  # noqa: N818
+    """The guard has vented by itself; the message says why. No device need have failed."""
+
+
 class CommandError(InputError):
     """A command to the rig is refused; nothing was written to any device."""
 

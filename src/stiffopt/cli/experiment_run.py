@@ -148,6 +148,7 @@ def _planned(experiment: str, options: Options) -> _Plan:
         )
     if rig.tracker is None:
         raise InputError("this rig has no tracker; the experiments need one")
+    rig.supply.check_arming()
     if isinstance(settings, KinematicsSettings):
         sequence_for(rig, settings)
         poses_for(rig, settings)

@@ -25,6 +25,7 @@ from stiffopt.cli.map import map_app
 from stiffopt.cli.robots import robots
 from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
 from stiffopt.cli.solve import HELP, examples, solve
+from stiffopt.cli.vent import VENT_EPILOG, VENT_HELP, vent
 from stiffopt.cli.version import print_version
 
 __all__ = ["app", "main", "solve_pressure_app", "solve_pressure_main"]
@@ -46,6 +47,7 @@ app = _application()
 app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
 app.command("robots")(robots)
 app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
+app.command("vent", help=VENT_HELP, epilog=VENT_EPILOG)(vent)
 app.add_typer(map_app, name="map")
 app.add_typer(experiment_app, name="experiment")
 app.add_typer(log_app, name="log")

@@ -26,13 +26,6 @@ class Guarded(Protocol):
     def alive(self) -> bool:
         """Whether the guard is there."""
 
-    @property
-    def hung(self) -> bool:
-        """Whether the guard is there and does not answer any more."""
-
-    def kill(self) -> None:
-        """End a guard that hangs."""
-
     def open(self) -> None:
         """Start a guard, which connects to the supply and vents it."""
 
@@ -43,9 +36,8 @@ class Guarded(Protocol):
 class Keeper:
     """Looks after a running daemon, in a thread of its own.
 
-    - A guard process that has ended, which is a fault for the loop, is replaced: the new one
-      connects to the supply and vents it, which nobody else could do then. One that hangs is
-      ended before.
+    - A guard process that has ended, which is a fault for the loop, is replaced. Its link has
+      vented the supply by then, as far as that answers, and has ended a guard that hung.
     - When the control interface ends, nobody watches any more whether who has control is alive:
       the arm is held.
     - The service manager is told the state.
@@ -94,8 +86,6 @@ class Keeper:
     def look(self) -> None:
         """See to everything once."""
         self._tell()
-        if self._link.hung:
-            self._link.kill()  # it would keep the supply from the one that is to vent it
         if not self._link.alive:
             self._replace_guard()
         if self._serving is not None:
@@ -122,8 +112,8 @@ class Keeper:
             return
         self._loop.add_alarm(
             _GUARD,
-            "the guard process has ended; only the supply's own watchdog vents until another one "
-            "has been started",
+            "the guard process has ended; the supply is vented directly, and cannot be armed until "
+            "another guard has been started",
         )
         with suppress(StiffoptError):  # what it has to say of the old one is known
             self._link.close()

@@ -176,6 +176,7 @@ class Conductor:
         self._setpoint = limits.clamp(np.where((target == 0) & outside, 0.0, wanted))
         self._last = now
         reading = self.rig.supply.exchange(PressureCommand(self._setpoint, now, self._valid))
+        self._setpoint = self.rig.supply.commanded  # as far as the gate has let it go
         self._gauges.note(now, before, self._setpoint, reading.pressures)
         self._gauges.refuse_nonsense(limits)
         force, stage = np.nan, np.nan
@@ -202,6 +203,9 @@ class Conductor:
         pause = self.clock.now() - self._last
         if pause <= max(_PAUSE, 3 * self._period):
             return self._gauges.fallen(self._setpoint, np.maximum(half, _FAR))
+        if not self.rig.supply.armed:  # the last command has expired meanwhile
+            self.rig.supply.arm()
+            return np.ones(self.n, dtype=bool)
         for count in range(_MOST_LOOKS):
             if count >= AGREE and self._gauges.steady():
                 break
@@ -350,7 +354,7 @@ def split_window(rows: Sequence[Row], window: float, parts: int) -> list[list[Ro
 
 
 def check_pressures(rig: Rig, pressures: ArrayLike, channels: Sequence[int]) -> None:
-    """Refuse pressures (any number) that channels (counted from 0) may not have.
+    """Refuse pressures (any number) that channels (counted from 0) may not have, one at a time.
 
     Raises
     ------
@@ -366,3 +370,18 @@ def check_pressures(rig: Rig, pressures: ArrayLike, channels: Sequence[int]) -> 
                     f"channel {channel + 1} cannot have {p * 1e-5:g} bar; the limits of this rig "
                     f"are {low * 1e-5:g} to {high * 1e-5:g} bar"
                 )
+            _check_force(rig, channel, float(p))
+
+
+def _check_force(rig: Rig, channel: int, pressure: float) -> None:
+    """Refuse a pressure of a channel, in Pa, that alone is above the limit of the total force."""
+    alone = np.zeros(rig.supply.n)
+    alone[channel] = pressure
+    force = rig.force(alone)
+    if rig.max_force is not None and force > rig.max_force:
+        most = pressure * rig.max_force / force
+        raise InputError(
+            f"channel {channel + 1} cannot have {pressure * 1e-5:g} bar: that is {force:.3g} N, "
+            f"and the rig file's safety.max_force is {rig.max_force:g} N, or {most * 1e-5:.3g} bar "
+            "of this channel"
+        )

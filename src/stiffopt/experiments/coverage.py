@@ -190,12 +190,33 @@ def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = No
             f"combined poses of at most {high[channel] * 1e-5:g} bar: channel {channel + 1} has "
             f"{limits.low[channel] * 1e-5:g} to {limits.high[channel] * 1e-5:g} bar"
         )
+    poses = spread_pressures(count, limits.low, high)
     return Coverage(
         base=limits.clamp(np.clip(0.0, limits.low, limits.high)),
-        poses=spread_pressures(count, limits.low, high),
+        poses=np.array([_shortened(rig, pose) for pose in poses]).reshape(poses.shape),
         speed=np.minimum(steepest(rig), GENTLE),
         settle=settle,
     )
+
+
+def _shortened(rig: Rig, pose: Array) -> Array:
+    """Return pressures (n,) with no more total force than the rig allows, in the same proportion.
+
+    Raises
+    ------
+    InputError
+        That is below a channel's low limit.
+    """
+    force = rig.force(pose)
+    if rig.max_force is None or force <= rig.max_force:
+        return pose
+    shortened = pose * (rig.max_force / force)
+    if (shortened < rig.supply.limits.low).any():
+        raise InputError(
+            f"combined poses: safety.max_force, {rig.max_force:g} N, leaves no pressures within "
+            "the limits of the channels; ask for no combined poses (--poses 0)"
+        )
+    return shortened
 
 
 def round_count(poses: int) -> int:

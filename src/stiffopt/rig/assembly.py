@@ -37,6 +37,7 @@ def make_rig(
             None if probe is None else _real(probe).device(clock),
             clock=clock,
             slew=slew,
+            max_force=description.safety.max_force,
             settings=description,
         )
     if rig.tracker is not None and registration is not None:

@@ -77,21 +77,21 @@ def _driver_of(value: Any) -> str:
 
 _BY_DRIVER = Discriminator(_driver_of)
 
-SupplySettings = Annotated[
+SupplyBlock = Annotated[
     Annotated[SimulatedSupplySettings, Tag("<simulated>")]
     | Annotated[ModbusSettings, Tag("<modbus>")]
     | Annotated[NidaqSettings, Tag("<nidaq>")],
     _BY_DRIVER,
     _known("simulated", "modbus", "nidaq"),
 ]
-TrackerSettings = Annotated[
+TrackerBlock = Annotated[
     Annotated[SimulatedTrackerSettings, Tag("<simulated>")]
     | Annotated[AuroraSettings, Tag("<aurora>")]
     | Annotated[OpenIGTLinkSettings, Tag("<openigtlink>")],
     _BY_DRIVER,
     _known("simulated", "aurora", "openigtlink"),
 ]
-ProbeSettingsOf = Annotated[
+ProbeBlock = Annotated[
     Annotated[SimulatedProbeSettings, Tag("<simulated>")]
     | Annotated[ProbeSettings, Tag("<probe>")],
     _BY_DRIVER,
@@ -134,9 +134,9 @@ class RigDescription(Schema):
     name: Annotated[str, Field(min_length=1)] = "rig"
     robot: Annotated[str, Field(min_length=1)]
     rate: Annotated[Frequency, Field(gt=0, le=1000)] = 100.0
-    supply: SupplySettings
-    tracker: TrackerSettings | None = None
-    probe: ProbeSettingsOf | None = None
+    supply: SupplyBlock
+    tracker: TrackerBlock | None = None
+    probe: ProbeBlock | None = None
     safety: Safety = Safety()
     control: ControlSettings = ControlSettings()
     service: ServiceSettings = ServiceSettings()

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stiffopt.errors import CommandError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.device import Clock, Device, Opened, SystemClock
 from stiffopt.rig.pressure import (
@@ -24,6 +25,9 @@ from stiffopt.rig.pressure import (
     PressureLimits,
     PressureReading,
     PressureSupply,
+    Supply,
+    SupplySettings,
+    total_force,
 )
 from stiffopt.rig.probing import ForceProbe, ForceSample
 from stiffopt.rig.tracking import PoseSample, PoseTracker, RawPose
@@ -45,7 +49,10 @@ __all__ = [
     "PressureSupply",
     "RawPose",
     "Rig",
+    "Supply",
+    "SupplySettings",
     "SystemClock",
+    "total_force",
 ]
 
 
@@ -80,7 +87,9 @@ class Rig(Opened):
     clock :
         Of all of them. Time passes only through it: a simulated rig moves while one sleeps.
     slew :
-        Greatest rate of change of a command (n,), in Pa/s, that whoever commands must keep.
+        Greatest rate of change of a set-point (n,), in Pa/s; inf where there is no limit.
+    max_force :
+        Greatest sum over the channels of pressure times chamber area, in N; None: no limit.
     settings :
         The `RigDescription` that the rig was made from, if it was.
     """
@@ -88,12 +97,13 @@ class Rig(Opened):
     def __init__(
         self,
         robot: RobotDescription,
-        supply: PressureSupply,
+        supply: Supply,
         tracker: PoseTracker | None = None,
         probe: ForceProbe | None = None,
         *,
         clock: Clock | None = None,
         slew: ArrayLike | None = None,
+        max_force: float | None = None,
         settings: RigDescription | None = None,
     ) -> None:
         self.robot = robot
@@ -103,6 +113,7 @@ class Rig(Opened):
         self.clock = clock or SystemClock()
         self.settings = settings
         self.slew = np.broadcast_to(np.inf if slew is None else np.asarray(slew), supply.n)
+        self.max_force = max_force
 
     @property
     def devices(self) -> tuple[Device, ...]:
@@ -142,9 +153,23 @@ class Rig(Opened):
         poses = self.tracker.read() if self.tracker is not None else ()
         return Observation(self.clock.now(), pressure, poses)
 
-    def command(self, pressures: ArrayLike | PressureCommand) -> None:
-        """Set the pressures (n,), in Pa; see `PressureSupply.command`."""
+    def command(
+        self, pressures: ArrayLike | PressureCommand, valid_for: float | None = None
+    ) -> None:
+        """Have the pressures go to (n,), in Pa, and stay there for `valid_for` seconds.
+
+        On a rig of `stiffopt.open_rig` this is a goal: the set-points approach it within the
+        limits of slew and force, and are let down and vented when it has expired.
+        """
+        if valid_for is not None:
+            if isinstance(pressures, PressureCommand):
+                raise CommandError("a PressureCommand says itself for how long it is valid")
+            pressures = PressureCommand(pressures, self.clock.now(), valid_for)
         self.supply.command(pressures)
+
+    def force(self, pressures: ArrayLike) -> float:
+        """Return the sum of pressure (n,) times chamber area, in N; a vacuum relieves nothing."""
+        return total_force(pressures, self.robot.channel_areas)
 
     def vent(self) -> None:
         """Let all pressure out at once."""

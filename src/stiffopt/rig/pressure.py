@@ -13,12 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.rig.device import Clock, Device
+from stiffopt.schema import Schema
 
-__all__ = ["PressureCommand", "PressureLimits", "PressureReading", "PressureSupply"]
+__all__ = [
+    "PressureCommand",
+    "PressureLimits",
+    "PressureReading",
+    "PressureSupply",
+    "Supply",
+    "SupplySettings",
+    "total_force",
+]
 
 Array = NDArray[np.float64]
 
 _FLOAT = np.dtype(float)
+_LOOK = 0.05  # s between looks at whether somebody else commands the device
 
 
 @dataclass(frozen=True)
@@ -51,6 +61,21 @@ class PressureLimits:
     def n(self) -> int:
         """Number of channels."""
         return len(self.low)
+
+    def within(self, other: PressureLimits) -> PressureLimits:
+        """Return the pressures that both allow.
+
+        Raises
+        ------
+        InputError
+            Another number of channels, or a channel for which nothing is left.
+        """
+        if other.n != self.n:
+            raise InputError(f"there are {self.n} channels, but limits for {other.n}")
+        low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
+        for index in np.flatnonzero(low > high):
+            raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
+        return PressureLimits(low, high)
 
     def check(self, pressures: ArrayLike) -> Array:
         """Return pressures (n,) if they may be commanded.
@@ -130,7 +155,7 @@ class PressureCommand:
 
     Attributes
     ----------
-    pressures : ndarray
+    pressures : array_like
         Gauge pressures (n,), in Pa.
     time : float
         When it was given.
@@ -138,7 +163,7 @@ class PressureCommand:
         Seconds after which a command that was not repeated holds no longer.
     """
 
-    pressures: Array
+    pressures: ArrayLike
     time: float
     valid_for: float = 0.5
 
@@ -147,13 +172,129 @@ class PressureCommand:
         return not 0 <= now - self.time <= self.valid_for
 
 
-class PressureSupply(Device):
-    """Sets and reads the pressures of all channels.
+def total_force(pressures: ArrayLike, areas: ArrayLike) -> float:
+    """Return the sum of pressure (n,) times chamber area (n,), in N; a vacuum relieves nothing."""
+    return float(np.asarray(areas) @ np.maximum(np.asarray(pressures, dtype=float), 0.0))
+
+
+class Supply(Device):
+    """Whatever sets and reads the pressures of all channels; see `Rig.supply`.
+
+    Attributes
+    ----------
+    limits : PressureLimits
+        What may be commanded.
+    """
+
+    limits: PressureLimits
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return self.limits.n
+
+    @property
+    @abstractmethod
+    def commanded(self) -> Array:
+        """The set-points (n,) that the device has, in Pa; a copy."""
+
+    @property
+    @abstractmethod
+    def armed(self) -> bool:
+        """Whether commands of pressure are taken; not so after `open` and `vent`."""
+
+    @property
+    @abstractmethod
+    def has_dump_valve(self) -> bool:
+        """Whether `vent` also opens a valve that needs no regulator's cooperation."""
+
+    def check_arming(self) -> None:
+        """Raise `CommandError` if this supply may never be armed; it need not be open."""
+
+    @abstractmethod
+    def arm(self) -> None:
+        """Take commands from now on; all set-points are 0 then."""
+
+    @abstractmethod
+    def command(self, pressures: ArrayLike | PressureCommand) -> None:
+        """Set the pressures (n,), in Pa."""
+
+    @abstractmethod
+    def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
+        """Set the pressures (n,), in Pa, and read the measured ones."""
+
+    @abstractmethod
+    def read(self) -> PressureReading:
+        """Read the measured pressures."""
+
+    @abstractmethod
+    def vent(self) -> None:
+        """Let all pressure out at once; no pressure is taken until `arm`."""
+
+
+class SupplySettings(Schema):
+    """Base of the settings of a supply in a rig file: how to reach it, and its channels.
+
+    A subclass has the key ``driver``, and ``channels`` with an item for each channel of the robot.
+    Where such an item has ``min`` or ``max``, in Pa, no supply that `device` returns commands less
+    or more, whatever its driver does.
+    """
+
+    def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
+        """Return the supply, not yet open, limited to what rig and channels allow.
+
+        Raises
+        ------
+        InputError
+            Another number of channels than `limits` has, or limits that leave no pressure.
+        """
+        allowed = self.limits_within(limits)
+        supply = self._make(allowed, clock)
+        supply.restrict(allowed)
+        return supply
+
+    def limits_within(self, limits: PressureLimits) -> PressureLimits:
+        """Return the limits, tightened by those of the channels and the reach of the hardware.
+
+        Raises
+        ------
+        InputError
+            As for `device`.
+        """
+        channels = getattr(self, "channels", None)
+        if channels is None:
+            return limits
+        if len(channels) != limits.n:
+            raise InputError(f"there are {len(channels)} channels, but limits for {limits.n}")
+        low, high = limits.low.copy(), limits.high.copy()
+        for index, channel in enumerate(channels):
+            lowest, highest = self._reach(index)
+            least, most = getattr(channel, "min", None), getattr(channel, "max", None)
+            low[index] = max(low[index], lowest, -np.inf if least is None else least)
+            high[index] = min(high[index], highest, np.inf if most is None else most)
+            if low[index] > high[index]:
+                raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
+        return PressureLimits(low, high)
+
+    def _make(self, limits: PressureLimits, clock: Clock | None) -> PressureSupply:
+        """Return the supply, not yet open, with these limits."""
+        raise NotImplementedError(f"{type(self).__name__} makes no supply")
+
+    def _reach(self, channel: int) -> tuple[float, float]:
+        """Return the lowest and highest pressure that the hardware can say, in Pa."""
+        return -np.inf, np.inf
+
+
+class PressureSupply(Supply):
+    """A device that sets and reads the pressures of all channels: the base of all drivers.
 
     Nothing reaches a device that is out of range or not finite: `command` refuses it, and what is
     handed to the driver's `_write` has been clamped once more. A supply vents when it is opened,
     when it is closed, also by an exception, and when the interpreter exits; once vented it takes
     no pressure until it is armed. Any thread may call any method.
+
+    It knows nothing of rates, forces and other programs: those are the business of
+    `stiffopt.safety`, in front of it.
     """
 
     def __init__(self, limits: PressureLimits, clock: Clock | None = None) -> None:
@@ -161,12 +302,53 @@ class PressureSupply(Device):
         self.limits = limits
         self._commanded: Array = np.zeros(limits.n)
         self._armed = False
+        self._looked_at = 0.0  # when what the device holds was last compared
         self._lock = threading.RLock()  # what was checked is written before anything else happens
 
+    # what the hardware is -------------------------------------------------------------------------
+
     @property
-    def n(self) -> int:
-        """Number of channels."""
-        return self.limits.n
+    def endpoints(self) -> tuple[str, ...]:
+        """What the supply is claimed by, so that no two programs command it; empty: by nothing.
+
+        A driver returns the names of its device from `stiffopt.rig.endpoints`. By default all
+        supplies of a class count as one device.
+
+        Raises
+        ------
+        DeviceError
+            The address cannot be resolved.
+        """
+        return (f"{type(self).__module__}.{type(self).__qualname__}",)
+
+    @property
+    def is_simulated(self) -> bool:
+        """Whether nobody can be hurt by it."""
+        return False
+
+    @property
+    def has_watchdog(self) -> bool:
+        """Whether the device vents by itself when no command comes any more."""
+        return False
+
+    @property
+    def has_dump_valve(self) -> bool:
+        """Whether `vent` also opens a valve that needs no regulator's cooperation."""
+        return False
+
+    @property
+    def patience(self) -> float:
+        """Seconds that one call may take at most, while the device answers within its timeout."""
+        return 1.0
+
+    def restrict(self, limits: PressureLimits) -> None:
+        """Tighten the limits; they never become wider again."""
+        self.limits = self.limits.within(limits)
+
+    def prepare(self) -> None:
+        """Import what connecting needs, so that it takes no time when it is urgent."""
+
+    # what is done with it -------------------------------------------------------------------------
 
     @property
     def commanded(self) -> Array:
@@ -212,7 +394,7 @@ class PressureSupply(Device):
                 super().close()
 
     def command(self, pressures: ArrayLike | PressureCommand) -> None:
-        """Set the pressures (n,), in Pa.
+        """Set the pressures (n,), in Pa, until they are set again: a device keeps no time.
 
         Raises
         ------
@@ -220,10 +402,12 @@ class PressureSupply(Device):
             Wrong number, not finite, out of range, expired, or the supply is not armed: nothing
             was written.
         DeviceError
-            The device did not take it.
+            The device did not take it, or held something else than it was told before.
         """
         with self._lock:
-            self._write_clamped(self._checked(pressures))
+            checked = self._checked(pressures)
+            self._look_for_others()
+            self._write_clamped(checked)
 
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
         """Set the pressures and read the measured ones, in one exchange where the device can.
@@ -233,10 +417,11 @@ class PressureSupply(Device):
         CommandError
             As for `command`: nothing was written.
         DeviceError
-            The device did not take it or does not answer.
+            The device did not take it, does not answer, or held something else than it was told.
         """
         with self._lock:
             last = self.limits.clamp(self._checked(pressures))
+            self._look_for_others()
             values = self._exchange(last)
             if values is None:
                 self._write_clamped(last)
@@ -273,11 +458,6 @@ class PressureSupply(Device):
                 self._write_clamped(np.zeros(self.n))
 
     @property
-    def has_dump_valve(self) -> bool:
-        """Whether `vent` also opens a valve that needs no regulator's cooperation."""
-        return False
-
-    @property
     def armed(self) -> bool:
         """Whether commands of pressure are taken; not so after `open` and `vent`."""
         return self._armed
@@ -298,6 +478,7 @@ class PressureSupply(Device):
                 self._write_clamped(np.zeros(self.n))
             self._dump(open_valve=False)
             self._armed = True
+            self._looked_at = self.clock.now()
 
     def _reading(self, pressures: ArrayLike) -> PressureReading:
         values = np.array(pressures, dtype=float)
@@ -321,6 +502,20 @@ class PressureSupply(Device):
         last = self.limits.clamp(pressures)
         self._write(last)
         self._commanded = last
+
+    def _look_for_others(self) -> None:
+        """Check from time to time, before a command, that nobody else has commanded the device."""
+        now = self.clock.now()
+        if self._armed and now - self._looked_at >= _LOOK:
+            self._looked_at = now
+            self._check_held()
+
+    def _check_held(self) -> None:
+        """Raise `DeviceError` if the device holds other set-points than it was told last.
+
+        Another program commands it then, or its own watchdog has run out. Called before a command
+        of an armed supply, every 50 ms; a driver that can read its set-points back looks here.
+        """
 
     @abstractmethod
     def _write(self, pressures: Array) -> None:

@@ -34,6 +34,9 @@ class Safety(Schema):
     max_overruns : ticks in a row that came too late, which are a fault.
     ramp_time : in which pressures are let down in a controlled way, in s.
     heartbeat : a client that has not been heard for this long has lost control, in s.
+    unprotected_supply : ``accepted``: a supply may be armed although it has neither a watchdog nor
+        a dump valve, so that nothing vents the arm when this computer fails; ``refused``: it may
+        not. Simulated supplies are exempt.
     """
 
     max_pressure: PerChannelPressure | None = None
@@ -50,6 +53,7 @@ class Safety(Schema):
     max_overruns: Annotated[int, Field(ge=1)] = 10
     ramp_time: Annotated[Duration, Field(gt=0, le=10)] = 1.0
     heartbeat: Annotated[Duration, Field(gt=0, le=60)] = 1.0
+    unprotected_supply: Literal["refused", "accepted"] = "refused"
 
 
 class ControlSettings(Schema):

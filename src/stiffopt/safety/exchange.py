@@ -17,7 +17,8 @@ from stiffopt.safety.frames import Answer, Channel, CommandFrame, Message, Poses
 
 __all__ = ["Exchange"]
 
-_ANSWER = 2.0  # s, in which the guard must answer; a device that takes longer is of no use
+_ANSWER = 2.0  # s, at least, in which the guard must answer
+_CALLS = 4  # of the driver, at most, that an answer may have to wait for
 _SLICE = 0.02  # s; no thread keeps others from receiving for longer
 _AGAIN = 1e-3  # s, until a request is sent again that could not be sent
 _RESOLUTION = 1e-3  # s, of waiting for the channel
@@ -34,14 +35,20 @@ class Exchange:
     ----------
     channel :
         To the guard.
+    patience :
+        Seconds that one call of the supply's driver may take.
 
     Attributes
     ----------
     newest : the newest answer of the guard, to whatever; None before the first.
+    to_command : the newest answer to a command; None before the first since arming.
     """
 
-    def __init__(self, channel: Channel) -> None:
+    def __init__(self, channel: Channel, patience: float = 0.0) -> None:
         self.newest: Answer | None = None
+        self.to_command: Answer | None = None
+        self.answer_within = max(_ANSWER, _CALLS * patience)
+        self._heard = time.monotonic()  # when the guard last said anything
         self._channel = channel
         self._numbers = itertools.count(1)
         self._receiving = threading.Lock()
@@ -52,8 +59,8 @@ class Exchange:
         self._poses: deque[PoseSample] = deque(maxlen=_KEPT)
         self._broken = 0  # messages that the guard could not understand
 
-    def send(self, command: PressureCommand, wait: float) -> None:
-        """Send a command, and wait for its answer for up to `wait` s.
+    def send(self, command: PressureCommand, wait: float, *, goal: bool = False) -> bool:
+        """Send a command, wait up to `wait` s for its answer, and return whether it came.
 
         Raises
         ------
@@ -62,7 +69,7 @@ class Exchange:
         """
         sequence, now = next(self._numbers), time.monotonic()
         pressures = np.asarray(command.pressures, dtype=float)
-        frame = CommandFrame(sequence, now, command.time, command.valid_for, pressures)
+        frame = CommandFrame(sequence, now, command.time, command.valid_for, pressures, goal)
         self._unanswered.append((sequence, now))
         if not self._channel.send(frame):
             self.must_live()
@@ -70,7 +77,9 @@ class Exchange:
         end = now + wait
         while self._answered < sequence and (left := end - time.monotonic()) > _RESOLUTION / 2:
             self._receive(left)
+            self.must_live()
         self._receive()
+        return self._answered >= sequence
 
     def ask(self, do: str, **about: Any) -> Answer:
         """Send a request and return the answer, which may say that it could not be met.
@@ -80,7 +89,7 @@ class Exchange:
         DeviceError
             The guard is gone, or does not answer.
         """
-        sequence, end = next(self._numbers), time.monotonic() + _ANSWER
+        sequence, end = next(self._numbers), time.monotonic() + self.answer_within
         self._waiting.add(sequence)
         try:
             while not self._channel.send(Request(sequence, do, about)):
@@ -95,6 +104,15 @@ class Exchange:
             self._waiting.discard(sequence)
             self._answers.pop(sequence, None)
 
+    def ping(self) -> None:
+        """Ask for a sign of life, and take in what has come; wait for nothing."""
+        self._channel.send(Request(0, "ping"))
+        self._receive()
+
+    def quiet(self) -> float:
+        """Return for how long the guard has said nothing, in s."""
+        return time.monotonic() - self._heard
+
     def take_poses(self) -> tuple[PoseSample, ...]:
         """Return the tracker's samples that have come since the last call."""
         self._receive()
@@ -104,7 +122,7 @@ class Exchange:
         """Raise `DeviceError` if the guard is gone."""
         if self._channel.closed:
             raise DeviceError(
-                "the guard process has ended; whether the supply is vented is not known"
+                "the guard process has ended; the supply is vented directly, as far as it answers"
             )
 
     def silence(self) -> float:
@@ -122,14 +140,17 @@ class Exchange:
     def _go_on_waiting(self, do: str, end: float) -> None:
         self.must_live()
         if time.monotonic() > end:
-            raise DeviceError(f"the guard process did not answer to '{do}' within {_ANSWER:g} s")
+            raise DeviceError(f"the guard process did not answer to '{do}' in time")
 
     def _receive(self, wait: float = 0.0) -> None:
         """Take in what has come; wait for something for up to `wait` s, but never for long."""
         if not self._receiving.acquire(timeout=wait):
             return  # another thread receives, also for this one
         try:
-            for message in self._channel.receive(min(wait, _SLICE)):
+            messages = self._channel.receive(min(wait, _SLICE))
+            if messages:
+                self._heard = time.monotonic()
+            for message in messages:
                 self._note(message)
         finally:
             self._receiving.release()
@@ -139,6 +160,8 @@ class Exchange:
             self._poses.extend(message.samples)
         if isinstance(message, Answer):
             self.newest = message
+            if message.sequence != 0 and message.sequence not in self._waiting:
+                self.to_command = message
             if message.broken != self._broken:
                 self._broken = message.broken
                 _log.warning("the guard could not understand %d messages so far", message.broken)

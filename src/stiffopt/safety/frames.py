@@ -11,6 +11,7 @@ import math
 import select
 import socket
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,7 +34,7 @@ _POSE = 10  # numbers: time, received, frame, position, quaternion
 
 @dataclass(frozen=True)
 class CommandFrame:
-    """A command of pressures; that it comes tells the guard that the loop lives.
+    """A command of pressures.
 
     Attributes
     ----------
@@ -41,6 +42,8 @@ class CommandFrame:
     sent : when, in s.
     time, valid_for : of the command, in s.
     pressures : (n,), in Pa.
+    goal : whether the guard shall approach and repeat it while it is valid, see
+        `stiffopt.safety.goal`; otherwise it is one of a stream whose silence makes the guard vent.
     """
 
     sequence: int
@@ -48,10 +51,12 @@ class CommandFrame:
     time: float
     valid_for: float
     pressures: Array
+    goal: bool = False
 
     def pack(self) -> bytes:
         """Return the packet."""
-        head = _COMMAND.pack(b"C", self.sequence, self.sent, self.time, self.valid_for)
+        kind = b"G" if self.goal else b"C"
+        head = _COMMAND.pack(kind, self.sequence, self.sent, self.time, self.valid_for)
         return head + np.ascontiguousarray(self.pressures, dtype="<f8").tobytes()
 
 
@@ -174,10 +179,10 @@ def unpack(packet: bytes) -> Message:
     """
     try:
         match packet[:1]:
-            case b"C":
+            case b"C" | b"G" as kind:
                 _, sequence, sent, time, valid_for = _COMMAND.unpack_from(packet)
                 pressures = _numbers(packet[_COMMAND.size :])
-                return CommandFrame(sequence, sent, time, valid_for, pressures)
+                return CommandFrame(sequence, sent, time, valid_for, pressures, kind == b"G")
             case b"A":
                 return _answer(packet)
             case b"R":
@@ -251,8 +256,15 @@ class Channel:
         self._end.setblocking(False)
         self._poll = select.poll()
         self._poll.register(end, select.POLLIN | select.POLLRDHUP)
+        self._hang_up = select.poll()
+        self._hang_up.register(end, select.POLLIN | select.POLLRDHUP)
         self.closed = False
         self.broken = 0
+
+    def wake_for(self, descriptors: Sequence[int]) -> None:
+        """Let a wait end also when one of these can be read."""
+        for descriptor in descriptors:
+            self._poll.register(descriptor, select.POLLIN)
 
     def send(self, message: Message) -> bool:
         """Send a message; say whether it could be, which it cannot where nobody takes any."""
@@ -295,7 +307,7 @@ class Channel:
     def _hung_up(self) -> bool:
         """Say whether nothing more can come: an empty packet reads like the end."""
         gone = select.POLLHUP | select.POLLRDHUP | select.POLLERR | select.POLLNVAL
-        return any(events & gone for _, events in self._poll.poll(0))
+        return any(events & gone for _, events in self._hang_up.poll(0))
 
     def close(self) -> None:
         """Let the other end know that nothing more comes."""

@@ -14,14 +14,20 @@ from stiffopt.rig.interface import (
     PressureLimits,
     PressureReading,
     PressureSupply,
+    Rig,
+    total_force,
 )
 from stiffopt.rig.settings import Safety
+from stiffopt.safety.claim import Claim
 from stiffopt.safety.outlet import Applied
+from stiffopt.safety.vent_line import guard_behind
 
-__all__ = ["SafetyGate"]
+__all__ = ["DEFAULT_SLEW", "SafetyGate", "check_protection", "effective_slew", "gate_before"]
 
 Array = NDArray[np.float64]
 
+DEFAULT_SLEW = 5e5
+"""Rate in Pa/s of a channel for which neither robot nor rig file has a limit."""
 _PERIODS = 3  # a pause allows no greater step than this many periods do
 
 
@@ -89,6 +95,8 @@ class SafetyGate:
         elif self._max_force is not None:
             raise InputError("a limit of the force needs the chambers' areas: force_per_pressure")
         self._jumps_to_low = bool((self.limits.low > 0).any())
+        self._safety = safety
+        self._claim = Claim(lambda: supply.endpoints, _who_has)
         self._lock = threading.RLock()
         self._armed = False
         self._vent_failed = False
@@ -102,26 +110,34 @@ class SafetyGate:
         return self._armed
 
     def open(self) -> None:
-        """Connect to the supply, which vents it.
+        """Claim the supply and connect to it, which vents it.
 
         Raises
         ------
         DeviceError
-            It does not answer.
+            Another program commands it, or it does not answer.
         """
-        self.supply.open()
+        with self._lock:
+            self._claim.take()
+            try:
+                self.supply.open()
+            except BaseException:
+                self._claim.release()
+                raise
 
     def close(self) -> None:
-        """Vent and disconnect.
+        """Vent, disconnect and give up the claim.
 
         Raises
         ------
         DeviceError
-            The supply did not take it; see `PressureSupply.close`.
+            The supply did not take it, see `PressureSupply.close`; it stays claimed, for it is
+            tried again when the interpreter exits.
         """
         with self._lock:
             self._armed = False
             self.supply.close()
+            self._claim.release()
 
     def arm(self) -> None:
         """Take commands from now on; the set-points are 0 then.
@@ -129,19 +145,25 @@ class SafetyGate:
         Raises
         ------
         CommandError
-            No rate of change is set.
+            No rate of change is set, or nothing would vent the arm if this computer failed and
+            the rig file does not accept that.
         DeviceError
             The supply did not take it.
         """
         with self._lock:
-            if not np.isfinite(self._slew).all():
-                raise CommandError(
-                    "there is no limit to how fast pressures may rise; set safety.max_slew in the "
-                    "rig file, or pressure.slew in the robot file"
-                )
+            self.check_arming()
             self.supply.arm()
             self._forget(self.clock.now())
             self._armed = True
+
+    def check_arming(self) -> None:
+        """Raise `CommandError` if this supply may never be armed; see `arm`."""
+        if not np.isfinite(self._slew).all():
+            raise CommandError(
+                "there is no limit to how fast pressures may rise; set safety.max_slew in the "
+                "rig file, or pressure.slew in the robot file"
+            )
+        check_protection(self.supply, self._safety)
 
     def vent(self) -> None:
         """Let all pressure out at once; no command is taken until `arm`.
@@ -266,8 +288,7 @@ class SafetyGate:
         return shortened
 
     def _force(self, pressures: Array) -> float:
-        """Sum of pressure times area, in N; a vacuum relieves nothing."""
-        return float(self._areas @ np.maximum(pressures, 0.0))
+        return total_force(pressures, self._areas)
 
     def _writable(self, ramp: Array) -> Array:
         """Return set-points (n,) that the supply has: none between 0 and a low limit above 0."""
@@ -282,6 +303,57 @@ class SafetyGate:
         """Begin anew with a vented supply."""
         self._ramp = self._told = np.zeros(self.limits.n)
         self._written_at = self._valid_at = now
+
+
+def effective_slew(rig: Rig) -> Array:
+    """Return the rates (n,) in Pa/s that no set-point exceeds: the rig's, or `DEFAULT_SLEW`."""
+    return np.where(np.isfinite(rig.slew), rig.slew, DEFAULT_SLEW)
+
+
+def gate_before(rig: Rig, safety: Safety, period: float) -> SafetyGate:
+    """Return the gate before the supply of a rig of bare devices.
+
+    Parameters
+    ----------
+    rig :
+        Of `stiffopt.rig.assembly.make_rig`.
+    safety :
+        Limits of pressure, force and age.
+    period :
+        Time between commands, in s.
+    """
+    if not isinstance(rig.supply, PressureSupply):
+        raise InputError("this rig's supply has a gate before it already")
+    return SafetyGate(
+        rig.supply,
+        slew=effective_slew(rig),
+        safety=safety,
+        force_per_pressure=rig.robot.channel_areas,
+        clock=rig.clock,
+        period=period,
+    )
+
+
+def check_protection(supply: PressureSupply, safety: Safety) -> None:
+    """Refuse a supply that nothing vents when this computer fails, unless that is accepted.
+
+    Raises
+    ------
+    CommandError
+        The supply is real and has neither a watchdog nor a dump valve.
+    """
+    protected = supply.is_simulated or supply.has_watchdog or supply.has_dump_valve
+    if not protected and safety.unprotected_supply != "accepted":
+        raise CommandError(
+            "this supply has neither a watchdog nor a dump valve: nothing lets the pressure out "
+            "when this computer fails; name one in the rig file's supply block, or accept that "
+            "with safety: {unprotected_supply: accepted}"
+        )
+
+
+def _who_has(endpoint: str) -> str:
+    guard = guard_behind(endpoint)
+    return "another program" if guard is None else guard.name
 
 
 def _tightened(limits: PressureLimits, safety: Safety) -> PressureLimits:

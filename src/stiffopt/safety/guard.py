@@ -1,13 +1,21 @@
-"""The guard: a process of its own that owns the supply, and vents when the loop falls silent.
+"""The guard: a process of its own that owns the supply, and vents when nobody commands any more.
 
-Started by `stiffopt.safety.link.GuardLink`. The control loop sends its commands here; they go
-through the safety gate to the supply at once. When none has come for the guard's timeout, because
-the loop was killed or stopped or hangs, or when the loop's process is gone, the guard vents. Then
-it is *tripped*: it takes no command until it is armed by a loop that has been told of the trip.
+Started by `stiffopt.safety.link.GuardLink`. It takes commands of two kinds, through the safety
+gate:
+
+- A control loop sends a *stream*. When no command has come for the guard's timeout, because the
+  loop was killed or stopped or hangs, the guard vents.
+- A program that commands now and then sends *goals*, which say for how long they are valid. The
+  guard approaches and repeats a goal, and lets the pressures down when it has expired
+  (`stiffopt.safety.goal`).
+
+In both cases it vents when the other process is gone, on every signal that ends it, and when
+somebody calls on the vent line. After it has vented by itself it is *tripped*: it takes no command
+until it is armed by a client that has been told of the trip.
 
 What the guard cannot do: while the supply's driver waits for its device, at most for the driver's
-own timeouts, nothing else happens here; and a guard that is killed itself vents nothing. Both are
-what the watchdog of the device is for.
+own timeouts, nothing else happens here; and a guard that is killed itself vents nothing. Its client
+then vents in its place (`stiffopt.safety.rescue`), and the watchdog of the device does.
 """
 
 from __future__ import annotations
@@ -28,10 +36,12 @@ import numpy as np
 from stiffopt.errors import CommandError, DeviceError, SlowWarning, StiffoptError
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading
 from stiffopt.safety.frames import Answer, Channel, CommandFrame, Message, Poses, Request, Word
+from stiffopt.safety.goal import GoalFollower
 from stiffopt.safety.hosted import Hosted, Owned, owned
 from stiffopt.safety.lines import JSON, json_line
 from stiffopt.safety.outlet import Applied, Outlet
 from stiffopt.safety.realtime import real_time
+from stiffopt.safety.vent_line import VentLine
 
 __all__ = ["FIRST_COMMAND", "Guard", "main"]
 
@@ -47,6 +57,9 @@ _TIDY = 10.0  # s between collections of garbage while nothing is under pressure
 _ASKED = "asked to"
 _POSES = 200  # samples in a packet
 _LONGEST = 500  # characters of a text: what is told must fit into a packet
+_IGNORED = ("SIGINT", "SIGPIPE", "SIGTSTP", "SIGTTIN", "SIGTTOU")  # the client says when it is over
+_HARMLESS = ("SIGCHLD", "SIGCONT", "SIGURG", "SIGWINCH")  # which do nothing by themselves
+_FATAL = ("SIGKILL", "SIGSTOP", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL")
 
 
 class Guard:
@@ -59,7 +72,11 @@ class Guard:
     channel :
         To the loop.
     timeout :
-        It vents when no command has come for this long, in s.
+        It vents when no command of a stream has come for this long, in s.
+    follower :
+        Brings the supply to goals; None: only streams are taken.
+    line :
+        Where those call who want to vent; None: there is none.
     clock :
         Time in s, `time.monotonic` of all processes.
     pause :
@@ -78,6 +95,8 @@ class Guard:
         channel: Channel,
         timeout: float,
         *,
+        follower: GoalFollower | None = None,
+        line: VentLine | None = None,
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
         epoch: float = 0.0,
@@ -87,7 +106,14 @@ class Guard:
         self._outlet = outlet
         self._channel = channel
         self._timeout = timeout
-        self._silence = f"no command had come for {timeout * 1e3:g} ms"
+        self._silence = (
+            f"no command had come for {timeout * 1e3:g} ms: the program that commands, or this "
+            "computer, was late"
+        )
+        self._follower = follower
+        self._line = line
+        if line is not None:
+            channel.wake_for(line.descriptors())
         self._clock = clock
         self._pause = pause
         self._epoch = epoch
@@ -96,7 +122,9 @@ class Guard:
         n = outlet.limits.n
         self._commanded = np.zeros(n)
         self._reading = PressureReading(np.nan, np.full(n, np.nan))
-        self._due: float | None = None  # when it vents; None while no command is taken
+        self._armed = False
+        self._goals = False  # whether it is armed for goals
+        self._due: float | None = None  # when it vents; None while no stream is taken
         self._to_vent: float | None = None  # when to try again to vent; None: it is vented or armed
         self._trips = 0
         self._tripped = ""
@@ -123,15 +151,17 @@ class Guard:
     def step(self) -> None:
         """Take in what has come, or wait a little for it, and do what has to be done unasked."""
         self._take(self._channel.receive(self._patience()))
+        self._hear_callers()
         if self._channel.broken >= 2 * self._broken_told:
             self._tell_of_broken()
         if self._channel.closed and not self._leaving:
             self._leaving = "the process of the control loop has ended"
         self._look_at_the_time()
+        self._follow()
         now = self._clock()
         if self._to_vent is not None and now >= self._to_vent:
             self._vent()
-        if self._due is None and now - self._tidied > _TIDY:
+        if not self._armed and now - self._tidied > _TIDY:
             gc.collect()
             self._tidied = now
         self._forward_poses()
@@ -139,6 +169,8 @@ class Guard:
     def _patience(self) -> float:
         moments = [self._clock() + (_IDLE if self._hosted is None else _HOSTING)]
         moments += [moment for moment in (self._due, self._to_vent) if moment is not None]
+        if self._follower is not None:
+            moments.append(self._follower.due + self._epoch)
         return max(0.0, min(moments) - self._clock())
 
     # what comes ----------------------------------------------------------------------------------
@@ -163,7 +195,7 @@ class Guard:
 
     def _feed(self, frame: CommandFrame) -> None:
         """Note when the loop was alive: when it sent, for the frame may have waited here."""
-        if self._due is None:
+        if self._due is None or frame.goal:
             return
         if not frame.sent <= self._due:  # NaN is no time either
             self._trip(self._silence)
@@ -180,7 +212,7 @@ class Guard:
             return
         command = PressureCommand(frame.pressures, frame.time - self._epoch, frame.valid_for)
         try:
-            applied = self._outlet.apply(command)
+            applied = self._carry_out(command, goal=frame.goal)
         except CommandError as error:
             applied = Applied(self._commanded, self._reading, refused=str(error))
         except Exception as error:
@@ -191,12 +223,46 @@ class Guard:
         self._commanded, self._reading = applied.pressures, applied.reading
         self._answer(frame.sequence, applied)
 
+    def _carry_out(self, command: PressureCommand, *, goal: bool) -> Applied:
+        if goal != self._goals and self._armed:
+            raise CommandError("the supply was armed for commands of another kind; arm it again")
+        if goal and self._follower is not None:
+            applied = self._follower.pursue(command)
+            self._armed = self._follower.armed
+            return applied
+        return self._outlet.apply(command)
+
+    def _follow(self) -> None:
+        """Repeat a goal, or let the pressures down after it, when that is due."""
+        follower = self._follower
+        if follower is None or follower.due + self._epoch > self._clock():
+            return
+        try:
+            follower.tick()
+        except Exception as error:
+            self._trip(f"the supply failed: {_told(error)}")
+            return
+        self._commanded, self._armed = follower.commanded, follower.armed
+
+    def _hear_callers(self) -> None:
+        """Vent for those who call on the vent line."""
+        if self._line is None:
+            return
+        for caller in self._line.asked():
+            if self._armed:
+                error = self._trip(f"{caller.peer.name} called 'stiffopt vent'")
+            else:
+                error = self._vent()
+            caller.answer(error)
+
     def _obey(self, request: Request) -> None:
         error, value = "", None
         try:
             match request.do:
                 case "arm":
-                    self._arm(request.about.get("told"))
+                    self._arm(request.about.get("told"), goals=bool(request.about.get("goals")))
+                case "ping":
+                    pass
                 case "vent":
                     error = self._vent()
                 case "read":
@@ -210,22 +276,26 @@ class Guard:
             error = _told(problem)
         self._answer(request.sequence, error=error, value=value)
 
-    def _arm(self, told: Any) -> None:
-        """Arm, unless there is a trip that the loop has not been told of."""
+    def _arm(self, told: Any, *, goals: bool) -> None:
+        """Arm, unless there is a trip that the client has not been told of."""
         if self._tripped and told != self._trips:
             raise DeviceError(f"the guard had vented: {self._tripped}")
         if self._to_vent is not None:
             raise DeviceError("the supply could not be vented yet; it cannot be armed")
         try:
-            if self._due is not None:  # it may be under pressure, and arming begins without
+            if self._armed:  # it may be under pressure, and arming begins without
                 self._outlet.vent()
-            self._outlet.arm()
+            if goals and self._follower is not None:
+                self._follower.arm_for_goals()
+            else:
+                self._outlet.arm()
         except BaseException:
             self._vent()
             raise
         self._commanded = np.zeros_like(self._commanded)
         self._tripped = ""
-        self._due = self._clock() + FIRST_COMMAND
+        self._armed, self._goals = True, goals
+        self._due = None if goals else self._clock() + FIRST_COMMAND
 
     def _ask(self, word: str, about: dict[str, Any]) -> Any:
         if self._hosted is None:
@@ -239,19 +309,21 @@ class Guard:
 
     # what is done --------------------------------------------------------------------------------
 
-    def _trip(self, reason: str) -> None:
-        """Vent, and stay vented until a loop that knows of it arms again."""
+    def _trip(self, reason: str) -> str:
+        """Vent, and stay vented until a client that knows of it arms; say if that fails, why."""
         self._tripped = reason[:_LONGEST]
         self._trips += 1
-        if not self._vent():
+        error = self._vent()
+        if not error:
             self._say(f"vented: {reason}")
         self._answer(0)
+        return error
 
     def _vent(self) -> str:
         """Vent; where it fails say why, and try again soon."""
-        self._due = None
+        self._armed, self._due = False, None
         try:
-            self._outlet.vent()
+            (self._follower or self._outlet).vent()
         except Exception as error:
             if self._to_vent is None:
                 self._say(f"COULD NOT VENT, and tries again: {_told(error)}", "error")
@@ -271,7 +343,7 @@ class Guard:
             self._commanded,
             self._reading.pressures,
             self._reading.time + self._epoch,
-            armed=self._due is not None,
+            armed=self._armed,
             limited=applied is not None and applied.limited,
             force_limited=applied is not None and applied.force_limited,
             trips=self._trips,
@@ -292,7 +364,7 @@ class Guard:
 
     def _end(self) -> int:
         """Vent, whatever it takes, and close; 0 if the supply took it."""
-        surprised = self._due is not None and self._leaving != _ASKED
+        surprised = self._armed and self._leaving != _ASKED
         failure = self._vent()
         for _ in range(_ATTEMPTS):
             if not failure:
@@ -301,6 +373,8 @@ class Guard:
             failure = self._vent()
         if surprised and not failure:
             self._say(f"vented: {self._leaving}")
+        if self._line is not None:
+            self._line.close()
         try:
             self._outlet.close()
         except Exception as error:
@@ -336,28 +410,53 @@ def main(arguments: Sequence[str] | None = None) -> int:
         those of the command line. The rig comes pickled on standard input, from the process that
         started this one.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the loop ramps down; it says when it is over
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))  # until there is something to vent
+    _ignore(_IGNORED)
+    _on_signals(lambda *_: sys.exit(0))  # until there is something to vent
     given = sys.argv[1:] if arguments is None else arguments
     descriptor, as_json = int(given[0]), JSON in given[1:]
     with closing(Channel(socket.socket(fileno=descriptor))) as channel:
         try:
-            supply = _opened(channel)
+            owns = _opened(channel)
         except StiffoptError as error:
             channel.send(Word("failed", {"kind": type(error).__name__, "args": _plain(error)}))
             return 1
         guard = Guard(
-            supply.outlet,
+            owns.gate,
             channel,
-            supply.timeout,
-            epoch=supply.epoch,
-            hosted=supply.hosted,
+            owns.timeout,
+            follower=owns.follower,
+            line=owns.line(),
+            epoch=owns.epoch,
+            hosted=owns.hosted,
             as_json=as_json,
         )
-        signal.signal(signal.SIGTERM, lambda *_: guard.leave("SIGTERM"))
+        _on_signals(lambda number, _: guard.leave(_signal_name(number)))
         with real_time(PRIORITY) as granted:
             channel.send(Word("ready", {"real_time": granted.notice}))
             return guard.serve()
+
+
+def _ignore(names: Sequence[str]) -> None:
+    for name in names:
+        signal.signal(getattr(signal, name), signal.SIG_IGN)
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # a real-time signal
+        return f"signal {number}"
+
+
+def _on_signals(handler: Callable[[int, Any], object]) -> None:
+    """Have a handler called on every signal that would end the process, as far as that can be.
+
+    A fault of the processor is not among them: after its handler the same instruction fails again.
+    """
+    left = {getattr(signal, name) for name in (*_IGNORED, *_HARMLESS, *_FATAL)}
+    for number in signal.valid_signals() - left:
+        with suppress(OSError, ValueError):  # the system keeps some for itself
+            signal.signal(number, handler)
 
 
 def _opened(channel: Channel) -> Owned:
@@ -369,9 +468,9 @@ def _opened(channel: Channel) -> Owned:
     with warnings.catch_warnings():
         warnings.simplefilter("always", SlowWarning)
         warnings.showwarning = tell
-        supply = owned(*pickle.load(sys.stdin.buffer))
-        supply.outlet.open()
-    return supply
+        owns = owned(*pickle.load(sys.stdin.buffer))
+        owns.gate.open()
+    return owns
 
 
 def _plain(error: BaseException) -> list[str]:

@@ -1,10 +1,8 @@
-"""The control loop's side of the guard process: an outlet, and the rig around it."""
+"""The client's end of the guard process: it takes streams and goals, and is part of a rig."""
 
 from __future__ import annotations
 
-import math
 import os
-import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,42 +10,49 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import DeviceError, InputError
+from stiffopt.errors import DeviceError, GuardTripped, InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, limits_of, load_rig_description, slew_of
 from stiffopt.rig.interface import (
     Clock,
+    ForceProbe,
     PoseSample,
     PoseTracker,
     PressureCommand,
     PressureLimits,
     PressureReading,
+    PressureSupply,
     Rig,
     SystemClock,
 )
 from stiffopt.safety.exchange import Exchange
 from stiffopt.safety.frames import Answer
+from stiffopt.safety.gate import check_protection
+from stiffopt.safety.goal import GoalSupply
 from stiffopt.safety.guard_process import GuardProcess
-from stiffopt.safety.guarded import ForwardedTracker, GuardedSupply
+from stiffopt.safety.guarded import ForwardedProbe, ForwardedTracker
 from stiffopt.safety.outlet import Applied
+from stiffopt.safety.rescue import GuardWatch
 
 __all__ = ["GuardLink", "guarded_rig"]
 
 Array = NDArray[np.float64]
 
 _FRESH = 1e-3  # s, that a command waits for its own answer
-_HUNG = 1.0  # s without any answer, after which it is not waited for any more
-_SILENT = 0.25  # s without an answer to a command, after which something is wrong
+_HUNG = 1.0  # s without a sign of life, beyond the driver's own time, after which it is ended
+_SILENT = 0.25  # s without an answer to a command, at least, after which something is wrong
+_RESCUE = 1.0  # s to wait until a supply is vented directly
 
 
 class GuardLink:
     """Commands a supply that a guard process owns; see `stiffopt.safety.guard`.
 
     It is an `Outlet` whose times are those of `time.monotonic`. Any thread may call any method.
-    When the guard has vented by itself, `apply` and `arm` say so by a `DeviceError`; `arm` works
-    again once it was said, or the loop has vented too.
+    When the guard has vented by itself, `apply`, `pursue` and `arm` say so by `GuardTripped`; `arm`
+    works again once it was said, or the client has vented too. When the guard is gone, or hangs,
+    the supply is vented directly, see `GuardWatch`.
 
     Parameters
     ----------
@@ -55,6 +60,9 @@ class GuardLink:
         The rig.
     limits :
         What may be commanded.
+    spare :
+        Another object for the same supply, never opened while the guard lives: to vent it directly
+        when the guard is gone. None for a simulated supply, which is gone with its guard.
     json_lines :
         Whether the guard speaks JSON on stderr; else for people.
 
@@ -68,17 +76,21 @@ class GuardLink:
         description: RigDescription,
         robot: RobotDescription,
         limits: PressureLimits,
+        spare: PressureSupply | None = None,
         *,
         json_lines: bool = False,
     ) -> None:
         self.limits = limits
+        self.has_dump_valve = spare is not None and spare.has_dump_valve
         self.real_time = ""
         self._rig = (description, robot)
         self._json_lines = json_lines
         self._process: GuardProcess | None = None
         self._exchange: Exchange | None = None
+        self._spare = spare
+        self._patience = 0.0 if spare is None else spare.patience
+        self._watch: GuardWatch | None = None
         self._told = 0  # trips that were said
-        self._deaf = math.inf  # since when it does not answer
 
     # life ----------------------------------------------------------------------------------------
 
@@ -94,15 +106,17 @@ class GuardLink:
         """
         if self._process is not None:
             return
-        self._told, self._deaf = 0, math.inf
+        self._told = 0
         self._process = GuardProcess(self._rig, json_lines=self._json_lines)
         try:
             self.real_time = self._process.wait_until_ready()
-            self._exchange = Exchange(self._process.channel)
+            self._exchange = Exchange(self._process.channel, self._patience)
             self.read()
         except BaseException:
             self._end()
             raise
+        self._watch = GuardWatch(self, self._spare)
+        self._watch.start()
 
     def close(self) -> None:
         """Vent, and end the guard; it is killed only if it does not end by itself.
@@ -114,13 +128,22 @@ class GuardLink:
         """
         if self._process is None:
             return
-        with suppress(DeviceError):  # how it ended tells better
-            self._ask("close")
+        watch, self._watch = self._watch, None
+        lost = not self._process.alive
+        if watch is not None:
+            if lost:
+                watch.wait(_RESCUE)
+            watch.stop()
+        if not lost:
+            with suppress(DeviceError):  # how it ended tells better
+                self._ask("close")
         code = self._end()
-        if code != 0:
+        rescued = watch is not None and watch.rescued.is_set()
+        if code != 0 and not rescued:
+            reason = watch.error if watch is not None and watch.error else f"it ended with {code}"
             raise DeviceError(
-                f"the guard ended with code {code}: the supply may not be vented; only its own "
-                "watchdog and valves can do that now"
+                f"the guard process is gone and the supply may not be vented ({reason}); only its "
+                "own watchdog and valves can do that now"
             )
 
     def _end(self) -> int:
@@ -139,7 +162,14 @@ class GuardLink:
     @property
     def hung(self) -> bool:
         """Whether the guard is there and has not answered for so long that it never may."""
-        return self.alive and self._deaf < time.monotonic() - _HUNG
+        exchange = self._exchange
+        quiet = 0.0 if exchange is None else exchange.quiet()
+        return self.alive and quiet > _HUNG + self._patience
+
+    def ping(self) -> None:
+        """Ask the guard for a sign of life; waits for nothing."""
+        if self._exchange is not None:
+            self._exchange.ping()
 
     def kill(self) -> None:
         """End a guard that hangs, so that another can be started; the kernel takes its devices."""
@@ -153,18 +183,51 @@ class GuardLink:
 
     # outlet --------------------------------------------------------------------------------------
 
+    def check_arming(self) -> None:
+        """Raise `CommandError` if this supply may never be armed."""
+        if self._spare is not None:
+            check_protection(self._spare, self._rig[0].safety)
+
     def arm(self) -> None:
-        """Let the guard take commands; the first must come within a second.
+        """Let the guard take a stream of commands; the first must come within a second.
 
         Raises
         ------
+        GuardTripped
+            The guard had vented by itself and this was not said yet.
         DeviceError
-            The guard had vented by itself and this was not said yet, or the supply fails.
+            The supply or the guard fails.
         """
-        answer = self._answer("arm", told=self._told)
+        self._arm(goals=False)
+
+    def arm_for_goals(self) -> None:
+        """Let the guard take goals; all set-points are 0 until the first one comes.
+
+        Raises
+        ------
+        GuardTripped, DeviceError
+            As for `arm`.
+        """
+        self._arm(goals=True)
+
+    def _arm(self, *, goals: bool) -> None:
+        self._open_exchange().to_command = None
+        answer = self._answer("arm", told=self._told, goals=goals)
         if answer.error:
-            self._told = answer.trips
+            unsaid, self._told = answer.trips != self._told, answer.trips
+            if unsaid and answer.tripped:
+                raise GuardTripped(answer.error)
             raise DeviceError(answer.error)
+
+    @property
+    def armed(self) -> bool:
+        """Whether the guard takes commands."""
+        return self.alive and self._answer("ping").armed
+
+    @property
+    def commanded(self) -> Array:
+        """The set-points (n,) that the supply has been told, in Pa."""
+        return self._answer("ping").commanded.copy()
 
     def vent(self) -> None:
         """Let all pressure out at once; this waits for nothing but the guard.
@@ -172,10 +235,14 @@ class GuardLink:
         Raises
         ------
         DeviceError
-            The supply did not take it, or the guard is gone; the guard tries on as long as it
-            lives.
+            The supply did not take it; the guard tries on as long as it lives. Or the guard is
+            gone, and the supply could not be vented directly yet.
         """
-        self._told = self._ask("vent").trips
+        try:
+            self._told = self._ask("vent").trips
+        except DeviceError:
+            if self.alive or self._watch is None or not self._watch.wait(_RESCUE):
+                raise
 
     def read(self) -> PressureReading:
         """Let the guard read the pressures, in Pa.
@@ -197,22 +264,44 @@ class GuardLink:
         """
         exchange = self._open_exchange()
         exchange.send(command, _FRESH)
-        newest = exchange.newest
+        self._check_trip()
+        exchange.must_live()
+        newest, silence = exchange.newest, exchange.silence()
+        if newest is None or silence > max(_SILENT, self._patience):
+            raise DeviceError(f"the guard process has not answered for {silence:.2g} s")
+        return self._applied()
+
+    def pursue(self, goal: PressureCommand) -> Applied:
+        """Send a goal, and return what became of it.
+
+        Raises
+        ------
+        GuardTripped
+            The guard has vented by itself.
+        DeviceError
+            The guard is gone or does not answer, or the supply fails.
+        """
+        exchange = self._open_exchange()
+        if not exchange.send(goal, exchange.answer_within, goal=True):
+            raise DeviceError("the guard process did not answer to a command in time")
+        self._check_trip()
+        return self._applied()
+
+    def _check_trip(self) -> None:
+        newest = self._open_exchange().newest
         if newest is not None and newest.tripped:
             self._told = newest.trips
-            raise DeviceError(f"the guard has vented: {newest.tripped}")
-        exchange.must_live()
-        silence = exchange.silence()
-        if newest is None or silence > _SILENT:
-            self._deaf = min(self._deaf, time.monotonic())
-            raise DeviceError(f"the guard process has not answered for {silence:.2g} s")
-        self._deaf = math.inf
+            raise GuardTripped(f"the guard has vented: {newest.tripped}")
+
+    def _applied(self) -> Applied:
+        """Return the newest set-points and readings, and what became of the newest command."""
+        exchange = self._open_exchange()
+        newest, to_command = exchange.newest, exchange.to_command
+        if newest is None:
+            raise DeviceError("the guard process has not answered yet")
+        done = to_command or newest
         return Applied(
-            newest.commanded,
-            _reading(newest),
-            newest.limited,
-            newest.refused,
-            newest.force_limited,
+            newest.commanded, _reading(newest), done.limited, done.refused, done.force_limited
         )
 
     # simulated rigs ------------------------------------------------------------------------------
@@ -235,6 +324,16 @@ class GuardLink:
         """Return the true pressures (n,) in simulated chambers, in Pa."""
         return np.array(self._ask("pressures").value)
 
+    def ask_world(self, word: str, **about: Any) -> Any:
+        """Have the simulated rig in the guard process do something, and return what it answers.
+
+        Raises
+        ------
+        DeviceError
+            It cannot.
+        """
+        return self._ask(word, **about).value
+
     def take_poses(self) -> tuple[PoseSample, ...]:
         """Return what a simulated tracker has seen since the last call; waits for nothing."""
         return () if self._exchange is None else self._exchange.take_poses()
@@ -247,15 +346,8 @@ class GuardLink:
         return answer
 
     def _answer(self, do: str, **about: Any) -> Answer:
-        """Return the answer to a request, whatever it says; take note if there is none."""
-        exchange = self._open_exchange()
-        try:
-            answer = exchange.ask(do, **about)
-        except DeviceError:
-            self._deaf = min(self._deaf, time.monotonic())
-            raise
-        self._deaf = math.inf
-        return answer
+        """Return the answer to a request, whatever it says."""
+        return self._open_exchange().ask(do, **about)
 
     def _open_exchange(self) -> Exchange:
         if self._exchange is None:
@@ -303,15 +395,29 @@ def guarded_rig(
     else:
         description = load_rig_description(rig)
         robot = robot or load_description(description.robot, base=Path(rig).parent)
+    limits, slew = limits_of(description, robot), slew_of(description, robot)
     clock: Clock = SystemClock()
     tracker: PoseTracker | None
+    probe: ForceProbe | None
     if description.supply.driver == "simulated":
-        limits = limits_of(description, robot)
         link = GuardLink(description, robot, limits, json_lines=json_lines)
+        link.has_dump_valve = description.supply.dump_valve
         tracker = None if description.tracker is None else ForwardedTracker(link)
+        probe = None if description.probe is None else ForwardedProbe(link)
     else:
-        real = make_rig(description.model_copy(update={"probe": None}), robot)
-        link = GuardLink(description, robot, real.supply.limits, json_lines=json_lines)
-        tracker, clock = real.tracker, real.clock
-    supply, slew = GuardedSupply(link), slew_of(description, robot)
-    return Rig(robot, supply, tracker, clock=clock, slew=slew, settings=description), link
+        real = make_rig(description, robot)
+        spare = real.supply
+        assert isinstance(spare, PressureSupply)
+        link = GuardLink(description, robot, spare.limits, spare, json_lines=json_lines)
+        tracker, probe, clock = real.tracker, real.probe, real.clock
+    guarded = Rig(
+        robot,
+        GoalSupply(link, clock),
+        tracker,
+        probe,
+        clock=clock,
+        slew=slew,
+        max_force=description.safety.max_force,
+        settings=description,
+    )
+    return guarded, link

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stiffopt.rig.interface import PressureCommand, PressureLimits, PressureReading
 
-__all__ = ["Applied", "Outlet"]
+__all__ = ["Applied", "Outlet", "let_down"]
 
 Array = NDArray[np.float64]
 
@@ -38,6 +38,16 @@ class Applied:
     limited: bool = False
     refused: str = ""
     force_limited: bool = False
+
+
+def let_down(pressures: Array, share: float, limits: PressureLimits) -> Array:
+    """Return a share of pressures (n,), in Pa, as it can be commanded.
+
+    The share is at most 1; a channel below a low limit above 0 is at 0.
+    """
+    down: Array = pressures * min(max(share, 0.0), 1.0)
+    low = limits.low
+    return np.where((low > 0) & (down < low), 0.0, down)
 
 
 class Outlet(Protocol):

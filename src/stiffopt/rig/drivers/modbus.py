@@ -14,7 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from stiffopt.errors import DeviceError, InputError
-from stiffopt.rig.drivers.modbus_line import ModbusLine, RefusedError, SerialLine, Tcp
+from stiffopt.rig.drivers.modbus_line import (
+    ModbusLine,
+    RefusedError,
+    SerialLine,
+    Tcp,
+    library,
+)
 from stiffopt.rig.drivers.modbus_registers import (
     Channel,
     DumpValve,
@@ -28,8 +34,8 @@ from stiffopt.rig.drivers.modbus_registers import (
     runs_of,
     values_of,
 )
-from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply
-from stiffopt.schema import BadKeyError, Items, Schema
+from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
+from stiffopt.schema import BadKeyError, Items
 from stiffopt.units import Duration
 
 __all__ = ["DumpValve", "ModbusSettings", "ModbusSupply", "SerialLine", "Tcp", "Watchdog"]
@@ -40,7 +46,7 @@ Registers = dict[int, tuple[int, ...]]
 _ILLEGAL_FUNCTION = 1
 
 
-class ModbusSettings(Schema):
+class ModbusSettings(SupplySettings):
     """Connection and register map of a supply.
 
     Attributes
@@ -139,27 +145,17 @@ class ModbusSettings(Schema):
             raise InputError("expected one of the keys 'tcp' and 'serial'")
         return connection
 
-    def limits(self, limits: PressureLimits) -> PressureLimits:
-        """Return limits as tight as those of the channels and the range of their registers."""
-        if limits.n != self.n:
-            raise InputError(f"there are {self.n} channels, but limits for {limits.n}")
-        low, high = limits.low.copy(), limits.high.copy()
-        for index, (channel, point) in enumerate(zip(self.channels, self.setpoints, strict=True)):
-            lowest, highest = point.pressure_range()
-            low[index] = max(low[index], lowest, *([] if channel.min is None else [channel.min]))
-            high[index] = min(high[index], highest, *([] if channel.max is None else [channel.max]))
-            if low[index] > high[index]:
-                raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
+    def _reach(self, channel: int) -> tuple[float, float]:
+        return self.setpoints[channel].pressure_range()
+
+    def _make(self, limits: PressureLimits, clock: Clock | None) -> ModbusSupply:
+        for index, point in enumerate(self.setpoints):
+            low, high = float(limits.low[index]), float(limits.high[index])
             try:
-                at = float(low[index] or high[index])
-                point.encode(at, lowest=low[index], highest=high[index])
+                point.encode(low or high, lowest=low, highest=high)
             except InputError as error:
                 raise InputError(f"channel {index + 1}: {error}; widen its limits") from None
-        return PressureLimits(low, high)
-
-    def device(self, limits: PressureLimits, clock: Clock | None = None) -> ModbusSupply:
-        """Return the supply, not yet open."""
-        return ModbusSupply(self, self.limits(limits), clock)
+        return ModbusSupply(self, limits, clock)
 
     def _point(self, register: Any, table: str) -> Point:
         kind, scale = register.type or self.type, register.scale or self.scale
@@ -189,6 +185,26 @@ class ModbusSupply(PressureSupply):
         self._verified = runs_of(enumerate(self._read_backs)) if settings.verify else ()
         self._measured = runs_of(self._readings.items())
         self._joint = self._joint_run() if settings.read_write else None
+        self._told: Registers | None = None  # what the device must hold; None: that is not known
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """The address of the device; its unit does not count, for many devices ignore it."""
+        return self.settings.connection.endpoints()
+
+    @property
+    def has_watchdog(self) -> bool:
+        """Whether the rig file names one."""
+        return self.settings.watchdog is not None
+
+    @property
+    def patience(self) -> float:
+        """A few answers: the set-points, the readings and what is read back."""
+        return 4 * self.settings.timeout
+
+    def prepare(self) -> None:
+        """Import pymodbus, which takes a third of a second."""
+        library("pymodbus.client")
 
     def _joint_run(self) -> Run | None:
         """Return what function 23 reads, if it can write and read all in one request."""
@@ -259,6 +275,7 @@ class ModbusSupply(PressureSupply):
             _insist(lambda: self._write_once(registers, whatever_happens=True))
 
     def _write_once(self, registers: Registers, *, whatever_happens: bool = False) -> None:
+        self._told = None
         errors: list[DeviceError] = []
         for run in self._written:
             try:
@@ -273,6 +290,14 @@ class ModbusSupply(PressureSupply):
         self._trigger()
         for run in self._verified:
             self._read_back(run, registers)
+        self._told = registers
+
+    def _check_held(self) -> None:
+        told = self._told
+        if told is None or self.settings.serial is not None:  # which has one master, and is slow
+            return
+        for run in self._verified:
+            self._read_back(run, told)
 
     def _read_back(self, run: Run, registers: Registers) -> None:
         self._verify(run, self._line.read(str(run), run.table, run.start, run.count), registers)
@@ -284,8 +309,9 @@ class ModbusSupply(PressureSupply):
                 raise DeviceError(
                     f"{self.settings.connection}: register {point.address} of channel "
                     f"{channel + 1} holds {point.decode(held) * 1e-5:.6g} bar after "
-                    f"{point.decode(written) * 1e-5:.6g} bar was written; does someone else write "
-                    "to it, or does the device read it back at another address?"
+                    f"{point.decode(written) * 1e-5:.6g} bar was written; does another program "
+                    "write to it, has the device's watchdog run out, or does the device read it "
+                    "back at another address?"
                 )
 
     # readings ------------------------------------------------------------------------------------
@@ -308,6 +334,7 @@ class ModbusSupply(PressureSupply):
             return None
         self._watch()
         registers, (written,) = self._encoded(pressures), self._written
+        self._told = None
         what = f"write {written} and read {joint}"
         addresses = {"read_address": joint.start, "write_address": written.start}
         try:
@@ -332,6 +359,7 @@ class ModbusSupply(PressureSupply):
                 self._verify(joint, values, registers)
             else:
                 self._read_back(run, registers)
+        self._told = registers
         return measured
 
     # dump valve ----------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from stiffopt.errors import DeviceError, MissingExtraError
+from stiffopt.rig.endpoints import serial_endpoints, tcp_endpoints
 from stiffopt.schema import Schema
 
 __all__ = ["ModbusLine", "RefusedError", "SerialLine", "Tcp", "library"]
@@ -53,6 +54,10 @@ class Tcp(Schema):
     def __str__(self) -> str:
         return f"the Modbus device at {self.host}:{self.port}"
 
+    def endpoints(self) -> tuple[str, ...]:
+        """Return what a supply at this address is claimed by."""
+        return tcp_endpoints(self.host, self.port)
+
     def client(self, **options: Any) -> Any:
         """Return pymodbus's client."""
         return library("pymodbus.client").ModbusTcpClient(self.host, port=self.port, **options)
@@ -76,6 +81,10 @@ class SerialLine(Schema):
 
     def __str__(self) -> str:
         return f"the Modbus device on {self.port}"
+
+    def endpoints(self) -> tuple[str, ...]:
+        """Return what a supply on this line is claimed by."""
+        return serial_endpoints(self.port)
 
     def options(self) -> dict[str, Any]:
         """Return the settings by pymodbus's names."""

@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from stiffopt.errors import DeviceError, InputError
+from stiffopt.errors import DeviceError
 from stiffopt.rig.drivers.daqmx import Address, Daqmx, InputName, OutputName, Pair, Terminals
 from stiffopt.rig.drivers.daqmx_tasks import AnalogueInput, AnalogueOutput, InputChannel
 from stiffopt.rig.drivers.nidaq_valve import DumpValve, Valve
-from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply
+from stiffopt.rig.endpoints import tcp_endpoints
+from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Pressure, Voltage
 
@@ -110,7 +111,7 @@ class RegulatorChannel(Schema):
     max: Pressure | None = None
 
 
-class NidaqSettings(Schema):
+class NidaqSettings(SupplySettings):
     """Regulators on NI-DAQ devices.
 
     Attributes
@@ -149,34 +150,18 @@ class NidaqSettings(Schema):
                     names[name] = f"channel {index + 1}"
         return self
 
-    def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
-        """Return the supply.
+    def _reach(self, channel: int) -> tuple[float, float]:
+        low, high = sorted(self.channels[channel].output.pressures)
+        return low, high
 
-        Raises
-        ------
-        InputError
-            Another number of channels than the arm has, or limits that leave nothing.
-        """
+    def _make(self, limits: PressureLimits, clock: Clock | None) -> NidaqSupply:
         return NidaqSupply(self, limits, clock)
 
-    def tightened(self, limits: PressureLimits) -> PressureLimits:
-        """Return what is within limits, those of the channels and the reach of the regulators."""
-        if len(self.channels) != limits.n:
-            raise InputError(
-                f"the supply has {len(self.channels)} channels, the robot {limits.n}; "
-                "list one under 'channels' for each channel of the robot"
-            )
-        low, high = limits.low.copy(), limits.high.copy()
-        for index, channel in enumerate(self.channels):
-            lowest, highest = sorted(channel.output.pressures)
-            low[index] = max(low[index], lowest, *([] if channel.min is None else [channel.min]))
-            high[index] = min(high[index], highest, *([] if channel.max is None else [channel.max]))
-            if low[index] > high[index]:
-                raise InputError(
-                    f"channel {index + 1}: no pressure is within the limits of the robot, those "
-                    "of the channel and what the regulator reaches"
-                )
-        return PressureLimits(low, high)
+
+def _places(server: str) -> tuple[str, ...]:
+    """Return the endpoints of a gRPC server, ``host:port``."""
+    host, _, port = server.rpartition(":")
+    return tcp_endpoints(host.strip("[]"), int(port))
 
 
 class NidaqSupply(PressureSupply):
@@ -185,13 +170,31 @@ class NidaqSupply(PressureSupply):
     def __init__(
         self, settings: NidaqSettings, limits: PressureLimits, clock: Clock | None = None
     ) -> None:
-        super().__init__(settings.tightened(limits), clock)
+        super().__init__(limits, clock)
         self._settings = settings
         outputs = [channel.output for channel in settings.channels]
         self._lowest = np.array([min(output.volts) for output in outputs])
         self._highest = np.array([max(output.volts) for output in outputs])
         self._read_backs = [i for i, output in enumerate(outputs) if output.read_back is not None]
         self._vented = np.array([output.volts_for(0.0) for output in outputs])
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        """The devices whose outputs it has, on this machine or behind a server."""
+        address = self._settings.grpc
+        names = sorted({c.output.channel.split("/")[0].lower() for c in self._settings.channels})
+        places = ("ni-daq",) if address is None else _places(address)
+        return tuple(f"{place} {name}" for place in places for name in names)
+
+    @property
+    def has_watchdog(self) -> bool:
+        """Whether the device opens the dump valve by itself."""
+        return self._settings.watchdog is not None
+
+    @property
+    def patience(self) -> float:
+        """Outputs, valve and inputs have a deadline each."""
+        return 3 * self._settings.timeout
 
     @property
     def has_dump_valve(self) -> bool:

@@ -48,6 +48,21 @@ class SimulatedSupply(PressureSupply):
             raise DeviceError("the simulated supply does not answer (its fault is 'off')")
 
     @property
+    def endpoints(self) -> tuple[str, ...]:
+        """None: every rig has a world of its own."""
+        return ()
+
+    @property
+    def is_simulated(self) -> bool:
+        """It is."""
+        return True
+
+    @property
+    def has_watchdog(self) -> bool:
+        """Whether the rig file gives it one."""
+        return self._world.supply.watchdog is not None
+
+    @property
     def has_dump_valve(self) -> bool:
         """Whether the rig file gives it one."""
         return self._world.supply.dump_valve

@@ -51,5 +51,6 @@ def simulated_rig(
         None if probe is None else SimulatedProbe(world, clock),
         clock=clock,
         slew=slew,
+        max_force=description.safety.max_force,
         settings=description,
     )

@@ -1,0 +1,56 @@
+"""The command `stiffopt vent`: let the pressure out of a rig, whoever commands it."""
+
+import json
+from typing import Annotated
+
+import typer
+
+VENT_HELP = """\
+Let all pressure out of the arm of RIG at once.
+
+If a program commands it, its guard vents and takes no command until somebody arms again. If none
+does, the supply is vented directly. A guard that does not answer is ended first. This needs no
+network, no token and no control interface; it works for the user who started that program, and for
+root.
+"""
+
+VENT_EPILOG = """\
+\b
+Examples:
+  stiffopt vent rig/modbus-aurora.yaml
+  sudo stiffopt vent rig/modbus-aurora.yaml
+
+\b
+Exit codes:
+  0    vented, or nothing to vent
+  2    bad input, a missing library
+  5    it is NOT certain that the arm is vented
+"""
+
+
+def vent(
+    rig: Annotated[str, typer.Argument(metavar="RIG", help="A rig file.")],
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object: vented, text.")
+    ] = False,
+) -> None:
+    """Vent a rig."""
+    from stiffopt.cli.console import report_error, write_line
+    from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED
+    from stiffopt.errors import DeviceError, StiffoptError
+    from stiffopt.safety.vent import vent_rig
+
+    vented, code = False, SOLVED
+    try:
+        text, vented = vent_rig(rig), True
+    except DeviceError as error:
+        text, code = f"THE ARM MAY BE UNDER PRESSURE: {error}", FAULT
+    except StiffoptError as error:
+        text, code = str(error), BAD_INPUT
+    if as_json:
+        write_line(json.dumps({"vented": vented, "text": text}))
+    elif vented:
+        write_line(text)
+    if not vented:
+        report_error(text)
+    raise typer.Exit(code)

@@ -1,0 +1,57 @@
+"""Endpoints: one name for each device, however a rig file addresses it.
+
+Two addresses of the same device must give the same endpoint, so that a supply can be claimed by it:
+a link in ``/dev/serial/by-id`` and the port it leads to, a host name and the address it stands for.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+from contextlib import suppress
+
+from stiffopt.errors import DeviceError
+
+__all__ = ["serial_endpoints", "tcp_endpoints"]
+
+_THIS_MACHINE = "this machine"
+
+
+def tcp_endpoints(host: str, port: int) -> tuple[str, ...]:
+    """Return the endpoints of a TCP port, one for each address of its host.
+
+    All addresses of this machine are one host: a server on it usually listens on all of them.
+
+    Raises
+    ------
+    DeviceError
+        The host has no address.
+    """
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:
+        raise DeviceError(f"the host '{host}' cannot be found: {error}") from None
+    return tuple(sorted({f"tcp {_host(str(address[0]))}:{port}" for *_, address in found}))
+
+
+def _host(address: str) -> str:
+    """Return an address, or the word for this machine if it is one of this machine's."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    plain = address.removeprefix("::ffff:") if "." in address else address
+    if plain != address:
+        family = socket.AF_INET
+    with suppress(OSError), socket.socket(family, socket.SOCK_DGRAM) as probe:
+        probe.bind((plain, 0))  # only an address of this machine can be bound to
+        return _THIS_MACHINE
+    return plain
+
+
+def serial_endpoints(port: str) -> tuple[str, ...]:
+    """Return the endpoint of a serial port: the device itself where the system has one."""
+    path = os.path.realpath(port)
+    with suppress(OSError):
+        found = os.stat(path)
+        if stat.S_ISCHR(found.st_mode):
+            return (f"serial {os.major(found.st_rdev)}:{os.minor(found.st_rdev)}",)
+    return (f"serial {path}",)

@@ -1,0 +1,152 @@
+"""What the client of a guard does when the guard is gone: it vents the supply itself, at once."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+from contextlib import ExitStack, suppress
+from typing import Protocol
+
+from stiffopt.errors import StiffoptError
+from stiffopt.rig.interface import PressureSupply
+from stiffopt.safety.claim import Claim
+
+__all__ = ["GuardWatch", "vent_directly"]
+
+_LOOK = 0.1  # s between looks at a guard that answers
+_AGAIN = 0.1  # s between attempts to vent
+_ATTEMPTS = 50
+
+
+class Watched(Protocol):
+    """What is watched: the client's end of a guard."""
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the guard's process."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether the guard's process is there."""
+
+    @property
+    def hung(self) -> bool:
+        """Whether it has not answered for so long that it never may."""
+
+    def ping(self) -> None:
+        """Ask for a sign of life; a guard that gives none is hung after some time."""
+
+    def kill(self) -> None:
+        """End it; the kernel takes its devices and its claim."""
+
+
+def vent_directly(supply: PressureSupply, claim: Claim | None = None) -> None:
+    """Claim a supply that nobody owns any more, and vent it.
+
+    Raises
+    ------
+    DeviceError
+        The supply does not take it, or somebody else owns it.
+    """
+    claim = claim or Claim(lambda: supply.endpoints)
+    claim.take()
+    try:
+        with supply:  # to open it vents it, and so does to close it
+            pass
+    finally:
+        claim.release()
+
+
+class GuardWatch:
+    """Watches a guard in a thread of its own, and vents in its place when it is gone or hangs.
+
+    Parameters
+    ----------
+    guard :
+        What is watched.
+    supply :
+        Another object for the guard's supply, not open; None: it is gone with the guard.
+
+    Attributes
+    ----------
+    rescued : threading.Event
+        Set when the supply has been vented directly.
+    error : str
+        Why it could not be so far; empty if it was, or need not be.
+    """
+
+    def __init__(self, guard: Watched, supply: PressureSupply | None) -> None:
+        self.rescued = threading.Event()
+        self.error = ""
+        self._guard, self._supply = guard, supply
+        self._ended = threading.Event()
+        self._over = threading.Event()
+        self._wake, self._waker = os.pipe()
+        self._thread = threading.Thread(target=self._run, name="guard watch", daemon=True)
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self._thread.start()
+
+    def stop(self, timeout: float = 1.0) -> None:
+        """Watch no more, for the guard is about to end as it should."""
+        self._ended.set()
+        with suppress(OSError):
+            os.write(self._waker, b".")
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout)
+
+    def wait(self, timeout: float) -> bool:
+        """Wait until the supply of a lost guard is vented; return whether it is."""
+        end = time.monotonic() + timeout
+        while not self.rescued.wait(0.01):
+            if self._over.is_set() or time.monotonic() > end:
+                break
+        return self.rescued.is_set()
+
+    def _run(self) -> None:
+        try:
+            if self._supply is not None:
+                with suppress(StiffoptError):
+                    self._supply.prepare()
+            self._watch()
+            if not self._ended.is_set():
+                self._rescue()
+        finally:
+            self._over.set()
+            os.close(self._wake)
+            os.close(self._waker)
+
+    def _watch(self) -> None:
+        """Return when the guard has ended, or nobody needs it any more."""
+        poll = select.poll()
+        poll.register(self._wake, select.POLLIN)
+        with ExitStack() as stack:
+            with suppress(OSError, AttributeError):  # systems without these look more slowly
+                end = os.pidfd_open(self._guard.pid or 0)
+                stack.callback(os.close, end)
+                poll.register(end, select.POLLIN)
+            while self._guard.alive and not self._ended.is_set():
+                poll.poll(_LOOK * 1e3)
+                if self._guard.alive and not self._ended.is_set():
+                    self._guard.ping()
+                    if self._guard.hung:
+                        self._guard.kill()
+
+    def _rescue(self) -> None:
+        if self._supply is None:  # a simulated arm is gone with its guard
+            self.rescued.set()
+            return
+        for _ in range(_ATTEMPTS):
+            try:
+                vent_directly(self._supply)
+            except StiffoptError as error:
+                self.error = str(error)
+            else:
+                self.error = ""
+                self.rescued.set()
+                return
+            if self._ended.wait(_AGAIN):
+                return

@@ -1,0 +1,88 @@
+"""Venting a rig from outside, whoever commands it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from stiffopt.errors import DeviceError
+from stiffopt.model.robot_files import load_description
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription, load_rig_description
+from stiffopt.rig.interface import PressureSupply
+from stiffopt.safety.hosted import simulated_endpoint
+from stiffopt.safety.rescue import vent_directly
+from stiffopt.safety.vent_line import Peer, ask_to_vent
+
+__all__ = ["vent_rig"]
+
+_PATIENCE = 3.0  # s in which a guard must have vented, beyond its driver's own time
+_GONE = 2.0  # s in which a process that was ended must be gone
+
+
+def vent_rig(path: str | os.PathLike[str]) -> str:
+    """Vent the supply of a rig, by the guard that owns it, else directly; return how, in words.
+
+    A guard that does not answer is ended, and the supply vented in its place. None of this uses the
+    network, and no other user can keep it from happening.
+
+    Raises
+    ------
+    FileError
+        A file is wrong.
+    MissingExtraError
+        A library is not installed.
+    DeviceError
+        It is not certain that the supply is vented.
+    """
+    description = load_rig_description(path)
+    if description.supply.driver == "simulated":
+        return _vent_simulated(description)
+    robot = load_description(description.robot, base=Path(path).parent)
+    supply = make_rig(description.model_copy(update={"tracker": None, "probe": None}), robot).supply
+    if not isinstance(supply, PressureSupply):
+        raise DeviceError("this rig's supply cannot be reached directly")
+    for endpoint in supply.endpoints:
+        for guard, error in ask_to_vent(endpoint, patience=_PATIENCE + supply.patience):
+            if not error:
+                return f"vented by its guard, {guard.name}, which takes no command now"
+            if not _ended(guard):
+                raise DeviceError(f"{guard.name}: {error}")
+    vent_directly(supply)
+    return "vented directly: no program commands this supply"
+
+
+def _vent_simulated(description: RigDescription) -> str:
+    found = ask_to_vent(simulated_endpoint(description), shared=True, patience=_PATIENCE)
+    failed = [f"{guard.name}: {error}" for guard, error in found if error]
+    if failed:
+        raise DeviceError("; ".join(failed))
+    if not found:
+        return f"nothing to vent: nobody runs the simulated rig '{description.name}'"
+    guards = ", ".join(guard.name for guard, _ in found)
+    return f"vented by its guard, {guards}, which takes no command now"
+
+
+def _ended(guard: Peer) -> bool:
+    """End a guard that does not answer; return whether it is gone."""
+    if guard.pid <= 0 or not _is_guard(guard.pid):
+        return False
+    with suppress(ProcessLookupError, PermissionError):
+        os.kill(guard.pid, signal.SIGKILL)
+    end = time.monotonic() + _GONE
+    while time.monotonic() < end:
+        if not _is_guard(guard.pid):
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def _is_guard(pid: int) -> bool:
+    """Return whether a process runs, and is a guard."""
+    try:
+        return b"stiffopt.safety.guard" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
