@@ -100,6 +100,13 @@ class DeviceError(StiffoptError):
     """A device of the rig cannot be reached, does not answer or answers nonsense."""
 
 
+class GuardTripped(DeviceError):  # noqa: N818
+    """The guard vented by itself; the message says why.
+
+    No command came in time, for example, and the guard waits for nobody.
+    """
+
+
 class CommandError(InputError):
     """A command to the rig is refused; nothing was written to any device."""
 
