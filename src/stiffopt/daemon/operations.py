@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
+from stiffopt import units
 from stiffopt.control.state import State
 from stiffopt.daemon.calls import Commanded, LoopCalls, start
 from stiffopt.daemon.lease import ControlLease
@@ -57,6 +58,7 @@ class Operations:
         clock: Clock,
         patience: float,
     ) -> None:
+        units.get_ready()  # not when a task comes: the control loop shares the interpreter
         self.loop = loop
         self.robot = robot
         self.lease = ControlLease(heartbeat, clock)
