@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from stiffopt.control.requested import check_task
 from stiffopt.control.state import Event, Severity, Snapshot, State
-from stiffopt.rig.interface import Clock
+from stiffopt.rig.interface import Clock, PressureLimits
 
 N = 6
 
@@ -79,6 +80,7 @@ class FakeLoop:
         self._do("disarm", State.INACTIVE)
 
     def set_task(self, task: Any) -> None:
+        check_task(task, PressureLimits(self.now.low, self.now.high))  # as the real one does
         self._do("set_task", State.ACTIVE, task)
 
     def set_target(self, target: Any) -> None:

@@ -375,7 +375,7 @@ def test_tasks_that_do_not_suit_change_nothing():
     empty = Task(
         robot=HANGING, target=Target(position=position), pressure=PressureRange(min=2 * BAR)
     )
-    for task, words in ((many, "3"), (empty, "no pressure")):
+    for task, words in ((many, "3"), (empty, "beyond the limits")):
         with pytest.raises(InputError, match=words):
             bench.controller.set_task(task)
         after = bench.controller.standing(now)

@@ -186,3 +186,82 @@ def test_importing_the_task_schema_is_cheap() -> None:
     code = "import sys, stiffopt.optimise.task; print(*sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"scipy", "matplotlib", "pint"} & set(run.stdout.split())
+
+
+EVALUATED = [
+    "1 m^9^9",
+    "1 m**9**9",
+    "1 m^9^9^9",
+    "1 (m^9)^9^9",
+    "1 m^9**9",
+    "1 m²³",
+    "1 m²^9",
+    "1 m^-9^-9",
+    "1 m^(9)^9",
+    "1 m^(9^9)",
+    "1 m^1e9",
+    "1 m^9e9",
+    "1 m^0x9",
+    "1 (1e9 m)",
+    "1 cubic m^9",
+    "1 m cubed^9",
+    "1 cubic m cubed squared",
+    "1 m^99",
+    "1 m^",
+    "1 m*9",
+    "1 (((m)))",
+    "1 " + "(" * 70 + "m",
+    "1 " + "(" * 35 + "m" + ")" * 35,
+    "1 )m(",
+    "1 " + "m*" * 30 + "m/m",
+    "1 " + "m" * 100_000,
+    "1" * 100_000 + " m",
+    "(" * 100_000,
+    "9**9**9 m",
+    "1e999999999 m",
+    "1 9^9^9",
+    "1 m^\u0663",
+    "\u0663 m",
+    "1 m\u2079",
+    "1 __import__('os')",
+]
+
+
+@pytest.mark.parametrize("text", EVALUATED, ids=lambda text: text[:20])
+def test_what_would_cost_time_is_never_evaluated(
+    text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def evaluate() -> None:
+        raise AssertionError("handed to pint")
+
+    monkeypatch.setattr(units, "_registry", evaluate)
+    with pytest.raises(InputError, match=r"is not a (number with a unit|known unit); expected a"):
+        parse_quantity(text, "m", "length")
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "value"),
+    [
+        ("1 m^2/m", "m", 1.0),
+        ("1 m ^ 2 / m", "m", 1.0),
+        ("1 m²/m", "m", 1.0),
+        ("1 (m^2)/(m)", "m", 1.0),
+        ("1 ((m/s)*s)", "m", 1.0),
+        ("2 km s^-1 s", "m", 2000.0),
+        ("1 m**(-1)*m**2", "m", 1.0),
+        ("1 kg*m/s^2/m^2", "Pa", 1.0),
+        ("1 kg per cubic m", "kg/m^3", 1.0),
+        ("1 (1/s)", "Hz", 1.0),
+        ("1 cmH2O", "Pa", 98.0665),
+        ("1 inch", "m", 0.0254),
+    ],
+)
+def test_rarer_units_and_products_are_read(text: str, unit: str, value: float) -> None:
+    assert parse_quantity(text, unit) == pytest.approx(value, rel=1e-4)
+
+
+def test_integers_of_thousands_of_digits_are_refused_like_others() -> None:
+    with pytest.raises(InputError, match="bare number a huge int has no unit"):
+        parse_quantity(10**5000, "m", "length")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="a huge int is not a finite number"):
+        units.finite_number(10**5000)

@@ -125,7 +125,10 @@ def shown(value: object) -> str:
         return "a mapping"
     if isinstance(value, list | tuple):
         return "a list"
-    text = f"'{printable(value)}'" if isinstance(value, str) else repr(value)
+    try:
+        text = f"'{printable(value[:100])}'" if isinstance(value, str) else repr(value)
+    except ValueError:  # an integer of thousands of digits
+        return f"a huge {type(value).__name__}"
     return text if len(text) <= 60 else f"{text[:56]}...{text[-1]}"
 
 

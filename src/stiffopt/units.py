@@ -46,6 +46,7 @@ __all__ = [
     "Voltage",
     "finite_number",
     "format_quantity",
+    "get_ready",
     "parse_quantity",
     "read_from_file",
     "within",
@@ -54,9 +55,19 @@ __all__ = [
 FROM_FILE = {"from_file": True}
 """The pydantic validation context that says: this comes from a file, units are due."""
 
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?")
-_UNIT = re.compile(r"(?=[A-Za-zµμ°%(])(?:[A-Za-zµμ°%²³·*/^() ]|-?\d(?!\d))+")
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
+_UNIT = re.compile(r"(?=[A-Za-zµμ°%(])(?:[A-Za-zµμ°%²³·*/^() ]|-?[0-9](?![0-9]))+")
+_TOKEN = re.compile(
+    r"""\ *(?:
+        (?P<power> (?:\^|\*\*)\ *(?:-?[0-9]|\(\ *-?[0-9]\ *\))(?![A-Za-z0-9]) | [²³] )
+        | (?P<factor> [A-Za-zµμ°%][A-Za-zµμ°%0-9]* | 1(?![A-Za-z0-9]) )
+        | (?P<open> \( ) | (?P<close> \) ) | (?P<operator> [*/·] )
+    )\ *""",
+    re.VERBOSE,
+)
+_POWER_WORD = re.compile(r"\b(?:sq|squared?|cubic|cubed)\b")  # exponents to pint
 _LONGEST = 80  # characters; no quantity that a person writes is longer
+_MOST, _DEEPEST = 10, 2  # factors of a unit, and parentheses in each other
 
 
 @dataclass(frozen=True)
@@ -144,12 +155,12 @@ def parse_quantity(text: str, unit: str, what: str = "quantity") -> float:
     """
     expected = f"expected {_article(what)} such as '{_EXAMPLES.get(unit, f'1 {unit}'.strip())}'"
     if isinstance(text, Real) and not isinstance(text, bool):
-        raise InputError(f"bare number {text} has no unit; {expected}")
+        raise InputError(f"bare number {shown(text)} has no unit; {expected}")
     if not isinstance(text, str):
         raise InputError(f"{shown(text)} is not a quantity; {expected}")
     stripped = text.strip()
-    number = _NUMBER.match(stripped)
-    if len(stripped) > _LONGEST or number is None:
+    number = _NUMBER.match(stripped) if len(stripped) <= _LONGEST else None
+    if number is None:
         raise InputError(f"{shown(text)} is not a number with a unit; {expected}")
     unit_text = stripped[number.end() :].strip()
     if unit_text[:1] in tuple(",._0123456789"):
@@ -212,7 +223,7 @@ def _factor(text: str, unit: str) -> Decimal | str:
     if common is not None:
         return Decimal(common)
     unknown = "is not a known unit"
-    if not _UNIT.fullmatch(text):
+    if not _is_simple(text):
         return unknown
     registry = _registry()
     joule = registry.get_root_units("joule")[1]
@@ -227,6 +238,37 @@ def _factor(text: str, unit: str) -> Decimal | str:
     except Exception:  # pint, its tokenizer and its evaluator raise many kinds for junk
         return unknown
     return Decimal(one) if zero == 0 else unknown  # an offset unit has another zero
+
+
+def _is_simple(text: str) -> bool:
+    """Whether text is a product of few units, each with one exponent of one digit at most.
+
+    Only that is handed to pint, which evaluates what it is given: 9^9^9 takes it for ever.
+    """
+    if len(text) > _LONGEST or not _UNIT.fullmatch(text):
+        return False
+    at = depth = factors = powers = 0
+    before = ""
+    while at < len(text):
+        token = _TOKEN.match(text, at)
+        if token is None or token.end() == at:
+            return False
+        at, kind = token.end(), token.lastgroup or ""
+        factors += kind == "factor"
+        powers += kind == "power"
+        depth += (kind == "open") - (kind == "close")
+        if not 0 <= depth <= _DEEPEST or factors > _MOST:
+            return False
+        if kind == "power" and before not in ("factor", "close"):  # of a power, for example
+            return False
+        before = kind
+    words = len(_POWER_WORD.findall(text))
+    return depth == 0 and (not words or words + powers == 1)
+
+
+def get_ready() -> None:
+    """Load what knows the rarer units, which takes a second: before anything must not wait."""
+    _registry()
 
 
 def _article(noun: str) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.errors import InputError
+from stiffopt.control.requested import tightened
 from stiffopt.model.compliance import directional_stiffness
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.target import Target
@@ -37,21 +37,10 @@ def within_limits(task: Task, robot: Manipulator, limits: PressureLimits) -> Tas
     Raises
     ------
     InputError
-        It asks for more than the rig may give, or leaves a channel no pressure.
+        It asks for more than the rig may give (see `tightened`), or leaves a channel no pressure.
     """
-    description = robot.description
-    lower, upper = task.pressure_bounds(description)
-    if task.pressure.max is not None:
-        asked = np.broadcast_to(np.array(task.pressure.max, dtype=float), upper.shape)
-        for index in np.flatnonzero(asked > limits.high * (1 + 1e-6)):
-            raise InputError(
-                f"the task asks for up to {asked[index] * 1e-5:g} bar; "
-                f"{description.channel_name(int(index))} may have "
-                f"{limits.high[index] * 1e-5:g} bar on this rig"
-            )
-    lower, upper = np.maximum(lower, limits.low), np.minimum(upper, limits.high)
-    if (lower > upper).any():
-        raise InputError("the task leaves a channel no pressure within the limits of this rig")
+    on_the_rig = task.model_copy(update={"pressure": tightened(task.pressure, limits)})
+    lower, upper = on_the_rig.pressure_bounds(robot.description)
     pressure = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
     # of a load, the tip's offset tells how much of it there is
     return task.model_copy(update={"pressure": pressure, "load": None})

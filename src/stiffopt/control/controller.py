@@ -33,6 +33,7 @@ from stiffopt.control.planner import InlinePlanner, Planner, ProcessPlanner
 from stiffopt.control.plans import Plan, Request
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import RegulatorModel
+from stiffopt.control.requested import preparing
 from stiffopt.control.state import Severity
 from stiffopt.control.steering import Move, Notice, Seen, Standing
 from stiffopt.control.trajectory import Course, Trajectory
@@ -180,25 +181,39 @@ class Controller:
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Steering.set_task`."""
-        self._task = within_limits(task, self.robot, self.limits)
-        self._target, self._course = task.target, None
-        self._asked = parts_asked(task.target)
-        self._measure = stiffness_of(task)
-        self._unit = task.measures[0].unit if task.measures else "N/m"
-        lower, upper = self._task.pressure_bounds(self.robot.description)
-        self._allocation.limit(lower, upper)
-        self._anew()
+        with preparing("task"):
+            pursue = self._prepared_task(task)
+        pursue()
+
+    def _prepared_task(self, task: Task) -> Callable[[], None]:
+        """Return what pursues a task from its call on; until then nothing changes."""
+        limited = within_limits(task, self.robot, self.limits)
+        lower, upper = limited.pressure_bounds(self.robot.description)
+        asked, measure = parts_asked(task.target), stiffness_of(task)
+        unit = task.measures[0].unit if task.measures else "N/m"
+
+        def pursue() -> None:
+            self._task, self._target, self._course = limited, task.target, None
+            self._asked, self._measure, self._unit = asked, measure, unit
+            self._allocation.limit(lower, upper)
+            self._anew()
+
+        return pursue
 
     def set_target(self, target: Target) -> None:
         """Go to another target; see `Steering.set_target`."""
-        self._pursue(target)
+        with preparing("target"):
+            pursue = self._prepared_target(target)
+        pursue()
         self._course = None
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory; see `Steering.follow`."""
-        estimate = self._estimator.estimate
-        course = Course(trajectory, now, estimate.position, estimate.rotation)
-        self._pursue(course.at(now))
+        with preparing("trajectory"):
+            estimate = self._estimator.estimate
+            course = Course(trajectory, now, estimate.position, estimate.rotation)
+            pursue = self._prepared_target(course.at(now))
+        pursue()
         self._course = course
 
     def resume(self, now: float) -> None:
@@ -321,17 +336,22 @@ class Controller:
 
     # -- what is asked --------------------------------------------------------------------------
 
-    def _pursue(self, target: Target) -> None:
+    def _prepared_target(self, target: Target) -> Callable[[], None]:
+        """Return what goes to a target from its call on; until then nothing changes."""
         if self._task is None:
-            self.set_task(Task(robot=self.robot.description.name, target=target))
-            return
+            return self._prepared_task(Task(robot=self.robot.description.name, target=target))
         asked = parts_asked(target)
-        if self._target is None or (asked != self._asked).any():
-            self._anew()
-        elif is_far(self._target, target):
-            self._search = True
-        self._target, self._asked = target, asked
-        self._asked_at = -math.inf
+        anew = self._target is None or bool((asked != self._asked).any())
+        far = self._target is not None and is_far(self._target, target)
+
+        def pursue() -> None:
+            if anew:
+                self._anew()
+            self._search = self._search or far
+            self._target, self._asked = target, asked
+            self._asked_at = -math.inf
+
+        return pursue
 
     def _anew(self) -> None:
         self._serial += 1

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from stiffopt.control.journal import EventLog
 from stiffopt.control.machine import Machine
+from stiffopt.control.requested import check_target, check_task, check_trajectory
 from stiffopt.control.requests import Requests, asking
 from stiffopt.control.state import Snapshot, State
 from stiffopt.control.steering import Standing, Steering
@@ -124,7 +125,9 @@ class ControlLoop:
         InputError
             It is not armed, or the task does not suit.
         """
-        self._ask(lambda now: self._machine.set_task(now, task))
+        self._check_started()
+        check_task(task, self._machine.outlet.limits)
+        self._carry_out(lambda now: self._machine.set_task(now, task))
 
     def set_target(self, target: Target) -> None:
         """Go to another target; what else the task asks for stays.
@@ -134,7 +137,9 @@ class ControlLoop:
         InputError
             It is not armed, or the target does not suit.
         """
-        self._ask(lambda now: self._machine.set_target(now, target))
+        self._check_started()
+        check_target(target)
+        self._carry_out(lambda now: self._machine.set_target(now, target))
 
     def follow_trajectory(self, trajectory: Trajectory) -> None:
         """Follow a trajectory that begins now.
@@ -144,7 +149,9 @@ class ControlLoop:
         InputError
             It is not armed, or the trajectory does not suit.
         """
-        self._ask(lambda now: self._machine.follow_trajectory(now, trajectory))
+        self._check_started()
+        check_trajectory(trajectory)  # here, not in the control thread, which has to tick
+        self._carry_out(lambda now: self._machine.follow_trajectory(now, trajectory))
 
     def hold(self, reason: str = "asked to") -> None:
         """Keep the pressures as they are until the next task, target or trajectory.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from stiffopt.control.checks import check_rig, check_vented_arm
-from stiffopt.control.requested import check_target, check_task, check_trajectory
+from stiffopt.control.requested import preparing
 from stiffopt.control.state import State
 from stiffopt.control.ticking import Ticking
 from stiffopt.control.trajectory import Trajectory
@@ -19,9 +19,10 @@ _LAST_TRIES = 3  # to vent before nobody tries any more
 
 
 class Machine(Ticking):
-    """Carries out requests between the ticks.
+    """Carries out requests between the ticks; `ControlLoop` has checked what they ask for.
 
-    Each raises `InputError` with the reason where it is refused; nothing has changed then.
+    Each raises `InputError` with the reason where it is refused; nothing has changed then. What
+    goes wrong while something changes is a fault.
     """
 
     def carry_out(self, request: Callable[[float], None]) -> None:
@@ -40,15 +41,16 @@ class Machine(Ticking):
     def configure(self, now: float) -> None:
         """Connect and check; see `ControlLoop.configure`."""
         self.lifecycle.permit("configure")
-        try:
-            if self.rig.tracker is not None:
-                self.rig.tracker.open()
-            self.outlet.open()
-            problems = list(check_rig(self.rig, self.outlet, self.steering))
-            reading = self.outlet.read()  # now: to compile the model may take its time
-        except StiffoptError as error:
-            raise CommandError(f"devices: {error}") from error
-        trouble = self._pressures.implausible(self._clock.now(), reading)
+        with preparing("configuration"):
+            try:
+                if self.rig.tracker is not None:
+                    self.rig.tracker.open()
+                self.outlet.open()
+                problems = list(check_rig(self.rig, self.outlet, self.steering))
+                reading = self.outlet.read()  # now: to compile the model may take its time
+            except StiffoptError as error:
+                raise CommandError(f"devices: {error}") from error
+            trouble = self._pressures.implausible(self._clock.now(), reading)
         if trouble is not None:
             problems.append(f"pressures: {trouble.text}")
         if problems:
@@ -61,13 +63,14 @@ class Machine(Ticking):
     def arm(self, now: float, unwanted: Callable[[], bool] = lambda: False) -> None:
         """Check, and take commands unless nobody wants that any more; see `ControlLoop.arm`."""
         self.lifecycle.permit("arm")
-        reading = self.outlet.read()
-        problems = [
-            *check_rig(self.rig, self.outlet, self.steering),
-            *check_vented_arm(
-                now, self.rig, self.steering, self._pressures, reading, self._tracker
-            ),
-        ]
+        with preparing("arming"):
+            reading = self.outlet.read()
+            problems = [
+                *check_rig(self.rig, self.outlet, self.steering),
+                *check_vented_arm(
+                    now, self.rig, self.steering, self._pressures, reading, self._tracker
+                ),
+            ]
         if problems:
             raise CommandError("; ".join(problems))
         if unwanted():
@@ -98,21 +101,18 @@ class Machine(Ticking):
     def set_task(self, now: float, task: Task) -> None:
         """Pursue a task; see `ControlLoop.set_task`."""
         self._permit_motion("set a task")
-        check_task(task, self.outlet.limits)
         self.steering.set_task(task)
         self._go_on(now, "task", "there is a new task")
 
     def set_target(self, now: float, target: Target) -> None:
         """Go to a target; see `ControlLoop.set_target`."""
         self._permit_motion("set a target")
-        check_target(target)
         self.steering.set_target(target)
         self._go_on(now, "target", "")  # these may come in a stream: no event for each
 
     def follow_trajectory(self, now: float, trajectory: Trajectory) -> None:
         """Follow a trajectory; see `ControlLoop.follow_trajectory`."""
         self._permit_motion("follow a trajectory")
-        check_trajectory(trajectory)
         self.steering.follow(trajectory, now)
         self._go_on(now, "trajectory", "there is a new trajectory")
 
@@ -126,11 +126,17 @@ class Machine(Ticking):
             self.events.add(now, kind, text)
         for asked in ("asked", "solver"):
             self._holds.pop(asked, None)
-        self._resume(now)
+        try:
+            self._resume(now)
+        except Exception as error:  # what was asked for is pursued already: no refusal any more
+            self.fault(now, "internal", f"unexpected {type(error).__name__}: {error}")
+            raise CommandError(self.lifecycle.reason) from error
 
     def hold(self, now: float, reason: str) -> None:
         """Keep the pressures; see `ControlLoop.hold`."""
         self._permit_motion("hold")
+        if not isinstance(reason, str):
+            raise CommandError(f"expected text as the reason, not {type(reason).__name__}")
         self._hold(now, "asked", reason)
         self.lifecycle.reason = reason
 

@@ -1,18 +1,49 @@
-"""What may be asked of the loop: refused here is what no arm can be asked for."""
+"""What may be asked of the loop: refused here is what no arm can be asked for.
+
+Whoever asks, a program in Python, a client of the daemon or the command line, is answered by these
+checks, and nothing has changed when they refuse.
+"""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-from stiffopt.control.trajectory import Trajectory
-from stiffopt.errors import CommandError
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.contents import understood
+from stiffopt.control.trajectory import Trajectory, Waypoint
+from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Task
+from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.rig.interface import PressureLimits
 
-__all__ = ["check_target", "check_task", "check_trajectory"]
+__all__ = ["check_target", "check_task", "check_trajectory", "preparing", "tightened"]
 
-_SLACK = 1e-9  # relative
+Array = NDArray[np.float64]
+
+
+@contextmanager
+def preparing(what: str) -> Iterator[None]:
+    """Raise whatever goes wrong in the body as `InputError`: a refusal, nothing has changed.
+
+    Parameters
+    ----------
+    what :
+        What is checked or prepared in the body, for the message.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except StiffoptError as error:
+        raise CommandError(str(error)) from error
+    except Exception as error:
+        raise CommandError(
+            f"the {what} is refused and nothing has changed: unexpected "
+            f"{type(error).__name__} while it was prepared: {error}"
+        ) from error
 
 
 def check_task(task: Task, limits: PressureLimits) -> None:
@@ -20,59 +51,77 @@ def check_task(task: Task, limits: PressureLimits) -> None:
 
     Raises
     ------
-    CommandError
-        It says which channel is to blame.
+    InputError
+        It names the key and, for a pressure, the channel.
     """
-    if not isinstance(task, Task):
-        raise CommandError(f"expected a Task, not {type(task).__name__}")
-    slack = _SLACK * (limits.high - limits.low)
-    for key, bound, sign in (("max", limits.high, 1), ("min", limits.low, -1)):
-        asked = getattr(task.pressure, key)
-        if asked is None:
-            continue
-        values = np.array(asked, dtype=float)  # None, which is no limit, becomes NaN
-        if values.shape not in ((), limits.low.shape):
-            raise CommandError(
-                f"pressure.{key} has {values.size} values; expected one, or {limits.n}"
-            )
-        values = np.broadcast_to(values, limits.n)
-        for channel in np.flatnonzero(sign * (values - bound) > slack):
-            raise CommandError(
-                f"pressure.{key}: channel {channel + 1}: {values[channel] * 1e-5:.6g} bar is "
-                f"beyond the limit of {bound[channel] * 1e-5:g} bar"
-            )
-    check_target(task.target)
+    with preparing("task"):
+        tightened(understood(task, Task).pressure, limits)
 
 
 def check_target(target: Target) -> None:
-    """Refuse what is no target, or is not finite.
+    """Refuse what is no target.
 
     Raises
     ------
-    CommandError
-        It says what was expected.
+    InputError
+        It names the key.
     """
-    if not isinstance(target, Target):
-        raise CommandError(f"expected a Target, not {type(target).__name__}")
-    for key in ("position", "pointing", "orientation"):
-        values = getattr(target, key)
-        if values is None:
-            continue
-        if not all(x is None or np.isfinite(x) for x in values):
-            raise CommandError(f"target.{key}: expected finite numbers")
+    with preparing("target"):
+        understood(target, Target)
 
 
 def check_trajectory(trajectory: Trajectory) -> None:
-    """Refuse what is no trajectory, or is not finite.
+    """Refuse what is no trajectory.
 
     Raises
     ------
-    CommandError
-        It says what was expected.
+    InputError
+        It names the key.
     """
-    if not isinstance(trajectory, Trajectory):
-        raise CommandError(f"expected a Trajectory, not {type(trajectory).__name__}")
-    for waypoint in trajectory.waypoints:
-        if not np.isfinite(waypoint.time):
-            raise CommandError("waypoints: expected finite times")
-        check_target(waypoint.target)
+    with preparing("trajectory"):
+        if not isinstance(trajectory, Trajectory):
+            raise InputError(f"expected a Trajectory, not {type(trajectory).__name__}")
+        # one by one: all at once would keep the control thread from its ticks
+        waypoints = tuple(understood(waypoint, Waypoint) for waypoint in trajectory.waypoints)
+        understood(trajectory.model_copy(update={"waypoints": waypoints[:1]}), Trajectory)
+        Trajectory(waypoints=waypoints)
+
+
+def tightened(asked: PressureRange, limits: PressureLimits) -> PressureRange:
+    """Return the limits that a task asks for, for each channel, none of them beyond a rig's.
+
+    They may be beyond the rig's by `PressureLimits.slack`, for rounding, and are moved back then.
+
+    Raises
+    ------
+    InputError
+        A limit is beyond the rig's, or a channel is left no pressure; it names the channel.
+    """
+    lower = _bound("min", asked.min, limits.low, limits)
+    upper = _bound("max", asked.max, limits.high, limits)
+    for index in np.flatnonzero(lower > upper):
+        raise InputError(
+            f"pressure: channel {index + 1} is left no pressure: its min is "
+            f"{lower[index] * 1e-5:g} bar, its max {upper[index] * 1e-5:g} bar"
+        )
+    return PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
+
+
+def _bound(
+    key: str, asked: float | tuple[float | None, ...] | None, default: Array, limits: PressureLimits
+) -> Array:
+    """Return one of a task's limits for each channel (n,), within those of the rig."""
+    values = np.array(asked, dtype=float)  # None, which is no limit, becomes NaN
+    if values.shape not in ((), (limits.n,)):
+        raise InputError(
+            f"pressure.{key}: expected one value or a list of {limits.n}, not {values.size}"
+        )
+    values = np.where(np.isnan(values), default, values)
+    beyond = (values < limits.low - limits.slack) | (values > limits.high + limits.slack)
+    for index in np.flatnonzero(beyond):
+        raise InputError(
+            f"pressure.{key}: {values[index] * 1e-5:g} bar is beyond the limits of channel "
+            f"{index + 1}, {limits.low[index] * 1e-5:g} to {limits.high[index] * 1e-5:g} bar"
+        )
+    clipped: Array = np.clip(values, limits.low, limits.high)
+    return clipped

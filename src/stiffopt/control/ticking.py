@@ -13,12 +13,12 @@ from stiffopt.control.lifecycle import Lifecycle
 from stiffopt.control.state import Severity, State
 from stiffopt.control.steering import Steering
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
-from stiffopt.errors import DeviceError
+from stiffopt.errors import DeviceError, GuardTripped
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig
 from stiffopt.rig.settings import ControlSettings, Safety
 from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.monitors import PressureMonitor, Trouble
-from stiffopt.safety.outlet import Outlet
+from stiffopt.safety.outlet import Outlet, let_down
 
 __all__ = ["Ticking"]
 
@@ -30,11 +30,20 @@ _UNSOUND = 3  # moves in a row that are no answer, after which the pressures are
 
 @dataclass(frozen=True)
 class _Ramp:
-    """Pressures (n,) that are let down from a moment on, and why."""
+    """Pressures (n,) that are let down from a moment on within a duration, in s, and why."""
 
     begin: float
+    duration: float
     pressures: Array
     reason: str
+
+    def share(self, now: float) -> float:
+        """Return what is left of the pressures at a moment: from 1 down to 0.
+
+        A request begins its ramp while a tick is under way, and so later than that tick's `now`:
+        the ramp never asks for more than it began with.
+        """
+        return min(max(1 - (now - self.begin) / self.duration, 0.0), 1.0)
 
 
 class Ticking:
@@ -126,6 +135,8 @@ class Ticking:
     def _guarded(self, action: Callable[[float], None], now: float) -> None:
         try:
             action(now)
+        except GuardTripped as error:
+            self.fault(now, "guard", str(error))
         except DeviceError as error:
             self.fault(now, "device", f"a device fails: {error}")
         except Exception as error:
@@ -259,13 +270,11 @@ class Ticking:
                 self._kept = np.minimum(self._asked, self.commanded)
             self._command(now, self._kept)
             return
-        share = 1 - (now - ramp.begin) / self._safety.ramp_time
+        share = ramp.share(now)
         if not share > 1e-9:
             self._end(now, ramp.reason)
             return
-        down = ramp.pressures * share
-        low = self.outlet.limits.low
-        self._command(now, np.where((low > 0) & (down < low), 0.0, down))
+        self._command(now, let_down(ramp.pressures, share, self.outlet.limits))
 
     def _command(self, now: float, pressures: Array, *, steered: bool = False) -> bool:
         """Hand pressures (n,) to the outlet; return whether it took them."""
@@ -335,7 +344,7 @@ class Ticking:
         """Begin to let the pressures down, once; what was begun is finished."""
         if self._ramp is not None:
             return
-        self._ramp = _Ramp(now, self.commanded, reason)
+        self._ramp = _Ramp(now, self._safety.ramp_time, self.commanded, reason)
         if self.lifecycle.state is State.ACTIVE:
             self.lifecycle.change(State.HOLDING, f"letting down: {reason}")
         else:

@@ -18,11 +18,18 @@ from stiffopt.optimise.target import Target
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
-__all__ = ["Course", "Trajectory", "Waypoint"]
+__all__ = ["MAX_WAYPOINTS", "Course", "Trajectory", "Waypoint"]
 
 Array = NDArray[np.float64]
 
+MAX_WAYPOINTS = 2_000
+"""Of a trajectory; its splines are made between two ticks of the control loop."""
+_LONGEST = 86_400.0  # s, of a trajectory
+_CLOSEST = 1e-3  # s, between waypoints
+_ROUNDING = 1e-6  # of that
 _OPPOSITE = -0.99  # cosine between directions, beyond which the way is not clear
+_SHORT = 0.05  # length of what is made a unit vector, below which its direction is not clear
+_BETWEEN = np.arange(1, 8) / 8  # shares of the way between two waypoints that are looked at
 
 
 class Waypoint(Schema):
@@ -30,11 +37,11 @@ class Waypoint(Schema):
 
     Attributes
     ----------
-    time : since the beginning of the trajectory, in s.
+    time : since the beginning of the trajectory, in s; at most a day.
     target : the pose.
     """
 
-    time: Annotated[Duration, Field(ge=0)]
+    time: Annotated[Duration, Field(ge=0, le=_LONGEST)]
     target: Target
 
 
@@ -43,21 +50,19 @@ class Trajectory(Schema):
 
     Attributes
     ----------
-    waypoints : in order of time; all ask for the same kinds of things (the same axes).
+    waypoints : in order of time, at least 1 ms apart, the first at 0 or 1 ms later; all ask for
+        the same kinds of things (the same axes).
     """
 
     waypoints: Items[Waypoint]
 
     @model_validator(mode="after")
     def _check(self) -> Trajectory:
-        if not self.waypoints:
-            raise ValueError("has no waypoints")
-        times = [w.time for w in self.waypoints]
-        for before, after in itertools.pairwise(times):
-            if after <= before:
-                raise ValueError(
-                    f"waypoints must be in order of time; {after:g} s follows {before:g} s"
-                )
+        if len(self.waypoints) > MAX_WAYPOINTS:
+            raise ValueError(
+                f"{len(self.waypoints)} waypoints are too many; at most {MAX_WAYPOINTS}"
+            )
+        _check_times([w.time for w in self.waypoints])
         kinds = {_kind(w.target) for w in self.waypoints}
         if len(kinds) > 1:
             raise ValueError("all waypoints must ask for the same axes of the pose")
@@ -67,6 +72,27 @@ class Trajectory(Schema):
     def duration(self) -> float:
         """Time of the last waypoint, in s."""
         return self.waypoints[-1].time
+
+
+def _check_times(times: list[float]) -> None:
+    """Refuse times at which nothing could be, or not one after the other."""
+    if not times:
+        raise InputError("has no waypoints")
+    for time in (times[0], times[-1]):
+        if not 0 <= time <= _LONGEST:
+            raise InputError(f"waypoints must be between 0 s and {_LONGEST:g} s, not at {time:g} s")
+    for before, after in itertools.pairwise(times):
+        if not after > before:
+            raise InputError(
+                f"waypoints must be in order of time; {after:g} s follows {before:g} s"
+            )
+    begun = times if times[0] == 0 else [0.0, *times]  # from where the tip is
+    for before, after in itertools.pairwise(begun):
+        if after - before < _CLOSEST * (1 - _ROUNDING):
+            raise InputError(
+                f"waypoints must be at least {_CLOSEST:g} s apart, and the first at 0 s or as "
+                f"much later; {after:g} s follows {before:g} s"
+            )
 
 
 def _kind(target: Target) -> tuple[object, ...]:
@@ -92,20 +118,21 @@ class Course:
     Raises
     ------
     InputError
-        Waypoints point in opposite directions.
+        Waypoints point in opposite directions, or nothing finite leads through them.
     """
 
     def __init__(
         self, trajectory: Trajectory, begin: float, position: Array, rotation: Array
     ) -> None:
-        self.begin, self.end = begin, begin + trajectory.duration
-        first = trajectory.waypoints[0].target
-        self._first = first
-        times = [waypoint.time for waypoint in trajectory.waypoints]
+        times = _numbers([waypoint.time for waypoint in trajectory.waypoints]).tolist()
+        _check_times(times)
         targets = [waypoint.target for waypoint in trajectory.waypoints]
+        self._first = first = targets[0]
         later = times[0] > 0
         knots = np.array([0.0, *times] if later else times)
-        self._position = self._pointing = self._orientation = None
+        self._position: Callable[..., Array] | None = None
+        self._pointing: Callable[..., Array] | None = None
+        self._orientation: Callable[..., Array] | None = None
         if first.position is not None:
             rows = [[0.0 if axis is None else axis for axis in t.position or ()] for t in targets]
             self._position = _spline(knots, [list(position), *rows] if later else rows)
@@ -113,13 +140,14 @@ class Course:
             rows = [list(t.pointing or ()) for t in targets]
             rows = [list(rotation[:, 2]), *rows] if later else rows
             _refuse_opposites(rows)
-            self._pointing = _spline(knots, rows)
+            self._pointing = _clear(_spline(knots, rows), knots)
         if first.orientation is not None:
             rows = [list(t.orientation or ()) for t in targets]
             if later:
                 rows.insert(0, lie.quaternion_from_rotation(rotation).tolist())
-            self._orientation = _spline(knots, _the_short_way(rows))
+            self._orientation = _clear(_spline(knots, _the_short_way(rows)), knots)
         self._knots = knots
+        self.begin, self.end = begin, begin + times[-1]
 
     def at(self, now: float) -> Target:
         """Target at a moment, in s."""
@@ -162,9 +190,36 @@ def _the_short_way(quaternions: list[list[float]]) -> list[list[float]]:
     return [row.tolist() for row in rows]
 
 
-def _spline(knots: Array, rows: list[list[float]]) -> Callable[[float], Array]:
-    values = np.array(rows, dtype=float)
+def _numbers(rows: object) -> Array:
+    """Return numbers in lists as an array; refuse what is none."""
+    try:
+        return np.array(rows, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError("waypoints: expected finite numbers, as many in each") from None
+
+
+def _spline(knots: Array, rows: list[list[float]]) -> Callable[..., Array]:
+    """Return the spline through rows at knots: a function of one time or of many."""
+    values = _numbers(rows)
+    if not (np.isfinite(knots).all() and np.isfinite(values).all()):
+        raise InputError("waypoints, and where the tip is at the beginning, must be finite")
     if len(knots) == 1:
-        return lambda _: values[0]
-    spline: Callable[[float], Array] = CubicSpline(knots, values, bc_type="clamped")
+        return lambda times: np.broadcast_to(values[0], (*np.shape(times), values.shape[1]))
+    try:
+        with np.errstate(all="ignore"):
+            spline = CubicSpline(knots, values, bc_type="clamped")
+    except ValueError as error:
+        raise InputError(f"nothing smooth leads through the waypoints: {error}") from None
+    if not np.isfinite(spline.c).all():
+        raise InputError("nothing smooth leads through the waypoints; they are too close in time")
+    found: Callable[..., Array] = spline
+    return found
+
+
+def _clear(spline: Callable[..., Array], knots: Array) -> Callable[..., Array]:
+    """Return a spline of what is made unit vectors, if it keeps away from zero on its way."""
+    gaps = np.diff(knots)[:, None] * _BETWEEN
+    between = spline((knots[:-1, None] + gaps).ravel())
+    if (np.linalg.norm(between, axis=-1) < _SHORT).any():
+        raise InputError("the way between two waypoints is not clear; put one between them")
     return spline

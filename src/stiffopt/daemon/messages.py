@@ -7,10 +7,9 @@ and infinities are refused.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Any, Literal, TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     BaseModel,
     ConfigDict,
@@ -21,7 +20,8 @@ from pydantic import (
     ValidationError,
 )
 
-from stiffopt.control.trajectory import Trajectory, Waypoint
+from stiffopt.control.contents import contents, differences, listed
+from stiffopt.control.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
 from stiffopt.daemon.refusals import sentence
 from stiffopt.documents import document_of
 from stiffopt.errors import InputError, Loc, shown
@@ -40,21 +40,19 @@ __all__ = [
     "TaskRequest",
     "TaskText",
     "TrajectoryMessage",
-    "check_pressures",
     "task_of",
     "trajectory_of",
 ]
 
 MAX_MESSAGE = 16_384
 """Characters of the longest message to a stream."""
-MAX_WAYPOINTS = 2_000
 _MAX_TEXT = 65_536  # characters of a task file; to read more would keep the control loop waiting
 _MAX_MEASURES = 50
 _MAX_CHANNELS = 200
 
 ModelT = TypeVar("ModelT")
+MessageT = TypeVar("MessageT", bound="_Message")
 
-Array = NDArray[np.float64]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
 Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
 Position = Annotated[list[Coordinate | None], Field(min_length=3, max_length=3)]
@@ -117,15 +115,8 @@ class TargetMessage(_Message):
 
     @classmethod
     def of(cls, target: Target) -> TargetMessage:
-        """Return the message that says this."""
-        return cls(
-            position_m=_listed(target.position),
-            pointing=_listed(target.pointing),
-            orientation_wxyz=_listed(target.orientation),
-            tolerance=ToleranceMessage(
-                position_m=target.tolerance.position, angle_rad=target.tolerance.angle
-            ),
-        )
+        """Return the message that says this; raise `InputError` if it cannot say all of it."""
+        return _saying_all_of(target, lambda: _target_message(target), cls.target)
 
 
 class WaypointMessage(_Message):
@@ -133,6 +124,10 @@ class WaypointMessage(_Message):
 
     time_s: Annotated[float, Field(ge=0)]
     target: TargetMessage
+
+    def waypoint(self) -> Waypoint:
+        """Return it in code; raise `InputError` if it makes no sense."""
+        return Waypoint(time=self.time_s, target=self.target.target())
 
 
 class TrajectoryMessage(_Message):
@@ -149,17 +144,12 @@ class TrajectoryMessage(_Message):
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> TrajectoryMessage:
-        """Return the message that says this; raise `InputError` if it is too long."""
-        if len(trajectory.waypoints) > MAX_WAYPOINTS:
-            raise InputError(
-                f"{len(trajectory.waypoints)} waypoints are too many; at most {MAX_WAYPOINTS}"
-            )
-        return cls(
-            waypoints=[
-                WaypointMessage(time_s=w.time, target=TargetMessage.of(w.target))
-                for w in trajectory.waypoints
-            ]
-        )
+        """Return the message that says this; raise `InputError` if it cannot say all of it."""
+        return _saying_all_of(trajectory, lambda: _trajectory_message(trajectory), cls.trajectory)
+
+    def trajectory(self) -> Trajectory:
+        """Return it in code; raise `InputError` if it makes no sense."""
+        return Trajectory(waypoints=[waypoint.waypoint() for waypoint in self.waypoints])
 
 
 def trajectory_of(given: Any) -> Trajectory:
@@ -179,8 +169,7 @@ def trajectory_of(given: Any) -> Trajectory:
     _valid(_TRAJECTORY, {**given, "waypoints": waypoints[:1]}, ())
     read = []
     for index, waypoint in enumerate(waypoints):
-        message = _valid(_WAYPOINT, waypoint, ("waypoints", index))
-        read.append(Waypoint(time=message.time_s, target=message.target.target()))
+        read.append(_valid(_WAYPOINT, waypoint, ("waypoints", index)).waypoint())
     return Trajectory(waypoints=read)
 
 
@@ -255,20 +244,28 @@ class TaskMessage(_Message):
 
     @classmethod
     def of(cls, task: Task, robot: str | None = None) -> TaskMessage:
-        """Return the message that says this of the robot of a name."""
-        load, limits = task.load, task.pressure
-        return cls(
-            target=TargetMessage.of(task.target),
-            stiffness=None if task.stiffness is None else _stiffness_message(task.stiffness),
+        """Return the message that says this of the robot of a name.
+
+        Raises
+        ------
+        InputError
+            It cannot say all of it; the text names what it cannot.
+        """
+        return _saying_all_of(
+            task, lambda: _task_message(task, robot), lambda message: message.task(task.robot)
+        )
+
+    def task(self, robot: str) -> Task:
+        """Return it in code, for the robot of a name; raise `InputError` if it makes no sense."""
+        load, limits = self.load, self.pressure
+        return Task(
+            robot=robot,
+            target=self.target.target(),
+            stiffness=None if self.stiffness is None else _stiffness(self.stiffness),
             load=None
             if load is None
-            else LoadMessage(
-                force_n=list(load.force), moment_nm=list(load.moment), frame=load.frame
-            ),
-            pressure=PressureMessage(
-                min_pa=_per_channel(limits.min), max_pa=_per_channel(limits.max)
-            ),
-            robot=robot,
+            else Load(force=load.force_n, moment=load.moment_nm, frame=load.frame),
+            pressure=PressureRange(min=limits.min_pa, max=limits.max_pa),
         )
 
 
@@ -313,33 +310,7 @@ def task_of(given: Any, robot: str) -> Task:
     if isinstance(request, TaskText):
         return _task_of_text(request.text, robot)
     _same_robot(request.robot, robot)
-    load, limits = request.load, request.pressure
-    return Task(
-        robot=robot,
-        target=request.target.target(),
-        stiffness=None if request.stiffness is None else _stiffness(request.stiffness),
-        load=None
-        if load is None
-        else Load(force=load.force_n, moment=load.moment_nm, frame=load.frame),
-        pressure=PressureRange(min=limits.min_pa, max=limits.max_pa),
-    )
-
-
-def check_pressures(task: Task, low: Array, high: Array) -> None:
-    """Raise `InputError` if a task asks for pressures beyond the limits (n,), in Pa."""
-    slack = 1e-6 * (high - low)
-    for key, asked in (("min", task.pressure.min), ("max", task.pressure.max)):
-        values = np.array(asked, dtype=float)  # None is NaN, which is beyond nothing
-        if values.ndim and values.shape != low.shape:
-            raise InputError(
-                f"pressure.{key}: expected one value or a list of {len(low)}, not {len(values)}"
-            )
-        values = np.broadcast_to(values, low.shape)
-        for index in np.flatnonzero((values > high + slack) | (values < low - slack)):
-            raise InputError(
-                f"pressure.{key}: {values[index] * 1e-5:g} bar is beyond the limits of channel "
-                f"{index + 1}, {low[index] * 1e-5:g} to {high[index] * 1e-5:g} bar"
-            )
+    return request.task(robot)
 
 
 def _task_of_text(text: str, robot: str) -> Task:
@@ -385,6 +356,69 @@ def _stiffness(message: StiffnessMessage) -> StiffnessGoal:
     )
 
 
+def _saying_all_of(
+    given: BaseModel, said: Callable[[], MessageT], heard: Callable[[MessageT], BaseModel]
+) -> MessageT:
+    """Return a message, if whoever gets it hears all that was to be said.
+
+    Parameters
+    ----------
+    given :
+        What is to be said.
+    said :
+        Makes the message.
+    heard :
+        Makes of the message what its receiver makes of it.
+
+    Raises
+    ------
+    InputError
+        The message cannot say all of it, or says it differently; the text names the keys.
+    """
+    try:
+        message = said()
+    except ValidationError as error:
+        raise InputError(sentence(error.errors())) from None
+    if lost := differences(contents(given), contents(heard(message))):
+        raise InputError(
+            f"{listed(lost)}: the daemon's messages cannot say this, and it would be lost"
+        )
+    return message
+
+
+def _target_message(target: Target) -> TargetMessage:
+    return TargetMessage(
+        position_m=_listed(target.position),
+        pointing=_listed(target.pointing),
+        orientation_wxyz=_listed(target.orientation),
+        tolerance=ToleranceMessage(
+            position_m=target.tolerance.position, angle_rad=target.tolerance.angle
+        ),
+    )
+
+
+def _trajectory_message(trajectory: Trajectory) -> TrajectoryMessage:
+    return TrajectoryMessage(
+        waypoints=[
+            WaypointMessage(time_s=w.time, target=_target_message(w.target))
+            for w in trajectory.waypoints
+        ]
+    )
+
+
+def _task_message(task: Task, robot: str | None) -> TaskMessage:
+    load, limits = task.load, task.pressure
+    return TaskMessage(
+        target=_target_message(task.target),
+        stiffness=None if task.stiffness is None else _stiffness_message(task.stiffness),
+        load=None
+        if load is None
+        else LoadMessage(force_n=list(load.force), moment_nm=list(load.moment), frame=load.frame),
+        pressure=PressureMessage(min_pa=_per_channel(limits.min), max_pa=_per_channel(limits.max)),
+        robot=robot,
+    )
+
+
 def _stiffness_message(goal: StiffnessGoal) -> StiffnessMessage:
     match: MatchMessage | MatrixMessage | None = None
     if isinstance(goal.match, MatchMatrix):
@@ -395,16 +429,17 @@ def _stiffness_message(goal: StiffnessGoal) -> StiffnessMessage:
             tolerance=goal.match.tolerance,
         )
     elif goal.match is not None:
-        match = MatchMessage(**_measure(goal.match))
+        match = MatchMessage(**_measure(goal.match, MatchMessage))
     return StiffnessMessage(
-        maximise=[MeasureMessage(**_measure(m)) for m in goal.maximise],
-        at_least=[AtLeastMessage(**_measure(m)) for m in goal.at_least],
+        maximise=[MeasureMessage(**_measure(m, MeasureMessage)) for m in goal.maximise],
+        at_least=[AtLeastMessage(**_measure(m, AtLeastMessage)) for m in goal.at_least],
         match=match,
     )
 
 
-def _measure(measure: StiffnessMeasure) -> dict[str, Any]:
-    return {**measure.model_dump(), "direction": list(measure.direction)}
+def _measure(measure: StiffnessMeasure, message: type[_Message]) -> dict[str, Any]:
+    said = {name: getattr(measure, name) for name in message.model_fields}
+    return {**said, "direction": list(measure.direction)}
 
 
 def _listed(values: Any) -> Any:

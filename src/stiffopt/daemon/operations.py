@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
+from stiffopt import units
 from stiffopt.control.state import State
 from stiffopt.daemon.calls import Commanded, LoopCalls, start
 from stiffopt.daemon.lease import ControlLease
-from stiffopt.daemon.messages import TargetMessage, TaskMessage, check_pressures, task_of
+from stiffopt.daemon.messages import TargetMessage, TaskMessage, task_of
 from stiffopt.daemon.refusals import RefusedError, refusal_of
 from stiffopt.daemon.reports import (
     DoneReport,
@@ -24,7 +25,6 @@ from stiffopt.daemon.reports import (
 from stiffopt.daemon.wire import LEASE_HEADER
 from stiffopt.errors import CommandError, StiffoptError
 from stiffopt.model.description import RobotDescription
-from stiffopt.optimise.task import Task
 from stiffopt.rig.interface import Clock
 
 __all__ = ["Operations"]
@@ -58,12 +58,13 @@ class Operations:
         clock: Clock,
         patience: float,
     ) -> None:
+        units.get_ready()  # not when a task comes: the control loop shares the interpreter
         self.loop = loop
         self.robot = robot
         self.lease = ControlLease(heartbeat, clock)
         self._clock = clock
         self._call = LoopCalls(patience)
-        self._task: Task | None = None  # the last one that was accepted, while it matters
+        self._task: TaskMessage | None = None  # the last that was accepted, while it matters
         self._settling: asyncio.Task[None] | None = None
 
     def state(self) -> StateReport:
@@ -96,12 +97,8 @@ class Operations:
                 orientation_wxyz=_whole(now.target_quaternion_wxyz),
                 pointing=_whole(now.target_pointing),
             )
-        given = None if self._task is None or now.state in _VENTED else self._task
-        return TaskReport(
-            doing=now.task,
-            target=asked,
-            task=None if given is None else TaskMessage.of(given, self.robot.name),
-        )
+        given = None if now.state in _VENTED else self._task
+        return TaskReport(doing=now.task, target=asked, task=given)
 
     # Control ----------------------------------------------------------------------------------
 
@@ -172,12 +169,11 @@ class Operations:
     async def set_task(self, identity: str | None, given: Any) -> DoneReport:
         """Pursue a task, given as the JSON of a `TaskRequest`."""
 
-        def pursue() -> Task:
-            snapshot = self.loop.snapshot()
+        def pursue() -> TaskMessage:
             task = task_of(given, self.robot.name)
-            check_pressures(task, snapshot.low, snapshot.high)
+            message = TaskMessage.of(task, self.robot.name)  # what clients are told later
             self.loop.set_task(task)
-            return task
+            return message
 
         with self._control(identity):
             self._task = await self._asked(pursue)

@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 
 _FLOAT = np.dtype(float)
 _LOOK = 0.05  # s between looks at whether somebody else commands the device
+_SLACK = 1e-6  # of a channel's range
 
 
 @dataclass(frozen=True)
@@ -77,6 +78,11 @@ class PressureLimits:
             raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
         return PressureLimits(low, high)
 
+    @property
+    def slack(self) -> Array:
+        """By how much (n,) a pressure may be beyond a limit and counts as rounded, in Pa."""
+        return _SLACK * (self.high - self.low)
+
     def check(self, pressures: ArrayLike) -> Array:
         """Return pressures (n,) if they may be commanded.
 
@@ -99,7 +105,7 @@ class PressureLimits:
             raise CommandError(f"expected {self.n} pressures, not an array of shape {p.shape}")
         for index in np.flatnonzero(~np.isfinite(p)):
             raise CommandError(f"channel {index + 1}: {p[index]} is not a finite pressure")
-        slack = 1e-6 * (self.high - self.low)
+        slack = self.slack
         outside = (p < self.low - slack) | (p > self.high + slack)
         for index in np.flatnonzero(outside & (p != 0)):
             raise CommandError(

@@ -41,9 +41,9 @@ class Applied:
 
 
 def let_down(pressures: Array, share: float, limits: PressureLimits) -> Array:
-    """Return a share of pressures (n,), in Pa, as it can be commanded.
+    """Return a share, from 0 to 1, of pressures (n,), in Pa, as it can be commanded.
 
-    The share is at most 1; a channel below a low limit above 0 is at 0.
+    A channel that would be below a low limit above 0 is at 0.
     """
     down: Array = pressures * min(max(share, 0.0), 1.0)
     low = limits.low

@@ -1,0 +1,234 @@
+"""Messages to the daemon say all that a task, target or trajectory says, or refuse to."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import BaseModel
+
+from simulated_loop import TASK, Lab
+from stiffopt.control.contents import contents, differences
+from stiffopt.control.requested import check_target, check_task, check_trajectory
+from stiffopt.control.state import State
+from stiffopt.control.trajectory import Trajectory, Waypoint
+from stiffopt.daemon.messages import (
+    TargetMessage,
+    TaskMessage,
+    TrajectoryMessage,
+    task_of,
+    trajectory_of,
+)
+from stiffopt.errors import InputError
+from stiffopt.optimise.goal import (
+    AtLeast,
+    MatchMatrix,
+    MatchValue,
+    StiffnessGoal,
+    StiffnessMeasure,
+)
+from stiffopt.optimise.target import Target, Tolerance
+from stiffopt.optimise.task import Load, PressureRange, Task, load_task
+from stiffopt.rig.interface import PressureLimits
+
+PROBLEMS = Path(__file__).resolve().parent.parent / "problems"
+LIMITS = PressureLimits([0.0] * 3, [1.5e5] * 3)  # type: ignore[arg-type]
+X = (1.0, 0.0, 0.0)
+
+
+class GentleTarget(Target):
+    speed: float | None = None
+
+
+class GentleTolerance(Tolerance):
+    time: float | None = None
+
+
+class GentleMeasure(StiffnessMeasure):
+    damping: float | None = None
+
+
+class GentleAtLeast(AtLeast):
+    damping: float | None = None
+
+
+class GentleMatch(MatchValue):
+    damping: float | None = None
+
+
+class GentleMatrix(MatchMatrix):
+    damping: float | None = None
+
+
+class GentleGoal(StiffnessGoal):
+    dynamics: str | None = None
+
+
+class GentleLoad(Load):
+    rate: float | None = None
+
+
+class GentleRange(PressureRange):
+    spread: float | None = None
+
+
+class GentleTask(Task):
+    gentle: bool | None = None
+
+
+class GentleWaypoint(Waypoint):
+    speed: float | None = None
+
+
+class GentleTrajectory(Trajectory):
+    repeat: int | None = None
+
+
+def task(**parts: Any) -> Task:
+    return Task(robot="stiff-flop-1", **{"target": TASK.target, **parts})
+
+
+def goal(**parts: Any) -> Task:
+    return task(stiffness=StiffnessGoal(**parts))
+
+
+def gentle_tasks(more: float | None) -> list[tuple[Task, str]]:
+    """Return tasks that say one thing more than a task can, if there is more, and where."""
+    matrix = ((100.0, 0.0, 0.0), (0.0, 100.0, 0.0), (0.0, 0.0, 900.0))
+    position = TASK.target.position
+    tolerance = GentleTolerance(time=more)
+    return [
+        (
+            GentleTask(robot="stiff-flop-1", target=TASK.target, gentle=more and bool(more)),
+            "gentle",
+        ),
+        (task(target=GentleTarget(position=position, speed=more)), "target.speed"),
+        (task(target=Target(position=position, tolerance=tolerance)), "target.tolerance.time"),
+        (
+            task(
+                stiffness=GentleGoal(
+                    at_least=AtLeast(direction=X, value=9.0), dynamics=more and "slow"
+                )
+            ),
+            "stiffness.dynamics",
+        ),
+        (
+            goal(
+                maximise=[StiffnessMeasure(direction=X), GentleMeasure(direction=X, damping=more)]
+            ),
+            "stiffness.maximise[1].damping",
+        ),
+        (
+            goal(at_least=GentleAtLeast(direction=X, value=9.0, damping=more)),
+            "stiffness.at_least[0].damping",
+        ),
+        (
+            goal(match=GentleMatch(direction=X, value=9.0, damping=more)),
+            "stiffness.match.damping",
+        ),
+        (goal(match=GentleMatrix(matrix=matrix, damping=more)), "stiffness.match.damping"),
+        (task(load=GentleLoad(rate=more)), "load.rate"),
+        (task(pressure=GentleRange(spread=more)), "pressure.spread"),
+    ]
+
+
+@pytest.mark.parametrize("index", range(len(gentle_tasks(1.0))))
+def test_what_a_message_cannot_say_is_refused_and_named(index: int) -> None:
+    given, key = gentle_tasks(1.0)[index]
+    with pytest.raises(InputError, match="cannot say this, and it would be lost") as caught:
+        TaskMessage.of(given)
+    assert str(caught.value).startswith(f"{key}: ")
+    with pytest.raises(InputError, match="unknown key") as caught:
+        check_task(given, LIMITS)
+    assert key.split(".")[-1] in str(caught.value)
+    plain, _ = gentle_tasks(None)[index]
+    check_task(plain, LIMITS)
+    TaskMessage.of(plain)
+
+
+def test_a_message_of_a_target_or_trajectory_says_all_of_it() -> None:
+    target = GentleTarget(position=TASK.target.position, speed=0.1)
+    with pytest.raises(InputError, match="speed: the daemon's messages cannot say this"):
+        TargetMessage.of(target)
+    with pytest.raises(InputError, match=r"Target\.speed: unknown key"):
+        check_target(target)
+    plain = Waypoint(time=0.0, target=TASK.target)
+    for trajectory, key in (
+        (Trajectory(waypoints=(plain, Waypoint(time=1.0, target=target))), "target.speed"),
+        (Trajectory(waypoints=(GentleWaypoint(time=1.0, target=TASK.target, speed=1.0),)), "speed"),
+        (GentleTrajectory(waypoints=(plain,), repeat=2), "repeat"),
+    ):
+        with pytest.raises(InputError, match=f"{key}: the daemon's messages cannot say"):
+            TrajectoryMessage.of(trajectory)
+        with pytest.raises(InputError, match=f"{key}: unknown key"):
+            check_trajectory(trajectory)
+
+
+def test_the_loop_refuses_what_its_steering_does_not_understand() -> None:
+    lab = Lab().under_pressure()
+    calls = list(lab.steering.calls)
+    for given, key in gentle_tasks(1.0):
+        with pytest.raises(InputError, match=key.split(".")[-1]):
+            lab.loop.set_task(given)
+    assert lab.steering.calls == calls
+    assert lab.tick().state is State.ACTIVE
+
+
+def test_a_floor_among_what_is_maximised_is_not_forgotten() -> None:
+    given = goal(maximise=AtLeast(direction=X, value=9.0))
+    with pytest.raises(InputError, match=r"stiffness\.maximise\[0\]\.value"):
+        TaskMessage.of(given)
+    with pytest.raises(InputError, match="value"):
+        check_task(given, LIMITS)
+
+
+def test_too_much_for_a_message_is_refused_as_input() -> None:
+    with pytest.raises(InputError, match=r"maximise: .* at most 50"):
+        TaskMessage.of(goal(maximise=[StiffnessMeasure(direction=X)] * 51))
+    with pytest.raises(InputError, match=r"position_m"):
+        TargetMessage.of(Target.model_construct(position=(1.0, float("nan"), 0.0)))
+
+
+@pytest.mark.parametrize("path", sorted(PROBLEMS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_problem_survives_its_message(path: Path) -> None:
+    given = load_task(path)
+    sent = json.loads(json.dumps(TaskMessage.of(given, "the arm").model_dump()))
+    assert task_of(sent, "the arm") == given.model_copy(update={"robot": "the arm", "source": None})
+    assert not differences(contents(given), contents(task_of({**sent, "robot": None}, given.robot)))
+
+
+def test_a_trajectory_survives_its_message() -> None:
+    target = Target(position=(0.01, None, -0.0), tolerance=Tolerance(position=2e-3, angle=0.3))
+    given = Trajectory(waypoints=[Waypoint(time=t, target=target) for t in (0.0, 0.1, 2.0)])
+    sent = json.loads(json.dumps(TrajectoryMessage.of(given).model_dump()))
+    assert trajectory_of(sent) == given
+
+
+def test_whoever_adds_a_key_decides_whether_messages_and_steering_know_it() -> None:
+    """A key that is new here needs a word in `daemon.messages` and a meaning in `control`."""
+    known: dict[type[BaseModel], set[str]] = {
+        Task: {"robot", "target", "stiffness", "load", "pressure", "source"},
+        Target: {"position", "pointing", "orientation", "tolerance"},
+        Tolerance: {"position", "angle"},
+        StiffnessGoal: {"maximise", "at_least", "match"},
+        StiffnessMeasure: {"direction", "frame", "kind", "boundary"},
+        AtLeast: {"direction", "frame", "kind", "boundary", "value"},
+        MatchValue: {"direction", "frame", "kind", "boundary", "value", "tolerance"},
+        MatchMatrix: {"unit", "matrix", "frame", "boundary", "tolerance"},
+        Load: {"force", "moment", "frame"},
+        PressureRange: {"min", "max"},
+        Waypoint: {"time", "target"},
+        Trajectory: {"waypoints"},
+    }
+    for model, keys in known.items():
+        assert set(model.model_fields) == keys, model.__name__
+
+
+def test_differences_are_named_by_their_place() -> None:
+    one = {"a": [1, {"b": 2}], "c": 3, "d": None}
+    assert differences(one, one) == []
+    assert differences(one, {"a": [1, {"b": 3}], "c": 3}) == ["a[1].b"]
+    assert differences(one, {"a": [1], "c": 4}) == ["a", "c"]
+    assert differences({"x": float("nan")}, {"x": float("nan")}) == ["x"]
