@@ -9,8 +9,9 @@ gate:
   guard approaches and repeats a goal, and lets the pressures down when it has expired
   (`stiffopt.safety.goal`).
 
-In both cases it vents when the other process is gone, on every signal that ends it, and when
-somebody calls on the vent line. After it has vented by itself it is *tripped*: it takes no command
+In both cases it vents when the other process is gone (and none that was forked from it still holds
+the line), on every signal that would end the guard and can be handled, and when somebody calls on
+the vent line. After it has vented by itself it is *tripped*: it takes no command
 until it is armed by a client that has been told of the trip.
 
 What the guard cannot do: while the supply's driver waits for its device, at most for the driver's

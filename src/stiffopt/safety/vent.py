@@ -26,8 +26,8 @@ _GONE = 2.0  # s in which a process that was ended must be gone
 def vent_rig(path: str | os.PathLike[str]) -> str:
     """Vent the supply of a rig, by the guard that owns it, else directly; return how, in words.
 
-    A guard that does not answer is ended, and the supply vented in its place. None of this uses the
-    network, and no other user can keep it from happening.
+    A guard that does not answer, or cannot vent, is ended, and the supply vented in its place. The
+    daemon's interface and its token are not needed.
 
     Raises
     ------

@@ -1,8 +1,10 @@
-"""The vent line: a way to have a guard vent that needs no network, and that no stranger can block.
+"""The vent line: a way to have a guard vent that needs no network service and no token.
 
 Each guard listens under an abstract socket address made of its supply's endpoint. The kernel tells
-who calls: only root and the guard's own user are heard, all others are hung up on at once. Whoever
-is heard says ``vent`` and is answered, as JSON, once that is done.
+who calls: only root and the guard's own user are heard, all others are hung up on at once, so that
+their calls keep nobody away. Whoever is heard says ``vent`` and is answered, as JSON, once that is
+done. The address belongs to whichever process takes it first; a guard that finds it taken goes on
+without a line.
 """
 
 from __future__ import annotations
