@@ -250,12 +250,9 @@ class KeptLoop(FakeLoop):
 
 class FakeLink:
     def __init__(self) -> None:
-        self.alive = self.hung = False
+        self.alive = False
         self.opened = 0
         self.fails = False
-
-    def kill(self) -> None:
-        self.alive = self.hung = False
 
     def open(self) -> None:
         self.opened += 1
@@ -288,14 +285,6 @@ def test_the_keeper_replaces_a_guard_again_and_again() -> None:
     keeper.look()
     assert link.opened == 2
     assert not loop.alarms
-
-
-def test_a_guard_that_hangs_is_ended_and_replaced() -> None:
-    loop, link = KeptLoop(), FakeLink()
-    link.alive = link.hung = True
-    keeper = Keeper(loop, link, FakeManager(), clock=lambda: 100.0)  # type: ignore[arg-type]
-    keeper.look()
-    assert (link.opened, link.alive, link.hung) == (1, True, False)
 
 
 def test_the_keeper_holds_the_arm_when_the_service_ends() -> None:

@@ -120,7 +120,7 @@ _NAMES = {
     "stiffopt.control.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.daemon.client": ("Client",),
     "stiffopt.errors": (
-        *("CommandError", "DeviceError", "EquilibriumError", "FileError"),
+        *("CommandError", "DeviceError", "EquilibriumError", "FileError", "GuardTripped"),
         *("InputError", "MissingExtraError", "PressureError", "ServiceError"),
         *("SlowWarning", "StiffoptError"),
     ),

@@ -84,6 +84,7 @@ class SafetyGate:
         self.clock = clock
         n = supply.n
         self.limits = _tightened(supply.limits, safety)
+        supply.restrict(self.limits)  # so that its driver rounds towards these
         self._slew = _positive("slew", slew, n)
         if not period > 0:
             raise InputError(f"the period must be above 0 s, not {period:g} s")

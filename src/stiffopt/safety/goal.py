@@ -208,7 +208,11 @@ class GoalFollower:
                 )
             self._goal, self._until = pressures, goal.time + goal.valid_for
             self._let_down_from = None
-            applied = self._step(now, pressures)
+            try:
+                applied = self._step(now, pressures)
+            except DeviceError as error:
+                self.fail(error)
+                raise
             self.due = now + _LATE * self._period
             return applied
 
@@ -223,6 +227,7 @@ class GoalFollower:
         with self._lock:
             now = self._clock.now()
             if not self._gate.armed:
+                self._gate.expire(now)  # which vents again what could not be vented
                 self._rest(self._why_vented)
                 return
             self.due = now + self._period
@@ -247,6 +252,7 @@ class GoalFollower:
                 self._gate.vent()
             except DeviceError as again:
                 self._failure = f"{error}; THE SUPPLY COULD NOT BE VENTED: {again}"
+                self.due = self._clock.now() + self._period
 
     def _step(self, now: float, pressures: Array) -> Applied:
         applied = self._gate.apply(PressureCommand(pressures, now))
