@@ -17,6 +17,7 @@ from stiffopt.control.controller import Controller
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
+from stiffopt.daemon.exposure import bracketed, check_exposure
 from stiffopt.daemon.keeper import Keeper
 from stiffopt.daemon.logged import LogEvents
 from stiffopt.daemon.notify import ServiceManager
@@ -175,7 +176,8 @@ class Daemon:
         Raises
         ------
         InputError
-            A port is not free, a device does not answer, or a check failed.
+            A port is not free, the token is too short for others to reach it, a device does not
+            answer, or a check failed.
         MissingExtraError
             A library is not installed.
         DeviceError
@@ -190,8 +192,7 @@ class Daemon:
                 self._listen()
             self._manager.status("connecting to the rig")
             self.loop.configure()
-            if self._telemetry is not None:
-                self._telemetry.start()
+            self._start_telemetry()
             self.loop.listen(self._ticked)
             self._control = threading.Thread(target=self._run, name="control", daemon=True)
             self._control.start()
@@ -348,6 +349,22 @@ class Daemon:
         )
         return Server(app, settings.host, settings.port)
 
+    def _start_telemetry(self) -> None:
+        if self._telemetry is None:
+            return
+        self._telemetry.start()
+        if (port := self._telemetry.port) is not None:
+            self._warn(
+                "foxglove",
+                f"Foxglove is served at ws://{bracketed(self.description.service.host)}:{port} "
+                "without a token: whoever can reach that may read all telemetry, and so may any "
+                "web page that is open in a browser there",
+            )
+
+    def _warn(self, kind: str, text: str) -> None:
+        """Append an event that is a warning."""
+        self.loop.events.add(self._clock.now(), kind, text, Severity.WARNING)
+
     def _is_serving(self) -> bool:
         return self._server is not None and self._server.alive
 
@@ -355,10 +372,14 @@ class Daemon:
         """Open the port, then keep the token: not in the place of that of one who has the port."""
         if self._server is None:
             return
+        given = self._secret.path is None
+        warnings = check_exposure(self.description.service.host, self.token, given=given)
         try:
             self._server.start()
         except InputError as error:
             raise InputError(f"{error} (service.host, service.port in the rig file)") from None
+        for kind, text in warnings:
+            self._warn(kind, text)
         self._secret.write()
 
     # the control thread --------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import threading
 import time
 from typing import Any
 
+from stiffopt.daemon.exposure import bracketed
 from stiffopt.daemon.messages import MAX_MESSAGE
 from stiffopt.errors import InputError, MissingExtraError, ServiceError
 
@@ -47,7 +48,7 @@ class Server:
     def url(self) -> str:
         """Where clients of this machine reach it."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
-        return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
+        return f"http://{bracketed(host)}:{self.port}"
 
     @property
     def alive(self) -> bool:
