@@ -31,7 +31,7 @@ from stiffopt.control.journal import EventLog
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon import secret as secret_module
 from stiffopt.daemon.client import Client
-from stiffopt.daemon.connections import MAX_CONNECTIONS
+from stiffopt.daemon.crowd import MAX_CONNECTIONS
 from stiffopt.daemon.daemon import Daemon
 from stiffopt.daemon.exposure import check_exposure, is_loopback
 from stiffopt.daemon.keeper import Keeper
