@@ -29,10 +29,11 @@ from fake_loop import FakeLoop, ManualClock
 from running import ONE, TWO, patient_rig, wait_for, with_simulator
 from stiffopt.control.journal import EventLog
 from stiffopt.control.state import Severity, Snapshot, State
+from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon import secret as secret_module
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.crowd import MAX_CONNECTIONS
-from stiffopt.daemon.daemon import Daemon
+from stiffopt.daemon.daemon import STOP_TIME, Daemon
 from stiffopt.daemon.exposure import check_exposure, is_loopback
 from stiffopt.daemon.keeper import Keeper
 from stiffopt.daemon.logged import LogEvents
@@ -344,10 +345,10 @@ def test_the_unit_restarts_vented_and_lets_the_pressures_down() -> None:
     assert "--arm" not in unit["ExecStart"]  # it would be refused, too
     assert unit["Type"] == "notify"
     assert unit["KillMode"] == "mixed"  # the guard is not signalled
+    assert "15 s" in _page()
+    assert STOP_TIME == 15
     longest = next(m.le for m in Safety.model_fields["ramp_time"].metadata if hasattr(m, "le"))
-    assert (
-        float(unit["TimeoutStopSec"]) > longest + 7 + 10
-    )  # and `Daemon.stop`, and the guard's end
+    assert float(unit["TimeoutStopSec"]) > longest + STOP_TIME
     assert unit["Restart"] == "on-failure"
     assert "5" not in unit["RestartPreventExitStatus"].split()
     assert "RestrictRealtime" not in unit
@@ -612,6 +613,120 @@ def _write(folder: Path) -> None:
         secret.write()
     finally:
         secret.remove()
+
+
+# the end, whatever hangs --------------------------------------------------------------------------
+
+
+class Standstill:
+    """Everything that a daemon ends: parts that hang wait for `go_on`, and all are in a diary."""
+
+    def __init__(self, made: Daemon, hangs: set[str]) -> None:
+        self.calls: list[str] = []
+        self.go_on = threading.Event()
+        self._hangs = hangs
+        made.link = SimpleNamespace(close=self("supply"), vent=self("vent"))  # type: ignore[assignment]
+        made.loop.vent = self("loop")  # type: ignore[method-assign, assignment]
+        made.loop.rig.tracker = SimpleNamespace(close=self("tracker"))  # type: ignore[assignment]
+        made._controller.close = self("planner")  # type: ignore[method-assign]
+        made._telemetry = SimpleNamespace(stop=self("telemetry"))  # type: ignore[assignment]
+        made._server = SimpleNamespace(stop=self("service"))  # type: ignore[assignment]
+        made._recorded = True
+        control = self("control")
+        made._control = threading.Thread(
+            target=lambda: (made._stopping.wait(60), control()), daemon=True
+        )
+        made._control.start()
+
+    def __call__(self, name: str) -> Any:
+        def part(*_: Any) -> None:
+            self.calls.append(name)
+            if name in self._hangs:
+                self.go_on.wait(60)
+
+        return part
+
+
+@pytest.fixture
+def idle(tmp_path: Path) -> Iterator[Daemon]:
+    """A daemon that is not started, of devices that are not there."""
+    made = Daemon(patient_rig(tmp_path, "modbus-aurora", safety={"ramp_time": "0.1 s"}))
+    end_planner = made._controller.close
+    yield made
+    end_planner()
+
+
+def stopped(made: Daemon, hangs: set[str]) -> list[str]:
+    """Stop a daemon of which some parts hang, and return what it has ended, in order."""
+    still = Standstill(made, hangs)
+    try:
+        begin = time.monotonic()
+        made.stop()
+        taken = time.monotonic() - begin
+    finally:
+        still.go_on.set()
+    assert taken < made.description.safety.ramp_time + STOP_TIME - 1, hangs
+    return still.calls
+
+
+REST = {"planner", "tracker", "telemetry", "service"}
+
+
+@pytest.mark.parametrize("hangs", [set(), {"tracker"}, {"telemetry"}, {"service"}, REST], ids=str)
+def test_what_hangs_keeps_neither_the_supply_from_being_closed_nor_the_end(
+    idle: Daemon, monkeypatch: pytest.MonkeyPatch, hangs: set[str]
+) -> None:
+    monkeypatch.setattr(daemon_module, "_REST_TIME", 0.3)
+    calls = stopped(idle, hangs)
+    assert calls[:2] == ["control", "supply"]  # vented first, and this waits for nothing
+    assert set(calls[2:]) == REST
+    assert set(idle.hung) == hangs
+    assert idle.trouble == ""
+    told = [e.text for e in idle.loop.events.since(0)[0] if e.kind == "stop"]
+    assert len(told) == len(hangs)
+
+
+def test_a_supply_that_hangs_is_told_and_the_rest_ends(
+    idle: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(daemon_module, "_SUPPLY_TIME", 0.3)
+    assert set(stopped(idle, {"supply"})) >= REST
+    assert idle.hung == ("supply",)
+    assert "whether the supply is vented is not known" in idle.trouble
+
+
+def test_it_ends_in_time_though_everything_hangs(idle: Daemon) -> None:
+    calls = stopped(idle, {"control", "loop", "vent", "supply", *REST})
+    assert calls.index("vent") < calls.index("supply") < min(calls.index(name) for name in REST)
+    assert set(idle.hung) == {"control", "supply", *REST}
+    assert isinstance(idle.failure, TimeoutError)
+
+
+def test_what_fails_at_the_end_keeps_nothing_from_ending(idle: Daemon) -> None:
+    still = Standstill(idle, set())
+
+    def fail() -> None:
+        raise DeviceError("no luck")
+
+    idle.loop.rig.tracker.close = fail  # type: ignore[union-attr, method-assign]
+    idle.link.close = fail  # type: ignore[method-assign]
+    idle.stop()
+    assert {"planner", "telemetry", "service"} <= set(still.calls)
+    assert idle.trouble == "no luck"
+    told = [e.text for e in idle.loop.events.since(0)[0] if e.kind == "stop"]
+    assert told == ["the tracker did not end well: no luck"]
+
+
+def test_telemetry_that_does_not_start_is_an_alarm_and_control_goes_on(
+    idle: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(daemon_module, "_START", 0.2)
+    hangs = threading.Event()
+    idle._telemetry = SimpleNamespace(start=lambda: hangs.wait(20), port=None)  # type: ignore[assignment]
+    idle._start_telemetry()
+    hangs.set()
+    events, _ = idle.loop.events.since(0)
+    assert any(e.kind == "telemetry" and "has not started" in e.text for e in events)
 
 
 # who can reach it --------------------------------------------------------------------------------

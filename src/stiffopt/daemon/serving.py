@@ -18,7 +18,7 @@ _STARTING = 10.0  # s
 _CONNECTIONS = 1024  # that have not been accepted yet
 _AT_ONCE = 16  # of these are accepted, then others are heard; far fewer than make anyone give way
 _IDLE = 10  # s; longer than clients keep a connection that they do not use
-_CLOSING = 2  # s for requests that are being answered when the server stops
+_CLOSING = 1  # s for requests that are being answered when the server stops
 _log = logging.getLogger(__name__)
 
 
