@@ -239,8 +239,11 @@ class Strangers:
 
 @pytest.mark.parametrize("says", [UPGRADE, b"", b"GET /v1/sta"], ids=["stream", "silent", "slow"])
 def test_strangers_who_come_again_and_again_keep_the_tokens_holder_from_nothing(
-    loop: FakeLoop, server: Server, says: bytes
+    loop: FakeLoop, says: bytes
 ) -> None:
+    server = Server(create_app(loop, robot=ROBOT, token=TOKEN, heartbeat=30.0, patience=20.0))
+    server.start()
+
     def within_2_s(do: Callable[[], object]) -> None:
         begin = time.monotonic()
         do()
@@ -257,6 +260,7 @@ def test_strangers_who_come_again_and_again_keep_the_tokens_holder_from_nothing(
                 within_2_s(client.vent)
                 stream.__exit__(None, None, None)
                 within_2_s(client.release)
+    server.stop()
     assert loop.names.count("vent") == 3
 
 
