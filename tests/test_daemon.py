@@ -689,7 +689,7 @@ def test_what_hangs_keeps_neither_the_supply_from_being_closed_nor_the_end(
 def test_a_supply_that_hangs_is_told_and_the_rest_ends(
     idle: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(daemon_module, "_SUPPLY_TIME", 0.3)
+    monkeypatch.setattr(daemon_module, "CONTROL_TIME", 0.3)
     assert set(stopped(idle, {"supply"})) >= REST
     assert idle.hung == ("supply",)
     assert "whether the supply is vented is not known" in idle.trouble

@@ -290,9 +290,10 @@ class Daemon:
         self._keeper.stop(_KEEPER_TIME)
         state = self.loop.snapshot().state
         closing = Part("supply", self.link.close)
-        closing.ends_within(_SUPPLY_TIME)
+        before = CONTROL_TIME + _KEEPER_TIME + _VENT_TIME
+        closing.ends_within(self._left(before + _SUPPLY_TIME, _SUPPLY_TIME))
         self._end_the_rest()
-        if not closing.ends_within(0.0):
+        if not closing.ends_within(self._left(before + _SUPPLY_TIME + _REST_TIME)):
             self.trouble = "the guard does not end; whether the supply is vented is not known"
             self.hung = ("supply", *self.hung)
         elif closing.error is not None:
@@ -301,12 +302,16 @@ class Daemon:
         self._manager.close()
         return state
 
+    def _left(self, beyond: float, least: float = 0.0) -> float:
+        """Return what is left of the ramp and a time beyond it, from the beginning of the end."""
+        end = self._stop_begun + self.description.safety.ramp_time + beyond
+        return max(end - time.monotonic(), least)
+
     def _end_control(self) -> None:
         """Wait for the control thread, which lets the pressures down; vent if it hangs."""
         if self._control is None:
             return
-        longest = self.description.safety.ramp_time + CONTROL_TIME
-        self._control.join(max(self._stop_begun + longest - time.monotonic(), 0.0))
+        self._control.join(self._left(CONTROL_TIME))
         if self._control.is_alive():
             self.failure = TimeoutError("the control thread hangs")
             self.hung = (*self.hung, "control")
