@@ -21,15 +21,14 @@ from websockets.sync.client import ClientConnection, connect
 from fake_loop import FakeLoop
 from stiffopt.control.state import Alarm, Severity, State, Timing
 from stiffopt.control.trajectory import Trajectory, Waypoint
-from stiffopt.daemon import connections
+from stiffopt.daemon import connections, crowd
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.client_stream import ClientStream
-from stiffopt.daemon.connections import MAX_CONNECTIONS
+from stiffopt.daemon.crowd import MAX_CONNECTIONS, MAX_STREAMS, Crowd, Member
 from stiffopt.daemon.messages import MAX_MESSAGE
 from stiffopt.daemon.reports import StateReport
 from stiffopt.daemon.service import create_app
 from stiffopt.daemon.serving import Server
-from stiffopt.daemon.stream import MAX_STREAMS
 from stiffopt.errors import CommandError, InputError, MissingExtraError, ServiceError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
@@ -90,7 +89,7 @@ def test_connections_that_idle_or_dribble_keep_nobody_away_and_use_up_nothing(
         with Client(server.url, TOKEN) as late:
             late.vent()
         ends_of_ours = 3 * MAX_CONNECTIONS + 2
-        eventually(lambda: open_files() - before <= ends_of_ours + MAX_CONNECTIONS + 2)
+        eventually(lambda: open_files() - before <= ends_of_ours + 2 * MAX_CONNECTIONS + 2)
         assert loop.names[-1] == "vent"
         other.sendall(b"       }")
         last = other.recv(100)
@@ -120,10 +119,10 @@ def test_a_connection_on_which_nothing_is_answered_is_closed(
                 assert silent.recv(100) == b""
 
 
-def test_where_all_are_being_answered_the_newest_has_to_go(
+def test_where_all_with_the_token_are_being_answered_the_newest_has_to_go(
     loop: FakeLoop, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 2)
+    monkeypatch.setattr(crowd, "MAX_CONNECTIONS", 2)
     free = threading.Event()
     waiting: list[str] = []
 
@@ -141,11 +140,141 @@ def test_where_all_are_being_answered_the_newest_has_to_go(
             busy[-1].sendall(asks + b"\r\n\r\n")
         eventually(lambda: len(waiting) == 2)
         late = stack.enter_context(socket.create_connection(address, 10))
+        late.sendall(asks + b"\r\n\r\n")
         with suppress(ConnectionResetError):
             assert late.recv(100) == b""
         free.set()
         for each in busy:
             assert each.recv(100).startswith(b"HTTP/1.1 200")
+
+
+def dropping(member: Member, dropped: list[Member]) -> Member:
+    member.drop = lambda: dropped.append(member)
+    return member
+
+
+def test_strangers_give_way_to_strangers_and_who_is_trusted_to_nobody() -> None:
+    everyone, dropped = Crowd(), list[Member]()
+    trusted = dropping(Member(), dropped)
+    everyone.join(trusted)
+    assert everyone.trust(trusted)
+    strangers = [dropping(Member(), dropped) for _ in range(MAX_CONNECTIONS + 3)]
+    for stranger in strangers:
+        everyone.join(stranger)
+    assert dropped == strangers[:3]
+    everyone.distrust(trusted)
+    assert dropped == strangers[:4]
+    assert not trusted.trusted
+
+
+def test_of_streams_strangers_and_trusted_have_seats_of_their_own() -> None:
+    everyone = Crowd()
+    members = [Member() for _ in range(2 * MAX_STREAMS + 2)]
+    for k, member in enumerate(members):
+        member.is_stream = True
+        everyone.join(member)
+        assert everyone.seat(member) is (k < MAX_STREAMS)
+    for k, member in enumerate(members[MAX_STREAMS:]):
+        everyone.trust(member)
+        assert everyone.seat(member) is (k < MAX_STREAMS)
+    assert not everyone.trust(members[0])  # there is no seat for it, and it keeps what it has
+    assert members[0].seated
+    everyone.leave(members[-3])
+    assert everyone.seat(members[-1])
+    everyone.leave(members[-2])
+    everyone.leave(members[-4])
+    assert everyone.trust(members[0])
+
+
+def test_handshakes_of_strangers_come_at_a_limited_rate() -> None:
+    now = [0.0]
+    everyone = Crowd(clock=lambda: now[0])
+    assert sum(everyone.permits_handshake() for _ in range(200)) == 50
+    now[0] = 0.5
+    assert sum(everyone.permits_handshake() for _ in range(200)) == 25
+
+
+UPGRADE = (
+    b"GET /v1/stream HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\n"
+    b"Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+    b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+)
+
+
+class Strangers:
+    """Threads that connect without a token, say something, and come again when they are closed."""
+
+    def __init__(self, server: Server, count: int, says: bytes) -> None:
+        self._server, self._says = server, says
+        self.opened, self.end = 0, time.monotonic() + 20
+        self._enough = threading.Event()
+        threads = [threading.Thread(target=self._run, daemon=True) for _ in range(count)]
+        self._threads = threads
+
+    def __enter__(self) -> Strangers:
+        for thread in self._threads:
+            thread.start()
+        eventually(lambda: self.opened > len(self._threads))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._enough.set()
+        for thread in self._threads:
+            thread.join(10)
+
+    def _run(self) -> None:
+        while not self._enough.is_set() and time.monotonic() < self.end:
+            with (
+                suppress(OSError),
+                socket.create_connection(("127.0.0.1", self._server.port), 5) as other,
+            ):
+                self.opened += 1
+                other.sendall(self._says)
+                other.settimeout(0.2)
+                with suppress(TimeoutError):
+                    while other.recv(4096) and not self._enough.is_set():
+                        pass
+                self._enough.wait(0.2)
+
+
+@pytest.mark.parametrize("says", [UPGRADE, b"", b"GET /v1/sta"], ids=["stream", "silent", "slow"])
+def test_strangers_who_come_again_and_again_keep_the_tokens_holder_from_nothing(
+    loop: FakeLoop, says: bytes
+) -> None:
+    server = Server(create_app(loop, robot=ROBOT, token=TOKEN, heartbeat=30.0, patience=20.0))
+    server.start()
+
+    def within_2_s(do: Callable[[], object]) -> None:
+        begin = time.monotonic()
+        do()
+        assert time.monotonic() - begin < 2
+
+    with Strangers(server, 100 if says == UPGRADE else 200, says):
+        for _ in range(3):
+            with Client(server.url, TOKEN, name="planner", heartbeat="manual") as client:
+                within_2_s(client.take_control)
+                stream = client.stream(rate=20)
+                within_2_s(stream.__enter__)
+                for _ in range(5):
+                    within_2_s(stream.state)
+                within_2_s(client.vent)
+                stream.__exit__(None, None, None)
+                within_2_s(client.release)
+    server.stop()
+    assert loop.names.count("vent") == 3
+
+
+def test_a_stream_for_which_there_is_no_room_may_show_the_token(server: Server) -> None:
+    with ExitStack() as stack:
+        for _ in range(MAX_STREAMS):
+            told(stack.enter_context(opened(server)), {})
+        with opened(server, "?rate=50") as one_more:
+            assert told(one_more, {"token": TOKEN}) == {"type": "access", "trusted": True}
+            assert json.loads(one_more.recv(timeout=20))["type"] == "state"
+        with opened(server, "?rate=50", Authorization=f"Bearer {TOKEN}") as trusted:
+            assert json.loads(trusted.recv(timeout=20))["type"] == "state"
+        with opened(server, "?rate=50") as stranger:  # no state before it is refused
+            assert json.loads(stranger.recv(timeout=20))["error"]["code"] == "busy"
 
 
 # Reading and commands -----------------------------------------------------------------------------

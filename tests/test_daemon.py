@@ -29,9 +29,12 @@ from fake_loop import FakeLoop, ManualClock
 from running import ONE, TWO, patient_rig, wait_for, with_simulator
 from stiffopt.control.journal import EventLog
 from stiffopt.control.state import Severity, Snapshot, State
+from stiffopt.daemon import daemon as daemon_module
+from stiffopt.daemon import secret as secret_module
 from stiffopt.daemon.client import Client
-from stiffopt.daemon.connections import MAX_CONNECTIONS
-from stiffopt.daemon.daemon import Daemon
+from stiffopt.daemon.crowd import MAX_CONNECTIONS
+from stiffopt.daemon.daemon import STOP_TIME, Daemon
+from stiffopt.daemon.exposure import check_exposure, is_loopback
 from stiffopt.daemon.keeper import Keeper
 from stiffopt.daemon.logged import LogEvents
 from stiffopt.daemon.notify import ServiceManager
@@ -94,6 +97,10 @@ def test_it_settles_where_a_client_says_and_tells_of_it(daemon: tuple[Daemon, Cl
     with urllib.request.urlopen(f"{made.url}/metrics") as answer:
         assert b'stiffopt_state{rig="sim",state="active"} 1.0' in answer.read()
     assert made.foxglove_port
+    (served,) = [e for e in made.loop.events.since(0)[0] if e.kind == "foxglove"]
+    assert served.severity is Severity.WARNING
+    assert f"ws://127.0.0.1:{made.foxglove_port}" in served.text
+    assert "web page" in served.text
     assert made.recording is not None
     wait_for(lambda: os.path.getsize(made.recording or "") > 5_000)
     told = [event.text for event in made.loop.events.since(0)[0] if event.kind == "real-time"]
@@ -327,10 +334,10 @@ def test_the_unit_restarts_vented_and_lets_the_pressures_down() -> None:
     assert "--arm" not in unit["ExecStart"]  # it would be refused, too
     assert unit["Type"] == "notify"
     assert unit["KillMode"] == "mixed"  # the guard is not signalled
+    assert "15 s" in _page()
+    assert STOP_TIME == 15
     longest = next(m.le for m in Safety.model_fields["ramp_time"].metadata if hasattr(m, "le"))
-    assert (
-        float(unit["TimeoutStopSec"]) > longest + 7 + 10
-    )  # and `Daemon.stop`, and the guard's end
+    assert float(unit["TimeoutStopSec"]) > longest + STOP_TIME
     assert unit["Restart"] == "on-failure"
     assert "5" not in unit["RestartPreventExitStatus"].split()
     assert "RestrictRealtime" not in unit
@@ -522,6 +529,257 @@ def test_a_token_that_cannot_be_kept_is_told(tmp_path: Path) -> None:
     settings = ServiceSettings(token="NOWHERE_SET", token_file=str(tmp_path / "file" / "token"))
     with pytest.raises(FileError, match=r"service\.token_file"):
         Secret(settings, tmp_path, "rig").write()
+
+
+def test_a_lock_or_token_that_others_put_there_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    for name in (".my-rig.token.lock", "my-rig.token"):
+        place = tmp_path / name
+        place.symlink_to(victim)
+        with pytest.raises(FileError, match="is a symbolic link") as told:
+            _write(tmp_path)
+        assert told.value.path == str(place)
+        place.unlink()
+        place.symlink_to(tmp_path / "new")
+        with pytest.raises(FileError, match="is a symbolic link"):
+            _write(tmp_path)
+        place.unlink()
+        os.mkfifo(place)
+        with pytest.raises(FileError, match="is no regular file"):
+            _write(tmp_path)
+        place.unlink()
+    assert victim.read_text() == "precious"
+    assert not (tmp_path / "new").exists()
+    _write(tmp_path)
+
+
+def test_a_link_that_comes_while_the_lock_is_opened_is_not_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    monkeypatch.setattr(secret_module, "check_mine", lambda *_: None)
+    (tmp_path / ".my-rig.token.lock").symlink_to(tmp_path / "new")
+    with pytest.raises(FileError, match="symbolic links"):
+        _write(tmp_path)
+    assert not (tmp_path / "new").exists()
+
+
+def test_files_of_other_users_are_refused_and_so_are_their_folders(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    folder.chmod(0o777)
+    with pytest.raises(FileError, match="writable for all"):
+        _write(folder)
+    folder.chmod(0o1777)  # as /tmp: others cannot exchange what is mine
+    _write(folder)
+    (folder / "my-rig.token").write_text("")
+    me = os.geteuid()
+    monkeypatch.setattr(os, "geteuid", lambda: me + 1)
+    with pytest.raises(FileError, match="belongs to another user") as told:
+        _write(folder)
+    assert told.value.path in (str(folder), str(folder / ".my-rig.token.lock"))
+
+
+def test_folders_that_are_made_are_for_this_user_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
+    _write(tmp_path / "a" / "b")
+    modes = [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("a", "a/b")]
+    assert modes == [0o700, 0o700]
+
+
+def _write(folder: Path) -> None:
+    secret = Secret(ServiceSettings(), folder, "my-rig")
+    try:
+        secret.write()
+    finally:
+        secret.remove()
+
+
+# the end, whatever hangs --------------------------------------------------------------------------
+
+
+class Standstill:
+    """Everything that a daemon ends: parts that hang wait for `go_on`, and all are in a diary."""
+
+    def __init__(self, made: Daemon, hangs: set[str]) -> None:
+        self.calls: list[str] = []
+        self.go_on = threading.Event()
+        self._hangs = hangs
+        made.link = SimpleNamespace(close=self("supply"), vent=self("vent"))  # type: ignore[assignment]
+        made.loop.vent = self("loop")  # type: ignore[method-assign, assignment]
+        made.loop.rig.tracker = SimpleNamespace(close=self("tracker"))  # type: ignore[assignment]
+        made._controller.close = self("planner")  # type: ignore[method-assign]
+        made._telemetry = SimpleNamespace(stop=self("telemetry"))  # type: ignore[assignment]
+        made._server = SimpleNamespace(stop=self("service"))  # type: ignore[assignment]
+        made._recorded = True
+        control = self("control")
+        made._control = threading.Thread(
+            target=lambda: (made._stopping.wait(60), control()), daemon=True
+        )
+        made._control.start()
+
+    def __call__(self, name: str) -> Any:
+        def part(*_: Any) -> None:
+            self.calls.append(name)
+            if name in self._hangs:
+                self.go_on.wait(60)
+
+        return part
+
+
+@pytest.fixture
+def idle(tmp_path: Path) -> Iterator[Daemon]:
+    """A daemon that is not started, of devices that are not there."""
+    made = Daemon(patient_rig(tmp_path, "modbus-aurora", safety={"ramp_time": "0.1 s"}))
+    end_planner = made._controller.close
+    yield made
+    end_planner()
+
+
+def stopped(made: Daemon, hangs: set[str]) -> list[str]:
+    """Stop a daemon of which some parts hang, and return what it has ended, in order."""
+    still = Standstill(made, hangs)
+    try:
+        begin = time.monotonic()
+        made.stop()
+        taken = time.monotonic() - begin
+    finally:
+        still.go_on.set()
+    assert taken < made.description.safety.ramp_time + STOP_TIME - 1, hangs
+    return still.calls
+
+
+REST = {"planner", "tracker", "telemetry", "service"}
+
+
+@pytest.mark.parametrize("hangs", [set(), {"tracker"}, {"telemetry"}, {"service"}, REST], ids=str)
+def test_what_hangs_keeps_neither_the_supply_from_being_closed_nor_the_end(
+    idle: Daemon, monkeypatch: pytest.MonkeyPatch, hangs: set[str]
+) -> None:
+    monkeypatch.setattr(daemon_module, "_REST_TIME", 0.3)
+    calls = stopped(idle, hangs)
+    assert calls[:2] == ["control", "supply"]  # vented first, and this waits for nothing
+    assert set(calls[2:]) == REST
+    assert set(idle.hung) == hangs
+    assert idle.trouble == ""
+    told = [e.text for e in idle.loop.events.since(0)[0] if e.kind == "stop"]
+    assert len(told) == len(hangs)
+
+
+def test_a_supply_that_hangs_is_told_and_the_rest_ends(
+    idle: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(daemon_module, "CONTROL_TIME", 0.3)
+    assert set(stopped(idle, {"supply"})) >= REST
+    assert idle.hung == ("supply",)
+    assert "whether the supply is vented is not known" in idle.trouble
+
+
+def test_it_ends_in_time_though_everything_hangs(idle: Daemon) -> None:
+    calls = stopped(idle, {"control", "loop", "vent", "supply", *REST})
+    assert calls.index("vent") < calls.index("supply") < min(calls.index(name) for name in REST)
+    assert set(idle.hung) == {"control", "supply", *REST}
+    assert isinstance(idle.failure, TimeoutError)
+
+
+def test_what_fails_at_the_end_keeps_nothing_from_ending(idle: Daemon) -> None:
+    still = Standstill(idle, set())
+
+    def fail() -> None:
+        raise DeviceError("no luck")
+
+    idle.loop.rig.tracker.close = fail  # type: ignore[union-attr, method-assign]
+    idle.link.close = fail  # type: ignore[method-assign]
+    idle.stop()
+    assert {"planner", "telemetry", "service"} <= set(still.calls)
+    assert idle.trouble == "no luck"
+    told = [e.text for e in idle.loop.events.since(0)[0] if e.kind == "stop"]
+    assert told == ["the tracker did not end well: no luck"]
+
+
+def test_telemetry_that_does_not_start_is_an_alarm_and_control_goes_on(
+    idle: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(daemon_module, "_START", 0.2)
+    hangs = threading.Event()
+    idle._telemetry = SimpleNamespace(start=lambda: hangs.wait(20), port=None)  # type: ignore[assignment]
+    idle._start_telemetry()
+    hangs.set()
+    events, _ = idle.loop.events.since(0)
+    assert any(e.kind == "telemetry" and "has not started" in e.text for e in events)
+
+
+# who can reach it --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("host", "loopback"),
+    [
+        *((h, True) for h in ("127.0.0.1", "127.9.9.9", "::1", "localhost")),
+        *((h, False) for h in ("0.0.0.0", "::", "192.0.2.1", "no-such-host.invalid")),
+    ],
+)
+def test_loopback_is_told_from_what_others_can_reach(host: str, loopback: bool) -> None:
+    assert is_loopback(host) is loopback
+
+
+def test_what_listens_beyond_this_machine_is_told_and_needs_a_long_token() -> None:
+    short, long = "x" * 15, "x" * 16
+    with pytest.raises(InputError, match=r"15 characters, too few .* at least 16, leave the envir"):
+        check_exposure("0.0.0.0", short, given=True)
+    for token, given in ((long, True), (short, False)):
+        ((kind, text),) = check_exposure("0.0.0.0", token, given=given)
+        assert kind == "exposed"
+        assert "unencrypted" in text
+    ((kind, _),) = check_exposure("127.0.0.1", "x", given=True)
+    assert kind == "token"
+    assert check_exposure("127.0.0.1", long, given=True) == []
+    assert check_exposure("127.0.0.1", "x", given=False) == []
+
+
+def _starting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, token: str, service: dict[str, Any]
+) -> Daemon:
+    """Start a daemon that gets no further than to its devices, of which none is there."""
+    monkeypatch.setenv("STIFFOPT_TOKEN", token)
+    rig = patient_rig(
+        tmp_path,
+        "modbus-aurora",
+        supply={"tcp": {"host": "127.0.0.1", "port": 1}},
+        tracker={"port": str(tmp_path / "no-aurora")},
+        service=service,
+    )
+    made = Daemon(rig)
+    with pytest.raises(InputError) as error:
+        made.start()
+    made.error = str(error.value)  # type: ignore[attr-defined]
+    return made
+
+
+def _warnings(made: Daemon) -> dict[str, str]:
+    events, _ = made.loop.events.since(0)
+    return {e.kind: e.text for e in events if e.severity is Severity.WARNING}
+
+
+def test_a_daemon_that_others_can_reach_warns_or_does_not_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = _starting(tmp_path, monkeypatch, "x", {"host": "0.0.0.0"})
+    assert "too few for the host 0.0.0.0" in made.error  # type: ignore[attr-defined]
+    made = _starting(tmp_path, monkeypatch, "x" * 20, {"host": "0.0.0.0"})
+    assert "devices: " in made.error  # type: ignore[attr-defined]
+    assert "beyond this machine and unencrypted" in _warnings(made)["exposed"]
+    made = _starting(tmp_path, monkeypatch, "x", {"host": "127.0.0.1"})
+    assert "shorter than 16 characters" in _warnings(made)["token"]
 
 
 def test_bounded_stop(daemon: tuple[Daemon, Client]) -> None:

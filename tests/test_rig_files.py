@@ -18,6 +18,7 @@ from stiffopt.registration import Placement, Registration
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, limits_of, load_rig_description, slew_of
 from stiffopt.rig.interface import Rig
+from stiffopt.rig.settings import ServiceSettings
 from stiffopt.rig.simulated.rig import SimulatedRig
 from stiffopt.safety.rigs import open_rig
 
@@ -307,3 +308,30 @@ def test_a_missing_extra_says_what_to_install(
 def test_in_code_mistakes_are_input_errors() -> None:
     with pytest.raises(InputError, match="no driver"):
         RigDescription(robot="stiff-flop-1", supply={"driver": "steam"})
+
+
+@pytest.mark.parametrize(("text", "port"), [("none", None), ("0", 0), ("8765", 8765)])
+def test_foxglove_is_served_only_where_a_file_names_a_port(
+    tmp_path: Path, text: str, port: int | None
+) -> None:
+    path = tmp_path / "rig.yaml"
+    content = "format: stiffopt-rig/1\nrobot: stiff-flop-2\nsupply: {driver: simulated}\n"
+    path.write_text(content)
+    assert load_rig_description(path).service.foxglove_port is None
+    path.write_text(f"{content}service: {{foxglove_port: {text}}}\n")
+    read = load_rig_description(path)
+    assert read.service.foxglove_port == port
+    save_file(path, "rig", read)
+    assert load_rig_description(path) == read
+    assert ServiceSettings(foxglove_port=port).foxglove_port == port
+
+
+@pytest.mark.parametrize("text", ["null", "off", "65536", "-1"])
+def test_what_is_no_port_for_foxglove_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(
+        "format: stiffopt-rig/1\nrobot: stiff-flop-2\nsupply: {driver: simulated}\n"
+        f"service: {{foxglove_port: {text}}}\n"
+    )
+    with pytest.raises(FileError, match=r"service\.foxglove_port"):
+        load_rig_description(path)

@@ -5,13 +5,17 @@ from __future__ import annotations
 import io
 import json
 import os
+import pty
 import re
 import signal
 import socket
 import stat
 import subprocess
 import sys
+import threading
 import time
+import urllib.request
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,11 +35,16 @@ from running import (
     wait_for,
     with_simulator,
 )
+from stiffopt.cli import run_daemon
 from stiffopt.cli.main import main
+from stiffopt.cli.run_ending import Screen
 from stiffopt.cli.run_lines import Lines
 from stiffopt.cli.run_status import LiveStatus, status
+from stiffopt.control.controller import Controller
 from stiffopt.control.state import Alarm, Event, Severity, State, Timing
+from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon.client import Client
+from stiffopt.daemon.daemon import STOP_TIME
 
 ROOT = Path(__file__).resolve().parent.parent
 EDGES, COUNTS = (1e-4, 1e-3, 1e-2), (90, 8, 2, 0)
@@ -244,6 +253,119 @@ def test_the_lab_is_driven_over_its_protocols_and_vented_whatever_happens(
             told = [json.loads(line) for line in run.err]  # also what the guard says
             assert [line["kind"] for line in told] == ["guard"]
             assert "the process of the control loop has ended" in told[0]["text"]
+
+
+# the end, whatever hangs --------------------------------------------------------------------------
+
+
+def test_a_terminal_that_takes_nothing_does_not_keep_it_from_ending(
+    tmp_path: Path, compiled: Path
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    rig = str(patient_rig(tmp_path, service={"port": port}))
+    master, slave = pty.openpty()  # nobody reads what is written there
+    os.set_blocking(slave, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(slave, b"x" * 100)
+    os.set_blocking(slave, True)
+    run = subprocess.Popen([*COMMAND, "run", rig], stdin=slave, stdout=slave, stderr=slave)
+    try:
+
+        def inactive() -> bool:
+            with (
+                suppress(OSError),
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/v1/state") as a,
+            ):
+                return bool(json.load(a)["state"] == "inactive")
+            return False
+
+        wait_for(inactive, 60)
+        time.sleep(0.5)
+        run.send_signal(signal.SIGTERM)
+        assert run.wait(1 + STOP_TIME) == 0
+    finally:
+        run.kill()
+        run.wait()
+        os.close(master)
+        os.close(slave)
+
+
+def test_the_screen_shows_in_order_and_is_not_waited_for_if_it_hangs() -> None:
+    screen, seen = Screen(), list[int]()
+    for k in range(3):
+        screen.post(lambda k=k: seen.append(k))  # type: ignore[misc]
+    screen.post(lambda: 1 / 0)
+    screen.post(lambda: seen.append(3))
+    assert screen.finish(10)
+    assert seen == [0, 1, 2, 3]
+    hangs, stuck = threading.Event(), Screen()
+    stuck.post(lambda: hangs.wait(20))
+    stuck.post(lambda: seen.append(4))
+    begin = time.monotonic()
+    assert stuck.is_behind
+    assert not stuck.finish(0.1)
+    assert time.monotonic() - begin < 5
+    hangs.set()
+
+
+ENDS = """
+import sys, threading, time
+from stiffopt.cli.run_ending import Backstop
+from stiffopt.cli.run_daemon import _Signals
+with _Signals().heard() as signals, Backstop(0.5, lambda: signals.count > 0):
+    print("ready", flush=True)
+    threading.Thread(target=time.sleep, args=(60,)).start()  # keeps an interpreter from ending
+    if sys.argv[1] == "hangs":
+        while True:
+            time.sleep(1)
+"""
+
+
+def test_the_backstop_ends_a_process_that_hangs() -> None:
+    run = subprocess.Popen(
+        [sys.executable, "-c", ENDS, "hangs"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    with run:
+        assert run.stdout is not None
+        assert run.stdout.readline() == b"ready\n"
+        time.sleep(1)  # without a signal it ends nothing
+        assert run.poll() is None
+        run.send_signal(signal.SIGHUP)
+        assert run.wait(10) == 5
+        assert run.stderr is not None
+        assert b"did not end in time" in run.stderr.read()
+
+
+def test_what_hangs_when_all_is_over_is_left(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A daemon of which a part hangs: the process is ended with the code that it would have had."""
+    codes: list[int] = []
+    monkeypatch.setattr(run_daemon, "leave", codes.append)
+    rig = str(
+        patient_rig(
+            tmp_path,
+            "modbus-aurora",
+            supply={"tcp": {"host": "127.0.0.1", "port": 1}},
+            tracker={"port": str(tmp_path / "no-aurora")},
+        )
+    )
+    monkeypatch.setattr(daemon_module, "_REST_TIME", 0.2)
+    hangs = threading.Event()
+    end = Controller.close
+
+    def hang(controller: Controller) -> None:
+        hangs.wait(20)
+        end(controller)
+
+    monkeypatch.setattr(Controller, "close", hang)
+    try:
+        assert main(["run", rig]) == 2
+        assert codes == [2]
+    finally:
+        hangs.set()
 
 
 # what is shown -----------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -100,6 +101,22 @@ def test_a_cut_anywhere_leaves_what_is_before(tmp_path: Path) -> None:
         if whole == 0:
             continue
         assert 5 * whole <= len(read_run(cut)) <= 5 * (whole + 1)
+
+
+def test_a_recording_is_for_this_user_alone(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        logger = Logger(tmp_path / "a" / "runs")
+        logger.recording.commit(0.0)
+    finally:
+        os.umask(before)
+    logger.recording.close()
+    assert logger.recording.path is not None
+    modes = [
+        stat.S_IMODE(os.stat(path).st_mode)
+        for path in (tmp_path / "a", tmp_path / "a" / "runs", logger.recording.path)
+    ]
+    assert modes == [0o700, 0o700, 0o600]
 
 
 def test_a_name_never_overwrites(tmp_path: Path) -> None:

@@ -242,6 +242,32 @@ def test_what_is_too_much_is_counted_and_said() -> None:
     made.stop()
 
 
+def test_a_disk_that_hangs_holds_nobody_up_and_the_end_is_bounded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = telemetry(FakeLoop(), tmp_path)
+    made.start()
+    hangs, begun, write = threading.Event(), threading.Event(), os.write
+
+    def hang(file: int, data: Any) -> int:
+        begun.set()
+        hangs.wait(20)
+        return write(file, data)
+
+    monkeypatch.setattr(os, "write", hang)
+    for tick in ticks(3):
+        made.put(tick)
+    assert begun.wait(10)
+    begin = time.monotonic()
+    made.put(ticks(4)[-1])
+    assert time.monotonic() - begin < 0.1
+    with pytest.raises(TimeoutError, match=r"within 0\.2 s"):
+        made.stop(0.2)
+    assert time.monotonic() - begin < 2
+    hangs.set()
+    made.stop()  # now it does not hang any more
+
+
 def test_to_hand_over_a_snapshot_costs_the_loop_next_to_nothing(tmp_path: Path) -> None:
     made = telemetry(FakeLoop(), tmp_path)
     tick, costs = snapshot(BEGIN), []

@@ -8,15 +8,17 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from queue import Empty, SimpleQueue
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from stiffopt.cli.console import report_error
 from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED
 from stiffopt.cli.quantities import quantity
+from stiffopt.cli.run_ending import Backstop, Screen, leave
 from stiffopt.cli.run_lines import Display, Lines
 from stiffopt.control.state import State
 from stiffopt.errors import InputError, SlowWarning, StiffoptError
@@ -31,7 +33,7 @@ _SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 _LOOK = 0.05  # s between looks at whether it has ended
-_PATIENCE = 5.0  # s beyond the ramp; `Daemon.stop` sees to what hangs
+_LAST_WORDS = 1.0  # s for what is shown at the end
 _FAVOURED = -10  # niceness, where permitted: see `_favour`
 
 
@@ -61,9 +63,9 @@ def run(rig: str, options: Options) -> int:
     """Run the daemon of a rig until it is ended; return the exit code."""
     try:
         seconds = _checked(options)
-        description = load_rig_description(rig)
+        load_rig_description(rig)  # its mistakes are told before anything is loaded
         with _Signals().heard() as signals:
-            return _run(rig, description.name, options, seconds, signals)
+            return _run(rig, options, seconds, signals)
     except StiffoptError as error:
         report_error(str(error))
         return BAD_INPUT
@@ -88,9 +90,9 @@ def _checked(options: Options) -> float:
     return seconds
 
 
-def _run(rig: str, name: str, options: Options, seconds: float, signals: _Signals) -> int:
+def _run(rig: str, options: Options, seconds: float, signals: _Signals) -> int:
     _favour()
-    from stiffopt.daemon.daemon import Daemon
+    from stiffopt.daemon.daemon import STOP_TIME, Daemon
 
     style = _style(options.style)
     daemon = Daemon(
@@ -99,45 +101,54 @@ def _run(rig: str, name: str, options: Options, seconds: float, signals: _Signal
         log_folder=options.log_folder,
         json_lines=style == "json",
     )
-    watch = _Watch(daemon, _display(style, daemon), signals)
+    screen = Screen()
+    watch = _Watch(daemon, _display(style, daemon), signals, screen)
+    longest = daemon.description.safety.ramp_time + STOP_TIME
+    with Backstop(longest, watch.is_ending), _warnings_shown(watch):
+        state, refused = _steered(daemon, watch, options, seconds)
+        code = _verdict(daemon, state, refused, watch.report)
+        if not screen.finish(_LAST_WORDS) or daemon.hung:
+            leave(code)
+    return code
+
+
+def _steered(daemon: Daemon, watch: _Watch, options: Options, seconds: float) -> tuple[State, str]:
+    """Run a daemon from its start to its end; return the last state, and why it was refused."""
     refused = ""
-    with _warnings_shown(watch.display):
-        try:
-            with signals.interrupting():
-                task = None if options.task is None else daemon.read_task(options.task)
-                watch.display.say(
-                    "starting", f"connecting to {name}; a first start compiles the model"
-                )
-                daemon.start()
-                watch.display.begin(daemon)
-                if options.arm:
-                    daemon.arm(task)
-            watch.go_on(time.monotonic() + seconds, unattended=not options.service)
-        except KeyboardInterrupt:
-            pass  # before it was ready
-        except StiffoptError as error:
-            refused = str(error)
-        finally:
-            watch.wind_up()
-            state = daemon.stop()
-            watch.show()
-            watch.display.end()
-    return _verdict(daemon, state, refused)
+    try:
+        with watch.signals.interrupting():
+            task = None if options.task is None else daemon.read_task(options.task)
+            name = daemon.description.name
+            watch.say("starting", f"connecting to {name}; a first start compiles the model")
+            daemon.start()
+            watch.begin()
+            if options.arm and not watch.is_ending():
+                daemon.arm(task)
+        watch.go_on(time.monotonic() + seconds, unattended=not options.service)
+    except KeyboardInterrupt:
+        pass  # before it was ready
+    except StiffoptError as error:
+        refused = str(error)
+    finally:
+        watch.wind_up()
+        state = daemon.stop()
+        watch.end()
+    return state, refused
 
 
-def _verdict(daemon: Daemon, state: State, refused: str) -> int:
+def _verdict(daemon: Daemon, state: State, refused: str, report: Callable[[str], None]) -> int:
     """Return the exit code, and say what must be known."""
     if refused:
-        report_error(refused)
+        report(refused)
     if daemon.trouble:
-        report_error(f"THE ARM MAY BE UNDER PRESSURE: {daemon.trouble}")
+        report(f"THE ARM MAY BE UNDER PRESSURE: {daemon.trouble}")
         return FAULT
     if daemon.failure is not None:
         kind = type(daemon.failure).__name__
-        report_error(f"control ended, vented, by {kind}: {daemon.failure}; please report it")
+        report(f"control ended, vented, by {kind}: {daemon.failure}; please report it")
         return FAULT
     if state is State.FAULT:
-        report_error(f"ended in the state fault, vented: {daemon.loop.snapshot().reason}")
+        report(f"ended in the state fault, vented: {daemon.loop.snapshot().reason}")
         return FAULT
     return BAD_INPUT if refused else SOLVED
 
@@ -145,38 +156,67 @@ def _verdict(daemon: Daemon, state: State, refused: str) -> int:
 class _Watch:
     """Shows what a daemon does until it shall end, and while it ends."""
 
-    def __init__(self, daemon: Daemon, display: Display, signals: _Signals) -> None:
-        self.display = display
-        self._daemon, self._signals = daemon, signals
+    def __init__(self, daemon: Daemon, display: Display, signals: _Signals, screen: Screen) -> None:
+        self.signals = signals
+        self._display, self._daemon, self._screen = display, daemon, screen
         self._next_event = 0
+        self._ending = False
+
+    def is_ending(self) -> bool:
+        """Whether the end has begun, or was asked for."""
+        return self._ending or self.signals.count > 0
+
+    def say(self, kind: str, text: str) -> None:
+        """Show something that is no event of the loop."""
+        self._screen.post(lambda: self._display.say(kind, text))
+
+    def report(self, text: str) -> None:
+        """Show an error on stderr."""
+        self._screen.post(lambda: report_error(text))
+
+    def begin(self) -> None:
+        """Show what was started."""
+        self._screen.post(lambda: self._display.begin(self._daemon))
 
     def show(self) -> None:
-        """Show what is new."""
+        """Show what is new, unless what was new before is not shown yet."""
+        if not self._screen.is_behind:
+            self._screen.post(self._update)
+
+    def end(self) -> None:
+        """Show what was last, and then no more."""
+        self._screen.post(self._update)
+        self._screen.post(self._display.end)
+
+    def _update(self) -> None:
         events, self._next_event = self._daemon.loop.events.since(self._next_event)
-        self.display.update(self._daemon.loop.snapshot(), events)
+        self._display.update(self._daemon.loop.snapshot(), events)
 
     def go_on(self, end: float, *, unattended: bool) -> None:
         """Show until a signal comes, `end` is over, or control has ended.
 
         Where no client could ever reset it, a fault is the end too.
         """
-        while not (self._signals.count or self._daemon.ended or time.monotonic() > end):
+        while not (self.signals.count or self._daemon.ended or time.monotonic() > end):
             self.show()
             if unattended and self._daemon.loop.snapshot().state is State.FAULT:
                 return
-            self._signals.wait(self.display.period)
+            self.signals.wait(self._display.period)
 
     def wind_up(self) -> None:
         """Show how the pressures are let down; another signal lets them out at once."""
+        from stiffopt.daemon.daemon import CONTROL_TIME
+
+        self._ending = True
         self._daemon.begin_stop()
         vented = False
-        end = time.monotonic() + self._daemon.description.safety.ramp_time + _PATIENCE
+        end = time.monotonic() + self._daemon.description.safety.ramp_time + CONTROL_TIME
         while not self._daemon.ended and time.monotonic() < end:
             self.show()
-            if self._signals.count > 1 and not vented:
+            if self.signals.count > 1 and not vented:
                 vented = True
                 self._daemon.vent("Ctrl-C, twice")
-            self._signals.wait(_LOOK)
+            self.signals.wait(_LOOK)
 
 
 class _Signals:
@@ -190,7 +230,7 @@ class _Signals:
     def __init__(self) -> None:
         self.count = 0
         self._interrupt = False
-        self._news = threading.Event()
+        self._news: SimpleQueue[None] = SimpleQueue()  # an Event's lock is not for handlers
 
     @contextmanager
     def heard(self) -> Iterator[_Signals]:
@@ -218,12 +258,12 @@ class _Signals:
 
     def wait(self, seconds: float) -> None:
         """Let some time pass, until the next signal at most."""
-        self._news.wait(seconds)
-        self._news.clear()
+        with suppress(Empty):
+            self._news.get(timeout=seconds)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         self.count += 1
-        self._news.set()
+        self._news.put(None)
         if self._interrupt:
             self._interrupt = False
             raise KeyboardInterrupt
@@ -247,13 +287,13 @@ def _display(style: str, daemon: Daemon) -> Display:
 
 
 @contextmanager
-def _warnings_shown(display: Display) -> Iterator[None]:
+def _warnings_shown(watch: _Watch) -> Iterator[None]:
     """Show a `SlowWarning` where the rest is shown."""
     others = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
         if issubclass(category, SlowWarning):
-            display.say("slow", str(message))
+            watch.say("slow", str(message))
         else:
             others(message, category, *rest, **more)
 

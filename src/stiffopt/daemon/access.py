@@ -47,6 +47,14 @@ class Token:
         if not hmac.compare_digest(given.encode("utf-8", "replace"), self._secret):
             raise RefusedError(403, "wrong-token", "that is not this daemon's token")
 
+    def is_shown(self, headers: Headers) -> bool:
+        """Return whether the token stands in the header Authorization."""
+        try:
+            self.check_headers(headers)
+        except RefusedError:
+            return False
+        return True
+
     def check_headers(self, headers: Headers) -> None:
         """Raise `RefusedError` unless the token stands in the header Authorization."""
         given = headers.getlist("authorization")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -17,9 +18,11 @@ from stiffopt.control.controller import Controller
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
+from stiffopt.daemon.exposure import bracketed, check_exposure
 from stiffopt.daemon.keeper import Keeper
 from stiffopt.daemon.logged import LogEvents
 from stiffopt.daemon.notify import ServiceManager
+from stiffopt.daemon.parts import Part
 from stiffopt.daemon.secret import Secret
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
 from stiffopt.files import file_text
@@ -34,7 +37,7 @@ if TYPE_CHECKING:
     from stiffopt.daemon.serving import Server
     from stiffopt.daemon.telemetry import Telemetry
 
-__all__ = ["Daemon"]
+__all__ = ["CONTROL_TIME", "STOP_TIME", "Daemon"]
 
 Array = NDArray[np.float64]
 
@@ -44,7 +47,17 @@ _SHARE = 0.02  # of the time, which the control thread needs too
 _TIDY = 10.0  # s between collections of garbage
 _ARMING = 10.0  # s in which an arm that was just connected must become ready
 _AGAIN = 0.2  # s between attempts to arm, in which the tracker sees the tip some times
-_MARGIN = 7.0  # s, beyond the ramp, in which the loop must have ended: devices answer within 5 s
+_START = 5.0  # s in which telemetry must have started
+
+STOP_TIME = 15.0
+"""Seconds beyond `Safety.ramp_time` after which a daemon has ended, whatever hangs. What follows
+adds up to less, so that the command has some time left to say what became of it."""
+CONTROL_TIME = 6.0
+"""Seconds beyond the ramp in which the control thread must have ended."""
+_KEEPER_TIME = 0.5
+_VENT_TIME = 1.0
+_SUPPLY_TIME = 3.0
+_REST_TIME = 2.5
 
 
 class Daemon:
@@ -77,6 +90,9 @@ class Daemon:
         What ended the control thread, if it was not asked to end.
     trouble : str
         Why it is not certain that the arm is vented, after `stop`; empty if it is.
+    hung : tuple of str
+        Parts that had not ended when `stop` did. They are threads that keep no process from
+        ending, but a library that they are in may: see `os._exit`.
 
     Raises
     ------
@@ -102,12 +118,13 @@ class Daemon:
         self.robot = load_robot(robot_path(description.robot, Path(rig).parent))
         self.failure: BaseException | None = None
         self.trouble = ""
+        self.hung: tuple[str, ...] = ()
         self._folder = os.fspath(log_folder or description.log.folder)
         self._manager = ServiceManager()
         guarded, self.link = guarded_rig(description, self.robot.description, json_lines=json_lines)
         self._clock = guarded.clock
         period = 1 / description.rate
-        controller = Controller(
+        self._controller = Controller(
             self.robot,
             self.link.limits,
             guarded.slew,
@@ -118,7 +135,7 @@ class Daemon:
             beside=True,
         )
         self.loop = ControlLoop(
-            guarded, controller, self.link, safety=description.safety, period=period
+            guarded, self._controller, self.link, safety=description.safety, period=period
         )
         self._secret = Secret(description.service, self._folder, description.name)
         self._telemetry = self._make_telemetry(service)
@@ -133,7 +150,8 @@ class Daemon:
         self._control: threading.Thread | None = None
         self._tidied = 0.0
         self._log = LogEvents(self.loop)
-        self._started = self._stopped = False
+        self._started = self._stopped = self._recorded = False
+        self._stop_begun = float("inf")
 
     # what there is -------------------------------------------------------------------------------
 
@@ -175,7 +193,8 @@ class Daemon:
         Raises
         ------
         InputError
-            A port is not free, a device does not answer, or a check failed.
+            A port is not free, the token is too short for others to reach it, a device does not
+            answer, or a check failed.
         MissingExtraError
             A library is not installed.
         DeviceError
@@ -190,8 +209,7 @@ class Daemon:
                 self._listen()
             self._manager.status("connecting to the rig")
             self.loop.configure()
-            if self._telemetry is not None:
-                self._telemetry.start()
+            self._start_telemetry()
             self.loop.listen(self._ticked)
             self._control = threading.Thread(target=self._run, name="control", daemon=True)
             self._control.start()
@@ -247,51 +265,80 @@ class Daemon:
     def begin_stop(self) -> None:
         """Let the pressures down, vent and end control; this does not wait for it."""
         if not self._stopping.is_set():
+            self._stop_begun = time.monotonic()
             self._stopping.set()
             self._manager.stopping()
 
     def vent(self, reason: str = "asked to", patience: float = 0.5) -> None:
         """Let all pressure out at once, also when the control thread does not answer."""
-
-        def ask() -> None:
-            with suppress(StiffoptError):  # the loop tries on
-                self.loop.vent(reason)
-
-        asking = threading.Thread(target=ask, name="vent", daemon=True)
-        asking.start()
-        asking.join(patience)
-        if asking.is_alive():
-            with suppress(StiffoptError):
-                self.link.vent()
+        if not Part("vent", lambda: self.loop.vent(reason)).ends_within(patience):
+            Part("vent-link", self.link.vent).ends_within(_VENT_TIME)
 
     def stop(self) -> State:
-        """End everything within some seconds, whatever happens, and return the last state.
+        """End everything and return the last state.
 
-        The pressures are let down and vented first. To stop twice does nothing.
+        The pressures are let down and vented first, and the guard, which owns the supply, is ended;
+        neither waits for anything else. Then all the rest ends. From `begin_stop` on, or from here
+        if that was not called, this takes `Safety.ramp_time` and less than `STOP_TIME`, whatever
+        hangs. To stop twice does nothing.
         """
         if self._stopped:
             return self.loop.snapshot().state
         self._stopped = True
         self.begin_stop()
-        if self._control is not None:
-            self._control.join(self.description.safety.ramp_time + _MARGIN)
-            if self._control.is_alive():
-                self.failure = TimeoutError("the control thread hangs")
-                self.vent("the control thread hangs", patience=0.0)
-        self._keeper.stop()
+        self._end_control()
+        self._keeper.stop(_KEEPER_TIME)
         state = self.loop.snapshot().state
-        try:
-            self.loop.close()
-        except Exception as error:
-            self.trouble = str(error)
-        if self._telemetry is not None and self._control is not None:
-            self._telemetry.stop()
-        if self._server is not None:
-            self._server.stop()
-            self._secret.remove()
+        closing = Part("supply", self.link.close)
+        before = CONTROL_TIME + _KEEPER_TIME + _VENT_TIME
+        closing.ends_within(self._left(before + _SUPPLY_TIME, _SUPPLY_TIME))
+        self._end_the_rest()
+        if not closing.ends_within(self._left(before + _SUPPLY_TIME + _REST_TIME)):
+            self.trouble = "the guard does not end; whether the supply is vented is not known"
+            self.hung = ("supply", *self.hung)
+        elif closing.error is not None:
+            self.trouble = str(closing.error)
         self._log.detach()
         self._manager.close()
         return state
+
+    def _left(self, beyond: float, least: float = 0.0) -> float:
+        """Return what is left of the ramp and a time beyond it, from the beginning of the end."""
+        end = self._stop_begun + self.description.safety.ramp_time + beyond
+        return max(end - time.monotonic(), least)
+
+    def _end_control(self) -> None:
+        """Wait for the control thread, which lets the pressures down; vent if it hangs."""
+        if self._control is None:
+            return
+        self._control.join(self._left(CONTROL_TIME))
+        if self._control.is_alive():
+            self.failure = TimeoutError("the control thread hangs")
+            self.hung = (*self.hung, "control")
+            self.vent("the control thread hangs", patience=0.0)
+
+    def _end_the_rest(self) -> None:
+        """End what does not command pressures, all at once, and note what does not end."""
+        works: dict[str, Callable[[], object]] = {"planner": self._controller.close}
+        if self.loop.rig.tracker is not None:
+            works["tracker"] = self.loop.rig.tracker.close
+        if self._telemetry is not None and self._recorded:
+            works["telemetry"] = self._telemetry.stop
+        if self._server is not None:
+            works["service"] = self._end_service
+        parts = [Part(name, work) for name, work in works.items()]
+        end = time.monotonic() + _REST_TIME
+        for part in parts:
+            if not part.ends_within(end - time.monotonic()):
+                self.hung = (*self.hung, part.name)
+                self._warn("stop", f"the {part.name} does not end and is left behind")
+            elif part.error is not None:
+                self._warn("stop", f"the {part.name} did not end well: {part.error}")
+
+    def _end_service(self) -> None:
+        if self._server is not None:
+            self._server.stop()
+            self._secret.remove()
 
     def __enter__(self) -> Self:
         self.start()
@@ -348,6 +395,29 @@ class Daemon:
         )
         return Server(app, settings.host, settings.port)
 
+    def _start_telemetry(self) -> None:
+        """Begin to record; where that hangs, as on a disk, control goes on without."""
+        if self._telemetry is None:
+            return
+        self._recorded = True
+        starting = Part("telemetry", self._telemetry.start)
+        if not starting.ends_within(_START):
+            text = f"telemetry has not started within {_START:g} s; control goes on without"
+            self.loop.add_alarm("telemetry", text)
+        elif starting.error is not None:
+            raise starting.error
+        if (port := self._telemetry.port) is not None:
+            self._warn(
+                "foxglove",
+                f"Foxglove is served at ws://{bracketed(self.description.service.host)}:{port} "
+                "without a token: whoever can reach that may read all telemetry, and so may any "
+                "web page that is open in a browser there",
+            )
+
+    def _warn(self, kind: str, text: str) -> None:
+        """Append an event that is a warning."""
+        self.loop.events.add(self._clock.now(), kind, text, Severity.WARNING)
+
     def _is_serving(self) -> bool:
         return self._server is not None and self._server.alive
 
@@ -355,10 +425,14 @@ class Daemon:
         """Open the port, then keep the token: not in the place of that of one who has the port."""
         if self._server is None:
             return
+        given = self._secret.path is None
+        warnings = check_exposure(self.description.service.host, self.token, given=given)
         try:
             self._server.start()
         except InputError as error:
             raise InputError(f"{error} (service.host, service.port in the rig file)") from None
+        for kind, text in warnings:
+            self._warn(kind, text)
         self._secret.write()
 
     # the control thread --------------------------------------------------------------------------

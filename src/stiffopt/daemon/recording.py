@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
+from stiffopt.daemon.private import make_private
 from stiffopt.logs.run_schemas import METADATA
 
 __all__ = ["MIN_FREE", "Recording", "free_bytes"]
@@ -44,7 +45,7 @@ class Recording:
     Parameters
     ----------
     folder :
-        Where the files go; made if it is not there.
+        Where the files go; made, for this user alone, if it is not there.
     name :
         Of the rig; files are named after it and the time.
     context :
@@ -125,7 +126,7 @@ class Recording:
         from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
         try:
-            os.makedirs(self._folder, exist_ok=True)
+            make_private(self._folder)
             self._check_free(_ENOUGH * MIN_FREE)
             self._file, self.path = self._new_file()
             self._size = 0
@@ -151,15 +152,13 @@ class Recording:
             self._give_up(f"the recording cannot begin: {error}")
 
     def _new_file(self) -> tuple[int, str]:
-        """Make a file that was not there."""
+        """Make a file that was not there, for this user alone."""
         stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(self._wall()))
         first = os.path.join(self._folder, f"{self._name}-{stamp}")
         path, count = f"{first}.mcap", 1
         while True:
             try:
-                return os.open(
-                    path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644
-                ), path
+                return os.open(path, _NEW, 0o600), path
             except FileExistsError:
                 count += 1
                 path = f"{first}-{count}.mcap"

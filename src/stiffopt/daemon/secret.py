@@ -8,10 +8,14 @@ import secrets
 from contextlib import suppress
 from pathlib import Path
 
+from stiffopt.daemon.private import check_folder, check_mine, make_private, read_mine
 from stiffopt.errors import FileError
 from stiffopt.rig.settings import ServiceSettings
 
 __all__ = ["Secret"]
+
+_LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_OTHERWISE = "give another log.folder or service.token_file"
 
 
 class Secret:
@@ -20,6 +24,7 @@ class Secret:
     The file is one daemon's for as long as that lives: a lock beside it, which the kernel releases
     however a process ends, keeps a second one from putting its token in the place of the first's.
     The lock's file stays: whoever had just opened it would else lock what nobody sees any more.
+    No symbolic link is followed, and nothing is written where another user could exchange it.
 
     Parameters
     ----------
@@ -52,14 +57,17 @@ class Secret:
         Raises
         ------
         FileError
-            It cannot be written, or is that of another daemon, which runs.
+            It cannot be written, is that of another daemon, which runs, or is not a regular file of
+            this user in a folder that others cannot change.
         """
         if self.path is None:
             return
         fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
+            make_private(self.path.parent)
+            check_folder(self.path.parent, _OTHERWISE)
             self._take(self.path)
+            check_mine(self.path, _OTHERWISE)
             with suppress(FileNotFoundError):
                 fresh.unlink()
             descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -79,8 +87,9 @@ class Secret:
         if self._lock is not None:
             return
         place = path.with_name(f".{path.name}.lock")
+        check_mine(place, _OTHERWISE)
         try:
-            lock = os.open(place, os.O_RDWR | os.O_CREAT, 0o600)
+            lock = os.open(place, _LOCK, 0o600)
         except PermissionError:
             if not place.exists():  # nothing can be written in this folder
                 raise
@@ -90,6 +99,7 @@ class Secret:
                 "it is not, remove this file, else give another log.folder or service.token_file",
             ) from None
         try:
+            check_mine(place, _OTHERWISE, lock)
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(lock)
@@ -98,6 +108,9 @@ class Secret:
                 "holds the token of another daemon of a rig of this name, which is running; end "
                 "that one, or give this one another log.folder or service.token_file",
             ) from None
+        except FileError:
+            os.close(lock)
+            raise
         except OSError:  # a file system without locks: nothing is to be known of others there
             os.close(lock)
             return
@@ -108,7 +121,7 @@ class Secret:
         if self.path is None:
             return
         with suppress(OSError, ValueError):
-            if self.path.read_text(encoding="ascii").strip() == self.token:
+            if read_mine(self.path).strip() == self.token:
                 self.path.unlink()
         if self._lock is not None:
             os.close(self._lock)

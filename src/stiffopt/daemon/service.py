@@ -48,6 +48,7 @@ except ModuleNotFoundError as error:
 
 from stiffopt.daemon.access import Access, Token
 from stiffopt.daemon.calls import Commanded
+from stiffopt.daemon.crowd import MEMBER, Crowd, Member
 from stiffopt.daemon.operations import Operations
 from stiffopt.daemon.page import POLICY, page_of
 from stiffopt.daemon.refusals import RefusedError, sentence
@@ -117,7 +118,8 @@ def create_app(
     Returns
     -------
     FastAPI
-        ``app.state.operations`` is the `Operations` behind it.
+        ``app.state.operations`` is the `Operations` behind it, ``app.state.crowd`` who is
+        connected: `Server` serves it.
 
     Raises
     ------
@@ -151,17 +153,12 @@ def create_app(
     app.include_router(_control(operations), prefix="/v1")
     app.include_router(_moving(operations), prefix="/v1")
 
-    streams: set[Stream] = set()
+    crowd = app.state.crowd = Crowd(secret.is_shown)
 
     @app.websocket("/v1/stream")
     async def stream(websocket: WebSocket) -> None:
-        new = Stream(websocket, operations, secret)
-        others = len(streams)
-        streams.add(new)
-        try:
-            await new.run(others)
-        finally:
-            streams.discard(new)
+        member = websocket.scope.get("state", {}).get(MEMBER) or Member()
+        await Stream(websocket, operations, secret, crowd, member).run()
 
     _add_pages(app, metrics)
     _add_refusals(app)

@@ -8,15 +8,17 @@ import threading
 import time
 from typing import Any
 
+from stiffopt.daemon.exposure import bracketed
 from stiffopt.daemon.messages import MAX_MESSAGE
 from stiffopt.errors import InputError, MissingExtraError, ServiceError
 
 __all__ = ["Server"]
 
 _STARTING = 10.0  # s
-_CONNECTIONS = 128  # that have not been accepted yet
+_CONNECTIONS = 1024  # that have not been accepted yet
+_AT_ONCE = 16  # of these are accepted, then others are heard; far fewer than make anyone give way
 _IDLE = 10  # s; longer than clients keep a connection that they do not use
-_CLOSING = 2  # s for requests that are being answered when the server stops
+_CLOSING = 1  # s for requests that are being answered when the server stops
 _log = logging.getLogger(__name__)
 
 
@@ -47,7 +49,7 @@ class Server:
     def url(self) -> str:
         """Where clients of this machine reach it."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
-        return f"http://[{host}]:{self.port}" if ":" in host else f"http://{host}:{self.port}"
+        return f"http://{bracketed(host)}:{self.port}"
 
     @property
     def alive(self) -> bool:
@@ -71,15 +73,19 @@ class Server:
             import websockets  # noqa: F401  # which uvicorn needs for the stream
         except ModuleNotFoundError as error:
             raise MissingExtraError(error.name or "uvicorn", "daemon") from error
-        from stiffopt.daemon.connections import BoundedProtocol
+        from stiffopt.daemon.connections import protocols_of
+        from stiffopt.daemon.crowd import Crowd
 
+        crowd = getattr(getattr(self._app, "state", None), "crowd", None) or Crowd()
+        connection, stream = protocols_of(crowd)
         listening = self._listen()
         self._port = int(listening.getsockname()[1])
         config = uvicorn.Config(
             self._app,
-            http=BoundedProtocol,
+            http=connection,
+            backlog=_AT_ONCE,
             timeout_keep_alive=_IDLE,
-            ws="websockets-sansio",
+            ws=stream,
             ws_max_size=8 * MAX_MESSAGE,  # what is longer ends the connection
             ws_max_queue=4,
             ws_per_message_deflate=False,  # a small message must not become a large one
@@ -102,6 +108,7 @@ class Server:
                 self.stop()
                 raise ServiceError(f"the control interface does not start at {self.url}")
             time.sleep(0.005)
+        listening.listen(_CONNECTIONS)  # `backlog` has made it less
 
     def stop(self, timeout: float = 5.0) -> None:
         """End all connections and stop listening; to stop what does not run does nothing."""

@@ -12,20 +12,19 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from stiffopt.daemon.access import Token
+from stiffopt.daemon.crowd import GRACE, MAX_STREAMS, Crowd, Member
 from stiffopt.daemon.messages import MAX_MESSAGE, TargetMessage
 from stiffopt.daemon.operations import Operations
 from stiffopt.daemon.refusals import RefusedError, sentence
 from stiffopt.daemon.wire import LEASE_HEADER
 
-__all__ = ["DEFAULT_RATE", "MAX_RATE", "MAX_STREAMS", "Stream"]
+__all__ = ["DEFAULT_RATE", "MAX_RATE", "Stream"]
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 DEFAULT_RATE = 20.0
 MAX_RATE = 100.0
 """Of states, in Hz."""
-MAX_STREAMS = 16
-"""At once; they need no token, and a hundred of them would keep the control loop from its work."""
 
 
 class AccessMessage(BaseModel):
@@ -60,37 +59,45 @@ class Stream:
         What is to be done.
     token :
         Of those who may move the arm.
+    crowd, member :
+        All connections, and which of them this is.
     """
 
-    def __init__(self, websocket: WebSocket, operations: Operations, token: Token) -> None:
+    def __init__(
+        self,
+        websocket: WebSocket,
+        operations: Operations,
+        token: Token,
+        crowd: Crowd,
+        member: Member,
+    ) -> None:
         self._socket = websocket
         self._operations = operations
         self._token = token
-        self._trusted = "authorization" in websocket.headers
+        self._crowd, self._member = crowd, member
         self._lease = websocket.headers.get(LEASE_HEADER)
         self._next: StreamedTarget | None = None
         self._arrived = asyncio.Event()
+        self._shown = asyncio.Event()  # the token, in a message
         self._sending = asyncio.Lock()
 
-    async def run(self, others: int = 0) -> None:
+    async def run(self) -> None:
         """Serve until the client goes, unless there are too many others."""
         await self._socket.accept()
         with suppress(WebSocketDisconnect):
             try:
-                if others >= MAX_STREAMS:
-                    raise RefusedError(503, "busy", f"there are {others} streams already")
-                rate = _rate(self._socket.query_params.get("rate"))
+                await self._serve(_rate(self._socket.query_params.get("rate")))
             except RefusedError as refusal:
                 await self._send({"type": "error", "seq": None, **refusal.body})
                 await self._socket.close(1008)
-                return
-            await self._serve(rate)
 
     async def _serve(self, rate: float) -> None:
-        tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._work())]
-        if rate > 0:
-            tasks.append(asyncio.create_task(self._report(1 / rate)))
+        tasks = [asyncio.create_task(self._receive())]
         try:
+            await self._be_seated(tasks[0])
+            tasks.append(asyncio.create_task(self._work()))
+            if rate > 0:
+                tasks.append(asyncio.create_task(self._report(1 / rate)))
             done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
@@ -98,6 +105,19 @@ class Stream:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _be_seated(self, receiving: asyncio.Task[None]) -> None:
+        """Find room among the streams; where there is none, the token may still be shown."""
+        if self._crowd.seat(self._member):
+            return
+        if not self._member.trusted:
+            shown = asyncio.create_task(self._shown.wait())
+            await asyncio.wait([shown, receiving], timeout=GRACE, return_when="FIRST_COMPLETED")
+            shown.cancel()
+            if receiving.done() or self._crowd.seat(self._member):
+                return
+        kind = "with" if self._member.trusted else "without"
+        raise RefusedError(503, "busy", f"there are {MAX_STREAMS} streams {kind} the token already")
 
     async def _report(self, period: float) -> None:
         clock = asyncio.get_running_loop()
@@ -125,20 +145,30 @@ class Stream:
         if isinstance(given, dict) and "target" not in given and "seq" not in given:
             access = _valid(AccessMessage, given)
             if access.token is not None:
-                self._trusted = False
-                self._token.check(access.token)
-                self._trusted = True
+                self._show(access.token)
             self._lease = access.lease or self._lease
-            await self._send({"type": "access", "trusted": self._trusted})
+            await self._send({"type": "access", "trusted": self._member.trusted})
             return
         target = _valid(StreamedTarget, given)
-        if not self._trusted:
+        if not self._member.trusted:
             self._token.check(None)
         replaced, self._next = self._next, target
         self._arrived.set()
         if replaced is not None:
             newer = RefusedError(409, "superseded", "a newer target came before this one was taken")
             await self._answer(replaced.seq, newer)
+
+    def _show(self, token: str) -> None:
+        """Trust the client from now on, or no longer, by what it shows."""
+        try:
+            self._token.check(token)
+        except RefusedError:
+            self._crowd.distrust(self._member)
+            raise
+        if not self._crowd.trust(self._member):
+            text = f"there are {MAX_STREAMS} streams with the token already"
+            raise RefusedError(503, "busy", text)
+        self._shown.set()
 
     async def _work(self) -> None:
         loop = self._operations.loop

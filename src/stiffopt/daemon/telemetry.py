@@ -129,6 +129,7 @@ class Telemetry:
         self._server: Any = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
+        self._working = threading.Lock()
         self._next_event = 0
         self._last_state: object = None
         self._logged = np.inf  # nothing was handed over yet
@@ -172,11 +173,21 @@ class Telemetry:
         self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
         self._thread.start()
 
-    def stop(self) -> None:
-        """Log what is left, end the recording and listen no more; to stop twice does nothing."""
+    def stop(self, patience: float = 5.0) -> None:
+        """Log what is left, end the recording and listen no more; to stop twice does nothing.
+
+        Raises
+        ------
+        TimeoutError
+            What is being written, as to a disk that hangs, was not done after `patience`, in s;
+            nothing more is recorded then.
+        """
         self._stop.set()
+        if not self._working.acquire(timeout=patience):
+            raise TimeoutError(f"telemetry was not written within {patience:g} s")
+        self._working.release()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(patience)
             self._thread = None
         end = self._loop.snapshot()
         if end.time > (self._queue[-1].time if self._queue else self._logged):
@@ -191,6 +202,10 @@ class Telemetry:
 
     def work(self, *, last: bool = False) -> None:
         """Log what has come since the last call; with `last`, see it onto the disk at once."""
+        with self._working:
+            self._work(last)
+
+    def _work(self, last: bool) -> None:
         if self._recording is not None and not self._recording.is_open:
             self._commit(time.monotonic())  # to have it before anything is logged
         while self._queue:

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from stiffopt.model.description import PerChannelPressure, PerChannelRate
 from stiffopt.schema import Schema
 from stiffopt.units import Duration, Force, Length, Ratio, Speed
 
 __all__ = ["ControlSettings", "LogSettings", "Safety", "ServiceSettings"]
+
+
+def _none(value: Any) -> Any:
+    """Read the word ``none`` as None, which a file cannot say otherwise."""
+    return None if value == "none" else value
+
+
+_Port = Annotated[int, Field(ge=0, le=65535)]
+_PortOrNone = Annotated[_Port | None, BeforeValidator(_none)]
 
 
 class Safety(Schema):
@@ -86,15 +95,16 @@ class ServiceSettings(Schema):
     ----------
     host : address.
     port : of the control interface (HTTP and WebSocket) and of the metrics; 0: any free one.
-    foxglove_port : of the Foxglove WebSocket; 0: any free one; None: no such server.
+    foxglove_port : of the Foxglove WebSocket, which anyone who reaches it may read, web pages of
+        any site included; 0: any free one; None, in a file ``none``: no such server.
     token : environment variable that holds the token of those who may move the arm; where it is
         empty, a token is drawn and written to `token_file`.
     token_file : for this user's eyes only; by default beside the recordings.
     """
 
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
-    port: Annotated[int, Field(ge=0, le=65535)] = 8470
-    foxglove_port: Annotated[int, Field(ge=0, le=65535)] | None = 8765
+    port: _Port = 8470
+    foxglove_port: _PortOrNone = None
     token: Annotated[str, Field(min_length=1)] = "STIFFOPT_TOKEN"
     token_file: str | None = None
 
