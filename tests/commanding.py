@@ -485,8 +485,8 @@ class Loop(Stream):
     """The control loop, whose steering wants what it is told to want, behind a guard."""
 
     def start(self) -> None:
-        rig = Rig(ROBOT, GoalSupply(self.follower, self.clock), SeenTip(self.clock), clock=self.clock,
-                  slew=self.bench.limits.slew, max_force=self.bench.limits.force)  # fmt: skip
+        limits, supply = self.bench.limits, GoalSupply(self.follower, self.clock)
+        rig = Rig(ROBOT, supply, SeenTip(self.clock), clock=self.clock, slew=limits.slew)
         self.limits = self.gate.limits
         self.steering = FakeSteering(N, np.array([0.0, 0.0, 0.09]), rate=1e9, period=PERIOD)
         self.loop = ControlLoop(rig, self.steering, self, safety=self.bench.safety, period=PERIOD)

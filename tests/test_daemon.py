@@ -333,7 +333,8 @@ def test_the_unit_restarts_vented_and_lets_the_pressures_down() -> None:
     assert " run " in unit["ExecStart"]
     assert "--arm" not in unit["ExecStart"]  # it would be refused, too
     assert unit["Type"] == "notify"
-    assert unit["KillMode"] == "mixed"  # the guard is not signalled
+    assert unit["KillMode"] == "process"  # the guard is neither signalled nor killed
+    assert unit["ExecStopPost"] == "-/opt/stiffopt/bin/stiffopt vent /etc/stiffopt/rig.yaml"
     assert "15 s" in _page()
     assert STOP_TIME == 15
     longest = next(m.le for m in Safety.model_fields["ramp_time"].metadata if hasattr(m, "le"))

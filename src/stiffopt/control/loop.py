@@ -299,12 +299,14 @@ class ControlLoop:
                 self.add_alarm("listener", f"unexpected {type(error).__name__}: {error}")
 
     def _let_down(self, due: float) -> None:
-        """Tick on until the pressures are let down, for a bounded number of ticks."""
+        """Tick on until the pressures are let down, for a bounded time and number of ticks."""
         machine = self._machine
         if machine.lifecycle.armed:
             machine.carry_out(lambda now: machine.disarm(now, "stopping"))
-        for _ in range(math.ceil((self._ramp_time + _LAST_TRIES) / self.period)):
-            if machine.vented:
+        patience = self._ramp_time + _LAST_TRIES
+        end = self.rig.clock.now() + patience
+        for _ in range(math.ceil(patience / self.period)):
+            if machine.vented or self.rig.clock.now() > end:
                 break
             due = self._ticked(due)
 

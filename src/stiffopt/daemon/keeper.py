@@ -123,6 +123,8 @@ class Keeper:
             self._loop.add_alarm(_GUARD, f"no guard process can be started: {error}")
         else:
             self._loop.clear_alarm(_GUARD)
+            if self._enough.is_set():  # the daemon has ended meanwhile
+                self._link.close()
         self._guard_at = self._clock()
 
     def _look_at_service(self, serves: bool) -> None:

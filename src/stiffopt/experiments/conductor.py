@@ -203,9 +203,11 @@ class Conductor:
         pause = self.clock.now() - self._last
         if pause <= max(_PAUSE, 3 * self._period):
             return self._gauges.fallen(self._setpoint, np.maximum(half, _FAR))
-        if not self.rig.supply.armed:  # the last command has expired meanwhile
-            self.rig.supply.arm()
-            return np.ones(self.n, dtype=bool)
+        if not self.rig.supply.armed:  # nobody may be there any more: do not begin by itself
+            raise DeviceError(
+                f"the experiment stood still for {pause:.3g} s, so that the arm was let down and "
+                "vented; go on with --resume"
+            )
         for count in range(_MOST_LOOKS):
             if count >= AGREE and self._gauges.steady():
                 break

@@ -20,7 +20,7 @@ from stiffopt.rig.interface import (
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.claim import Claim
 from stiffopt.safety.outlet import Applied
-from stiffopt.safety.vent_line import guard_behind
+from stiffopt.safety.vent_line import guards_of
 
 __all__ = ["DEFAULT_SLEW", "SafetyGate", "check_protection", "effective_slew", "gate_before"]
 
@@ -353,8 +353,7 @@ def check_protection(supply: PressureSupply, safety: Safety) -> None:
 
 
 def _who_has(endpoint: str) -> str:
-    guard = guard_behind(endpoint)
-    return "another program" if guard is None else guard.name
+    return ", ".join(guard.name for guard in guards_of(endpoint)) or "another program"
 
 
 def _tightened(limits: PressureLimits, safety: Safety) -> PressureLimits:

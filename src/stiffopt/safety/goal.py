@@ -22,6 +22,7 @@ from stiffopt.rig.interface import (
     PressureReading,
     Supply,
 )
+from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import SafetyGate
 from stiffopt.safety.outlet import Applied, let_down
 
@@ -32,6 +33,7 @@ Array = NDArray[np.float64]
 LONGEST = 3600.0
 """Seconds for which a goal may be valid: longer, nobody may be there any more."""
 _LATE = 1.5  # periods after a command until it is repeated: whoever commands in each is in time
+_REPEATS = 4  # of a goal, at least, within the time after which the gate finds a command too old
 _EXPIRED = (
     "no command came for as long as the last one was valid, so the pressures were let down and "
     "vented; arm the supply again, and give commands a longer valid_for"
@@ -130,6 +132,12 @@ class GoalFollower:
         self._told: Array = self._nothing
         self._why_vented = ""
         self._failure = ""  # of a tick, which nobody waited for
+
+    @classmethod
+    def before(cls, gate: SafetyGate, safety: Safety, period: float, clock: Clock) -> GoalFollower:
+        """Return the follower for a rig, which repeats goals before the gate finds them too old."""
+        often = min(period, safety.command_timeout / _REPEATS)
+        return cls(gate, period=often, ramp_time=safety.ramp_time, clock=clock)
 
     @property
     def armed(self) -> bool:

@@ -22,6 +22,7 @@ then vents in its place (`stiffopt.safety.rescue`), and the watchdog of the devi
 from __future__ import annotations
 
 import gc
+import os
 import pickle
 import signal
 import socket
@@ -29,7 +30,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from typing import Any
 
 import numpy as np
@@ -88,6 +89,9 @@ class Guard:
         The rest of a simulated rig.
     as_json :
         Whether what it has to say on stderr is JSON lines; else words for people.
+    orphaned :
+        Says whether the client's process has ended. Its end of the channel may outlive it, in a
+        child that it has forked.
     """
 
     def __init__(
@@ -103,7 +107,9 @@ class Guard:
         epoch: float = 0.0,
         hosted: Hosted | None = None,
         as_json: bool = False,
+        orphaned: Callable[[], bool] = lambda: False,
     ) -> None:
+        self._orphaned = orphaned
         self._outlet = outlet
         self._channel = channel
         self._timeout = timeout
@@ -155,8 +161,8 @@ class Guard:
         self._hear_callers()
         if self._channel.broken >= 2 * self._broken_told:
             self._tell_of_broken()
-        if self._channel.closed and not self._leaving:
-            self._leaving = "the process of the control loop has ended"
+        if (self._channel.closed or self._orphaned()) and not self._leaving:
+            self._leaving = "the process that commands has ended"
         self._look_at_the_time()
         self._follow()
         now = self._clock()
@@ -411,11 +417,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         those of the command line. The rig comes pickled on standard input, from the process that
         started this one.
     """
+    parent = os.getppid()
     _ignore(_IGNORED)
     _on_signals(lambda *_: sys.exit(0))  # until there is something to vent
     given = sys.argv[1:] if arguments is None else arguments
     descriptor, as_json = int(given[0]), JSON in given[1:]
-    with closing(Channel(socket.socket(fileno=descriptor))) as channel:
+    with ExitStack() as stack:
+        channel = stack.enter_context(closing(Channel(socket.socket(fileno=descriptor))))
+        with suppress(OSError, AttributeError):  # systems without these look now and then
+            ended = os.pidfd_open(parent)
+            stack.callback(os.close, ended)
+            channel.wake_for([ended])
         try:
             owns = _opened(channel)
         except StiffoptError as error:
@@ -430,6 +442,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             epoch=owns.epoch,
             hosted=owns.hosted,
             as_json=as_json,
+            orphaned=lambda: os.getppid() != parent,
         )
         _on_signals(lambda number, _: guard.leave(_signal_name(number)))
         with real_time(PRIORITY) as granted:

@@ -19,7 +19,7 @@ from stiffopt.safety.lines import JSON
 __all__ = ["GuardProcess"]
 
 _START = 120.0  # s, in which a guard must be ready: the simulator may have to be compiled
-_END = 10.0  # s, in which it must vent and end before it is killed
+_END = 4.0  # s, in which it must vent and end before it is told to, and then is killed
 _SLICE = 0.05  # s
 
 
@@ -104,7 +104,9 @@ class GuardProcess:
                 return self._process.wait(_END)
             except subprocess.TimeoutExpired:
                 last_word()
-        return self._process.wait()
+        with suppress(subprocess.TimeoutExpired):
+            return self._process.wait(_END)
+        return -1  # not even that ends it: the system itself waits for a device
 
 
 def _failure(kind: str, args: list[str]) -> Exception:

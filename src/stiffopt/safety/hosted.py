@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -66,18 +65,18 @@ def owned(description: RigDescription, robot: RobotDescription) -> Owned:
     rig = make_rig(description.model_copy(update=away), robot, real_time=True)
     safety, period = description.safety, 1 / description.rate
     gate = gate_before(rig, safety, period)
-    follower = GoalFollower(gate, period=period, ramp_time=safety.ramp_time, clock=rig.clock)
+    follower = GoalFollower.before(gate, safety, period, rig.clock)
     if not simulated:
         supply = gate.supply
         return Owned(gate, follower, safety.guard_timeout, lambda: VentLine(supply.endpoints))
     rest = SimulatedRest(rig)
-    line = partial(VentLine, (simulated_endpoint(description),), shared=True)
+    line = partial(VentLine, (simulated_endpoint(description),))
     return Owned(gate, follower, safety.guard_timeout, line, rest.world.epoch, rest)
 
 
 def simulated_endpoint(description: RigDescription) -> str:
     """Return the name under which the guards of a simulated rig listen; several may have it."""
-    return f"simulated {os.getuid()} {description.name}"
+    return f"simulated {description.name}"
 
 
 class SimulatedRest:

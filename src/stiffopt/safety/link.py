@@ -43,6 +43,7 @@ Array = NDArray[np.float64]
 _FRESH = 1e-3  # s, that a command waits for its own answer
 _HUNG = 1.0  # s without a sign of life, beyond the driver's own time, after which it is ended
 _SILENT = 0.25  # s without an answer to a command, at least, after which something is wrong
+_CALLS = 3  # of the driver, at most, that one step of the guard makes
 _RESCUE = 1.0  # s to wait until a supply is vented directly
 
 
@@ -164,7 +165,7 @@ class GuardLink:
         """Whether the guard is there and has not answered for so long that it never may."""
         exchange = self._exchange
         quiet = 0.0 if exchange is None else exchange.quiet()
-        return self.alive and quiet > _HUNG + self._patience
+        return self.alive and quiet > _HUNG + _CALLS * self._patience
 
     def ping(self) -> None:
         """Ask the guard for a sign of life; waits for nothing."""

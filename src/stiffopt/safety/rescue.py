@@ -9,7 +9,7 @@ import time
 from contextlib import ExitStack, suppress
 from typing import Protocol
 
-from stiffopt.errors import StiffoptError
+from stiffopt.errors import DeviceError, StiffoptError
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.claim import Claim
 
@@ -17,6 +17,7 @@ __all__ = ["GuardWatch", "vent_directly"]
 
 _LOOK = 0.1  # s between looks at a guard that answers
 _AGAIN = 0.1  # s between attempts to vent
+_CLAIM = 0.2  # s for which a claim may still be that of a guard that is just ending
 _ATTEMPTS = 50
 
 
@@ -42,21 +43,29 @@ class Watched(Protocol):
         """End it; the kernel takes its devices and its claim."""
 
 
-def vent_directly(supply: PressureSupply, claim: Claim | None = None) -> None:
-    """Claim a supply that nobody owns any more, and vent it.
+def vent_directly(supply: PressureSupply) -> bool:
+    """Vent a supply, and return whether nobody else commands it.
+
+    To vent is allowed also where another program has claimed the supply, who may raise the pressure
+    again.
 
     Raises
     ------
     DeviceError
-        The supply does not take it, or somebody else owns it.
+        The supply does not take it.
     """
-    claim = claim or Claim(lambda: supply.endpoints)
-    claim.take()
+    claim = Claim(lambda: supply.endpoints, wait=_CLAIM)
+    try:
+        claim.take()
+        alone = True
+    except DeviceError:
+        alone = False
     try:
         with supply:  # to open it vents it, and so does to close it
             pass
     finally:
         claim.release()
+    return alone
 
 
 class GuardWatch:
@@ -83,7 +92,6 @@ class GuardWatch:
         self._guard, self._supply = guard, supply
         self._ended = threading.Event()
         self._over = threading.Event()
-        self._wake, self._waker = os.pipe()
         self._thread = threading.Thread(target=self._run, name="guard watch", daemon=True)
 
     def start(self) -> None:
@@ -93,8 +101,6 @@ class GuardWatch:
     def stop(self, timeout: float = 1.0) -> None:
         """Watch no more, for the guard is about to end as it should."""
         self._ended.set()
-        with suppress(OSError):
-            os.write(self._waker, b".")
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout)
 
@@ -116,13 +122,10 @@ class GuardWatch:
                 self._rescue()
         finally:
             self._over.set()
-            os.close(self._wake)
-            os.close(self._waker)
 
     def _watch(self) -> None:
         """Return when the guard has ended, or nobody needs it any more."""
         poll = select.poll()
-        poll.register(self._wake, select.POLLIN)
         with ExitStack() as stack:
             with suppress(OSError, AttributeError):  # systems without these look more slowly
                 end = os.pidfd_open(self._guard.pid or 0)

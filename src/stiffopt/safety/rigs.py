@@ -53,9 +53,7 @@ def rig_for_programs(
         return rig
     rig, period = make_rig(description, robot), 1 / description.rate
     gate = gate_before(rig, description.safety, period)
-    follower = GoalFollower(
-        gate, period=period, ramp_time=description.safety.ramp_time, clock=rig.clock
-    )
+    follower = GoalFollower.before(gate, description.safety, period, rig.clock)
     clock = TickingClock(rig.clock, follower)
     for device in (rig.tracker, rig.probe):
         if device is not None:

@@ -20,6 +20,7 @@ from stiffopt.safety.vent_line import Peer, ask_to_vent
 __all__ = ["vent_rig"]
 
 _PATIENCE = 3.0  # s in which a guard must have vented, beyond its driver's own time
+_CALLS = 4  # of the driver, at most, that venting takes
 _GONE = 2.0  # s in which a process that was ended must be gone
 
 
@@ -45,25 +46,35 @@ def vent_rig(path: str | os.PathLike[str]) -> str:
     supply = make_rig(description.model_copy(update={"tracker": None, "probe": None}), robot).supply
     if not isinstance(supply, PressureSupply):
         raise DeviceError("this rig's supply cannot be reached directly")
+    done = ""
     for endpoint in supply.endpoints:
-        for guard, error in ask_to_vent(endpoint, patience=_PATIENCE + supply.patience):
-            if not error:
-                return f"vented by its guard, {guard.name}, which takes no command now"
-            if not _ended(guard):
-                raise DeviceError(f"{guard.name}: {error}")
-    vent_directly(supply)
+        done = _vent_by_guard(endpoint, _PATIENCE + _CALLS * supply.patience) or done
+    if done:
+        return done
+    if not vent_directly(supply):
+        raise DeviceError(
+            "it was vented directly, but another program, of another user, commands this supply "
+            "and may raise the pressure again"
+        )
     return "vented directly: no program commands this supply"
 
 
+def _vent_by_guard(endpoint: str, patience: float) -> str:
+    """Have the guards of a supply vent; return how, empty if none could be asked."""
+    done = []
+    for reply in ask_to_vent(endpoint, patience):
+        if reply.answered and reply.error:
+            raise DeviceError(f"{reply.guard.name} could not vent, and tries on: {reply.error}")
+        if reply.answered:
+            done.append(reply.guard.name)
+        elif not _ended(reply.guard):
+            raise DeviceError(f"{reply.guard.name}: {reply.error}")
+    return f"vented by its guard, {', '.join(done)}, which takes no command now" if done else ""
+
+
 def _vent_simulated(description: RigDescription) -> str:
-    found = ask_to_vent(simulated_endpoint(description), shared=True, patience=_PATIENCE)
-    failed = [f"{guard.name}: {error}" for guard, error in found if error]
-    if failed:
-        raise DeviceError("; ".join(failed))
-    if not found:
-        return f"nothing to vent: nobody runs the simulated rig '{description.name}'"
-    guards = ", ".join(guard.name for guard, _ in found)
-    return f"vented by its guard, {guards}, which takes no command now"
+    done = _vent_by_guard(simulated_endpoint(description), _PATIENCE)
+    return done or f"nothing to vent: nobody runs the simulated rig '{description.name}'"
 
 
 def _ended(guard: Peer) -> bool:

@@ -1,10 +1,10 @@
-"""The vent line: a way to have a guard vent that needs no network service and no token.
+"""The vent line: a way to have a guard vent that needs no network, and that no stranger can block.
 
-Each guard listens under an abstract socket address made of its supply's endpoint. The kernel tells
-who calls: only root and the guard's own user are heard, all others are hung up on at once, so that
-their calls keep nobody away. Whoever is heard says ``vent`` and is answered, as JSON, once that is
-done. The address belongs to whichever process takes it first; a guard that finds it taken goes on
-without a line.
+Each guard listens under an abstract socket address that begins with its supply's endpoint and ends
+with something random, so that nobody can take it first; whoever wants to vent finds all such
+addresses in the kernel's table. The kernel also tells each side who the other is: a guard hears
+only root and its own user, and hangs up on all others at once; a caller believes only those of its
+own user and root. Whoever is heard says ``vent`` and is answered, as JSON, once that is done.
 """
 
 from __future__ import annotations
@@ -12,22 +12,22 @@ from __future__ import annotations
 import json
 import os
 import pwd
+import secrets
 import socket
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
 from stiffopt.safety.claim import address_of
 
-__all__ = ["Caller", "VentLine", "ask_to_vent", "guard_behind"]
+__all__ = ["Caller", "Peer", "Reply", "VentLine", "ask_to_vent", "guards_of"]
 
 _WORD = b"vent"
 _BACKLOG = 64
 _AT_ONCE = 64  # callers that are looked at in one step
 _WAITING = 8  # callers of this user that have not said their word yet
-_SHARED = 16  # guards of simulated rigs of one name
 _CREDENTIALS = struct.Struct("3i")
 _ANSWER = 4096  # bytes
 
@@ -89,14 +89,10 @@ class VentLine:
     ----------
     endpoints :
         Of the supply that the guard owns.
-    shared :
-        Whether several guards may have these endpoints: simulated rigs of one name.
     """
 
-    def __init__(self, endpoints: Sequence[str], *, shared: bool = False) -> None:
-        places = range(_SHARED if shared else 1)
-        found = (_listening(endpoint, places) for endpoint in endpoints)
-        self._listening = [s for s in found if s is not None]
+    def __init__(self, endpoints: Sequence[str]) -> None:
+        self._listening = [_listening(endpoint) for endpoint in endpoints]
         self._callers: list[Caller] = []
 
     def descriptors(self) -> list[int]:
@@ -138,70 +134,94 @@ class VentLine:
                 self._callers.pop(0).hang_up()
 
 
-def _listening(endpoint: str, places: range) -> socket.socket | None:
-    """Return a listening socket, or None if all places are taken: the rig works without one."""
-    for place in places:
-        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            listening.bind(_address(endpoint, place))
-            listening.listen(_BACKLOG)
-        except OSError:
-            listening.close()
-            continue
-        listening.setblocking(False)
-        return listening
-    return None
+def _listening(endpoint: str) -> socket.socket:
+    """Return a listening socket at an address that nobody could foresee."""
+    listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        listening.bind(f"{address_of('vent', endpoint)}/{secrets.token_hex(8)}")
+        listening.listen(_BACKLOG)
+    except OSError:
+        listening.close()
+        raise
+    listening.setblocking(False)
+    return listening
 
 
-def _address(endpoint: str, place: int) -> str:
-    return address_of("vent", f"{endpoint}#{place}")
+# the caller's end --------------------------------------------------------------------------------
 
 
-def guard_behind(endpoint: str, place: int = 0) -> Peer | None:
-    """Return the process that listens for an endpoint; None: nobody does, or nobody accepts."""
-    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
-        line.settimeout(1.0)
-        line.connect(_address(endpoint, place))
-        return _peer(line)
-    return None
+@dataclass(frozen=True)
+class Reply:
+    """What a guard said, or did not say.
 
-
-def ask_to_vent(
-    endpoint: str, *, shared: bool = False, patience: float = 5.0
-) -> list[tuple[Peer, str]]:
-    """Have all guards of an endpoint vent.
-
-    Returns
-    -------
-    For each guard that was reached: which process it is, and what went wrong; empty where it says
-    that its supply is vented.
+    Attributes
+    ----------
+    guard : the process that listens.
+    answered : whether it said anything.
+    error : why its supply may not be vented; empty if it says that it is.
     """
-    answers = []
-    for place in range(_SHARED if shared else 1):
-        answer = _ask(endpoint, place, patience)
-        if answer is not None:
-            answers.append(answer)
-    return answers
+
+    guard: Peer
+    answered: bool
+    error: str = ""
 
 
-def _ask(endpoint: str, place: int, patience: float) -> tuple[Peer, str] | None:
-    end = time.monotonic() + patience
-    line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    with line:
-        line.settimeout(patience)
-        try:
-            line.connect(_address(endpoint, place))
-        except (ConnectionRefusedError, FileNotFoundError):
-            return None
-        except OSError as error:
-            return Peer(0, 0), f"the guard cannot be reached: {error}"
+def guards_of(endpoint: str) -> list[Peer]:
+    """Return the processes that listen for an endpoint, whoever their users are."""
+    found = []
+    for line in _lines_of(endpoint):
+        found.append(_peer(line))
+        line.close()
+    return found
+
+
+def ask_to_vent(endpoint: str, patience: float = 5.0) -> list[Reply]:
+    """Have all guards of an endpoint vent that belong to this user; for root, to any user.
+
+    Parameters
+    ----------
+    endpoint :
+        Of the supply.
+    patience :
+        Seconds in which each must have answered.
+    """
+    asked = []
+    for line in _lines_of(endpoint):
         peer = _peer(line)
-        try:
-            line.settimeout(max(0.1, end - time.monotonic()))
+        if os.getuid() != 0 and peer.uid not in (0, os.getuid()):
+            line.close()  # a stranger may say what he likes
+            continue
+        with suppress(OSError):
             line.send(_WORD)
+        asked.append((peer, line))
+    end = time.monotonic() + patience
+    return [_reply(peer, line, end) for peer, line in asked]
+
+
+def _reply(peer: Peer, line: socket.socket, end: float) -> Reply:
+    with line:
+        try:
+            line.settimeout(max(0.05, end - time.monotonic()))
             told = line.recv(_ANSWER)
         except OSError as error:
-            return peer, f"the guard does not answer: {error}"
-    if not told:
-        return peer, "the guard hangs up: it belongs to another user; ask that user, or root"
-    return peer, str(json.loads(told)["error"])
+            return Reply(peer, answered=False, error=f"the guard does not answer: {error}")
+    try:
+        return Reply(peer, answered=True, error=str(json.loads(told)["error"]))
+    except (ValueError, KeyError, TypeError):
+        return Reply(peer, answered=False, error="the guard has hung up without an answer")
+
+
+def _lines_of(endpoint: str) -> Iterator[socket.socket]:
+    """Yield a connection to each process that listens for an endpoint; wait for none of them."""
+    shown = address_of("vent", endpoint).replace("\0", "@") + "/"
+    with suppress(OSError), open("/proc/net/unix", encoding="utf-8", errors="replace") as table:
+        names = {row.split()[-1] for row in table if shown in row}
+        for name in sorted(name for name in names if name.startswith(shown)):
+            line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            line.setblocking(False)
+            try:
+                line.connect("\0" + name[1:])
+            except OSError:  # gone meanwhile, or it accepts nobody
+                line.close()
+            else:
+                yield line

@@ -199,8 +199,9 @@ class ModbusSupply(PressureSupply):
 
     @property
     def patience(self) -> float:
-        """A few answers: the set-points, the readings and what is read back."""
-        return 4 * self.settings.timeout
+        """An answer to each request of an exchange."""
+        requests = len(self._written) + len(self._verified) + len(self._measured) + 1
+        return requests * self.settings.timeout
 
     def prepare(self) -> None:
         """Import pymodbus, which takes a third of a second."""
