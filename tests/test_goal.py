@@ -356,7 +356,7 @@ def test_13_the_limits_are_those_of_the_gate() -> None:
     bench = Bench(max_pressure=(5e4, 9e4, 1e4))
     np.testing.assert_array_equal(bench.supply.limits.high, [5e4, 9e4, 1e4])
     bench.armed()
-    with pytest.raises(CommandError, match="channel 1: 0.6 bar is out of range"):
+    with pytest.raises(CommandError, match=r"channel 1: 0\.6 bar is out of range"):
         bench.goal(6e4, 0, 0)
 
 
@@ -403,7 +403,7 @@ def test_nothing_is_taken_before_it_is_armed() -> None:
     bench = Bench()
     assert not bench.supply.armed
     for _ in range(2):
-        with pytest.raises(CommandError, match="the supply is vented .* arm it first"):
+        with pytest.raises(CommandError, match=r"the supply is vented .* arm it first"):
             bench.goal(1e4, 1e4, 1e4)
     bench.clock.sleep(1.0)
     assert bench.vented()
@@ -541,7 +541,7 @@ def test_a_tick_that_fails_is_told_by_the_next_command_and_vented() -> None:
     bench.clock.sleep(1.0)
     assert bench.vented()
     for _ in range(2):
-        with pytest.raises(DeviceError, match="^a cable is loose; the supply was vented$"):
+        with pytest.raises(DeviceError, match=r"^a cable is loose; the supply was vented$"):
             bench.goal(3e4, 3e4, 3e4)
     assert bench.vented()
     bench.armed()
