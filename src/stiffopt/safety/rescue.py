@@ -9,7 +9,6 @@ import time
 from contextlib import ExitStack, suppress
 from typing import Protocol
 
-from stiffopt.errors import StiffoptError
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.claim import Claim
 
@@ -84,6 +83,7 @@ class GuardWatch:
         self._ended = threading.Event()
         self._over = threading.Event()
         self._wake, self._waker = os.pipe()
+        self._hold = threading.Lock()  # nobody writes to a descriptor that is closed and another's
         self._thread = threading.Thread(target=self._run, name="guard watch", daemon=True)
 
     def start(self) -> None:
@@ -93,8 +93,9 @@ class GuardWatch:
     def stop(self, timeout: float = 1.0) -> None:
         """Watch no more, for the guard is about to end as it should."""
         self._ended.set()
-        with suppress(OSError):
-            os.write(self._waker, b".")
+        with self._hold:
+            if not self._over.is_set():
+                os.write(self._waker, b".")
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout)
 
@@ -109,15 +110,16 @@ class GuardWatch:
     def _run(self) -> None:
         try:
             if self._supply is not None:
-                with suppress(StiffoptError):
+                with suppress(Exception):  # nothing keeps this from watching
                     self._supply.prepare()
             self._watch()
             if not self._ended.is_set():
                 self._rescue()
         finally:
-            self._over.set()
-            os.close(self._wake)
-            os.close(self._waker)
+            with self._hold:
+                self._over.set()
+                os.close(self._wake)
+                os.close(self._waker)
 
     def _watch(self) -> None:
         """Return when the guard has ended, or nobody needs it any more."""
@@ -142,8 +144,8 @@ class GuardWatch:
         for _ in range(_ATTEMPTS):
             try:
                 vent_directly(self._supply)
-            except StiffoptError as error:
-                self.error = str(error)
+            except Exception as error:  # a driver's bug is no reason not to try again
+                self.error = str(error) or type(error).__name__
             else:
                 self.error = ""
                 self.rescued.set()
