@@ -106,10 +106,10 @@ class VentLine:
         for listening in self._listening:
             self._accept(listening)
         said = [(caller, caller.asks()) for caller in self._callers]
-        self._callers = [caller for caller, word in said if word is None]
-        for caller, word in said:
-            if word is False:
-                caller.hang_up()
+        silent = [caller for caller, word in said if word is None]
+        self._callers = silent[-_WAITING:]
+        for caller in silent[:-_WAITING] + [caller for caller, word in said if word is False]:
+            caller.hang_up()
         return [caller for caller, word in said if word]
 
     def close(self) -> None:
@@ -132,8 +132,6 @@ class VentLine:
                 connection.close()
                 continue
             self._callers.append(Caller(connection, peer))
-            if len(self._callers) > _WAITING:
-                self._callers.pop(0).hang_up()
 
 
 def _listening(endpoint: str, places: range) -> socket.socket | None:
@@ -202,4 +200,9 @@ def _ask(endpoint: str, place: int, patience: float) -> tuple[Peer, str] | None:
             return peer, f"the guard does not answer: {error}"
     if not told:
         return peer, "the guard hangs up: it belongs to another user; ask that user, or root"
-    return peer, str(json.loads(told)["error"])
+    if os.getuid() not in (0, peer.uid) and peer.uid != 0:  # no guard, for it would have hung up
+        return peer, "a program of another user answers in the guard's place"
+    try:
+        return peer, str(json.loads(told)["error"])
+    except (ValueError, LookupError, TypeError):
+        return peer, "what answers makes no sense, and is no guard"
