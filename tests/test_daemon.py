@@ -662,7 +662,11 @@ def stopped(made: Daemon, hangs: set[str]) -> list[str]:
 REST = {"planner", "tracker", "telemetry", "service"}
 
 
-@pytest.mark.parametrize("hangs", [set(), {"tracker"}, {"telemetry"}, {"service"}, REST], ids=str)
+@pytest.mark.parametrize(
+    "hangs",
+    [set(), {"tracker"}, {"telemetry"}, {"service"}, REST],
+    ids=("nothing", "tracker", "telemetry", "service", "all"),
+)
 def test_what_hangs_keeps_neither_the_supply_from_being_closed_nor_the_end(
     idle: Daemon, monkeypatch: pytest.MonkeyPatch, hangs: set[str]
 ) -> None:

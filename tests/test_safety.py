@@ -7,60 +7,22 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fake_supply import HIGH, SLEW, FakeSupply, HandClock
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
-from stiffopt.rig.interface import Clock, PressureCommand, PressureLimits, PressureSupply
+from stiffopt.rig.interface import PressureCommand, PressureLimits
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import SafetyGate
 
-Array = NDArray[np.float64]
-
-HIGH = np.array([1.5e5, 1.0e5, 1.2e5])
-SLEW = np.array([5e5, 2e5, 1e5])
 AREAS = np.array([1e-5, 2e-5, 3e-5])
-
-
-class HandClock(Clock):
-    t = 50.0
-
-    def now(self) -> float:
-        return self.t
-
-    def sleep_until(self, moment: float) -> None:
-        self.t = max(self.t, moment)
-
-
-class Supply(PressureSupply):
-    """Keeps what it is told; dies when asked to, before or after it has taken a command."""
-
-    def __init__(self, clock: Clock, low: ArrayLike = 0.0) -> None:
-        super().__init__(PressureLimits(np.broadcast_to(low, 3), HIGH), clock)
-        self.written: list[Array] = []
-        self.dead = ""
-
-    endpoints = ()  # nothing that others could command too
-    has_watchdog = True
-
-    def _open(self) -> None: ...
-    def _close(self) -> None: ...
-
-    def _write(self, pressures: Array) -> None:
-        if self.dead == "before":
-            raise DeviceError("it does not answer")
-        self.written.append(pressures)
-        if self.dead == "after":
-            raise DeviceError("it answers no more")
-
-    def _read(self) -> ArrayLike:
-        return self.written[-1] + 7.0
 
 
 class Bench:
     def __init__(self, low: ArrayLike = 0.0, **options: Any) -> None:
         self.clock = HandClock()
-        self.supply = Supply(self.clock, low)
+        self.supply = FakeSupply(self.clock, low)
         safety = options.pop("safety", Safety())
         given = {"slew": SLEW, "force_per_pressure": None, "clock": self.clock, **options}
         self.gate = SafetyGate(self.supply, safety=safety, **given)
@@ -302,6 +264,22 @@ def test_after_a_command_whose_fate_is_unknown_nothing_jumps(dead: str) -> None:
     bench.supply.dead = ""
     applied = bench.ask(1e5, 1e5, 1e5)
     assert (applied.pressures <= 1e5 - 0.01 * SLEW + 1e-6).all()
+
+
+@pytest.mark.parametrize("dead", ["before", "after"])
+def test_a_write_that_failed_does_not_count_as_done(dead: str) -> None:
+    """A raise that may not be there is no step from which the next one begins."""
+    bench = Bench().armed()
+    bench.until(5e4, 5e4, 5e4)
+    bench.supply.dead = dead
+    for _ in range(4):
+        with pytest.raises(DeviceError):
+            bench.ask(*HIGH)
+    bench.supply.dead = ""
+    refused = bench.ask(math.nan, 0, 0)
+    np.testing.assert_array_equal(refused.pressures, [5e4] * 3)  # what is known to be there
+    applied = bench.ask(*HIGH, wait=0.0)
+    np.testing.assert_allclose(applied.pressures, 5e4 + 0.01 * SLEW)
 
 
 def test_a_supply_that_somebody_else_vented_takes_nothing() -> None:

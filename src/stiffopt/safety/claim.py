@@ -92,18 +92,25 @@ class Claim:
 
     def _taken(self, endpoint: str, end: float) -> socket.socket:
         name = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            self._bind(name, endpoint, end)
+        except BaseException:
+            name.close()
+            raise
+        return name
+
+    def _bind(self, name: socket.socket, endpoint: str, end: float) -> None:
         while True:
             try:
                 name.bind(address_of("claim", endpoint))
             except OSError as error:
-                if error.errno == errno.EADDRINUSE and time.monotonic() < end:
-                    time.sleep(_AGAIN)
-                    continue
-                name.close()
                 if error.errno != errno.EADDRINUSE:
                     raise DeviceError(f"the supply cannot be claimed: {error}") from None
+                if time.monotonic() < end:
+                    time.sleep(_AGAIN)
+                    continue
                 raise DeviceError(
                     f"the supply ({endpoint}) is commanded by {self._holder(endpoint)}; only one "
                     "program may, so end that one first ('stiffopt vent RIG' lets its pressure out)"
                 ) from None
-            return name
+            return

@@ -201,7 +201,7 @@ class GoalFollower:
         Raises
         ------
         CommandError
-            It is refused, and the last goal stays.
+            It is refused, and the last goal stays. So it does where the answer says `refused`.
         DeviceError
             The supply does not answer.
         """
@@ -214,6 +214,7 @@ class GoalFollower:
                 raise CommandError(
                     self._why_vented or "the supply is vented and nothing was written; arm it first"
                 )
+            before = self._goal, self._until, self._let_down_from
             self._goal, self._until = pressures, goal.time + goal.valid_for
             self._let_down_from = None
             try:
@@ -221,7 +222,10 @@ class GoalFollower:
             except DeviceError as error:
                 self.fail(error)
                 raise
-            self.due = now + _LATE * self._period
+            if self._gate.armed:
+                self.due = now + _LATE * self._period
+                if applied.refused:  # whoever is told so must not find the arm there later
+                    self._goal, self._until, self._let_down_from = before
             return applied
 
     def tick(self) -> None:

@@ -290,8 +290,8 @@ class Guard:
         if self._to_vent is not None:
             raise DeviceError("the supply could not be vented yet; it cannot be armed")
         try:
-            if self._armed:  # it may be under pressure, and arming begins without
-                self._outlet.vent()
+            if self._armed:  # it may be under pressure, and arming begins without; nor with a goal
+                (self._follower or self._outlet).vent()
             if goals and self._follower is not None:
                 self._follower.arm_for_goals()
             else:

@@ -61,14 +61,16 @@ def vent_rig(path: str | os.PathLike[str]) -> str:
 
 def _vent_by_guard(endpoint: str, patience: float) -> str:
     """Have the guards of a supply vent; return how, empty if none could be asked."""
-    done = []
+    done, failed = [], []
     for reply in ask_to_vent(endpoint, patience):
         if reply.answered and reply.error:
-            raise DeviceError(f"{reply.guard.name} could not vent, and tries on: {reply.error}")
-        if reply.answered:
+            failed.append(f"{reply.guard.name} could not vent, and tries on: {reply.error}")
+        elif reply.answered:
             done.append(reply.guard.name)
-        elif not _ended(reply.guard):
-            raise DeviceError(f"{reply.guard.name}: {reply.error}")
+        elif _is_guard(reply.guard.pid) and not _ended(reply.guard):
+            failed.append(f"{reply.guard.name}: {reply.error}")
+    if failed:
+        raise DeviceError("; ".join(failed))
     return f"vented by its guard, {', '.join(done)}, which takes no command now" if done else ""
 
 
@@ -78,22 +80,26 @@ def _vent_simulated(description: RigDescription) -> str:
 
 
 def _ended(guard: Peer) -> bool:
-    """End a guard that does not answer; return whether it is gone."""
-    if guard.pid <= 0 or not _is_guard(guard.pid):
+    """End a guard that does not answer; return whether it is gone, by this or already."""
+    if guard.pid <= 0:
         return False
-    with suppress(ProcessLookupError, PermissionError):
-        os.kill(guard.pid, signal.SIGKILL)
+    if _is_guard(guard.pid):
+        with suppress(ProcessLookupError, PermissionError):
+            os.kill(guard.pid, signal.SIGKILL)
     end = time.monotonic() + _GONE
-    while time.monotonic() < end:
-        if not _is_guard(guard.pid):
-            return True
+    while _is_guard(guard.pid) and time.monotonic() < end:
         time.sleep(0.01)
-    return False
+    return not _command_line(guard.pid)
 
 
 def _is_guard(pid: int) -> bool:
     """Return whether a process runs, and is a guard."""
+    return b"stiffopt.safety.guard" in _command_line(pid)
+
+
+def _command_line(pid: int) -> bytes:
+    """Return the command line of a process; empty if it has ended."""
     try:
-        return b"stiffopt.safety.guard" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
-        return False
+        return b""

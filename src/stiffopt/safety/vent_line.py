@@ -104,10 +104,10 @@ class VentLine:
         for listening in self._listening:
             self._accept(listening)
         said = [(caller, caller.asks()) for caller in self._callers]
-        self._callers = [caller for caller, word in said if word is None]
-        for caller, word in said:
-            if word is False:
-                caller.hang_up()
+        silent = [caller for caller, word in said if word is None]
+        self._callers = silent[-_WAITING:]
+        for caller in silent[:-_WAITING] + [caller for caller, word in said if word is False]:
+            caller.hang_up()
         return [caller for caller, word in said if word]
 
     def close(self) -> None:
@@ -130,8 +130,6 @@ class VentLine:
                 connection.close()
                 continue
             self._callers.append(Caller(connection, peer))
-            if len(self._callers) > _WAITING:
-                self._callers.pop(0).hang_up()
 
 
 def _listening(endpoint: str) -> socket.socket:
