@@ -21,6 +21,8 @@ from stiffopt.control.loop import ControlLoop
 from stiffopt.errors import StiffoptError
 from stiffopt.experiments.conductor import Conductor
 from stiffopt.model.robot_files import load_description
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.rig.interface import (
     Clock,
     PoseTracker,
@@ -68,6 +70,7 @@ class Limits:
     ----------
     high : what no channel may exceed (n,), in Pa.
     channel, register, safety : highest pressures by driver settings, hardware and rig file.
+    task : highest pressure of the task that the control loop pursues; others have none.
     slew : in Pa/s.
     force : in N.
     """
@@ -75,12 +78,13 @@ class Limits:
     channel: float | None = None
     register: float | None = None
     safety: float | None = None
+    task: float | None = None
     slew: float = 5e5
     force: float | None = None
 
     @property
     def high(self) -> float:
-        given = (ROBOT_HIGH, self.channel, self.register, self.safety)
+        given = (ROBOT_HIGH, self.channel, self.register, self.safety, self.task)
         return min(value for value in given if value is not None)
 
 
@@ -91,6 +95,7 @@ LIMITS = {
     "safety": Limits(safety=0.7e5),
     "slew": Limits(slew=1e4),
     "force": Limits(force=2.0),
+    "task": Limits(task=0.6e5),
     "all": Limits(channel=1.1e5, register=1.2e5, safety=1.3e5, slew=1e5, force=6.0),
 }
 
@@ -494,6 +499,11 @@ class Loop(Stream):
         for _ in range(60):
             self.tick()
         self.loop.arm()
+        if self.bench.limits.task is not None:
+            target = Target(position=(0.0, 0.0, 0.09))
+            pressure = PressureRange(max=self.bench.limits.task)
+            task = Task(robot="stiff-flop-1", target=target, pressure=pressure)
+            self.loop.set_task(task)
 
     def tick(self) -> None:
         super().rest(PERIOD)
@@ -517,6 +527,9 @@ class Loop(Stream):
 
     def arm(self) -> None:
         self._done("arm", told=self._trips())
+
+    def restrict(self, high: Array) -> None:
+        self._done("restrict", high=high.tolist())
 
     def vent(self) -> None:
         self._done("vent")

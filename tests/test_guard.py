@@ -98,6 +98,9 @@ class FakeOutlet:
         self._do("vent")
         self.pressures = np.zeros(2)
 
+    def restrict(self, high: Any) -> None:
+        self._do(f"restrict {high.tolist()}")
+
     def apply(self, command: PressureCommand) -> Applied:
         self._do("apply")
         self.commands.append(command)
@@ -768,6 +771,13 @@ def test_at_the_end_the_line_is_closed() -> None:
 
 
 # other requests ----------------------------------------------------------------------------------
+
+
+def test_the_limits_of_a_task_are_passed_on() -> None:
+    scene = Scene().pressed()
+    (answer,) = scene.step(scene.request("restrict", high=[5e4, 6e4]))
+    assert not answer.error
+    assert scene.outlet.did == ["restrict [50000.0, 60000.0]"]
 
 
 def test_a_reading_is_told() -> None:

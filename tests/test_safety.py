@@ -379,3 +379,43 @@ def test_areas_of_the_channels() -> None:
     areas = robot.channel_areas
     assert len(areas) == robot.n_pressures
     assert areas[0] == pytest.approx(2 * math.pi * robot.segments[0].chambers.radius ** 2)
+
+
+# limits of a task --------------------------------------------------------------------------------
+
+
+def test_no_channel_rises_above_a_task_s_limit() -> None:
+    bench = Bench().armed()
+    bench.gate.restrict([1e4, 2e4, 9e9])
+    applied = bench.until(5e4, 5e4, 5e4)
+    np.testing.assert_array_equal(applied.pressures, [1e4, 2e4, 5e4])
+    assert applied.limited
+    bench.gate.restrict(HIGH)
+    np.testing.assert_array_equal(bench.until(5e4, 5e4, 5e4).pressures, [5e4] * 3)
+
+
+def test_what_is_above_a_new_task_s_limit_may_stay_and_fall_but_not_rise() -> None:
+    bench = Bench().armed()
+    bench.until(5e4, 5e4, 5e4)
+    bench.gate.restrict([1e4, 1e4, 1e4])
+    np.testing.assert_array_equal(bench.until(6e4, 5e4, 3e4).pressures, [5e4, 5e4, 3e4])
+    np.testing.assert_array_equal(bench.until(6e4, 2e4, 3e4).pressures, [5e4, 2e4, 3e4])
+    np.testing.assert_array_equal(bench.until(0.0, 3e4, 4e4).pressures, [0.0, 2e4, 3e4])
+    np.testing.assert_array_equal(bench.until(6e4, 0.0, 0.0).pressures, [1e4, 0.0, 0.0])
+
+
+def test_to_arm_begins_without_a_task_s_limit() -> None:
+    bench = Bench().armed()
+    bench.gate.restrict([0.0, 0.0, 0.0])
+    assert not bench.until(5e4, 5e4, 5e4).pressures.any()
+    bench.gate.vent()
+    bench.armed()
+    np.testing.assert_array_equal(bench.until(5e4, 5e4, 5e4).pressures, [5e4] * 3)
+
+
+@pytest.mark.parametrize("high", [1e4, [1e4, 1e4], [1e4, math.nan, 1e4], [1e4, math.inf, 1e4]])
+def test_a_task_s_limits_are_one_pressure_for_each_channel(high: Any) -> None:
+    bench = Bench().armed()
+    with pytest.raises(InputError, match="one highest pressure in Pa for each channel"):
+        bench.gate.restrict(high)
+    np.testing.assert_array_equal(bench.until(5e4, 5e4, 5e4).pressures, [5e4] * 3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from stiffopt.control.checks import check_rig, check_vented_arm
-from stiffopt.control.requested import preparing
+from stiffopt.control.requested import highest_of, preparing
 from stiffopt.control.state import State
 from stiffopt.control.ticking import Ticking
 from stiffopt.control.trajectory import Trajectory
@@ -102,6 +102,7 @@ class Machine(Ticking):
         """Pursue a task; see `ControlLoop.set_task`."""
         self._permit_motion("set a task")
         self.steering.set_task(task)
+        self.outlet.restrict(highest_of(task, self.outlet.limits))
         self._go_on(now, "task", "there is a new task")
 
     def set_target(self, now: float, target: Target) -> None:

@@ -19,7 +19,14 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.rig.interface import PressureLimits
 
-__all__ = ["check_target", "check_task", "check_trajectory", "preparing", "tightened"]
+__all__ = [
+    "check_target",
+    "check_task",
+    "check_trajectory",
+    "highest_of",
+    "preparing",
+    "tightened",
+]
 
 Array = NDArray[np.float64]
 
@@ -44,6 +51,11 @@ def preparing(what: str) -> Iterator[None]:
             f"the {what} is refused and nothing has changed: unexpected "
             f"{type(error).__name__} while it was prepared: {error}"
         ) from error
+
+
+def highest_of(task: Task, limits: PressureLimits) -> Array:
+    """Return the highest pressures (n,) that a task allows on a rig, in Pa."""
+    return np.array(tightened(task.pressure, limits).max, dtype=float)
 
 
 def check_task(task: Task, limits: PressureLimits) -> None:

@@ -95,6 +95,7 @@ class SafetyGate:
             self._areas = _positive("force_per_pressure", force_per_pressure, n)
         elif self._max_force is not None:
             raise InputError("a limit of the force needs the chambers' areas: force_per_pressure")
+        self._task_high: Array = self.limits.high
         self._jumps_to_low = bool((self.limits.low > 0).any())
         self._safety = safety
         self._claim = Claim(lambda: supply.endpoints, _who_has)
@@ -166,6 +167,22 @@ class SafetyGate:
             )
         check_protection(self.supply, self._safety)
 
+    def restrict(self, high: ArrayLike) -> None:
+        """Let no channel rise above a task's limits (n,), in Pa, until the next call or `arm`.
+
+        What is above them already may stay, and fall.
+
+        Raises
+        ------
+        InputError
+            They are not one finite pressure for each channel.
+        """
+        given = np.array(high, dtype=float)
+        if given.shape != self.limits.high.shape or not np.isfinite(given).all():
+            raise InputError("expected one highest pressure in Pa for each channel")
+        with self._lock:
+            self._task_high = np.minimum(given, self.limits.high)
+
     def vent(self) -> None:
         """Let all pressure out at once; no command is taken until `arm`.
 
@@ -234,7 +251,7 @@ class SafetyGate:
             except CommandError as error:
                 return self._refused(str(error))
             self._valid_at = now
-            near = self._within_rate(asked, now)
+            near = self._within_rate(self._within_task(asked), now)
             ramp = self._within_force(near)
             before, self._written_at = self._ramp, now
             self._ramp = np.minimum(ramp, before)  # should it fail: no more than this is there
@@ -261,6 +278,10 @@ class SafetyGate:
         if not age <= min(command.valid_for, self._timeout):  # NaN is too old as well
             raise CommandError(f"the command has expired; it is {age:.3g} s old")
         return self.limits.check(command.pressures)
+
+    def _within_task(self, asked: Array) -> Array:
+        """Return what is nearest to `asked` (n,) and rises no higher than the task allows."""
+        return np.minimum(asked, np.maximum(self._task_high, self._ramp))
 
     def _within_rate(self, asked: Array, now: float) -> Array:
         """Return what is nearest to `asked` (n,) that can be reached by now."""
@@ -303,6 +324,7 @@ class SafetyGate:
     def _forget(self, now: float) -> None:
         """Begin anew with a vented supply."""
         self._ramp = self._told = np.zeros(self.limits.n)
+        self._task_high = self.limits.high
         self._written_at = self._valid_at = now
 
 

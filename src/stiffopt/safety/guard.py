@@ -270,6 +270,8 @@ class Guard:
                     self._arm(request.about.get("told"), goals=bool(request.about.get("goals")))
                 case "ping":
                     pass
+                case "restrict":
+                    self._outlet.restrict(np.array(request.about.get("high"), dtype=float))
                 case "vent":
                     error = self._vent()
                 case "read":

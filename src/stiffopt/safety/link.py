@@ -220,6 +220,16 @@ class GuardLink:
                 raise GuardTripped(answer.error)
             raise DeviceError(answer.error)
 
+    def restrict(self, high: Array) -> None:
+        """Let no channel rise above a task's limits (n,), in Pa; see `SafetyGate.restrict`.
+
+        Raises
+        ------
+        DeviceError
+            The guard does not take them.
+        """
+        self._ask("restrict", high=np.asarray(high, dtype=float).tolist())
+
     @property
     def armed(self) -> bool:
         """Whether the guard takes commands."""

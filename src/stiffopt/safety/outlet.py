@@ -68,6 +68,9 @@ class Outlet(Protocol):
     def arm(self) -> None:
         """Take commands from now on."""
 
+    def restrict(self, high: Array) -> None:
+        """Let no channel rise above a task's limits (n,), in Pa, until the next call or `arm`."""
+
     def vent(self) -> None:
         """Let all pressure out at once; no command is taken until `arm`."""
 
