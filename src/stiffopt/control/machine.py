@@ -9,7 +9,7 @@ from stiffopt.control.requested import highest_of, preparing
 from stiffopt.control.state import State
 from stiffopt.control.ticking import Ticking
 from stiffopt.control.trajectory import Trajectory
-from stiffopt.errors import CommandError, InputError, StiffoptError
+from stiffopt.errors import CommandError, DeviceError, InputError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 
@@ -101,8 +101,13 @@ class Machine(Ticking):
     def set_task(self, now: float, task: Task) -> None:
         """Pursue a task; see `ControlLoop.set_task`."""
         self._permit_motion("set a task")
+        highest = highest_of(task, self.outlet.limits)
         self.steering.set_task(task)
-        self.outlet.restrict(highest_of(task, self.outlet.limits))
+        try:
+            self.outlet.restrict(highest)
+        except DeviceError as error:  # the steering has the task, and the gate has not
+            self.fault(now, "device", f"a device fails: {error}")
+            raise
         self._go_on(now, "task", "there is a new task")
 
     def set_target(self, now: float, target: Target) -> None:
