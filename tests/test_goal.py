@@ -15,6 +15,7 @@ from stiffopt.rig.interface import PressureCommand, PressureLimits
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import SafetyGate
 from stiffopt.safety.goal import LONGEST, GoalFollower, GoalSupply, TickingClock, check_goal
+from stiffopt.safety.outlet import let_down
 
 Array = NDArray[np.float64]
 
@@ -175,6 +176,7 @@ def test_an_expired_goal_is_let_down_and_vented_and_told() -> None:
     assert steps[-1][0] - began <= 2.0 + RAMP + 2 * PERIOD
     assert bench.vented()
     assert bench.follower.due == math.inf
+    bench.follower.tick()  # one that comes late does nothing, and forgets nothing
     with pytest.raises(CommandError, match=EXPIRED):
         bench.goal(1e4, 1e4, 1e4)
     assert bench.vented()
@@ -281,6 +283,32 @@ def test_a_tick_after_too_long_a_pause_vents_and_tells_why() -> None:
     assert bench.follower.due == math.inf
     with pytest.raises(CommandError, match=r"no command came for 0\.3 s"):
         bench.goal(3e4, 3e4, 3e4)
+
+
+def test_a_goal_is_approached_to_the_last_instant() -> None:
+    bench = Bench().armed()
+    bench.clock.sleep_until(64.0)
+    bench.goal(*HIGH, valid_for=1.0 / 64)
+    before = bench.device.commanded
+    bench.hand.t = 64.0 + 1.0 / 64
+    bench.follower.tick()
+    np.testing.assert_allclose(bench.device.commanded, before + SLEW / 64)
+
+
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [(1.0, 4e4), (0.5, 2e4), (0.0, 0.0), (-3.0, 0.0), (1.5, 4e4), (math.inf, 4e4)],
+)
+def test_a_share_of_pressures(share: float, expected: float) -> None:
+    limits = PressureLimits(np.array([0.0, -5e4, 0.0]), HIGH)
+    np.testing.assert_array_equal(let_down(np.full(3, 4e4), share, limits), [expected] * 3)
+
+
+def test_a_share_of_pressures_with_a_low_limit_above_zero() -> None:
+    limits = PressureLimits(np.array([2e4, -2e4, 0.0]), HIGH)
+    at = np.array([4e4, -2e4, 4e4])
+    np.testing.assert_array_equal(let_down(at, 0.5, limits), [2e4, -1e4, 2e4])
+    np.testing.assert_array_equal(let_down(at, 0.25, limits), [0.0, -5e3, 1e4])
 
 
 # which goals are taken ---------------------------------------------------------------------------
@@ -500,6 +528,8 @@ def test_to_close_vents() -> None:
     bench.supply.open()
     assert bench.device.opened == 2
     assert not bench.supply.armed
+    with pytest.raises(CommandError, match=r"^the supply is vented and nothing was written"):
+        bench.supply.command(np.zeros(3))
 
 
 def test_a_supply_that_may_never_be_armed(monkeypatch: pytest.MonkeyPatch) -> None:
