@@ -1100,6 +1100,11 @@ def test_the_file_is_a_program(process: Process, monkeypatch: pytest.MonkeyPatch
     assert end.value.code == 1
 
 
+def test_a_signal_has_a_name() -> None:
+    assert guard_module._signal_name(signal.SIGTERM) == "SIGTERM"
+    assert guard_module._signal_name(signal.SIGRTMIN + 6) == f"signal {signal.SIGRTMIN + 6}"
+
+
 def test_a_sigterm_before_there_is_a_supply_ends(
     process: Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:
