@@ -2,7 +2,8 @@
 
 ``python tests/mutation.py`` lets mutmut make and try all mutants of the files of ``[tool.mutmut]``
 in pyproject.toml, in a copy of this checkout, or of those files alone that are named (``gate``);
-``--short`` a part of those of gate and goals, with their own tests. It prints what became of them by file, and those that nobody noticed.
+``--short`` a part of those of gate and goals, with their own tests. It prints what became of them
+by file, and those that nobody noticed.
 
 A mutant that no test notices must be in ``mutation_survivors.txt``, with the reason why that is no
 defect; else the exit code is 1. Not counted are mutants of nothing but the text of a message: of a
