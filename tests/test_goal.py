@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -243,6 +244,46 @@ def test_a_goal_that_comes_while_pressures_are_let_down_is_approached_from_there
     assert bench.supply.armed
     bench.clock.sleep(RAMP)
     assert bench.vented()
+
+
+def test_a_lower_goal_that_comes_while_pressures_are_let_down_never_rises_again() -> None:
+    bench = Bench().pressed(6e4, 6e4, 6e4, valid_for=4.0)
+    bench.clock.sleep(1.0 + 0.5 * RAMP)
+    bench.goal(1e4, 1e4, 1e4, valid_for=1.0)
+    before = bench.device.commanded
+    for _, told in bench.steps(1.0 + RAMP + 0.1):
+        assert (told <= before).all()
+        before = told
+    assert bench.vented()
+
+
+def test_nobody_else_gets_in_while_the_outlet_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    free: list[bool] = []
+    write = bench.device._write
+
+    def note(pressures: Array) -> None:
+        with ThreadPoolExecutor(1) as other:
+            free.append(other.submit(bench.follower._lock.acquire, blocking=False).result())
+        write(pressures)
+
+    monkeypatch.setattr(bench.device, "_write", note)
+    bench.supply.arm()
+    bench.goal(0, 0, 0)
+    bench.follower.tick()
+    bench.supply.vent()
+    bench.follower.fail(DeviceError("no answer"))
+    bench.supply.close()
+    assert free == [False] * 6
+
+
+def test_a_supply_that_cannot_be_vented_is_pressed_no_more() -> None:
+    bench = Bench().pressed(3e4, 3e4, 3e4)
+    bench.device.dead = "before"
+    with pytest.raises(DeviceError):
+        bench.supply.vent()
+    assert bench.follower.due == math.inf
+    assert not bench.supply.armed
 
 
 def test_a_goal_that_expires_on_its_way_is_let_down_from_where_it_was() -> None:

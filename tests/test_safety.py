@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -460,6 +461,58 @@ def test_a_command_while_venting_fails_does_not_pass() -> None:
     applied = bench.ask(*HIGH)
     assert "the supply was vented" in applied.refused
     assert not bench.supply.commanded.any()
+
+
+def test_a_supply_that_cannot_be_vented_takes_no_command_either() -> None:
+    bench = Bench().armed()
+    bench.supply.dead = "before"
+    with pytest.raises(DeviceError):
+        bench.gate.vent()
+    assert bench.gate.armed is False
+
+
+def test_a_supply_that_cannot_be_armed_is_not() -> None:
+    bench = Bench()
+    bench.supply.dead = "before"
+    with pytest.raises(DeviceError):
+        bench.gate.arm()
+    assert bench.gate.armed is False
+
+
+def test_a_fall_that_the_supply_refuses_has_not_happened(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench().armed()
+    bench.until(5e4, 5e4, 5e4)
+
+    def refuse(_: Any) -> Any:
+        raise CommandError("busy")
+
+    with monkeypatch.context() as busy:
+        busy.setattr(bench.supply, "exchange", refuse)
+        assert bench.ask(0, 0, 0).refused == "busy"
+    np.testing.assert_array_equal(bench.ask(5e4, 5e4, 5e4, wait=0.0).pressures, [5e4] * 3)
+
+
+def test_nobody_else_gets_in_while_the_supply_is_told_something(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench = Bench().armed()
+    free: list[bool] = []
+    write = bench.supply._write
+
+    def note(pressures: Any) -> None:
+        with ThreadPoolExecutor(1) as other:
+            free.append(other.submit(bench.gate._lock.acquire, blocking=False).result())
+        write(pressures)
+
+    monkeypatch.setattr(bench.supply, "_write", note)
+    bench.ask(0, 0, 0)
+    bench.gate.vent()
+    bench.gate.arm()
+    bench.clock.t += 1.0
+    bench.gate.expire(bench.clock.t)
+    bench.gate.close()
+    bench.gate.open()
+    assert free == [False] * 6
 
 
 def rig(**about: Any) -> Any:
