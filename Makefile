@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check
 PICTURE := docs/images/two_segment_stiff_x.png
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test lint types format picture bench clean
+.PHONY: help demo test mutate lint types format picture bench clean
 
 help:  ## say what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -23,6 +23,9 @@ demo: $(VENV)/.installed-plot  ## solve a task and plot the arm
 
 test: $(VENV)/.installed-dev  ## run the tests (make test ARGS=--long for the long ones too)
 	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
+
+mutate: $(VENV)/.installed-dev  ## try mutants of the safety package (make mutate ARGS=--short: some)
+	$(BIN)/python tests/mutation.py $(ARGS)
 
 lint: $(VENV)/.installed-dev  ## check style, formatting and import layers
 	$(BIN)/ruff check .

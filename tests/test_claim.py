@@ -255,6 +255,7 @@ def test_a_system_that_refuses_names_is_told_at_once(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     time_ = Time(monkeypatch)
+    NoSuchSocket.made.clear()
     monkeypatch.setattr(socket, "socket", NoSuchSocket)
     with pytest.raises(DeviceError, match=r"the supply cannot be claimed: .* not permitted"):
         Claim(lambda: [name]).take()

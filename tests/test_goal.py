@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from stiffopt.rig.interface import PressureCommand, PressureLimits
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import SafetyGate
 from stiffopt.safety.goal import LONGEST, GoalFollower, GoalSupply, TickingClock, check_goal
+from stiffopt.safety.outlet import let_down
 
 Array = NDArray[np.float64]
 
@@ -175,6 +177,7 @@ def test_an_expired_goal_is_let_down_and_vented_and_told() -> None:
     assert steps[-1][0] - began <= 2.0 + RAMP + 2 * PERIOD
     assert bench.vented()
     assert bench.follower.due == math.inf
+    bench.follower.tick()  # one that comes late does nothing, and forgets nothing
     with pytest.raises(CommandError, match=EXPIRED):
         bench.goal(1e4, 1e4, 1e4)
     assert bench.vented()
@@ -243,6 +246,46 @@ def test_a_goal_that_comes_while_pressures_are_let_down_is_approached_from_there
     assert bench.vented()
 
 
+def test_a_lower_goal_that_comes_while_pressures_are_let_down_never_rises_again() -> None:
+    bench = Bench().pressed(6e4, 6e4, 6e4, valid_for=4.0)
+    bench.clock.sleep(1.0 + 0.5 * RAMP)
+    bench.goal(1e4, 1e4, 1e4, valid_for=1.0)
+    before = bench.device.commanded
+    for _, told in bench.steps(1.0 + RAMP + 0.1):
+        assert (told <= before).all()
+        before = told
+    assert bench.vented()
+
+
+def test_nobody_else_gets_in_while_the_outlet_is_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench()
+    free: list[bool] = []
+    write = bench.device._write
+
+    def note(pressures: Array) -> None:
+        with ThreadPoolExecutor(1) as other:
+            free.append(other.submit(bench.follower._lock.acquire, blocking=False).result())
+        write(pressures)
+
+    monkeypatch.setattr(bench.device, "_write", note)
+    bench.supply.arm()
+    bench.goal(0, 0, 0)
+    bench.follower.tick()
+    bench.supply.vent()
+    bench.follower.fail(DeviceError("no answer"))
+    bench.supply.close()
+    assert free == [False] * 6
+
+
+def test_a_supply_that_cannot_be_vented_is_pressed_no_more() -> None:
+    bench = Bench().pressed(3e4, 3e4, 3e4)
+    bench.device.dead = "before"
+    with pytest.raises(DeviceError):
+        bench.supply.vent()
+    assert bench.follower.due == math.inf
+    assert not bench.supply.armed
+
+
 def test_a_goal_that_expires_on_its_way_is_let_down_from_where_it_was() -> None:
     bench = Bench().armed()
     bench.goal(*HIGH, valid_for=0.1)
@@ -281,6 +324,32 @@ def test_a_tick_after_too_long_a_pause_vents_and_tells_why() -> None:
     assert bench.follower.due == math.inf
     with pytest.raises(CommandError, match=r"no command came for 0\.3 s"):
         bench.goal(3e4, 3e4, 3e4)
+
+
+def test_a_goal_is_approached_to_the_last_instant() -> None:
+    bench = Bench().armed()
+    bench.clock.sleep_until(64.0)
+    bench.goal(*HIGH, valid_for=1.0 / 64)
+    before = bench.device.commanded
+    bench.hand.t = 64.0 + 1.0 / 64
+    bench.follower.tick()
+    np.testing.assert_allclose(bench.device.commanded, before + SLEW / 64)
+
+
+@pytest.mark.parametrize(
+    ("share", "expected"),
+    [(1.0, 4e4), (0.5, 2e4), (0.0, 0.0), (-3.0, 0.0), (1.5, 4e4), (math.inf, 4e4)],
+)
+def test_a_share_of_pressures(share: float, expected: float) -> None:
+    limits = PressureLimits(np.array([0.0, -5e4, 0.0]), HIGH)
+    np.testing.assert_array_equal(let_down(np.full(3, 4e4), share, limits), [expected] * 3)
+
+
+def test_a_share_of_pressures_with_a_low_limit_above_zero() -> None:
+    limits = PressureLimits(np.array([2e4, -2e4, 0.0]), HIGH)
+    at = np.array([4e4, -2e4, 4e4])
+    np.testing.assert_array_equal(let_down(at, 0.5, limits), [2e4, -1e4, 2e4])
+    np.testing.assert_array_equal(let_down(at, 0.25, limits), [0.0, -5e3, 1e4])
 
 
 # which goals are taken ---------------------------------------------------------------------------
@@ -500,6 +569,8 @@ def test_to_close_vents() -> None:
     bench.supply.open()
     assert bench.device.opened == 2
     assert not bench.supply.armed
+    with pytest.raises(CommandError, match=r"^the supply is vented and nothing was written"):
+        bench.supply.command(np.zeros(3))
 
 
 def test_a_supply_that_may_never_be_armed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -603,3 +674,26 @@ def test_the_clock_stops_at_each_tick_and_ends_where_it_should() -> None:
     bench.supply.vent()
     bench.clock.sleep(100.0)
     assert len(seen) == 11
+
+
+# a rig's own ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("period", "often"), [(0.5, 0.1), (0.02, 0.02)])
+def test_a_slow_rig_repeats_goals_before_they_are_too_old(period: float, often: float) -> None:
+    bench = Bench()
+    safety = Safety(command_timeout=0.4, ramp_time=0.7)
+    bench.follower = GoalFollower.before(bench.gate, safety, period, bench.hand)
+    bench.clock = TickingClock(bench.hand, bench.follower)
+    bench.supply = GoalSupply(bench.follower, bench.clock)
+    bench.supply.open()
+    bench.armed()
+    assert bench.follower.due == pytest.approx(bench.hand.t + often)
+    bench.goal(1e4, 1e4, 1e4, valid_for=5.0)
+    bench.clock.sleep(4.9)
+    assert bench.supply.armed
+    np.testing.assert_array_equal(bench.device.commanded, [1e4] * 3)
+    bench.clock.sleep(0.1 + 0.35)
+    np.testing.assert_allclose(bench.device.commanded, [5e3] * 3, atol=2e3)
+    bench.clock.sleep(0.6)
+    assert bench.vented()

@@ -243,8 +243,10 @@ def test_a_supply_that_fails_trips(error: Exception, capsys: pytest.CaptureFixtu
     assert scene.outlet.did == ["apply", "vent"]
     assert [answer.sequence for answer in answers] == [0, 3]
     assert "no answer" in answers[1].error
-    assert "the supply failed: " in answers[1].tripped
-    assert not answers[1].armed
+    kind = "" if isinstance(error, DeviceError) else "RuntimeError: "
+    assert answers[1].tripped == f"the supply failed: {kind}no answer"
+    assert answers[1].error == f"{kind}no answer"
+    assert answers[1].armed is False
     assert "vented: the supply failed" in capsys.readouterr().err
 
 
@@ -430,6 +432,37 @@ def test_to_vent_comes_first() -> None:
     assert scene.outlet.did == ["vent", "vent", "read"]
     assert [bool(answer.error) for answer in answers] == [True, False, True, False, False]
     assert "overtaken" in answers[0].error
+    sent = (arm, first, read, last)
+    assert [answer.sequence for answer in answers[:4]] == [request.sequence for request in sent]
+
+
+def test_a_request_overtakes_no_command() -> None:
+    scene = Scene().pressed()
+    answers = scene.step(scene.command(3e4), scene.request("read"))
+    assert scene.outlet.did == ["read", "apply"]
+    assert scene.outlet.pressures.tolist() == [3e4, 3e4]
+    assert not any(answer.error for answer in answers)
+
+
+def test_a_command_at_the_last_instant_feeds() -> None:
+    scene = Scene()
+    scene.clock.time = 1024.0  # what follows is exact in binary
+    scene.guard._timeout = 2.0**-4
+    scene.pressed()
+    for _ in range(3):
+        scene.clock.time += 2.0**-4
+        scene.step(scene.command())
+    assert scene.outlet.did == ["apply"] * 3
+
+
+def test_a_guard_to_which_nothing_has_happened_says_so() -> None:
+    scene = Scene()
+    (answer,) = scene.step(scene.request("ping"))
+    said = (answer.error, answer.tripped, answer.refused, answer.armed, answer.trips, answer.value)
+    assert said == ("", "", "", False, 0, None)
+    assert np.isnan(answer.measured).all()
+    assert answer.measured.dtype == float
+    assert scene.step(scene.request("read"))[0].time == 7.0  # the rig's clock is everybody's
 
 
 @pytest.mark.parametrize("do", ["arm", "vent"])
@@ -582,7 +615,7 @@ class GoalScene:
     def pressed(self, valid_for: float = 100.0) -> GoalScene:
         """Armed for goals, and arrived at one."""
         assert self.ask("arm", told=0, goals=True).armed
-        assert not self.command(2e4, valid_for).error
+        assert self.command(2e4, valid_for).armed is True
         self.run(0.2)
         assert self.device.commanded.tolist() == [2e4] * 3
         return self
@@ -621,8 +654,8 @@ def test_a_goal_is_repeated_without_being_asked_and_silence_is_no_trip() -> None
     scene.run(1.0)
     assert len(scene.device.written) - before == pytest.approx(100, abs=2)
     assert scene.device.commanded.tolist() == [2e4] * 3
-    assert scene.ask("ping").armed
-    assert not scene.ask("ping").tripped
+    answer = scene.ask("ping")
+    assert (answer.armed, answer.tripped, answer.error) == (True, "", "")
 
 
 def test_an_expired_goal_is_let_down_and_vented_and_is_no_trip() -> None:
@@ -667,7 +700,19 @@ def test_nothing_is_left_of_a_stream_when_goals_begin() -> None:
     assert not answer.commanded.any()
     scene.run(3.0)  # and nobody need be in time
     assert scene.ask("ping").armed
+    assert scene.device.armed
     assert not scene.device.commanded.any()
+    assert not scene.command(1e4).refused
+
+
+def test_what_is_not_due_is_not_repeated() -> None:
+    scene = GoalScene().pressed()
+    scene.run(PERIOD)
+    scene.guard.step()
+    before = len(scene.device.written)
+    for _ in range(5):
+        scene.ask("ping")  # which takes no time
+    assert len(scene.device.written) <= before + 1
 
 
 @pytest.mark.parametrize("goals", [False, True])
@@ -807,8 +852,11 @@ class FakeRest:
         return [about["n"]]
 
 
+UNTURNED = np.array([1.0, 0, 0, 0])
+
+
 def sample(frame: int) -> PoseSample:
-    return PoseSample(10.0 + frame, 10.5 + frame, frame, np.full(3, float(frame)), None)
+    return PoseSample(10.0 + frame, 10.5 + frame, frame, np.full(3, float(frame)), UNTURNED)
 
 
 def test_the_poses_of_a_hosted_tracker_are_forwarded() -> None:
@@ -820,6 +868,11 @@ def test_the_poses_of_a_hosted_tracker_are_forwarded() -> None:
     assert [len(packet.samples) for packet in packets] == [200, 200, 50]
     first = packets[0].samples[0]
     assert (first.time, first.received, first.frame) == (910.0, 910.5, 0)
+    last = packets[2].samples[-1]
+    assert last.position is not None
+    assert last.position.tolist() == [449.0] * 3
+    assert last.quaternion is not None
+    assert last.quaternion.tolist() == [1.0, 0, 0, 0]
     assert scene.channel.waits[-1] < 0.005
     scene.step()
     assert len([m for m in scene.channel.sent if isinstance(m, Poses)]) == 3
@@ -885,7 +938,7 @@ def test_a_signal_vents_and_ends() -> None:
     assert scene.outlet.did == ["vent", "close"]
 
 
-def test_a_bug_vents(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_vents(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     scene = Scene().pressed()
 
     def fail(wait: float) -> list[Message]:
@@ -895,6 +948,7 @@ def test_a_bug_vents(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RuntimeError, match="bug"):
         scene.guard.serve()
     assert scene.outlet.did == ["vent", "close"]
+    assert "vented: the guard failed: RuntimeError: bug" in capsys.readouterr().err
 
 
 def test_at_the_end_venting_is_tried_again_and_again() -> None:
@@ -903,7 +957,15 @@ def test_at_the_end_venting_is_tried_again_and_again() -> None:
     scene.channel.closed = True
     assert scene.guard.serve() == 0
     assert scene.outlet.did == ["vent"] * 8 + ["close"]
-    assert len(scene.pauses) == 7
+    assert scene.pauses == [0.05] * 7
+
+
+def test_the_end_of_what_was_not_armed_is_no_news(capsys: pytest.CaptureFixture[str]) -> None:
+    scene = Scene()
+    scene.channel.closed = True
+    assert scene.guard.serve() == 0
+    assert scene.outlet.did == ["vent", "close"]
+    assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("what", ["vent", "close"])
@@ -918,16 +980,34 @@ def test_what_cannot_be_vented_is_told_loudly(
     assert "THE SUPPLY COULD NOT BE VENTED: no answer" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("error", [BrokenPipeError(), OSError(), ValueError("closed file")])
 def test_a_listener_that_is_gone_keeps_nothing_from_venting(
-    monkeypatch: pytest.MonkeyPatch,
+    error: Exception, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    closed = io.StringIO()
-    closed.close()
-    monkeypatch.setattr(sys, "stderr", closed)
+    class Gone(io.StringIO):
+        def write(self, _: str) -> int:
+            raise error
+
+    monkeypatch.setattr(sys, "stderr", Gone())
     scene = Scene().pressed()
     scene.clock.time += 1.0
     scene.step()
     assert scene.outlet.did == ["vent"]
+
+
+def test_what_is_said_is_said_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Listener(io.StringIO):
+        heard = ""
+
+        def flush(self) -> None:
+            self.heard = self.getvalue()
+
+    listener = Listener()
+    monkeypatch.setattr(sys, "stderr", listener)
+    scene = Scene().pressed()
+    scene.clock.time += 1.0
+    scene.step()
+    assert SILENT in listener.heard
 
 
 # the process -------------------------------------------------------------------------------------
@@ -1028,6 +1108,11 @@ def test_the_file_is_a_program(process: Process, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(SystemExit) as end:
         runpy.run_path(str(guard_module.__file__), run_name="__main__")
     assert end.value.code == 1
+
+
+def test_a_signal_has_a_name() -> None:
+    assert guard_module._signal_name(signal.SIGTERM) == "SIGTERM"
+    assert guard_module._signal_name(signal.SIGRTMIN + 6) == f"signal {signal.SIGRTMIN + 6}"
 
 
 def test_a_sigterm_before_there_is_a_supply_ends(

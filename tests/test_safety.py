@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,13 @@ from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.interface import PressureCommand, PressureLimits
 from stiffopt.rig.settings import Safety
-from stiffopt.safety.gate import SafetyGate
+from stiffopt.safety.gate import (
+    DEFAULT_SLEW,
+    SafetyGate,
+    check_protection,
+    effective_slew,
+    gate_before,
+)
 
 AREAS = np.array([1e-5, 2e-5, 3e-5])
 
@@ -419,3 +427,175 @@ def test_a_task_s_limits_are_one_pressure_for_each_channel(high: Any) -> None:
     with pytest.raises(InputError, match="one highest pressure in Pa for each channel"):
         bench.gate.restrict(high)
     np.testing.assert_array_equal(bench.until(5e4, 5e4, 5e4).pressures, [5e4] * 3)
+
+
+def test_a_short_rise_below_a_low_limit_is_no_set_point() -> None:
+    """The supply's own clamp would make the low limit of it."""
+    bench = Bench([1.9e4, 0.0, 0.0]).armed()
+    for wait in (1e-7, 1e-6, 2e-6):
+        applied = bench.ask(*HIGH, wait=wait)
+        assert applied.pressures[0] == 0
+        assert bench.supply.commanded[0] == 0
+
+
+def test_the_last_instant_of_a_command_and_of_a_silence() -> None:
+    bench = Bench(safety=Safety(command_timeout=0.5)).armed()
+    bench.clock.t = 50.25  # what follows is exact in binary
+    command = PressureCommand(np.zeros(3), 50.0, 0.25)
+    assert not bench.gate.apply(command).refused
+    assert not bench.gate.expire(50.75)
+    assert bench.gate.armed
+    assert bench.gate.expire(math.nextafter(50.75, 51))
+    assert bench.gate.armed is False
+    bench.armed()
+    bench.clock.t = math.nextafter(50.25, 51)
+    assert "expired" in bench.gate.apply(command).refused
+
+
+def test_what_the_force_shortens_is_told() -> None:
+    bench = Bench(safety=Safety(max_force=2.5), force_per_pressure=AREAS).armed()
+    assert bench.ask(1e3, 1e3, 1e3).force_limited is False
+    assert bench.ask(*HIGH).force_limited is False  # limited, but by its rate
+    assert bench.until(*HIGH).force_limited is True
+    assert Bench().armed().ask(*HIGH).force_limited is False
+
+
+def test_a_gate_tells_whether_it_is_armed() -> None:
+    bench = Bench()
+    assert bench.gate.armed is False
+    bench.armed()
+    assert bench.gate.armed is True
+    bench.gate.vent()
+    assert bench.gate.armed is False
+    bench.armed().supply.vent()
+    bench.ask(*HIGH)
+    assert bench.gate.armed is False
+    bench.armed().gate.close()
+    assert bench.gate.armed is False
+
+
+def test_14_a_gate_that_was_told_no_period_takes_it_for_short() -> None:
+    bench = Bench().armed()
+    np.testing.assert_allclose(bench.ask(*HIGH, wait=0.4).pressures, 3 * 0.01 * SLEW)
+
+
+def test_to_vent_is_tried_again_also_while_nobody_arms() -> None:
+    bench = Bench()
+    bench.supply.dead = "before"
+    with pytest.raises(DeviceError):
+        bench.gate.vent()
+    bench.supply.dead = ""
+    before = len(bench.supply.written)
+    assert bench.gate.expire(bench.clock.t)
+    assert len(bench.supply.written) == before + 1
+    assert not bench.gate.expire(bench.clock.t)
+
+
+def test_a_command_while_venting_fails_does_not_pass() -> None:
+    bench = Bench().armed()
+    bench.until(5e4, 5e4, 5e4)
+    bench.supply.dead = "before"
+    with pytest.raises(DeviceError):
+        bench.gate.vent()
+    bench.supply.dead = ""
+    applied = bench.ask(*HIGH)
+    assert "the supply was vented" in applied.refused
+    assert not bench.supply.commanded.any()
+
+
+def test_a_supply_that_cannot_be_vented_takes_no_command_either() -> None:
+    bench = Bench().armed()
+    bench.supply.dead = "before"
+    with pytest.raises(DeviceError):
+        bench.gate.vent()
+    assert bench.gate.armed is False
+
+
+def test_a_supply_that_cannot_be_armed_is_not() -> None:
+    bench = Bench()
+    bench.supply.dead = "before"
+    with pytest.raises(DeviceError):
+        bench.gate.arm()
+    assert bench.gate.armed is False
+
+
+def test_a_fall_that_the_supply_refuses_has_not_happened(monkeypatch: pytest.MonkeyPatch) -> None:
+    bench = Bench().armed()
+    bench.until(5e4, 5e4, 5e4)
+
+    def refuse(_: Any) -> Any:
+        raise CommandError("busy")
+
+    with monkeypatch.context() as busy:
+        busy.setattr(bench.supply, "exchange", refuse)
+        assert bench.ask(0, 0, 0).refused == "busy"
+    np.testing.assert_array_equal(bench.ask(5e4, 5e4, 5e4, wait=0.0).pressures, [5e4] * 3)
+
+
+def test_nobody_else_gets_in_while_the_supply_is_told_something(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    bench = Bench().armed()
+    free: list[bool] = []
+    write = bench.supply._write
+
+    def note(pressures: Any) -> None:
+        with ThreadPoolExecutor(1) as other:
+            free.append(other.submit(bench.gate._lock.acquire, blocking=False).result())
+        write(pressures)
+
+    monkeypatch.setattr(bench.supply, "_write", note)
+    bench.ask(0, 0, 0)
+    bench.gate.vent()
+    bench.gate.arm()
+    bench.clock.t += 1.0
+    bench.gate.expire(bench.clock.t)
+    bench.gate.close()
+    bench.gate.open()
+    assert free == [False] * 6
+
+
+def rig(**about: Any) -> Any:
+    clock = HandClock()
+    robot = SimpleNamespace(channel_areas=AREAS)
+    given = {"supply": FakeSupply(clock), "clock": clock, "robot": robot, "slew": SLEW}
+    return SimpleNamespace(**{**given, **about})
+
+
+def test_the_gate_of_a_rig() -> None:
+    of, safety = rig(), Safety(max_force=2.5, max_pressure=9e4)
+    gate = gate_before(of, safety, 0.02)
+    assert gate.supply is of.supply
+    assert gate.clock is of.clock
+    np.testing.assert_array_equal(gate.limits.high, [9e4] * 3)
+    gate.open()
+    gate.arm()
+    of.clock.t += 0.4
+    applied = gate.apply(PressureCommand(np.full(3, 9e4), of.clock.t))
+    np.testing.assert_allclose(applied.pressures, 3 * 0.02 * SLEW)
+    for _ in range(100):
+        of.clock.t += 0.02
+        applied = gate.apply(PressureCommand(np.full(3, 9e4), of.clock.t))
+    assert float(AREAS @ applied.pressures) == pytest.approx(2.5)
+    with pytest.raises(InputError, match="has a gate before it already"):
+        gate_before(rig(supply=object()), safety, 0.02)
+
+
+def test_25_a_rig_without_rates_has_one() -> None:
+    slew = effective_slew(rig(slew=np.array([1e5, math.inf, math.nan])))
+    np.testing.assert_array_equal(slew, [1e5, DEFAULT_SLEW, DEFAULT_SLEW])
+    np.testing.assert_array_equal(effective_slew(rig()), SLEW)
+    assert DEFAULT_SLEW == 5e5
+
+
+@pytest.mark.parametrize("protects", ["is_simulated", "has_watchdog", "has_dump_valve", ""])
+def test_a_supply_that_nothing_vents_is_refused_unless_that_is_accepted(protects: str) -> None:
+    names = ("is_simulated", "has_watchdog", "has_dump_valve")
+    supply: Any = SimpleNamespace(**{name: name == protects for name in names})
+    accepted = Safety(unprotected_supply="accepted")
+    check_protection(supply, accepted)
+    if protects:
+        check_protection(supply, Safety())
+        return
+    with pytest.raises(CommandError, match=r"safety: \{unprotected_supply: accepted\}$"):
+        check_protection(supply, Safety())

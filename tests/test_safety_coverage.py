@@ -14,8 +14,12 @@ pytest.importorskip("coverage", reason="coverage is not installed; it is part of
 
 ROOT = Path(__file__).parents[1]
 GUARDING = {
-    "safety/gate.py": ("tests/test_safety.py",),
+    "safety/gate.py": ("tests/test_safety.py", "tests/test_claim.py"),
+    "safety/goal.py": ("tests/test_goal.py",),
+    "safety/claim.py": ("tests/test_claim.py",),
     "safety/guard.py": ("tests/test_guard.py",),
+    "safety/rescue.py": ("tests/test_rescue.py",),
+    "safety/vent_line.py": ("tests/test_vent_line.py",),
 }
 """Files that must be covered to the last line, and the tests that do so."""
 
@@ -37,7 +41,7 @@ def test_every_line_is_run(source: str, tmp_path: Path) -> None:
     run(*coverage, "run", "--branch", f"--include={path}", *pytest_)
     run(*coverage, "json", "-o", str(report))
     (found,) = json.loads(report.read_text())["files"].values()
-    assert found["summary"]["num_statements"] > 50
+    assert found["summary"]["num_statements"] > 40
     assert found["missing_lines"] == []
     assert found["excluded_lines"] == []
     assert found["missing_branches"] == []

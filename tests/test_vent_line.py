@@ -19,7 +19,7 @@ import pytest
 
 from stiffopt.safety import vent_line as module
 from stiffopt.safety.claim import address_of
-from stiffopt.safety.vent_line import Peer, Reply, VentLine, ask_to_vent, guards_of
+from stiffopt.safety.vent_line import Caller, Peer, Reply, VentLine, ask_to_vent, guards_of
 
 STRANGER = 54321
 """A user who is nobody."""
@@ -250,6 +250,21 @@ def test_one_step_looks_at_a_bounded_number_of_callers(line: VentLine) -> None:
 # other users -------------------------------------------------------------------------------------
 
 
+def test_a_connection_that_breaks_has_asked_for_nothing() -> None:
+    class Broken:
+        def recv(self, _: int) -> bytes:
+            raise ConnectionResetError
+
+    assert Caller(Broken(), Peer(1, 0)).asks() is False  # type: ignore[arg-type]
+
+
+def test_what_went_well_needs_no_word(line: VentLine, call: Callable[..., socket.socket]) -> None:
+    asking = call(b"vent")
+    (caller,) = line.asked()
+    caller.answer()
+    assert json.loads(asking.recv(100)) == {"error": ""}
+
+
 @pytest.mark.parametrize("uid", [0, os.getuid(), STRANGER])
 def test_root_and_the_same_user_are_heard_and_nobody_else(
     uid: int,
@@ -279,6 +294,19 @@ def test_who_is_neither_root_nor_the_user_of_the_guard_is_not_heard(
     caller = call(b"vent")
     assert line.asked() == []
     assert hung_up(caller)
+
+
+def test_root_is_heard_by_a_guard_that_does_not_run_as_root(
+    line: VentLine, call: Callable[..., socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "getuid", lambda: STRANGER)
+    for uid in (0, 1):
+        monkeypatch.setattr(module, "_peer", lambda connection, uid=uid: Peer(9, uid))
+        call(b"vent")
+        heard = line.asked()
+        assert len(heard) == (uid == 0)
+        for caller in heard:
+            caller.answer("")
 
 
 def test_strangers_do_not_use_up_the_turn_of_who_is_entitled(
