@@ -16,7 +16,7 @@ def recordings(pattern: str) -> list[Path]:
     return sorted(DATA.glob(pattern))
 
 
-UCL = recordings("ucl_*/*.csv")
+UCL = recordings("ucl_stiff_flop_58mm/*.csv")
 ASU = recordings("asu_*/*.csv")
 
 needs_ucl = pytest.mark.skipif(not UCL, reason=f"the UCL recordings are not in {DATA}")

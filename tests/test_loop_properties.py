@@ -62,6 +62,9 @@ class HandClock(Clock):
 class Recorder(PressureSupply):
     """Writes down what it is told, and judges it: no check of a real supply is in the way."""
 
+    endpoints = ()  # nothing that others could command too
+    has_watchdog = True
+
     def __init__(self, clock: Clock, chance: random.Random, low: float) -> None:
         super().__init__(PressureLimits(np.full(N, low), HIGH), clock)
         self.chance = chance
