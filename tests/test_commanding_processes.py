@@ -244,7 +244,20 @@ def test_a_killed_script_is_vented_at_once(
     wire.vented_within(1.0)
 
 
-def test_a_goal_outlives_a_stopped_script_and_no_more(wire: Wire) -> None:
+def test_a_script_that_was_stopped_finds_its_guard_as_it_was(
+    wire: Wire, script: Callable[..., subprocess.Popen[str]]
+) -> None:
+    process = script()
+    process.send_signal(signal.SIGSTOP)  # Ctrl-Z
+    time.sleep(8.0)  # longer than a guard may be silent
+    process.send_signal(signal.SIGCONT)
+    end = time.monotonic() + 1.5
+    while time.monotonic() < end:
+        assert wire.pressures.all()
+        time.sleep(0.01)
+
+
+def test_a_goal_holds_for_as_long_as_it_is_valid_and_no_longer(wire: Wire) -> None:
     rig = wire.rig()
     with rig:
         rig.supply.arm()

@@ -155,7 +155,7 @@ def test_a_guard_that_lives_is_asked_and_left_alone(
 def test_after_a_guard_that_was_killed_the_supply_is_vented(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rescue, "_LOOK", 1000.0)  # the kernel says so at once
+    monkeypatch.setattr(rescue, "PING_PERIOD", 1000.0)  # the kernel says so at once
     guard = ProcessGuard()
     assert guard.pid is not None
     assert guard.process is not None
@@ -175,7 +175,7 @@ def test_it_is_noticed_also_where_the_kernel_does_not_tell(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(os, "pidfd_open")
-    monkeypatch.setattr(rescue, "_LOOK", 0.01)
+    monkeypatch.setattr(rescue, "PING_PERIOD", 0.01)
     guard = FakeGuard()
     watch = watching(guard, supply)
     wait_for(lambda: guard.pings)

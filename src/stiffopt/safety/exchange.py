@@ -42,13 +42,15 @@ class Exchange:
     ----------
     newest : the newest answer of the guard, to whatever; None before the first.
     to_command : the newest answer to a command; None before the first since arming.
+    answer_within : seconds in which the guard must answer to a request.
+    unanswered_pings : how many have been sent since the guard last said anything.
     """
 
     def __init__(self, channel: Channel, patience: float = 0.0) -> None:
         self.newest: Answer | None = None
         self.to_command: Answer | None = None
         self.answer_within = max(_ANSWER, _CALLS * patience)
-        self._heard = time.monotonic()  # when the guard last said anything
+        self.unanswered_pings = 0
         self._channel = channel
         self._numbers = itertools.count(1)
         self._receiving = threading.Lock()
@@ -107,11 +109,8 @@ class Exchange:
     def ping(self) -> None:
         """Ask for a sign of life, and take in what has come; wait for nothing."""
         self._channel.send(Request(0, "ping"))
+        self.unanswered_pings += 1
         self._receive()
-
-    def quiet(self) -> float:
-        """Return for how long the guard has said nothing, in s."""
-        return time.monotonic() - self._heard
 
     def take_poses(self) -> tuple[PoseSample, ...]:
         """Return the tracker's samples that have come since the last call."""
@@ -149,7 +148,7 @@ class Exchange:
         try:
             messages = self._channel.receive(min(wait, _SLICE))
             if messages:
-                self._heard = time.monotonic()
+                self.unanswered_pings = 0
             for message in messages:
                 self._note(message)
         finally:

@@ -34,7 +34,7 @@ from stiffopt.safety.goal import GoalSupply
 from stiffopt.safety.guard_process import GuardProcess
 from stiffopt.safety.guarded import ForwardedProbe, ForwardedTracker
 from stiffopt.safety.outlet import Applied
-from stiffopt.safety.rescue import GuardWatch
+from stiffopt.safety.rescue import PING_PERIOD, GuardWatch
 
 __all__ = ["GuardLink", "guarded_rig"]
 
@@ -162,10 +162,12 @@ class GuardLink:
 
     @property
     def hung(self) -> bool:
-        """Whether the guard is there and has not answered for so long that it never may."""
-        exchange = self._exchange
-        quiet = 0.0 if exchange is None else exchange.quiet()
-        return self.alive and quiet > _HUNG + _CALLS * self._patience
+        """Whether the guard is there and has not answered for so long that it never may.
+
+        Unanswered pings are counted, not seconds: this process may have been stopped meanwhile.
+        """
+        pings = 0 if self._exchange is None else self._exchange.unanswered_pings
+        return self.alive and pings * PING_PERIOD > _HUNG + _CALLS * self._patience
 
     def ping(self) -> None:
         """Ask the guard for a sign of life; waits for nothing."""

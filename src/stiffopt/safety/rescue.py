@@ -13,9 +13,10 @@ from stiffopt.errors import DeviceError
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.claim import Claim
 
-__all__ = ["GuardWatch", "vent_directly"]
+__all__ = ["PING_PERIOD", "GuardWatch", "vent_directly"]
 
-_LOOK = 0.1  # s between looks at a guard that answers
+PING_PERIOD = 0.1
+"""Seconds between two looks at a guard."""
 _AGAIN = 0.1  # s between attempts to vent
 _CLAIM = 0.2  # s for which a claim may still be that of a guard that is just ending
 _ATTEMPTS = 50
@@ -132,7 +133,7 @@ class GuardWatch:
                 stack.callback(os.close, end)
                 poll.register(end, select.POLLIN)
             while self._guard.alive and not self._ended.is_set():
-                poll.poll(_LOOK * 1e3)
+                poll.poll(PING_PERIOD * 1e3)
                 if self._guard.alive and not self._ended.is_set():
                     self._guard.ping()
                     if self._guard.hung:
