@@ -429,11 +429,13 @@ def test_to_vent_comes_first() -> None:
     arm, command, read = scene.request("arm"), scene.command(), scene.request("read")
     first, last = scene.request("vent"), scene.request("vent")
     answers = scene.step(arm, command, first, read, last, scene.request("read"))
-    assert scene.outlet.did == ["vent", "vent", "read"]
-    assert [bool(answer.error) for answer in answers] == [True, False, True, False, False]
+    assert scene.outlet.did == ["vent", "vent", "read", "read"]
+    assert [bool(answer.error) for answer in answers] == [True, False, False, False, False]
     assert "overtaken" in answers[0].error
-    sent = (arm, first, read, last)
-    assert [answer.sequence for answer in answers[:4]] == [request.sequence for request in sent]
+    assert [answer.sequence for answer in answers[:3]] == [
+        request.sequence for request in (arm, first, last)
+    ]
+    assert read.sequence in [answer.sequence for answer in answers[3:]]  # it could wait
 
 
 def test_a_request_overtakes_no_command() -> None:

@@ -248,7 +248,7 @@ def test_it_is_tried_until_the_supply_can_be_vented(
     assert not supply.written[-1].any()
 
 
-def test_it_is_not_tried_for_ever(
+def test_it_is_tried_until_nobody_wants_it_any_more(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rescue, "_AGAIN", 0.0)
@@ -256,10 +256,26 @@ def test_it_is_not_tried_for_ever(
     guard = FakeGuard()
     guard.alive = False
     watch = watching(guard, supply)
-    assert not watch.wait(PATIENCE)
-    assert watch._over.is_set()
-    assert supply.opened == 50
+    wait_for(lambda: supply.opened > 60)
     assert watch.error == "it does not answer"
+    assert not watch.rescued.is_set()
+    supply.dead = ""
+    assert watch.wait(PATIENCE)
+
+
+def test_a_thread_that_wants_to_vent_tries_by_itself(
+    supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rescue, "_AGAIN", 1e-3)
+    watch = GuardWatch(FakeGuard(), supply)
+    supply.dead = "before"
+    assert not watch.vent(0.01)
+    assert watch.error == "it does not answer"
+    supply.dead = ""
+    assert watch.vent()
+    opened = supply.opened
+    assert watch.vent()  # once is enough
+    assert supply.opened == opened
 
 
 def test_to_stop_ends_the_attempts(

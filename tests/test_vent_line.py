@@ -45,9 +45,11 @@ def call(name: str) -> Iterator[Callable[..., socket.socket]]:
     made: list[socket.socket] = []
 
     def one(word: bytes = b"") -> socket.socket:
-        caller = next(iter(module._lines_of(name)), None)
-        if caller is None:
+        found = addresses(name)
+        if not found:
             raise ConnectionRefusedError
+        caller = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        caller.connect("\0" + found[0][1:])
         made.append(caller)
         caller.settimeout(5.0)
         if word:
@@ -425,6 +427,23 @@ def test_another_user_s_word_that_it_is_vented_is_not_believed(
     assert replies == ([Reply(Peer(9, uid), answered=True)] if believed else [])
 
 
+def test_a_hung_guard_is_found_though_its_backlog_is_full(name: str, line: VentLine) -> None:
+    held = []
+    for _ in range(200):  # nobody accepts
+        held += [one for _, one in module._lines_of(name) if one is not None]
+    assert ask_to_vent(name) == [Reply(ME, answered=False, error="the guard accepts no calls")]
+    for one in held:
+        one.close()
+
+
+def test_who_became_root_may_be_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "getuid", lambda: 0)
+    monkeypatch.setenv("SUDO_UID", str(STRANGER))
+    assert [module.trusted(uid) for uid in (0, STRANGER, STRANGER + 1)] == [True, True, False]
+    monkeypatch.setattr(os, "getuid", lambda: STRANGER + 2)
+    assert [module.trusted(uid) for uid in (0, STRANGER, STRANGER + 2)] == [True, False, True]
+
+
 def test_root_asks_the_guards_of_all_users(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 0)
     monkeypatch.setattr(module, "_peer", lambda connection: Peer(9, STRANGER))
@@ -444,8 +463,8 @@ def test_a_guard_that_accepts_nobody_is_not_waited_for(
         raise BlockingIOError("its backlog is full")
 
     monkeypatch.setattr(socket.socket, "connect", full)
-    assert ask_to_vent(name) == []
-    assert guards_of(name) == []
+    assert ask_to_vent(name) == [Reply(ME, answered=False, error="the guard accepts no calls")]
+    assert guards_of(name) == [ME]
 
 
 def test_a_process_has_a_name_for_people() -> None:

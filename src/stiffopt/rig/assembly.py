@@ -30,9 +30,11 @@ def make_rig(
         rig: Rig = simulated_rig(description, robot, limits, slew, real_time=real_time)
     else:
         clock = SystemClock()
+        real = supply.device(limits, clock)
+        real.restrict(supply.limits_within(limits))  # whatever its driver makes of them
         rig = Rig(
             robot,
-            supply.device(limits, clock),
+            real,
             None if tracker is None else _real(tracker).device(clock),
             None if probe is None else _real(probe).device(clock),
             clock=clock,

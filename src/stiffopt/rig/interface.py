@@ -28,6 +28,7 @@ from stiffopt.rig.pressure import (
     Supply,
     SupplySettings,
     total_force,
+    vent_at_exit,
 )
 from stiffopt.rig.probing import ForceProbe, ForceSample
 from stiffopt.rig.tracking import PoseSample, PoseTracker, RawPose
@@ -53,6 +54,7 @@ __all__ = [
     "SupplySettings",
     "SystemClock",
     "total_force",
+    "vent_at_exit",
 ]
 
 

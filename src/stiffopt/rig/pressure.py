@@ -23,6 +23,7 @@ __all__ = [
     "Supply",
     "SupplySettings",
     "total_force",
+    "vent_at_exit",
 ]
 
 Array = NDArray[np.float64]
@@ -276,6 +277,8 @@ class SupplySettings(Schema):
         for index, channel in enumerate(channels):
             lowest, highest = self._reach(index)
             least, most = getattr(channel, "min", None), getattr(channel, "max", None)
+            if not all(bound is None or np.isfinite(bound) for bound in (least, most)):
+                raise InputError(f"channel {index + 1}: its limits must be finite")
             low[index] = max(low[index], lowest, -np.inf if least is None else least)
             high[index] = min(high[index], highest, np.inf if most is None else most)
             if low[index] > high[index]:
@@ -305,7 +308,7 @@ class PressureSupply(Supply):
 
     def __init__(self, limits: PressureLimits, clock: Clock | None = None) -> None:
         super().__init__(clock)
-        self.limits = limits
+        self._limits = limits
         self._commanded: Array = np.zeros(limits.n)
         self._armed = False
         self._looked_at = 0.0  # when what the device holds was last compared
@@ -347,9 +350,18 @@ class PressureSupply(Supply):
         """Seconds that one call may take at most, while the device answers within its timeout."""
         return 1.0
 
+    @property
+    def limits(self) -> PressureLimits:
+        """What may be commanded; to set it may tighten it, and never makes it wider."""
+        return self._limits
+
+    @limits.setter
+    def limits(self, limits: PressureLimits) -> None:
+        self._limits = self._limits.within(limits)
+
     def restrict(self, limits: PressureLimits) -> None:
         """Tighten the limits; they never become wider again."""
-        self.limits = self.limits.within(limits)
+        self.limits = limits
 
     def prepare(self) -> None:
         """Import what connecting needs, so that it takes no time when it is urgent."""
@@ -543,6 +555,11 @@ class PressureSupply(Supply):
 
 
 _not_known_to_be_vented: set[PressureSupply] = set()  # held, so that none is forgotten
+
+
+def vent_at_exit(supply: PressureSupply) -> None:
+    """Have a supply vented when the interpreter exits: nobody could vent it so far."""
+    _not_known_to_be_vented.add(supply)
 
 
 @atexit.register

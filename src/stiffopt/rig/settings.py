@@ -18,7 +18,7 @@ def _none(value: Any) -> Any:
     return None if value == "none" else value
 
 
-_Port = Annotated[int, Field(ge=0, le=65535)]
+_Port = Annotated[int, Field(ge=0, le=65535, strict=True)]
 _PortOrNone = Annotated[_Port | None, BeforeValidator(_none)]
 
 

@@ -61,8 +61,22 @@ class Exchange:
         self._poses: deque[PoseSample] = deque(maxlen=_KEPT)
         self._broken = 0  # messages that the guard could not understand
 
-    def send(self, command: PressureCommand, wait: float, *, goal: bool = False) -> bool:
-        """Send a command, wait up to `wait` s for its answer, and return whether it came.
+    def send_goal(self, goal: PressureCommand) -> Answer:
+        """Send a goal and return the answer to it.
+
+        Raises
+        ------
+        DeviceError
+            The guard is gone, or does not answer.
+        """
+        sequence, end = next(self._numbers), time.monotonic() + self.answer_within
+        pressures = np.asarray(goal.pressures, dtype=float)
+        now = time.monotonic()
+        frame = CommandFrame(sequence, now, goal.time, goal.valid_for, pressures, goal=True)
+        return self._answer_to(frame, "a command", end)
+
+    def send(self, command: PressureCommand, wait: float) -> None:
+        """Send a command of a stream, and wait for its answer for up to `wait` s.
 
         Raises
         ------
@@ -71,7 +85,7 @@ class Exchange:
         """
         sequence, now = next(self._numbers), time.monotonic()
         pressures = np.asarray(command.pressures, dtype=float)
-        frame = CommandFrame(sequence, now, command.time, command.valid_for, pressures, goal)
+        frame = CommandFrame(sequence, now, command.time, command.valid_for, pressures)
         self._unanswered.append((sequence, now))
         if not self._channel.send(frame):
             self.must_live()
@@ -81,7 +95,6 @@ class Exchange:
             self._receive(left)
             self.must_live()
         self._receive()
-        return self._answered >= sequence
 
     def ask(self, do: str, **about: Any) -> Answer:
         """Send a request and return the answer, which may say that it could not be met.
@@ -92,16 +105,21 @@ class Exchange:
             The guard is gone, or does not answer.
         """
         sequence, end = next(self._numbers), time.monotonic() + self.answer_within
+        return self._answer_to(Request(sequence, do, about), f"'{do}'", end)
+
+    def _answer_to(self, message: CommandFrame | Request, what: str, end: float) -> Answer:
+        """Send a message and return the answer to it; `DeviceError` if none comes in time."""
+        sequence = message.sequence
         self._waiting.add(sequence)
         try:
-            while not self._channel.send(Request(sequence, do, about)):
-                self._go_on_waiting(do, end)
+            while not self._channel.send(message):
+                self._go_on_waiting(what, end)
                 time.sleep(_AGAIN)
             while True:
                 self._receive(_SLICE)
                 if sequence in self._answers:
                     return self._answers[sequence]
-                self._go_on_waiting(do, end)
+                self._go_on_waiting(what, end)
         finally:
             self._waiting.discard(sequence)
             self._answers.pop(sequence, None)
@@ -136,10 +154,10 @@ class Exchange:
         with self._receiving:
             self._channel.close()
 
-    def _go_on_waiting(self, do: str, end: float) -> None:
+    def _go_on_waiting(self, what: str, end: float) -> None:
         self.must_live()
         if time.monotonic() > end:
-            raise DeviceError(f"the guard process did not answer to '{do}' in time")
+            raise DeviceError(f"the guard process did not answer to {what} in time")
 
     def _receive(self, wait: float = 0.0) -> None:
         """Take in what has come; wait for something for up to `wait` s, but never for long."""

@@ -187,18 +187,34 @@ class Guard:
         vents = [i for i, m in enumerate(messages) if isinstance(m, Request) and m.do == "vent"]
         last_vent = vents[-1] if vents else 0
         newest: CommandFrame | None = None
+        later: list[Request] = []
         for index, message in enumerate(messages):
             if isinstance(message, CommandFrame):
                 self._feed(message)
+                self._overtaken(newest, "a newer command")
                 newest = message
             elif isinstance(message, Request) and (message.do == "vent" or index >= last_vent):
-                newest = None if message.do in ("arm", "vent") else newest
+                if message.do in ("arm", "vent"):
+                    self._overtaken(newest, f"a request to {message.do}")
+                    newest = None
                 self._obey(message)
-            elif isinstance(message, Request):
+            elif isinstance(message, Request) and message.do in ("arm", "restrict"):
                 self._answer(message.sequence, error="a command to vent has overtaken this")
+            elif isinstance(message, Request):
+                later.append(message)
+        for request in later:  # which came before a vent, and could wait
+            self._obey(request)
         if newest is not None:
             self._look_at_the_time()
             self._pass_on(newest)
+
+    def _overtaken(self, frame: CommandFrame | None, by: str) -> None:
+        """Tell who sent a goal that it is not pursued; a stream goes on anyway."""
+        if frame is not None and frame.goal:
+            self._answer(
+                frame.sequence,
+                Applied(self._commanded, self._reading, refused=f"{by} has overtaken this one"),
+            )
 
     def _feed(self, frame: CommandFrame) -> None:
         """Note when the loop was alive: when it sent, for the frame may have waited here."""

@@ -26,6 +26,7 @@ from stiffopt.rig.interface import (
     PressureSupply,
     Rig,
     SystemClock,
+    vent_at_exit,
 )
 from stiffopt.safety.exchange import Exchange
 from stiffopt.safety.frames import Answer
@@ -44,7 +45,8 @@ _FRESH = 1e-3  # s, that a command waits for its own answer
 _HUNG = 1.0  # s without a sign of life, beyond the driver's own time, after which it is ended
 _SILENT = 0.25  # s without an answer to a command, at least, after which something is wrong
 _CALLS = 3  # of the driver, at most, that one step of the guard makes
-_RESCUE = 1.0  # s to wait until a supply is vented directly
+_SIMULATED = 10.0  # s without a sign of life of a simulated world, which may be compiling
+_RESCUE = 5.0  # s, at least, for which a lost guard's supply is tried to be vented directly
 
 
 class GuardLink:
@@ -91,6 +93,7 @@ class GuardLink:
         self._spare = spare
         self._patience = 0.0 if spare is None else spare.patience
         self._watch: GuardWatch | None = None
+        self._rescue_time = 0.0 if spare is None else max(_RESCUE, 2 * _CALLS * spare.patience)
         self._told = 0  # trips that were said
 
     # life ----------------------------------------------------------------------------------------
@@ -133,14 +136,15 @@ class GuardLink:
         lost = not self._process.alive
         if watch is not None:
             if lost:
-                watch.wait(_RESCUE)
+                watch.wait(self._rescue_time)
             watch.stop()
         if not lost:
             with suppress(DeviceError):  # how it ended tells better
                 self._ask("close")
         code = self._end()
-        rescued = watch is not None and watch.rescued.is_set()
-        if code != 0 and not rescued:
+        if code != 0 and not (watch is not None and watch.vent(self._rescue_time)):
+            if self._spare is not None:
+                vent_at_exit(self._spare)
             reason = watch.error if watch is not None and watch.error else f"it ended with {code}"
             raise DeviceError(
                 f"the guard process is gone and the supply may not be vented ({reason}); only its "
@@ -167,7 +171,8 @@ class GuardLink:
         Unanswered pings are counted, not seconds: this process may have been stopped meanwhile.
         """
         pings = 0 if self._exchange is None else self._exchange.unanswered_pings
-        return self.alive and pings * PING_PERIOD > _HUNG + _CALLS * self._patience
+        longest = _SIMULATED if self._spare is None else _HUNG + _CALLS * self._patience
+        return self.alive and pings * PING_PERIOD > longest
 
     def ping(self) -> None:
         """Ask the guard for a sign of life; waits for nothing."""
@@ -254,7 +259,7 @@ class GuardLink:
         try:
             self._told = self._ask("vent").trips
         except DeviceError:
-            if self.alive or self._watch is None or not self._watch.wait(_RESCUE):
+            if self.alive or self._watch is None or not self._watch.vent():
                 raise
 
     def read(self) -> PressureReading:
@@ -294,11 +299,11 @@ class GuardLink:
         DeviceError
             The guard is gone or does not answer, or the supply fails.
         """
-        exchange = self._open_exchange()
-        if not exchange.send(goal, exchange.answer_within, goal=True):
-            raise DeviceError("the guard process did not answer to a command in time")
-        self._check_trip()
-        return self._applied()
+        answer = self._open_exchange().send_goal(goal)
+        if answer.tripped:
+            self._told = answer.trips
+            raise GuardTripped(f"the guard has vented: {answer.tripped}")
+        return _applied(answer, answer)
 
     def _check_trip(self) -> None:
         newest = self._open_exchange().newest
@@ -312,10 +317,7 @@ class GuardLink:
         newest, to_command = exchange.newest, exchange.to_command
         if newest is None:
             raise DeviceError("the guard process has not answered yet")
-        done = to_command or newest
-        return Applied(
-            newest.commanded, _reading(newest), done.limited, done.refused, done.force_limited
-        )
+        return _applied(newest, to_command or newest)
 
     # simulated rigs ------------------------------------------------------------------------------
 
@@ -370,6 +372,13 @@ class GuardLink:
 
 def _reading(answer: Answer) -> PressureReading:
     return PressureReading(answer.time, answer.measured)
+
+
+def _applied(newest: Answer, done: Answer) -> Applied:
+    """Return set-points and readings of one answer, and what became of a command of another."""
+    return Applied(
+        newest.commanded, _reading(newest), done.limited, done.refused, done.force_limited
+    )
 
 
 def guarded_rig(

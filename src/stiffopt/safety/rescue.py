@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import select
 import threading
@@ -18,8 +19,8 @@ __all__ = ["PING_PERIOD", "GuardWatch", "vent_directly"]
 PING_PERIOD = 0.1
 """Seconds between two looks at a guard."""
 _AGAIN = 0.1  # s between attempts to vent
+_log = logging.getLogger(__name__)
 _CLAIM = 0.2  # s for which a claim may still be that of a guard that is just ending
-_ATTEMPTS = 50
 
 
 class Watched(Protocol):
@@ -92,6 +93,7 @@ class GuardWatch:
         self.error = ""
         self._guard, self._supply = guard, supply
         self._ended = threading.Event()
+        self._venting = threading.Lock()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run, name="guard watch", daemon=True)
 
@@ -111,6 +113,16 @@ class GuardWatch:
         while not self.rescued.wait(0.01):
             if self._over.is_set() or time.monotonic() > end:
                 break
+        return self.rescued.is_set()
+
+    def vent(self, timeout: float = 0.0) -> bool:
+        """Vent the supply of a lost guard from this thread; return whether it is vented.
+
+        It is tried once, and again until `timeout` s are over.
+        """
+        end = time.monotonic() + timeout
+        while not self._try() and time.monotonic() < end:
+            time.sleep(_AGAIN)
         return self.rescued.is_set()
 
     def _run(self) -> None:
@@ -140,17 +152,28 @@ class GuardWatch:
                         self._guard.kill()
 
     def _rescue(self) -> None:
-        if self._supply is None:  # a simulated arm is gone with its guard
-            self.rescued.set()
-            return
-        for _ in range(_ATTEMPTS):
-            try:
-                vent_directly(self._supply)
-            except Exception as error:  # a driver's bug is no reason not to try again
-                self.error = str(error) or type(error).__name__
-            else:
-                self.error = ""
-                self.rescued.set()
-                return
+        """Vent, however long it takes until the supply answers."""
+        told = False
+        while not self._try():
+            if not told:
+                told = True
+                _log.error("the guard is gone and the supply is NOT VENTED yet: %s", self.error)
             if self._ended.wait(_AGAIN):
                 return
+        if self._supply is not None:
+            _log.warning("the guard is gone; the supply was vented directly")
+
+    def _try(self) -> bool:
+        """Vent the supply unless that is done; return whether it is."""
+        with self._venting:
+            if self.rescued.is_set():
+                return True
+            try:
+                if self._supply is not None:  # a simulated arm is gone with its guard
+                    vent_directly(self._supply)
+            except Exception as error:  # a driver's bug is no reason not to try again
+                self.error = str(error) or type(error).__name__
+                return False
+            self.error = ""
+            self.rescued.set()
+            return True

@@ -15,7 +15,7 @@ from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.hosted import simulated_endpoint
 from stiffopt.safety.rescue import vent_directly
-from stiffopt.safety.vent_line import Peer, ask_to_vent
+from stiffopt.safety.vent_line import Peer, ask_to_vent, trusted
 
 __all__ = ["vent_rig"]
 
@@ -27,8 +27,9 @@ _GONE = 2.0  # s in which a process that was ended must be gone
 def vent_rig(path: str | os.PathLike[str]) -> str:
     """Vent the supply of a rig, by the guard that owns it, else directly; return how, in words.
 
-    A guard that does not answer, or cannot vent, is ended, and the supply vented in its place. The
-    daemon's interface and its token are not needed.
+    A guard that does not answer is ended. Where no guard that can be believed says that it has
+    vented, the supply is vented directly, also beside a guard. None of this uses the network, and
+    no other user can keep it from happening.
 
     Raises
     ------
@@ -46,36 +47,53 @@ def vent_rig(path: str | os.PathLike[str]) -> str:
     supply = make_rig(description.model_copy(update={"tracker": None, "probe": None}), robot).supply
     if not isinstance(supply, PressureSupply):
         raise DeviceError("this rig's supply cannot be reached directly")
-    done = ""
+    failed: list[str] = []
     for endpoint in supply.endpoints:
-        done = _vent_by_guard(endpoint, _PATIENCE + _CALLS * supply.patience) or done
-    if done:
-        return done
-    if not vent_directly(supply):
+        done, troubles = _vent_by_guards(endpoint, _PATIENCE + _CALLS * supply.patience)
+        if done:
+            return done
+        failed += troubles
+    return _vent_directly(supply, failed)
+
+
+def _vent_by_guards(endpoint: str, patience: float) -> tuple[str, list[str]]:
+    """Have the guards of a supply vent; return who has done so, and what else was said."""
+    done, failed = [], []
+    for reply in ask_to_vent(endpoint, patience):
+        guard = reply.guard
+        if reply.answered and not reply.error and trusted(guard.uid):
+            done.append(guard.name)
+        elif reply.answered:
+            said = f"could not vent, and tries on: {reply.error}" if reply.error else "has vented"
+            failed.append(f"{guard.name} says that it {said}")
+        elif _is_guard(guard.pid) and not _ended(guard):
+            failed.append(f"{guard.name}: {reply.error}")
+    by = f"vented by its guard, {', '.join(done)}, which takes no command now"
+    return by if done else "", failed
+
+
+def _vent_directly(supply: PressureSupply, failed: list[str]) -> str:
+    try:
+        alone = vent_directly(supply)
+    except DeviceError as error:
+        raise DeviceError("; ".join([*failed, str(error)])) from None
+    if not alone:
         raise DeviceError(
-            "it was vented directly, but another program, of another user, commands this supply "
-            "and may raise the pressure again"
+            "; ".join(
+                [
+                    *failed,
+                    "it was vented directly, but another program has claimed this "
+                    "supply and may raise the pressure again",
+                ]
+            )
         )
     return "vented directly: no program commands this supply"
 
 
-def _vent_by_guard(endpoint: str, patience: float) -> str:
-    """Have the guards of a supply vent; return how, empty if none could be asked."""
-    done, failed = [], []
-    for reply in ask_to_vent(endpoint, patience):
-        if reply.answered and reply.error:
-            failed.append(f"{reply.guard.name} could not vent, and tries on: {reply.error}")
-        elif reply.answered:
-            done.append(reply.guard.name)
-        elif _is_guard(reply.guard.pid) and not _ended(reply.guard):
-            failed.append(f"{reply.guard.name}: {reply.error}")
+def _vent_simulated(description: RigDescription) -> str:
+    done, failed = _vent_by_guards(simulated_endpoint(description), _PATIENCE)
     if failed:
         raise DeviceError("; ".join(failed))
-    return f"vented by its guard, {', '.join(done)}, which takes no command now" if done else ""
-
-
-def _vent_simulated(description: RigDescription) -> str:
-    done = _vent_by_guard(simulated_endpoint(description), _PATIENCE)
     return done or f"nothing to vent: nobody runs the simulated rig '{description.name}'"
 
 

@@ -1,10 +1,10 @@
 """The vent line: a way to have a guard vent that needs no network, and that no stranger can block.
 
 Each guard listens under an abstract socket address that begins with its supply's endpoint and ends
-with something random, so that nobody can take it first; whoever wants to vent finds all such
-addresses in the kernel's table. The kernel also tells each side who the other is: a guard hears
-only root and its own user, and hangs up on all others at once; a caller believes only those of its
-own user and root. Whoever is heard says ``vent`` and is answered, as JSON, once that is done.
+with its process and something random, so that nobody can take it first; whoever wants to vent finds
+all such addresses in the kernel's table. The kernel also tells each side who the other is: a guard
+hears only root and its own user, and hangs up on all others at once; a caller believes only those
+of its own user and root. Whoever is heard says ``vent`` and is answered, as JSON, once that is done.
 """
 
 from __future__ import annotations
@@ -19,15 +19,18 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 from stiffopt.safety.claim import address_of
 
-__all__ = ["Caller", "Peer", "Reply", "VentLine", "ask_to_vent", "guards_of"]
+__all__ = ["Caller", "Peer", "Reply", "VentLine", "ask_to_vent", "guards_of", "trusted"]
 
 _WORD = b"vent"
 _BACKLOG = 64
 _AT_ONCE = 64  # callers that are looked at in one step
 _WAITING = 8  # callers of this user that have not said their word yet
+_STRANGERS = 32  # guards of other users that root asks
+_LEAST = 0.05  # s for each guard
 _CREDENTIALS = struct.Struct("3i")
 _ANSWER = 4096  # bytes
 
@@ -136,7 +139,8 @@ def _listening(endpoint: str) -> socket.socket:
     """Return a listening socket at an address that nobody could foresee."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        listening.bind(f"{address_of('vent', endpoint)}/{secrets.token_hex(8)}")
+        place = f"{os.getpid()}-{secrets.token_hex(8)}"
+        listening.bind(f"{address_of('vent', endpoint)}/{place}")
         listening.listen(_BACKLOG)
     except OSError:
         listening.close()
@@ -164,62 +168,100 @@ class Reply:
     error: str = ""
 
 
+def trusted(uid: int) -> bool:
+    """Return whether a user's word that a supply is vented may be believed.
+
+    Those of root and of this user are, and for root that of the user who became it by ``sudo``.
+    """
+    return uid in (0, os.getuid()) or (os.getuid() == 0 and os.environ.get("SUDO_UID") == str(uid))
+
+
 def guards_of(endpoint: str) -> list[Peer]:
     """Return the processes that listen for an endpoint, whoever their users are."""
     found = []
-    for line in _lines_of(endpoint):
-        found.append(_peer(line))
-        line.close()
+    for peer, line in _lines_of(endpoint):
+        found.append(peer)
+        if line is not None:
+            line.close()
     return found
 
 
 def ask_to_vent(endpoint: str, patience: float = 5.0) -> list[Reply]:
-    """Have all guards of an endpoint vent that belong to this user; for root, to any user.
+    """Have all guards of an endpoint vent that hear this user; see `trusted` for whom to believe.
 
     Parameters
     ----------
     endpoint :
         Of the supply.
     patience :
-        Seconds in which each must have answered.
+        Seconds in which all must have answered.
     """
-    asked = []
-    for line in _lines_of(endpoint):
-        peer = _peer(line)
-        if os.getuid() != 0 and peer.uid not in (0, os.getuid()):
-            line.close()  # a stranger may say what he likes
-            continue
-        with suppress(OSError):
-            line.send(_WORD)
+    asked: list[tuple[Peer, socket.socket | None]] = []
+    strangers = 0
+    for peer, line in _lines_of(endpoint):
+        if not trusted(peer.uid):
+            strangers += 1
+            if os.getuid() != 0 or strangers > _STRANGERS:
+                if line is not None:
+                    line.close()
+                continue
+        if line is not None:
+            with suppress(OSError):
+                line.send(_WORD)
         asked.append((peer, line))
     end = time.monotonic() + patience
+    asked.sort(key=lambda one: not trusted(one[0].uid))  # strangers have what time is left
     return [_reply(peer, line, end) for peer, line in asked]
 
 
-def _reply(peer: Peer, line: socket.socket, end: float) -> Reply:
+def _reply(peer: Peer, line: socket.socket | None, end: float) -> Reply:
+    if line is None:
+        return Reply(peer, answered=False, error="the guard accepts no calls")
     with line:
         try:
-            line.settimeout(max(0.05, end - time.monotonic()))
+            line.settimeout(max(_LEAST, end - time.monotonic()))
             told = line.recv(_ANSWER)
         except OSError as error:
             return Reply(peer, answered=False, error=f"the guard does not answer: {error}")
     try:
         return Reply(peer, answered=True, error=str(json.loads(told)["error"]))
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, LookupError, TypeError):
         return Reply(peer, answered=False, error="the guard has hung up without an answer")
 
 
-def _lines_of(endpoint: str) -> Iterator[socket.socket]:
-    """Yield a connection to each process that listens for an endpoint; wait for none of them."""
+def _lines_of(endpoint: str) -> Iterator[tuple[Peer, socket.socket | None]]:
+    """Yield who listens for an endpoint, with a connection where one is accepted at once.
+
+    A guard that hangs may accept none: what its address says of its process is checked then.
+    """
     shown = address_of("vent", endpoint).replace("\0", "@") + "/"
-    with suppress(OSError), open("/proc/net/unix", encoding="utf-8", errors="replace") as table:
-        names = {row.split()[-1] for row in table if shown in row}
-        for name in sorted(name for name in names if name.startswith(shown)):
-            line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            line.setblocking(False)
-            try:
-                line.connect("\0" + name[1:])
-            except OSError:  # gone meanwhile, or it accepts nobody
-                line.close()
-            else:
-                yield line
+    try:
+        table = Path("/proc/net/unix").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # not Linux: no guard either
+        return
+    rows = (row.split() for row in table.splitlines() if shown in row)
+    for name in sorted({row[-1] for row in rows if row[-1].startswith(shown)}):
+        line = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        line.setblocking(False)
+        try:
+            line.connect("\0" + name[1:])
+        except BlockingIOError:
+            line.close()
+            peer = _process_of(name.removeprefix(shown))
+            if peer is not None:
+                yield peer, None
+        except OSError:  # gone meanwhile
+            line.close()
+        else:
+            yield _peer(line), line
+
+
+def _process_of(place: str) -> Peer | None:
+    """Return the process that an address names; its user is the kernel's word."""
+    number = place.partition("-")[0]
+    if not number.isdecimal():
+        return None
+    try:
+        return Peer(int(number), os.stat(f"/proc/{number}").st_uid)
+    except OSError:
+        return None
