@@ -252,7 +252,7 @@ def test_the_lab_is_driven_over_its_protocols_and_vented_whatever_happens(
             wait_for(lambda: pressures().max() < 0.05, 5)
             told = [json.loads(line) for line in run.err]  # also what the guard says
             assert [line["kind"] for line in told] == ["guard"]
-            assert "the process of the control loop has ended" in told[0]["text"]
+            assert "the process that commands has ended" in told[0]["text"]
 
 
 # the end, whatever hangs --------------------------------------------------------------------------

@@ -4,7 +4,7 @@ Each guard listens under an abstract socket address that begins with its supply'
 with its process and something random, so that nobody can take it first; whoever wants to vent finds
 all such addresses in the kernel's table. The kernel also tells each side who the other is: a guard
 hears only root and its own user, and hangs up on all others at once; a caller believes only those
-of its own user and root. Whoever is heard says ``vent`` and is answered, as JSON, once that is done.
+of its own user and root. Whoever is heard says ``vent``, and is answered in JSON once that is done.
 """
 
 from __future__ import annotations
