@@ -355,7 +355,7 @@ def test_every_combined_pose_is_held_and_gently_reached(
 
 def test_combined_poses_of_channels_that_cannot_be_low(tmp_path: Path) -> None:
     rig = fake_rig(slew=1e5)
-    rig.supply.limits = PressureLimits(np.array([0.1e5, -0.5e5, 0.0]), np.array([1e5, 0.5e5, 1e5]))
+    rig.supply._limits = PressureLimits(np.array([0.1e5, -0.5e5, 0.0]), np.array([1e5, 0.5e5, 1e5]))
     with rig:
         run_kinematics(rig, tmp_path, short(repetitions=1, poses=3), rate=50.0)
         with pytest.raises(InputError, match=r"at most 0.05 bar: channel 1 has 0.1 to 1 bar"):

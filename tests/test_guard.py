@@ -15,6 +15,7 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -436,6 +437,17 @@ def test_to_vent_comes_first() -> None:
         request.sequence for request in (arm, first, last)
     ]
     assert read.sequence in [answer.sequence for answer in answers[3:]]  # it could wait
+
+
+def test_a_goal_that_is_overtaken_is_told() -> None:
+    scene = Scene()
+    scene.step(scene.request("arm"))
+    goals = [replace(scene.command(), goal=True) for _ in range(3)]
+    answers = scene.step(goals[0], goals[1], scene.request("vent"), goals[2])
+    told = {answer.sequence: answer.refused for answer in answers}
+    assert told[goals[0].sequence] == "a newer command has overtaken this one"
+    assert told[goals[1].sequence] == "a request to vent has overtaken this one"
+    assert goals[2].sequence in told
 
 
 def test_a_request_overtakes_no_command() -> None:

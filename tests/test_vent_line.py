@@ -471,3 +471,58 @@ def test_a_process_has_a_name_for_people() -> None:
     mine = pwd.getpwuid(os.getuid()).pw_name
     assert Peer(7, os.getuid()).name == f"process 7 (user {mine})"
     assert Peer(7, STRANGER).name == f"process 7 (user {STRANGER})"
+
+
+# what may go wrong -------------------------------------------------------------------------------
+
+
+def test_a_line_that_cannot_be_made_leaves_nothing_open(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: socket.socket, address: str) -> None:
+        raise OSError("no")
+
+    monkeypatch.setattr(socket.socket, "bind", full)
+    with pytest.raises(OSError, match="no"):
+        VentLine([name])
+
+
+@pytest.mark.parametrize("place", ["x-1", "", "999999999-1"])
+def test_an_address_that_names_no_process_is_left_out(
+    place: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(self: socket.socket, address: str) -> None:
+        raise BlockingIOError
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as decoy:
+        decoy.bind(f"{address_of('vent', name)}/{place}")
+        decoy.listen()
+        monkeypatch.setattr(socket.socket, "connect", full)
+        assert guards_of(name) == []
+
+
+def test_who_has_gone_meanwhile_is_left_out(name: str, line: VentLine) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as decoy:
+        decoy.bind(f"{address_of('vent', name)}/0-gone")  # it does not listen
+        assert guards_of(name) == [ME]
+
+
+def test_where_the_kernel_has_no_table_there_are_no_guards(
+    name: str, line: VentLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(self: Path, **_: Any) -> str:
+        raise FileNotFoundError
+
+    monkeypatch.setattr(Path, "read_text", missing)
+    assert ask_to_vent(name) == []
+
+
+def test_strangers_that_accept_nobody_are_left_out(
+    name: str, line: VentLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_lines_of", lambda _: iter([(Peer(9, STRANGER), None)] * 40))
+    monkeypatch.setattr(os, "getuid", lambda: STRANGER + 1)
+    assert ask_to_vent(name) == []
+    monkeypatch.setattr(os, "getuid", lambda: 0)
+    monkeypatch.delenv("SUDO_UID", raising=False)
+    assert len(ask_to_vent(name)) == 32  # root asks some of them

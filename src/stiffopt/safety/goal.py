@@ -87,10 +87,12 @@ def check_goal(goal: PressureCommand, now: float, limits: PressureLimits) -> Arr
     CommandError
         They are not within the limits, or the goal has expired, or is valid for too long.
     """
-    if isinstance(goal.valid_for, str) or not 0 < goal.valid_for <= LONGEST:  # NaN is not either
+    if isinstance(goal.valid_for, str):
+        raise CommandError("expected a number of seconds for valid_for, not text")
+    if not 0 < goal.valid_for <= LONGEST:  # NaN is not either
         raise CommandError(
             f"a command must be valid for more than 0 s and at most {LONGEST:g} s, not "
-            f"{goal.valid_for}"
+            f"{goal.valid_for:g} s"
         )
     if goal.expired(now):
         raise CommandError("the command has expired; nothing was written")
