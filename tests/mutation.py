@@ -36,8 +36,9 @@ SAMPLE = [
     *(f"{PACKAGE}.{name}.*__mutmut_*5" for name in SHORT),
 ]
 """Of the short form: all mutants of what decides most, and those of the rest that end with a 5."""
-NOT_HERE = re.compile(r"guard\.x_(main|_on_signals|_ignore|_signal_name|_opened|_plain)__")
-"""How the guard's process begins is tried with processes, which mutants do not reach."""
+GUARD = [f"{PACKAGE}.guard.{name}" for name in ("xǁ*", "x__told__*", "x__later__*")]
+"""What is tried of guard.py: how its process begins and ends needs processes, which mutants do not
+reach; and a mutant there that catches all signals cannot be ended by mutmut."""
 
 Change = tuple[str, str, str]  # in which function, and what from and to
 
@@ -52,7 +53,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="mutants-") as made:
         folder = Path(made)
         copy(folder, options.files, short=options.short)
-        outcomes = run(folder, SAMPLE if options.short else [])
+        outcomes = run(folder, SAMPLE if options.short else patterns(folder))
         if not outcomes:
             print("no mutant was tried: see above")
             return 1
@@ -87,7 +88,7 @@ def copy(folder: Path, files: list[str], *, short: bool) -> None:
 
 
 def run(folder: Path, names: list[str]) -> dict[str, str]:
-    """Try mutants, all of them without names, and return what became of each."""
+    """Try the mutants of these names and return what became of each."""
     begin = [sys.executable, "-m", "mutmut"]
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "COLUMNS": "200"}
     environment.pop("PYTHONPATH", None)
@@ -102,9 +103,15 @@ def run(folder: Path, names: list[str]) -> dict[str, str]:
         [*begin, "results", "--all", "true"], capture_output=True, check=True, **how
     )
     pairs = (line.strip().rsplit(": ", 1) for line in told.stdout.splitlines() if ": " in line)
-    return {
-        name: what for name, what in pairs if what != "not checked" and not NOT_HERE.search(name)
-    }
+    return {name: what for name, what in pairs if what != "not checked"}
+
+
+def patterns(folder: Path) -> list[str]:
+    """Return the names of what is tried in the long form."""
+    text = (folder / "pyproject.toml").read_text(encoding="utf-8")
+    files = [Path(file).stem for file in tomllib.loads(text)["tool"]["mutmut"]["only_mutate"]]
+    names = [f"{PACKAGE}.{name}.*" for name in files if name != "guard"]
+    return names + GUARD * ("guard" in files)
 
 
 def changes(folder: Path, outcomes: dict[str, str]) -> Iterator[tuple[str, Change | None]]:
