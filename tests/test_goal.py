@@ -697,3 +697,10 @@ def test_a_slow_rig_repeats_goals_before_they_are_too_old(period: float, often: 
     np.testing.assert_allclose(bench.device.commanded, [5e3] * 3, atol=2e3)
     bench.clock.sleep(0.6)
     assert bench.vented()
+
+
+def test_text_is_no_time() -> None:
+    bench = Bench().armed()
+    goal = PressureCommand(np.zeros(3), bench.clock.now(), "3")  # type: ignore[arg-type]
+    with pytest.raises(CommandError, match="expected a number of seconds for valid_for"):
+        bench.supply.command(goal)
