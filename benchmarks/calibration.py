@@ -37,9 +37,9 @@ from settings import Settings
 
 if TYPE_CHECKING:
     from stiffopt import CalibrationResult, Log, Manipulator, RobotDescription
+    from stiffopt.plant.rig import SimulatedRig
     from stiffopt.registration import Registration
     from stiffopt.rig.config import RigDescription
-    from stiffopt.rig.simulated.rig import SimulatedRig
 
 Array = NDArray[np.float64]
 
@@ -225,7 +225,7 @@ class Truth:
     """The simulated arm itself, beside any rig that has it."""
 
     def __init__(self, description: RigDescription, robot: RobotDescription) -> None:
-        from stiffopt.rig.simulated.plant import Plant
+        from stiffopt.plant.plant import Plant
 
         self._plant = Plant(robot, description.plant)
         self.mismatch = self._plant.mismatch
@@ -243,8 +243,8 @@ class Truth:
 def described(case: Case, seed: int) -> tuple[RigDescription, RobotDescription]:
     """Rig and robot file of an arm."""
     from stiffopt.model.robot_files import load_description
+    from stiffopt.plant.settings import PlantSettings, Silicone
     from stiffopt.rig.config import load_rig_description
-    from stiffopt.rig.simulated.settings import PlantSettings, Silicone
 
     path = RIGS / f"{case.rig}.yaml"
     rig = load_rig_description(path)

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from stiffopt.model.description import RobotDescription
     from stiffopt.optimise.target import Target
     from stiffopt.optimise.task import Task
+    from stiffopt.plant.rig import SimulatedRig
+    from stiffopt.plant.settings import PlantSettings
     from stiffopt.registration import Registration
     from stiffopt.rig.config import RigDescription
-    from stiffopt.rig.simulated.rig import SimulatedRig
-    from stiffopt.rig.simulated.settings import PlantSettings
 
 Array = NDArray[np.float64]
 
@@ -149,8 +149,8 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
     payload : mass at the tip that nobody knows of, beside the 20 g of the robot file, in kg.
     """
     from stiffopt.model.robot_files import load_description
+    from stiffopt.plant.settings import PlantSettings
     from stiffopt.rig.config import load_rig_description
-    from stiffopt.rig.simulated.settings import PlantSettings
 
     rig = load_rig_description(RIG)
     robot = load_description(rig.robot)
@@ -178,8 +178,8 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
 
 def _mismatch(robot: RobotDescription, rng: np.random.Generator) -> Any:
     from stiffopt import lie
+    from stiffopt.plant.settings import Mismatch
     from stiffopt.registration import Placement
-    from stiffopt.rig.simulated.settings import Mismatch
 
     n, segments = robot.n_pressures, robot.n_segments
     axes = rng.standard_normal((2, 3))
@@ -200,7 +200,7 @@ class Arm:
     """The simulated arm beside any rig, at rest, without creep and hysteresis."""
 
     def __init__(self, robot: RobotDescription, plant: PlantSettings, truth: Truth) -> None:
-        from stiffopt.rig.simulated.plant import Plant
+        from stiffopt.plant.plant import Plant
 
         self.high = np.array(robot.pressure_max)
         self._plant = Plant(robot, without_memory(plant))
@@ -213,7 +213,7 @@ class Arm:
 
     def stiffness(self, pressures: Array, direction: tuple[float, ...]) -> float:
         """Of the tip along a unit vector, in N/m, from small pushes and pulls."""
-        from stiffopt.rig.simulated.settings import Load
+        from stiffopt.plant.settings import Load
 
         d = np.array(direction)
         push = PUSH * self._truth.stiffness(pressures, direction)

@@ -17,7 +17,7 @@ from calibration import with_true_values
 
 if TYPE_CHECKING:
     from stiffopt.model.description import RobotDescription
-    from stiffopt.rig.simulated.settings import Mismatch
+    from stiffopt.plant.settings import Mismatch
 
 Array = NDArray[np.float64]
 

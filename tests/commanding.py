@@ -189,8 +189,8 @@ def _channel(limits: Limits, **rest: Any) -> dict[str, Any]:
 
 @contextmanager
 def modbus(limits: Limits, table: str = "input") -> Iterator[Bench]:
+    from stiffopt.lab.modbus_peer import ModbusPeer
     from stiffopt.rig.drivers.modbus import ModbusSettings
-    from stiffopt.rig.lab.modbus_peer import ModbusPeer
 
     clock = HandClock()
     reach = limits.register or 10e5
@@ -214,8 +214,8 @@ def modbus(limits: Limits, table: str = "input") -> Iterator[Bench]:
 
 @contextmanager
 def nidaq(limits: Limits) -> Iterator[Bench]:
+    from stiffopt.lab.nidaq_peer import NidaqPeer
     from stiffopt.rig.drivers.nidaq import NidaqSettings
-    from stiffopt.rig.lab.nidaq_peer import NidaqPeer
 
     clock = HandClock()
     reach = limits.register or 3e5

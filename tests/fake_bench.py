@@ -9,7 +9,7 @@ from threading import Lock
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stiffopt.rig.lab.bench import Array, Bench, TrackerFrame
+from stiffopt.lab.bench import Array, Bench, TrackerFrame
 
 FRAME_RATE = 40.0  # Hz
 

@@ -580,8 +580,8 @@ def test_a_dead_band_needs_pressures_that_are_never_negative() -> None:
 def plant_of(description: RobotDescription, law: str = "linear") -> Any:
     """The simulated arm without creep and hysteresis."""
     pytest.importorskip("numba")
-    from stiffopt.rig.simulated.plant import Plant
-    from stiffopt.rig.simulated.settings import PlantSettings, Silicone
+    from stiffopt.plant.plant import Plant
+    from stiffopt.plant.settings import PlantSettings, Silicone
 
     silicone = Silicone(law=law, damping=0.0, creep=(), hysteresis=())
     return Plant(description, PlantSettings(silicone=silicone, dynamics="quasi-static"))
@@ -598,7 +598,7 @@ def described(arm: Arm, law: str = "rest-length", **compensation: float) -> Robo
 
 def stiffness_of(plant: Any, p: Vector) -> Vector:
     """Stiffness (3,) of a simulated tip in the base axes, free, by forces of 0.2 mN."""
-    from stiffopt.rig.simulated.settings import Load
+    from stiffopt.plant.settings import Load
 
     found = []
     for axis in np.eye(3):

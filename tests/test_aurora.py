@@ -26,11 +26,11 @@ import pytest
 
 from fake_bench import FakeBench
 from stiffopt.errors import DeviceError, InputError, MissingExtraError
+from stiffopt.lab.aurora_peer import AuroraPeer
+from stiffopt.lab.ndi_wire import crc16
 from stiffopt.rig.drivers import aurora, ndi_reader
 from stiffopt.rig.drivers.aurora import AuroraSettings, AuroraTracker
 from stiffopt.rig.interface import PoseSample, SystemClock
-from stiffopt.rig.lab.aurora_peer import AuroraPeer
-from stiffopt.rig.lab.ndi_wire import crc16
 
 PLACE = (0.0123, -0.0456, -0.1512)  # m
 TURN = np.array([0.2, 0.4, -0.5, 0.7]) / np.sqrt(0.94)  # w first

@@ -17,10 +17,10 @@ import stiffopt
 from fake_bench import FakeBench
 from stiffopt.cli.main import main
 from stiffopt.errors import CommandError, DeviceError, GuardTripped
+from stiffopt.lab.modbus_peer import ModbusPeer
 from stiffopt.logs import read_log
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.drivers.modbus import ModbusSettings
-from stiffopt.rig.lab.modbus_peer import ModbusPeer
 
 AREAS = np.array(load_description("stiff-flop-1").channel_areas)
 SIM = """\

@@ -19,12 +19,12 @@ from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import Load
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, limits_of, slew_of
 from stiffopt.rig.interface import PressureReading
 from stiffopt.rig.settings import ControlSettings
-from stiffopt.rig.simulated.plant import Plant
-from stiffopt.rig.simulated.settings import Load
 
 BAR = 1e5
 HANGING, ONE, FREE = "stiff-flop-2-hanging", "stiff-flop-1", "stiff-flop-2"

@@ -32,6 +32,7 @@ from stiffopt.model.history import Creep, History, Play
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task
+from stiffopt.plant import settings as simulated
 from stiffopt.registration import Placement, Registration
 from stiffopt.rig.config import (
     LabSettings,
@@ -48,7 +49,6 @@ from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.drivers.probe import ForceSettings, ProbeSettings
 from stiffopt.rig.drivers.zaber import StageSettings
 from stiffopt.rig.settings import ControlSettings, ServiceSettings
-from stiffopt.rig.simulated import settings as simulated
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [

@@ -1486,9 +1486,7 @@ def test_two_processes_do_not_share_a_folder(
 def test_a_probe_that_is_mounted_by_hand_needs_somebody(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "stiffopt.rig.simulated.devices.SimulatedProbe.needs_a_person", True, raising=False
-    )
+    monkeypatch.setattr("stiffopt.plant.devices.SimulatedProbe.needs_a_person", True, raising=False)
     folder = tmp_path / "run"
     code = main(["experiment", "stiffness", str(SIM), "--out", str(folder), "--no-plot"])
     assert code == 2

@@ -20,11 +20,11 @@ import pytest
 
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError, SlowWarning
 from stiffopt.files import save_file
+from stiffopt.lab.virtual import VirtualLab
 from stiffopt.model.robot_files import load_description
+from stiffopt.plant.settings import PlantSettings
 from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.interface import PressureCommand, Rig
-from stiffopt.rig.lab.virtual import VirtualLab
-from stiffopt.rig.simulated.settings import PlantSettings
 from stiffopt.safety import exchange, guard_process
 from stiffopt.safety.link import GuardLink, guarded_rig
 from stiffopt.safety.outlet import Applied

@@ -18,12 +18,12 @@ import pytest
 from stiffopt.cli.main import main
 from stiffopt.errors import DeviceError, InputError
 from stiffopt.files import read_file, save_file
+from stiffopt.lab.virtual import VirtualLab
 from stiffopt.model.robot_files import load_description
+from stiffopt.plant.settings import PlantSettings, Silicone
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.interface import Rig
-from stiffopt.rig.lab.virtual import VirtualLab
-from stiffopt.rig.simulated.settings import PlantSettings, Silicone
 from stiffopt.safety.rigs import open_rig
 
 RIGS = Path(__file__).parent.parent / "rig"

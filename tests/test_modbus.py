@@ -23,11 +23,11 @@ from fake_bench import FakeBench
 from modbus_device import HandmadeDevice
 from stiffopt.errors import DeviceError, FileError, InputError, MissingExtraError
 from stiffopt.files import read_file
+from stiffopt.lab.modbus_peer import ModbusPeer
 from stiffopt.rig.drivers.modbus import ModbusSettings, ModbusSupply
 from stiffopt.rig.drivers.modbus_line import ModbusLine, Tcp
 from stiffopt.rig.drivers.modbus_registers import Point, Scale
 from stiffopt.rig.interface import Clock, PressureLimits
-from stiffopt.rig.lab.modbus_peer import ModbusPeer
 from stiffopt.schema import Schema
 
 LIMITS = PressureLimits(np.zeros(3), np.full(3, 1.5e5))

@@ -19,6 +19,8 @@ from pydantic import ValidationError
 
 from fake_bench import FakeBench
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
+from stiffopt.lab.daq_server import DaqHardware, DaqServer
+from stiffopt.lab.nidaq_peer import NidaqPeer
 from stiffopt.rig.drivers.daqmx import Daqmx
 from stiffopt.rig.drivers.daqmx_tasks import (
     AnalogueInput,
@@ -28,8 +30,6 @@ from stiffopt.rig.drivers.daqmx_tasks import (
 )
 from stiffopt.rig.drivers.nidaq import NidaqSettings, NidaqSupply
 from stiffopt.rig.interface import PressureLimits
-from stiffopt.rig.lab.daq_server import DaqHardware, DaqServer
-from stiffopt.rig.lab.nidaq_peer import NidaqPeer
 
 LIMITS = PressureLimits(np.zeros(2), np.full(2, 1.5e5))
 VALVE = {"line": "Dev1/port0/line0"}
@@ -626,10 +626,10 @@ def test_a_bad_rig_file(changes: dict[str, Any], message: str) -> None:
 
 
 def test_the_template_is_a_rig_that_can_be_rehearsed() -> None:
+    from stiffopt.lab.probe_peer import ProbePeer
     from stiffopt.model.robot_files import load_description
     from stiffopt.rig.config import limits_of, load_rig_description
     from stiffopt.rig.drivers.probe import ProbeSettings
-    from stiffopt.rig.lab.probe_peer import ProbePeer
 
     path = Path(__file__).parents[1] / "rig" / "nidaq-aurora.yaml"
     description = load_rig_description(path)

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike
 
 from fake_bench import FakeBench
 from stiffopt.errors import DeviceError, InputError, MissingExtraError
+from stiffopt.lab.openigtlink_peer import OpenIGTLinkPeer
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings, OpenIGTLinkTracker, SenderClock
 from stiffopt.rig.interface import PoseSample
-from stiffopt.rig.lab.openigtlink_peer import OpenIGTLinkPeer
 
 PLACE = (0.0123, -0.0456, -0.1512)  # m
 QUARTER = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # about z

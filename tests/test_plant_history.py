@@ -15,8 +15,8 @@ from stiffopt.lie import log
 from stiffopt.model.description import Corrections, RobotDescription
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.rig.simulated.plant import Plant, SimulationError
-from stiffopt.rig.simulated.settings import Discretisation, Mismatch, PlantSettings, Silicone
+from stiffopt.plant.plant import Plant, SimulationError
+from stiffopt.plant.settings import Discretisation, Mismatch, PlantSettings, Silicone
 
 Vector = NDArray[np.float64]
 

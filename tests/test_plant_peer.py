@@ -14,8 +14,8 @@ from independent import FLOP, Arm, planar_tip
 from pyelastica_peer import relax
 from references import beam
 from stiffopt.model.description import RobotDescription
-from stiffopt.rig.simulated.plant import Plant
-from stiffopt.rig.simulated.settings import Load, PlantSettings, Silicone
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import Load, PlantSettings, Silicone
 
 LINEAR = Silicone(law="linear", creep=(), hysteresis=())
 NONE = (0.0, 0.0, 0.0)

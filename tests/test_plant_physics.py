@@ -26,9 +26,8 @@ from references import (
 )
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
-from stiffopt.registration import Placement
-from stiffopt.rig.simulated.plant import Plant
-from stiffopt.rig.simulated.settings import (
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import (
     Creep,
     Discretisation,
     Hysteresis,
@@ -37,6 +36,7 @@ from stiffopt.rig.simulated.settings import (
     PlantSettings,
     Silicone,
 )
+from stiffopt.registration import Placement
 
 LINEAR = Silicone(law="linear", damping=0.0, creep=(), hysteresis=())
 PLAIN = replace(FLOP, factors=None)  # without lambda

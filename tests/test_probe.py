@@ -17,11 +17,11 @@ from pydantic import ValidationError
 
 from fake_bench import FakeBench
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
+from stiffopt.lab.probe_peer import ProbePeer
+from stiffopt.lab.zaber_peer import ZaberPeer
 from stiffopt.rig.drivers.probe import ProbeSettings, ZaberProbe, ask_at_the_terminal
 from stiffopt.rig.drivers.zaber import Stage, StageSettings
 from stiffopt.rig.interface import SystemClock
-from stiffopt.rig.lab.probe_peer import ProbePeer
-from stiffopt.rig.lab.zaber_peer import ZaberPeer
 
 ENDING = ("daq", "zaber", "Thread-")  # names of threads that must end with their peer
 MICROSTEP = 0.047625e-6  # m; of the X-LSM100A, from its data sheet

@@ -23,8 +23,8 @@ LIMITS = PressureLimits(np.zeros(3), np.array([1.5e5, 1.2e5, 0.9e5]))
 
 @contextmanager
 def modbus(table: str = "input", valve: bool = False) -> Iterator[Case]:
+    from stiffopt.lab.modbus_peer import ModbusPeer
     from stiffopt.rig.drivers.modbus import ModbusSettings
-    from stiffopt.rig.lab.modbus_peer import ModbusPeer
 
     settings = ModbusSettings(
         driver="modbus",
@@ -52,8 +52,8 @@ def modbus(table: str = "input", valve: bool = False) -> Iterator[Case]:
 
 @contextmanager
 def nidaq() -> Iterator[Case]:
+    from stiffopt.lab.nidaq_peer import NidaqPeer
     from stiffopt.rig.drivers.nidaq import NidaqSettings
-    from stiffopt.rig.lab.nidaq_peer import NidaqPeer
 
     settings = NidaqSettings(
         driver="nidaq",
@@ -89,8 +89,8 @@ def nidaq() -> Iterator[Case]:
 @contextmanager
 def simulated(valve: bool = False) -> Iterator[Case]:
     from stiffopt.model.robot_files import load_description
+    from stiffopt.plant.rig import simulated_rig
     from stiffopt.rig.config import RigDescription
-    from stiffopt.rig.simulated.rig import simulated_rig
 
     description = RigDescription(
         robot="stiff-flop-1",

@@ -11,16 +11,16 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from fake_bench import FakeBench
+from stiffopt.lab.aurora_peer import AuroraPeer
+from stiffopt.lab.openigtlink_peer import OpenIGTLinkPeer
 from stiffopt.model.robot_files import load_description
+from stiffopt.plant.rig import simulated_rig
+from stiffopt.plant.world import World
 from stiffopt.registration import Registration
 from stiffopt.rig.config import RigDescription, limits_of
 from stiffopt.rig.drivers.aurora import AuroraSettings
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.interface import PoseTracker
-from stiffopt.rig.lab.aurora_peer import AuroraPeer
-from stiffopt.rig.lab.openigtlink_peer import OpenIGTLinkPeer
-from stiffopt.rig.simulated.rig import simulated_rig
-from stiffopt.rig.simulated.world import World
 from tracker_contract import CHECKS, PLACE, TURN, Control, Factory
 
 

@@ -20,11 +20,11 @@ import pytest
 from running import COMMAND
 from stiffopt.errors import DeviceError, GuardTripped
 from stiffopt.files import save_file
+from stiffopt.lab.virtual import VirtualLab
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.interface import PressureCommand, PressureSupply
-from stiffopt.rig.lab.virtual import VirtualLab
 from stiffopt.safety import vent as vent_module
 from stiffopt.safety.claim import Claim
 from stiffopt.safety.link import GuardLink, guarded_rig

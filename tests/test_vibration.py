@@ -12,8 +12,8 @@ import stiffopt as so
 from independent import FLOP, Arm
 from stiffopt.control.vibration import Vibration
 from stiffopt.model.robot_files import load_description
-from stiffopt.rig.simulated.plant import Plant
-from stiffopt.rig.simulated.settings import PlantSettings
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import PlantSettings
 
 TWO = "stiff-flop-2-hanging"
 

@@ -9,12 +9,12 @@ import pytest
 
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
+from stiffopt.plant.plant import Plant, SimulationError
+from stiffopt.plant.rig import SimulatedRig, simulated_rig
+from stiffopt.plant.settings import Discretisation, Load, PlantSettings
+from stiffopt.plant.world import FAULTS
 from stiffopt.rig.config import RigDescription, limits_of
 from stiffopt.rig.interface import PressureCommand
-from stiffopt.rig.simulated.plant import Plant, SimulationError
-from stiffopt.rig.simulated.rig import SimulatedRig, simulated_rig
-from stiffopt.rig.simulated.settings import Discretisation, Load, PlantSettings
-from stiffopt.rig.simulated.world import FAULTS
 
 ROBOT = load_description("stiff-flop-1")
 SILENT = {"noise": 0.0, "ripple": 0.0, "resolution": 0.0}
@@ -386,7 +386,7 @@ def test_a_clock_that_was_held_up_does_not_go_back(monkeypatch: pytest.MonkeyPat
         rig.supply.arm()
         rig.world._epoch -= 100.0  # the machine slept
         before = rig.clock.now()
-        monkeypatch.setattr("stiffopt.rig.simulated.world._LONGEST", 0.2)
+        monkeypatch.setattr("stiffopt.plant.world._LONGEST", 0.2)
         poses = rig.observe().poses
         assert rig.clock.now() >= before
         assert rig.world.time == pytest.approx(rig.clock.now(), abs=0.5)

@@ -19,7 +19,7 @@ from stiffopt.model.robot_files import load_description, robot_path
 from stiffopt.rig.config import load_rig_description
 
 if TYPE_CHECKING:
-    from stiffopt.rig.lab.virtual import VirtualLab
+    from stiffopt.lab.virtual import VirtualLab
 
 _TICK = 0.2  # s, between looks at whether the arm still moves
 
@@ -27,7 +27,7 @@ _TICK = 0.2  # s, between looks at whether the arm still moves
 def run(rig: str, out: str | None, supply: str, tracker: str, *, quiet: bool) -> int:
     """Run the lab until it is ended; return the exit code."""
     try:
-        from stiffopt.rig.lab.virtual import VirtualLab  # here: without numba there is none
+        from stiffopt.lab.virtual import VirtualLab  # here: without numba there is none
 
         _refuse_to_overwrite(rig, out)
         description = load_rig_description(rig)

@@ -10,9 +10,9 @@ from typing import Any
 
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
+from stiffopt.plant.settings import SimulatedSupplySettings
 from stiffopt.rig.config import RigDescription, limits_of, registration_of, slew_of
 from stiffopt.rig.interface import Rig, SystemClock
-from stiffopt.rig.simulated.settings import SimulatedSupplySettings
 
 __all__ = ["make_rig"]
 
@@ -25,7 +25,7 @@ def make_rig(
     supply, tracker, probe = description.supply, description.tracker, description.probe
     registration = None if tracker is None else registration_of(tracker, robot)
     if isinstance(supply, SimulatedSupplySettings):
-        from stiffopt.rig.simulated.rig import simulated_rig  # here: numba takes its time
+        from stiffopt.plant.rig import simulated_rig  # here: numba takes its time
 
         rig: Rig = simulated_rig(description, robot, limits, slew, real_time=real_time)
     else:

@@ -15,6 +15,13 @@ from stiffopt.errors import FileError, InputError, dotted, shown
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
+from stiffopt.plant.mismatch import check_mismatch
+from stiffopt.plant.settings import (
+    PlantSettings,
+    SimulatedProbeSettings,
+    SimulatedSupplySettings,
+    SimulatedTrackerSettings,
+)
 from stiffopt.registration import Registration
 from stiffopt.rig.drivers.aurora import AuroraSettings
 from stiffopt.rig.drivers.modbus import ModbusSettings
@@ -23,13 +30,6 @@ from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.drivers.probe import ProbeSettings
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.settings import ControlSettings, LogSettings, Safety, ServiceSettings
-from stiffopt.rig.simulated.mismatch import check_mismatch
-from stiffopt.rig.simulated.settings import (
-    PlantSettings,
-    SimulatedProbeSettings,
-    SimulatedSupplySettings,
-    SimulatedTrackerSettings,
-)
 from stiffopt.schema import BadKeyError, Schema
 from stiffopt.units import Frequency
 

@@ -322,7 +322,7 @@ class GuardLink:
     # simulated rigs ------------------------------------------------------------------------------
 
     def inject(self, device: str, fault: str, channel: int | None = None) -> None:
-        """Let a device of a simulated rig misbehave; see `stiffopt.rig.simulated.world.World`.
+        """Let a device of a simulated rig misbehave; see `stiffopt.plant.world.World`.
 
         Raises
         ------

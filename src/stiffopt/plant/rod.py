@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stiffopt.rig.simulated.jit import jit
+from stiffopt.plant.jit import jit
 
 Array = Any  # an array of floats; numba infers the rest
 

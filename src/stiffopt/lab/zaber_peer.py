@@ -14,9 +14,9 @@ from threading import Event, RLock, Thread
 from typing import Any, NamedTuple
 
 from stiffopt.errors import DeviceError
+from stiffopt.lab.bench import Bench, Peer
 from stiffopt.rig.drivers.probe import ProbeSettings
 from stiffopt.rig.drivers.zaber import SPEED_FACTOR
-from stiffopt.rig.lab.bench import Bench, Peer
 
 __all__ = ["ZaberPeer"]
 

@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stiffopt.rig.simulated.jit import jit
-from stiffopt.rig.simulated.loads import (
+from stiffopt.plant.jit import jit
+from stiffopt.plant.loads import (
     Loads,
     add_contact,
     contact_force,
@@ -28,14 +28,14 @@ from stiffopt.rig.simulated.loads import (
     external_forces,
     loads_after,
 )
-from stiffopt.rig.simulated.material import (
+from stiffopt.plant.material import (
     Material,
     Memory,
     Scheme,
     internal_forces,
     remember,
 )
-from stiffopt.rig.simulated.rod import Rod, jacobians, poses
+from stiffopt.plant.rod import Rod, jacobians, poses
 
 Array = Any
 

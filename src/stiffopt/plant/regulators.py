@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-from stiffopt.rig.simulated.jit import jit
+from stiffopt.plant.jit import jit
 
 Array = Any
 

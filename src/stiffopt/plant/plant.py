@@ -21,20 +21,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import DeviceError, EquilibriumError, InputError, PressureError
 from stiffopt.model.description import RobotDescription
-from stiffopt.rig.simulated import dynamics, material, rod
-from stiffopt.rig.simulated.build import (
+from stiffopt.plant import dynamics, material, rod
+from stiffopt.plant.build import (
     make_channels,
     make_material,
     make_memory,
     make_rod,
     node_at,
 )
-from stiffopt.rig.simulated.dynamics import State
-from stiffopt.rig.simulated.jit import tell_if_new
-from stiffopt.rig.simulated.loads import Loads, contact_energy, contact_force, depth_of
-from stiffopt.rig.simulated.material import Memory, Scheme
-from stiffopt.rig.simulated.mismatch import draw
-from stiffopt.rig.simulated.settings import Load, PlantSettings
+from stiffopt.plant.dynamics import State
+from stiffopt.plant.jit import tell_if_new
+from stiffopt.plant.loads import Loads, contact_energy, contact_force, depth_of
+from stiffopt.plant.material import Memory, Scheme
+from stiffopt.plant.mismatch import draw
+from stiffopt.plant.settings import Load, PlantSettings
 
 __all__ = ["Energies", "Plant", "SimulationError"]
 

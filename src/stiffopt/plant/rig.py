@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.description import RobotDescription
+from stiffopt.plant.devices import SimulatedProbe, SimulatedSupply, SimulatedTracker
+from stiffopt.plant.settings import PlantSettings
+from stiffopt.plant.world import World, WorldClock
 from stiffopt.rig.interface import PressureLimits, Rig
-from stiffopt.rig.simulated.devices import SimulatedProbe, SimulatedSupply, SimulatedTracker
-from stiffopt.rig.simulated.settings import PlantSettings
-from stiffopt.rig.simulated.world import World, WorldClock
 
 __all__ = ["SimulatedRig", "simulated_rig"]
 

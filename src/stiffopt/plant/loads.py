@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stiffopt.rig.simulated.jit import jit
-from stiffopt.rig.simulated.rod import Rod
+from stiffopt.plant.jit import jit
+from stiffopt.plant.rod import Rod
 
 Array = Any
 

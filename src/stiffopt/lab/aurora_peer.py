@@ -1,7 +1,7 @@
 """An NDI Aurora on a pseudo-terminal: the tracker of the virtual lab.
 
 It follows NDI's description of the protocol (Aurora Application Program Interface Guide), not the
-library that reads it. How commands and replies are written is in `stiffopt.rig.lab.ndi_wire`.
+library that reads it. How commands and replies are written is in `stiffopt.lab.ndi_wire`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ from collections.abc import Callable
 import numpy as np
 
 from stiffopt.errors import DeviceError
-from stiffopt.rig.drivers.aurora import AuroraSettings
-from stiffopt.rig.lab.bench import Bench, Peer, TrackerFrame
-from stiffopt.rig.lab.ndi_wire import (
+from stiffopt.lab.bench import Bench, Peer, TrackerFrame
+from stiffopt.lab.ndi_wire import (
     RefusedError,
     crc16,
     framed,
@@ -26,6 +25,7 @@ from stiffopt.rig.lab.ndi_wire import (
     parse,
     pose_as_text,
 )
+from stiffopt.rig.drivers.aurora import AuroraSettings
 
 __all__ = ["AuroraPeer"]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.rig.simulated.plant import Plant
-from stiffopt.rig.simulated.settings import SimulatedTrackerSettings
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import SimulatedTrackerSettings
 
 __all__ = ["Camera", "Frame"]
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from stiffopt import lie
 from stiffopt.errors import DeviceError
+from stiffopt.lab.bench import Bench, Peer, TrackerFrame
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings, pyigtl_messages
-from stiffopt.rig.lab.bench import Bench, Peer, TrackerFrame
 
 __all__ = ["OpenIGTLinkPeer"]
 

@@ -7,13 +7,13 @@ from importlib import import_module
 from types import TracebackType
 from typing import Any, Self
 
+from stiffopt.lab.bench import Peer
+from stiffopt.lab.defaults import with_real_devices
+from stiffopt.lab.real_time import RealTimeBench
 from stiffopt.model.description import RobotDescription
+from stiffopt.plant.settings import PlantSettings
+from stiffopt.plant.world import World
 from stiffopt.rig.config import LabSettings, RigDescription, limits_of
-from stiffopt.rig.lab.bench import Peer
-from stiffopt.rig.lab.defaults import with_real_devices
-from stiffopt.rig.lab.real_time import RealTimeBench
-from stiffopt.rig.simulated.settings import PlantSettings
-from stiffopt.rig.simulated.world import World
 
 __all__ = ["VirtualLab"]
 
@@ -86,7 +86,7 @@ class VirtualLab:
                 if settings is None:
                     continue
                 module, kind = _PEERS[settings.driver].split(":")
-                peer_class = getattr(import_module(f"stiffopt.rig.lab.{module}"), kind)
+                peer_class = getattr(import_module(f"stiffopt.lab.{module}"), kind)
                 peer: Peer[Any] = peer_class(settings, self.bench)
                 self._peers.append(peer)
                 addressed[name] = peer.start()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from functools import partial
 
+from stiffopt.lab.bench import Bench, Peer
+from stiffopt.lab.daq_server import DaqHardware, DaqServer
+from stiffopt.lab.zaber_peer import ZaberPeer
 from stiffopt.rig.drivers.probe import ProbeSettings
-from stiffopt.rig.lab.bench import Bench, Peer
-from stiffopt.rig.lab.daq_server import DaqHardware, DaqServer
-from stiffopt.rig.lab.zaber_peer import ZaberPeer
 
 __all__ = ["ProbePeer"]
 

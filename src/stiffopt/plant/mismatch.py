@@ -7,8 +7,8 @@ import numpy as np
 from stiffopt import lie
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
+from stiffopt.plant.settings import Mismatch, PlantSettings
 from stiffopt.registration import Placement
-from stiffopt.rig.simulated.settings import Mismatch, PlantSettings
 
 __all__ = ["check_mismatch", "draw"]
 

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import CommandError, DeviceError
+from stiffopt.plant.plant import SimulationError
+from stiffopt.plant.world import World
 from stiffopt.registration import Registration
 from stiffopt.rig.interface import (
     Clock,
@@ -19,8 +21,6 @@ from stiffopt.rig.interface import (
     PressureSupply,
     RawPose,
 )
-from stiffopt.rig.simulated.plant import SimulationError
-from stiffopt.rig.simulated.world import World
 
 __all__ = ["SimulatedProbe", "SimulatedSupply", "SimulatedTracker"]
 

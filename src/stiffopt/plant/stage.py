@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.rig.simulated.plant import Plant
-from stiffopt.rig.simulated.settings import SimulatedProbeSettings
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import SimulatedProbeSettings
 
 __all__ = ["Stage"]
 

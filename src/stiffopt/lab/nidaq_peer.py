@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
+from stiffopt.lab.bench import Bench, Peer
+from stiffopt.lab.daq_server import DaqHardware, DaqServer
 from stiffopt.rig.drivers.nidaq import Input, NidaqSettings, Output
-from stiffopt.rig.lab.bench import Bench, Peer
-from stiffopt.rig.lab.daq_server import DaqHardware, DaqServer
 
 __all__ = ["NidaqPeer", "local"]
 

@@ -14,8 +14,8 @@ from typing import Any
 from uuid import uuid4
 
 from stiffopt.errors import DeviceError
+from stiffopt.lab.threads import LastingThreads
 from stiffopt.rig.drivers.daqmx import library
-from stiffopt.rig.lab.threads import LastingThreads
 
 __all__ = ["DaqHardware", "DaqServer"]
 

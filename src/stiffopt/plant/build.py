@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from stiffopt.errors import InputError
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.history import NO_HISTORY, Memory
-from stiffopt.rig.simulated.material import LINEAR, YEOH, Material
-from stiffopt.rig.simulated.rod import Rod
-from stiffopt.rig.simulated.settings import Mismatch, PlantSettings
+from stiffopt.plant.material import LINEAR, YEOH, Material
+from stiffopt.plant.rod import Rod
+from stiffopt.plant.settings import Mismatch, PlantSettings
 
 __all__ = ["Channels", "make_channels", "make_material", "make_memory", "make_rod", "node_at"]
 

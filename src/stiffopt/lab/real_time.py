@@ -8,9 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.rig.lab.bench import Bench, TrackerFrame
-from stiffopt.rig.simulated.camera import Frame
-from stiffopt.rig.simulated.world import World
+from stiffopt.lab.bench import Bench, TrackerFrame
+from stiffopt.plant.camera import Frame
+from stiffopt.plant.world import World
 
 __all__ = ["RealTimeBench"]
 

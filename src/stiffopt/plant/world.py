@@ -14,17 +14,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
-from stiffopt.rig.interface import Clock, PressureLimits
-from stiffopt.rig.simulated.camera import Camera, Frame
-from stiffopt.rig.simulated.plant import Plant
-from stiffopt.rig.simulated.regulators import Regulators, regulate
-from stiffopt.rig.simulated.settings import (
+from stiffopt.plant.camera import Camera, Frame
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.regulators import Regulators, regulate
+from stiffopt.plant.settings import (
     PlantSettings,
     SimulatedProbeSettings,
     SimulatedSupplySettings,
     SimulatedTrackerSettings,
 )
-from stiffopt.rig.simulated.stage import Stage
+from stiffopt.plant.stage import Stage
+from stiffopt.rig.interface import Clock, PressureLimits
 
 __all__ = ["FAULTS", "World", "WorldClock"]
 

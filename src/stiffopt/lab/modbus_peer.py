@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from stiffopt.errors import DeviceError
+from stiffopt.lab.bench import Bench, Peer
 from stiffopt.rig.drivers.modbus import ModbusSettings, SerialLine, Tcp
 from stiffopt.rig.drivers.modbus_line import library
 from stiffopt.rig.drivers.modbus_registers import Point
-from stiffopt.rig.lab.bench import Bench, Peer
 
 __all__ = ["ModbusPeer"]
 

@@ -10,7 +10,7 @@ import struct
 
 import numpy as np
 
-from stiffopt.rig.lab.bench import TrackerFrame
+from stiffopt.lab.bench import TrackerFrame
 
 __all__ = ["RefusedError", "crc16", "framed", "hexadecimal", "parse", "pose_as_text"]
 
