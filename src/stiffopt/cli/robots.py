@@ -13,7 +13,7 @@ def robots() -> None:
     from stiffopt.cli.tables import number_table
     from stiffopt.model.robot_files import builtin_robots, load_description
 
-    table = number_table("robot", "segments", "channels", "length", "pressures", "gravity, m/s^2")
+    table = number_table("robot", "segments", "channels", "length", "pressures", "g in m/s^2")
     for name in builtin_robots():
         table.add_row(name, *_columns(load_description(name)))
     show(table)
