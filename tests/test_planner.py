@@ -212,9 +212,7 @@ def test_asking_does_not_wait_and_the_newest_counts(robot, in_process):
     planner.request(request(robot, 2))
     assert time.monotonic() - start < 10
     assert planner.latest() is None
-    assert (
-        planner._waiting.search
-    )  # not lost with the request that was replaced
+    assert planner._waiting.search  # not lost with the request that was replaced
     os.kill(planner._process.pid, signal.SIGCONT)
     wait_for(lambda: planner.latest() is not None and planner.latest().serial == 2)
 
