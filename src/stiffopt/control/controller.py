@@ -34,8 +34,8 @@ from stiffopt.control.plans import Plan, Request
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import RegulatorModel
 from stiffopt.control.requested import preparing
-from stiffopt.control.state import Severity
-from stiffopt.control.steering import Move, Notice, Seen, Standing
+from stiffopt.control.state import Severity, SteeringStatus
+from stiffopt.control.steering import Move, Notice, Seen
 from stiffopt.control.trajectory import Course, Trajectory
 from stiffopt.control.vibration import Vibration
 from stiffopt.errors import InputError
@@ -275,11 +275,11 @@ class Controller:
         self._saturated = held if missing > _SHORT else np.zeros(n, dtype=bool)
         return Move(pressures, True, self._saturated.copy())
 
-    def standing(self, now: float) -> Standing:
-        """Say how things stand."""
+    def standing(self, now: float) -> SteeringStatus:
+        """Return what it knows of the state; see `Steering.standing`."""
         n = self.robot.n_pressures
         if self._at_u is None:
-            return Standing.unknown(n)
+            return SteeringStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
         target = self._course.at(now) if self._course is not None else self._target
         position, pointing, quaternion = parts_of(target)
@@ -287,12 +287,12 @@ class Controller:
         stiffness = math.nan
         if self._measure is not None:
             stiffness = float(self._measure(self._at_u.compliance, self._at_u.pose[:3, :3]))
-        return Standing(
+        return SteeringStatus(
             plan=np.full(n, np.nan) if plan is None else plan.pressures - self._remembered,
             tip_position=estimate.position,
             tip_quaternion=estimate.quaternion,
             seen_position=np.full(3, np.nan) if sample is None else sample.position,
-            seen_time=-math.inf if sample is None else sample.time,
+            seen_age=math.inf if sample is None else now - sample.time,
             target_position=position,
             target_quaternion=quaternion,
             target_pointing=pointing,

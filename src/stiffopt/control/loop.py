@@ -7,12 +7,14 @@ import threading
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from stiffopt.control.journal import EventLog
 from stiffopt.control.machine import Machine
 from stiffopt.control.requested import check_target, check_task, check_trajectory
 from stiffopt.control.requests import Requests, asking
-from stiffopt.control.state import Snapshot, State
-from stiffopt.control.steering import Standing, Steering
+from stiffopt.control.state import Snapshot, State, SteeringStatus
+from stiffopt.control.steering import Steering
 from stiffopt.control.timing import Punctuality
 from stiffopt.control.trajectory import Trajectory
 from stiffopt.errors import CommandError, InputError
@@ -73,7 +75,7 @@ class ControlLoop:
         self._punctuality = Punctuality(period)
         self._ramp_time = safety.ramp_time
         self.events: EventLog = self._machine.events
-        self._nothing = Standing.unknown(outlet.limits.n)
+        self._nothing = SteeringStatus(plan=np.full(outlet.limits.n, np.nan))
         self._snapshot = self._pictured(rig.clock.now())
         self._listeners: list[Callable[[Snapshot], None]] = []
 
@@ -342,22 +344,7 @@ class ControlLoop:
             saturated=machine.saturated,
             samples=machine.samples,
             rejected=machine.rejected,
-            seen_age=now - standing.seen_time,
             alarms=machine.alarms.now,
             timing=self._punctuality.timing(),
-            plan=standing.plan,
-            tip_position=standing.tip_position,
-            tip_quaternion=standing.tip_quaternion,
-            seen_position=standing.seen_position,
-            target_position=standing.target_position,
-            target_quaternion=standing.target_quaternion,
-            target_pointing=standing.target_pointing,
-            position_error=standing.position_error,
-            angle_error=standing.angle_error,
-            stiffness=standing.stiffness,
-            best_stiffness=standing.best_stiffness,
-            disturbance=standing.disturbance,
-            wrench=standing.wrench,
-            task=standing.task,
-            stiffness_unit=standing.stiffness_unit,
+            **vars(standing),
         )

@@ -83,4 +83,4 @@ class Punctuality:
     def timing(self) -> Timing:
         """Return all that as part of a snapshot."""
         counts = tuple(self._lateness.counts)
-        return Timing(self._ticks, self._overruns, self._tick_time, (self._lateness.edges, counts))
+        return Timing(self._ticks, self._overruns, self._tick_time, self._lateness.edges, counts)
