@@ -25,8 +25,8 @@ from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import Pursuit, Replanner
-from stiffopt.control.state import Severity
-from stiffopt.control.steering import Move, Notice, Seen, Standing
+from stiffopt.control.state import Severity, SteeringStatus
+from stiffopt.control.steering import Move, Notice, Seen
 from stiffopt.control.tip_errors import TipErrors, target_arrays, wrench_at
 from stiffopt.control.trajectory import Course, Trajectory
 from stiffopt.control.tuning import ControlTuning
@@ -256,11 +256,11 @@ class Controller:
         self._saturated = held if reported else np.zeros(n, dtype=bool)
         return Move(command, True, self._saturated.copy())
 
-    def standing(self, now: float) -> Standing:
-        """Return the state of control."""
+    def standing(self, now: float) -> SteeringStatus:
+        """Return the controller's part of the state; see `Steering.standing`."""
         n, tip, pursuit = self.robot.n_pressures, self._tip, self.replanner.pursuit
         if tip is None:
-            return Standing.unknown(n)
+            return SteeringStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
         target = pursuit.target_at(now)
         position, pointing, quaternion = target_arrays(target)
@@ -273,12 +273,12 @@ class Controller:
         planned = np.full(n, np.nan)
         if plan is not None:
             planned = plan.pressures - self._pressures.history_offset
-        return Standing(
+        return SteeringStatus(
             plan=planned,
             tip_position=estimate.position,
             tip_quaternion=estimate.quaternion,
             seen_position=np.full(3, np.nan) if sample is None else sample.position,
-            seen_time=-math.inf if sample is None else sample.time,
+            seen_age=math.inf if sample is None else now - sample.time,
             target_position=position,
             target_quaternion=quaternion,
             target_pointing=pointing,

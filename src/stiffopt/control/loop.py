@@ -7,11 +7,13 @@ import threading
 import time
 from collections.abc import Callable
 
+import numpy as np
+
 from stiffopt.control.checks import check_target, check_task, check_trajectory
 from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.request_queue import RequestQueue, current_requester
-from stiffopt.control.state import Snapshot, State
-from stiffopt.control.steering import Standing, Steering
+from stiffopt.control.state import Snapshot, State, SteeringStatus
+from stiffopt.control.steering import Steering
 from stiffopt.control.supervisor import Supervisor
 from stiffopt.control.timing import TickTiming
 from stiffopt.control.trajectory import Trajectory
@@ -85,7 +87,7 @@ class ControlLoop:
         self._timing = TickTiming(period)
         self._stop_time = safety.ramp_time + tuning.stop_margin
         self.events: EventBuffer = self._supervisor.events
-        self._unknown = Standing.unknown(outlet.limits.n)
+        self._unknown = SteeringStatus(plan=np.full(outlet.limits.n, np.nan))
         self._snapshot = self._current_snapshot(rig.clock.now())
         self._listeners: list[Callable[[Snapshot], None]] = []
 
@@ -351,22 +353,7 @@ class ControlLoop:
             saturated=supervisor.saturated,
             samples=supervisor.samples,
             rejected=supervisor.rejected,
-            seen_age=now - standing.seen_time,
             alarms=supervisor.alarms.now,
             timing=self._timing.statistics(),
-            plan=standing.plan,
-            tip_position=standing.tip_position,
-            tip_quaternion=standing.tip_quaternion,
-            seen_position=standing.seen_position,
-            target_position=standing.target_position,
-            target_quaternion=standing.target_quaternion,
-            target_pointing=standing.target_pointing,
-            position_error=standing.position_error,
-            angle_error=standing.angle_error,
-            stiffness=standing.stiffness,
-            best_stiffness=standing.best_stiffness,
-            disturbance=standing.disturbance,
-            wrench=standing.wrench,
-            task=standing.task,
-            stiffness_unit=standing.stiffness_unit,
+            **vars(standing),
         )

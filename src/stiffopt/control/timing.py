@@ -62,5 +62,5 @@ class TickTiming:
 
     def statistics(self) -> Timing:
         """Return the statistics so far."""
-        lateness = _EDGES, tuple(self._lateness)
-        return Timing(self._ticks, self._overruns, self._tick_time, lateness)
+        counts = tuple(self._lateness)
+        return Timing(self._ticks, self._overruns, self._tick_time, _EDGES, counts)
