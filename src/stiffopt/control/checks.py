@@ -21,8 +21,8 @@ from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.rig.interface import PressureLimits, PressureReading, Rig
+from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
-from stiffopt.safety.outlet import Outlet
 
 __all__ = [
     "check_rig",
