@@ -23,7 +23,7 @@ ENOUGH = 10
 
 _UNKNOWN = "#d5d9dd"
 _BEST, _CHOICE = "viridis", "YlOrRd"
-_ROW, _HEAD, _FOOT = 2.75, 1.45, 0.95  # inches: a direction, above and below all
+_ROW, _HEAD, _FOOT = 2.75, 1.55, 0.95  # inches: a direction, above and below all
 
 
 def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> Figure:
@@ -205,7 +205,7 @@ def _write_head(figure: Figure, found: WorkspaceMap, title: str, height: float) 
         (0.055, "How stiff can the tip be made at a place?"),
         (0.52, "How much can the stiffness be changed there? (1: not at all)"),
     ):
-        figure.text(x, 1 - 0.95 / height, text, fontsize=11.5, va="center", color="#20394f")
+        figure.text(x, 1 - 1.03 / height, text, fontsize=11.5, va="center", color="#20394f")
 
 
 def _write_foot(figure: Figure) -> None:
