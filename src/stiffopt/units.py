@@ -71,8 +71,8 @@ _MOST, _DEEPEST = 10, 2  # factors of a unit, and parentheses in each other
 
 
 @dataclass(frozen=True)
-class _Kind:
-    """A kind of quantity: its SI unit, an example, and the unit to write it in."""
+class _QuantityKind:
+    """A kind of quantity: its SI unit, name, an example, and the unit in which it is written."""
 
     unit: str
     what: str
@@ -80,23 +80,23 @@ class _Kind:
     written: str
 
 
-_LENGTH = _Kind("m", "length", "90 mm", "mm")
-_ANGLE = _Kind("rad", "angle", "30 deg", "deg")
-_PRESSURE = _Kind("Pa", "pressure", "1.5 bar", "kPa")
-_PRESSURE_RATE = _Kind("Pa/s", "rate of pressure", "5 bar/s", "kPa/s")
-_MASS = _Kind("kg", "mass", "20 g", "g")
-_DENSITY = _Kind("kg/m^3", "density", "1070 kg/m^3", "kg/m^3")
-_ACCELERATION = _Kind("m/s^2", "acceleration", "9.81 m/s^2", "m/s^2")
-_FORCE = _Kind("N", "force", "0.02 N", "N")
-_MOMENT = _Kind("N*m", "moment", "0.001 N*m", "N*m")
-_TRANSLATIONAL = _Kind("N/m", "translational stiffness", "1.3 N/m", "N/m")
-_ROTATIONAL = _Kind("N*m/rad", "rotational stiffness", "0.2 N*m/rad", "N*m/rad")
-_DURATION = _Kind("s", "duration", "20 ms", "s")
-_FREQUENCY = _Kind("Hz", "frequency", "50 Hz", "Hz")
-_SPEED = _Kind("m/s", "speed", "10 mm/s", "mm/s")
-_VOLTAGE = _Kind("V", "voltage", "10 V", "V")
-_FORCE_PER_VOLTAGE = _Kind("N/V", "force per voltage", "0.5 N/V", "N/V")
-_RATIO = _Kind("", "ratio", "1 %", "")
+_LENGTH = _QuantityKind("m", "length", "90 mm", "mm")
+_ANGLE = _QuantityKind("rad", "angle", "30 deg", "deg")
+_PRESSURE = _QuantityKind("Pa", "pressure", "1.5 bar", "kPa")
+_PRESSURE_RATE = _QuantityKind("Pa/s", "rate of pressure", "5 bar/s", "kPa/s")
+_MASS = _QuantityKind("kg", "mass", "20 g", "g")
+_DENSITY = _QuantityKind("kg/m^3", "density", "1070 kg/m^3", "kg/m^3")
+_ACCELERATION = _QuantityKind("m/s^2", "acceleration", "9.81 m/s^2", "m/s^2")
+_FORCE = _QuantityKind("N", "force", "0.02 N", "N")
+_MOMENT = _QuantityKind("N*m", "moment", "0.001 N*m", "N*m")
+_TRANSLATIONAL = _QuantityKind("N/m", "translational stiffness", "1.3 N/m", "N/m")
+_ROTATIONAL = _QuantityKind("N*m/rad", "rotational stiffness", "0.2 N*m/rad", "N*m/rad")
+_DURATION = _QuantityKind("s", "duration", "20 ms", "s")
+_FREQUENCY = _QuantityKind("Hz", "frequency", "50 Hz", "Hz")
+_SPEED = _QuantityKind("m/s", "speed", "10 mm/s", "mm/s")
+_VOLTAGE = _QuantityKind("V", "voltage", "10 V", "V")
+_FORCE_PER_VOLTAGE = _QuantityKind("N/V", "force per voltage", "0.5 N/V", "N/V")
+_RATIO = _QuantityKind("", "ratio", "1 %", "")
 
 _KINDS = (
     *(_LENGTH, _ANGLE, _PRESSURE, _PRESSURE_RATE, _MASS, _DENSITY, _ACCELERATION, _FORCE),
@@ -292,7 +292,7 @@ def _ratio(value: Any) -> float:
     return parse_quantity(value, "", "ratio") if isinstance(value, str) else finite_number(value)
 
 
-def _reader(kind: _Kind) -> BeforeValidator:
+def _reader(kind: _QuantityKind) -> BeforeValidator:
     """Return the validator for a kind: text with its unit, or in code a number in SI."""
 
     def read(value: Any, info: ValidationInfo) -> float:
@@ -305,7 +305,7 @@ def _reader(kind: _Kind) -> BeforeValidator:
     return BeforeValidator(read)
 
 
-def _writer(kind: _Kind) -> PlainSerializer:
+def _writer(kind: _QuantityKind) -> PlainSerializer:
     """Return the serializer with which ``model_dump(mode="json")`` writes quantities as text."""
 
     def write(value: float) -> str:
