@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import degrees, isfinite
+from math import degrees
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from stiffopt.cli.calibration_logs import (
     fixed_keys,
     read_tables,
 )
-from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_line
+from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_json
 from stiffopt.cli.exits import Interruptible, exit_code
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
 from stiffopt.errors import InputError
@@ -190,8 +189,7 @@ def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
 
 def _print_calibration(result: CalibrationResult, options: CalibrateOptions) -> None:
     if options.as_json:
-        record = calibration_record(result, options.out, options.report)
-        write_line(json.dumps(record, allow_nan=False))
+        write_json(calibration_record(result, options.out, options.report))
     elif not options.quiet:
         from stiffopt.cli.calibration_report import calibration
 
@@ -202,7 +200,7 @@ def _print_validation(
     robot: RobotDescription, found: tuple[Comparison, ...], options: ValidateOptions
 ) -> None:
     if options.as_json:
-        write_line(json.dumps(validation_record(robot, found), allow_nan=False))
+        write_json(validation_record(robot, found))
     elif not options.quiet:
         from stiffopt.cli.calibration_report import validation
 
@@ -234,7 +232,7 @@ def calibration_record(result: CalibrationResult, out: str, report: str | None) 
         "models": [
             {
                 "name": each.structure.name,
-                "held_back_mean_mm": _number(each.score * MM),
+                "held_back_mean_mm": each.score * MM,
                 "held_back": {name: _errors(e, length) for name, e in each.folds.items()},
             }
             for each in result.candidates
@@ -249,7 +247,7 @@ def calibration_record(result: CalibrationResult, out: str, report: str | None) 
                 "unit": each.unit,
                 "before": each.before,
                 "value": each.value,
-                "interval_95": [_number(each.low), _number(each.high)],
+                "interval_95": [each.low, each.high],
                 "learnt": each.learnt,
                 "tolerances_from_before": each.far,
             }
@@ -280,19 +278,10 @@ def _with_outside(robot: RobotDescription, found: Sequence[Comparison]) -> dict[
 
 
 def _errors(errors: Errors, length: float) -> dict[str, Any]:
-    values = {
-        "mean": errors.mean,
-        "median": errors.median,
-        "p95": errors.p95,
-        "max": errors.max,
-    }
+    names = ("mean", "median", "p95", "max")
     return {
         "n": errors.n,
-        "position_error_mm": {name: _number(value * MM) for name, value in values.items()},
-        "position_error_percent_of_length": _number(errors.mean / length * 100),
+        "position_error_mm": {name: getattr(errors, name) * MM for name in names},
+        "position_error_percent_of_length": errors.mean / length * 100,
         "angle_error_deg": None if errors.angle is None else degrees(errors.angle),
     }
-
-
-def _number(value: float) -> float | None:
-    return float(value) if isfinite(value) else None
