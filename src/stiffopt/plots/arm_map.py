@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.directions import direction_name
 from stiffopt.experiments.arm_map import ArmMap, TipMap
-from stiffopt.experiments.stiffness import direction_name
 from stiffopt.plots.style import (
     ARM,
     draw_head,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.documents import write_whole
-from stiffopt.errors import FileError, MissingExtraError, printable
+from stiffopt.errors import FileError, printable, require_package
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -82,12 +81,7 @@ def require_matplotlib() -> None:
     MissingExtraError
         If it is not installed.
     """
-    try:
-        missing = find_spec("matplotlib") is None
-    except ValueError:  # a placeholder in sys.modules
-        missing = True
-    if missing:
-        raise MissingExtraError("matplotlib", "plot")
+    require_package("matplotlib", "plot")
 
 
 def new_figure(width: float, height: float, **settings: Any) -> Figure:
