@@ -62,7 +62,7 @@ Settings = KinematicsSettings | StiffnessSettings
 
 @dataclass(frozen=True)
 class ExperimentOptions:
-    """The arguments of a command; `given` are those that say what is done, None where absent."""
+    """The arguments of a command; `given` are the settings of the experiment, None where absent."""
 
     rig: str
     out: str | None
@@ -203,7 +203,7 @@ def _settings(
 
 
 def _kinematics_settings(folder: Path) -> KinematicsSettings:
-    """Settings of a folder; one that does not speak of combined poses was begun without them."""
+    """Settings of a folder; an old one that does not mention combined poses has none."""
     settings = open_folder(folder, KinematicsSettings)
     begun_with = settings.poses if "poses" in settings.model_fields_set else 0
     return settings.model_copy(update={"poses": begun_with})

@@ -128,7 +128,7 @@ class _Progress:
 
 
 def _summary(found: WorkspaceMap, out: str | None, seconds: float) -> RenderableType:
-    """All there is to say about a map, about 80 columns wide."""
+    """The report of a map, about 80 columns wide."""
     parts: list[RenderableType] = [title(out or "workspace"), labelled(_facts(found, seconds))]
     if len(found.table):
         parts += [Text(""), _stiffnesses(found)]

@@ -79,7 +79,7 @@ def _json_point(solution: PressureSolution) -> Record:
 
 
 def priced(solution: PressureSolution) -> Sensitivities | None:
-    """Return the sensitivities if they are worth something in stiffness, else None."""
+    """Return the sensitivities if they are prices in stiffness, else None."""
     given = solution.sensitivities
     if given is None or not solution.found or given.objective_unit not in ("N/m", "N*m/rad"):
         return None
