@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.daemon.run_log import RecordedRun, RunEvent, RunSpan
 from stiffopt.errors import printable
-from stiffopt.logs.run_log import Run, RunEvent, RunSpan
 from stiffopt.plots.style import (
     AXES,
     DARK,
@@ -58,7 +58,7 @@ _LETTER_WIDTH = 0.0095  # of the panel's width
 _APART = 0.012  # of the panel's width, between two numbers of events
 
 
-def plot_run(run: Run, *, title: str | None = None) -> Figure:
+def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
     """Draw a run.
 
     Parameters
@@ -101,7 +101,7 @@ def plot_run(run: Run, *, title: str | None = None) -> Figure:
     return figure
 
 
-def _draw_tip(axes: Any, run: Run, axis: int) -> None:
+def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
     seen = run.seen_position[:, axis] * MM
     if np.isfinite(seen).any():
         axes.plot(
@@ -109,10 +109,10 @@ def _draw_tip(axes: Any, run: Run, axis: int) -> None:
             markeredgewidth=0, label="tracker",
         )  # fmt: skip
     axes.plot(
-        *thinned(run.time, run.tip[:, axis] * MM), color=AXES[axis], linewidth=1.3,
+        *thinned(run.time, run.tip_position[:, axis] * MM), color=AXES[axis], linewidth=1.3,
         label="estimate",
     )  # fmt: skip
-    target = run.target[:, axis] * MM
+    target = run.target_position[:, axis] * MM
     if np.isfinite(target).any():
         axes.plot(
             *thinned(run.time, target), color=TARGET, linewidth=1.3, linestyle=(0, (4, 2)),
@@ -127,7 +127,7 @@ def _draw_tip(axes: Any, run: Run, axis: int) -> None:
     tidy(axes)
 
 
-def _draw_error(axes: Any, run: Run) -> None:
+def _draw_error(axes: Any, run: RecordedRun) -> None:
     error = np.maximum(run.position_error, _FLOOR) * MM
     axes.plot(*thinned(run.time, error), color=DARK, linewidth=1.2, label="position")
     axes.set_ylabel("error (mm)")
@@ -143,7 +143,7 @@ def _draw_error(axes: Any, run: Run) -> None:
     tidy(axes)
 
 
-def _draw_angle(axes: Any, run: Run) -> None:
+def _draw_angle(axes: Any, run: RecordedRun) -> None:
     axes.plot(
         *thinned(run.time, np.degrees(run.angle_error)), color=DARK, linewidth=1.2,
         label="angle",
@@ -155,7 +155,7 @@ def _draw_angle(axes: Any, run: Run) -> None:
     tidy(axes)
 
 
-def _draw_pressures(axes: Any, run: Run, segment: int, channels: range) -> None:
+def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) -> None:
     from matplotlib.lines import Line2D
 
     for channel in channels:
@@ -185,7 +185,7 @@ def _draw_pressures(axes: Any, run: Run, segment: int, channels: range) -> None:
     tidy(axes)
 
 
-def _draw_stiffness(axes: Any, run: Run) -> None:
+def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
     if np.isfinite(run.best_stiffness).any():
         axes.plot(
             *thinned(run.time, run.best_stiffness), color=TARGET, linewidth=1.3,
@@ -200,7 +200,7 @@ def _draw_stiffness(axes: Any, run: Run) -> None:
     tidy(axes)
 
 
-def _shade(panels: Any, run: Run) -> None:
+def _shade(panels: Any, run: RecordedRun) -> None:
     """Shade the times at which the loop was not active, in the colours of its states."""
     for span in run.states:
         if span.kind in _STATES and span.kind != "active":
@@ -238,7 +238,7 @@ def _listed(events: tuple[RunEvent, ...]) -> list[RunEvent]:
     return [events[i] for i in sorted(order[:_MOST_EVENTS])]
 
 
-def _what(run: Run) -> str:
+def _what(run: RecordedRun) -> str:
     begin = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(int(run.about["start_ns"]) // 10**9))
     parts = [run.about.get("robot", ""), begin, f"{run.time[-1] - run.time[0]:.1f} s"]
     if "overruns" in run.timing:
@@ -248,7 +248,7 @@ def _what(run: Run) -> str:
     return "      ".join(parts)
 
 
-def _figures(run: Run) -> str:
+def _figures(run: RecordedRun) -> str:
     """Median errors and stiffness while the loop was active."""
     active = np.zeros(len(run), dtype=bool)
     for span in run.states:
@@ -268,7 +268,7 @@ def _figures(run: Run) -> str:
 # -- states, alarms and events over time ----------------------------------------------------------
 
 
-def _draw_timeline(axes: Any, run: Run, listed: list[RunEvent]) -> None:
+def _draw_timeline(axes: Any, run: RecordedRun, listed: list[RunEvent]) -> None:
     """Draw bands for states and alarms, and marks for events; those that are listed by number."""
     kinds = _alarm_kinds(run)
     labels = ["state", *kinds, *(["events"] if run.events else [])]
@@ -295,7 +295,9 @@ def _band(axes: Any, span: RunSpan, row: int, colour: str) -> None:
     axes.fill_between([span.begin, span.end], row - _HALF, row + _HALF, color=colour, linewidth=0.6)
 
 
-def _draw_events(axes: Any, run: Run, listed: list[RunEvent], row: int, width: float) -> None:
+def _draw_events(
+    axes: Any, run: RecordedRun, listed: list[RunEvent], row: int, width: float
+) -> None:
     numbers = {id(event): number for number, event in enumerate(listed, start=1)}
     last = -float("inf")
     for event in run.events:
@@ -314,7 +316,7 @@ def _short(name: str) -> str:
     return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 3]}..."
 
 
-def _alarm_kinds(run: Run) -> list[str]:
+def _alarm_kinds(run: RecordedRun) -> list[str]:
     """The kinds of alarms that have a row: those that stood longest."""
     stood: dict[str, float] = {}
     for span in run.alarms:
