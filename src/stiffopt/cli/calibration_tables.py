@@ -84,8 +84,8 @@ def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[
     """Return sentences on the logs whose pressures the calibration had not seen."""
     if robot.calibration is None:
         return [
-            f"the robot '{robot.name}' was not calibrated, so that there is no training range that "
-            "these logs could leave"
+            f"the robot '{robot.name}' was not calibrated: there is no recorded range that these "
+            "logs could leave"
         ]
     lines = []
     for each in found:
