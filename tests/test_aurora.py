@@ -26,8 +26,7 @@ import pytest
 
 from fake_bench import FakeBench
 from stiffopt.errors import DeviceError, InputError, MissingExtraError
-from stiffopt.lab.aurora_peer import AuroraPeer
-from stiffopt.lab.ndi_wire import crc16
+from stiffopt.lab.aurora_peer import AuroraPeer, crc16
 from stiffopt.rig.drivers import aurora, ndi_reader
 from stiffopt.rig.drivers.aurora import AuroraSettings, AuroraTracker
 from stiffopt.rig.interface import PoseSample, SystemClock

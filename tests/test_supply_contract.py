@@ -89,7 +89,7 @@ def nidaq() -> Iterator[Case]:
 @contextmanager
 def simulated(valve: bool = False) -> Iterator[Case]:
     from stiffopt.model.robot_files import load_description
-    from stiffopt.plant.rig import simulated_rig
+    from stiffopt.plant.devices import simulated_rig
     from stiffopt.rig.config import RigDescription
 
     description = RigDescription(

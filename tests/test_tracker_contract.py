@@ -14,7 +14,7 @@ from fake_bench import FakeBench
 from stiffopt.lab.aurora_peer import AuroraPeer
 from stiffopt.lab.openigtlink_peer import OpenIGTLinkPeer
 from stiffopt.model.robot_files import load_description
-from stiffopt.plant.rig import simulated_rig
+from stiffopt.plant.devices import simulated_rig
 from stiffopt.plant.world import World
 from stiffopt.registration import Registration
 from stiffopt.rig.config import RigDescription, limits_of

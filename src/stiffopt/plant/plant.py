@@ -23,18 +23,18 @@ from stiffopt.errors import DeviceError, EquilibriumError, InputError, PressureE
 from stiffopt.model.description import RobotDescription
 from stiffopt.plant import dynamics, material, rod
 from stiffopt.plant.build import (
+    draw,
     make_channels,
     make_material,
     make_memory,
     make_rod,
     node_at,
 )
-from stiffopt.plant.dynamics import State
+from stiffopt.plant.dynamics import RodState
 from stiffopt.plant.jit import tell_if_new
-from stiffopt.plant.loads import Loads, contact_energy, contact_force, depth_of
-from stiffopt.plant.material import Memory, Scheme
-from stiffopt.plant.mismatch import draw
-from stiffopt.plant.settings import Load, PlantSettings
+from stiffopt.plant.material import FibreMemory, Scheme
+from stiffopt.plant.rod import RodLoads, contact_energy, contact_force, depth_of
+from stiffopt.plant.settings import PlantLoad, PlantSettings
 
 __all__ = ["Energies", "Plant", "SimulationError"]
 
@@ -101,7 +101,7 @@ class Plant:
         self._channels = make_channels(robot, self.mismatch)
         self._past = make_memory(robot)
         self._steps = 0
-        self._load: Load | None = None
+        self._load: PlantLoad | None = None
         self._plate: tuple[Array, float, float, float] | None = None
         self._material = make_material(robot, self.settings, self.mismatch, self._channels, 0.0)
         self._mesh(None)
@@ -121,11 +121,11 @@ class Plant:
     def _mesh(self, station: float | None) -> None:
         self._rod = make_rod(self.robot, self.settings, self.mismatch, station)
 
-    def _at_rest(self) -> State:
+    def _at_rest(self) -> RodState:
         parts, n = self._material, self._rod.per_segment * self.robot.n_segments
         nodes = len(self._rod.mass)
         shape = (self.robot.n_segments, len(self._rod.weight), parts.fibre_x.shape[1])
-        state = State(
+        state = RodState(
             q=np.zeros(n),
             momentum=np.zeros(n),
             rate=np.zeros(n),
@@ -135,7 +135,7 @@ class Plant:
             inverse=np.zeros((n, n)),
             tangent_of=np.zeros(2),
             totals=np.zeros(3),
-            memory=Memory(
+            memory=FibreMemory(
                 strain=np.zeros(shape),
                 creep=np.zeros((*shape[:2], len(parts.creep_share), shape[2])),
                 slip=np.zeros((*shape[:2], len(parts.slip_share), shape[2])),
@@ -166,7 +166,7 @@ class Plant:
         T[:, :3, 3] = self._state.positions
         return T
 
-    def set_load(self, load: Load | None) -> None:
+    def set_load(self, load: PlantLoad | None) -> None:
         """Let a wrench act from now on, or none.
 
         Raises
@@ -266,7 +266,7 @@ class Plant:
         """Let time pass in which nothing happens, in s; rounded down to whole steps."""
         self._steps += int(duration / self.step)
 
-    def settle(self, pressures: ArrayLike, load: Load | None = None) -> None:
+    def settle(self, pressures: ArrayLike, load: PlantLoad | None = None) -> None:
         """Bring the arm to rest in equilibrium, with all creep done and no hysteresis left.
 
         That is, none of its silicone. A history in the robot file begins anew with a rise from no
@@ -358,7 +358,7 @@ class Plant:
         damped = np.einsum("ik,ij,jk->k", shapes, half @ C @ half.T, shapes)[:count]
         return omega / (2 * math.pi), damped / (2 * omega)
 
-    def _tangent(self, parts: material.Material, scheme: Scheme) -> Array:
+    def _tangent(self, parts: material.SectionMaterial, scheme: Scheme) -> Array:
         """Change of the imbalance without inertia (n, n) with the end of a step from here."""
         q, n = self._state.q.copy(), len(self._state.q)
         work = dynamics.make_work(n, len(self._state.positions))
@@ -381,7 +381,7 @@ class Plant:
         rod.mass_matrix(self._rod, self._state.rotations, J, M)
         return M
 
-    def _loads(self) -> Loads:
+    def _loads(self) -> RodLoads:
         load, plate = self._load, self._plate
         last = len(self._rod.mass) - 1
         normal, at, speed, stiffness = (np.zeros(3), 0.0, 0.0, 0.0) if plate is None else plate
@@ -391,7 +391,7 @@ class Plant:
                 node, lever = node_at(self.robot, self._rod, load.at)
             force, moment = np.array(load.force), np.array(load.moment)
             follows = load.frame == "tip"
-        return Loads(node, lever, force, moment, follows, normal, at, speed, stiffness)
+        return RodLoads(node, lever, force, moment, follows, normal, at, speed, stiffness)
 
     def _checked(self, pressures: ArrayLike) -> Array:
         p = np.array(pressures, dtype=float)

@@ -14,16 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
-from stiffopt.plant.camera import Camera, Frame
+from stiffopt.plant.hardware import Camera, Frame, Regulators, SimulatedStage, regulate
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.regulators import Regulators, regulate
 from stiffopt.plant.settings import (
     PlantSettings,
     SimulatedProbeSettings,
     SimulatedSupplySettings,
     SimulatedTrackerSettings,
 )
-from stiffopt.plant.stage import Stage
 from stiffopt.rig.interface import Clock, PressureLimits
 
 __all__ = ["FAULTS", "World", "WorldClock"]
@@ -98,7 +96,7 @@ class World:
         streams = np.random.SeedSequence([plant.seed, 2]).spawn(4)
         self._ripple, self._gauge, optics, balance = map(np.random.default_rng, streams)
         self.camera = None if tracker is None else Camera(tracker, self.plant, optics)
-        self.stage = None if probe is None else Stage(probe, self.plant, balance)
+        self.stage = None if probe is None else SimulatedStage(probe, self.plant, balance)
         self._run(0)  # compiles what has not been compiled yet: no time for that later
         self.plant.contact_force()
         self._epoch = time.monotonic()

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,11 +30,15 @@ from stiffopt.rig.pressure import (
     total_force,
     vent_at_exit,
 )
-from stiffopt.rig.probing import ForceProbe, ForceSample
-from stiffopt.rig.tracking import PoseSample, PoseTracker, RawPose
-
-if TYPE_CHECKING:
-    from stiffopt.rig.config import RigDescription
+from stiffopt.rig.probing import ForceProbe, ForceSample, ProbeSettings
+from stiffopt.rig.tracking import (
+    PoseSample,
+    PoseTracker,
+    RawPose,
+    StreamedSettings,
+    StreamedTracker,
+    TrackerSettings,
+)
 
 __all__ = [
     "Clock",
@@ -48,11 +52,15 @@ __all__ = [
     "PressureLimits",
     "PressureReading",
     "PressureSupply",
+    "ProbeSettings",
     "RawPose",
     "Rig",
+    "StreamedSettings",
+    "StreamedTracker",
     "Supply",
     "SupplySettings",
     "SystemClock",
+    "TrackerSettings",
     "total_force",
     "vent_at_exit",
 ]
@@ -93,7 +101,7 @@ class Rig(Opened):
     max_force :
         Greatest sum over the channels of pressure times chamber area, in N; None: no limit.
     settings :
-        The `RigDescription` that the rig was made from, if it was.
+        What the rig was made from, such as the content of a rig file; None: nothing of the kind.
     """
 
     def __init__(
@@ -106,7 +114,7 @@ class Rig(Opened):
         clock: Clock | None = None,
         slew: ArrayLike | None = None,
         max_force: float | None = None,
-        settings: RigDescription | None = None,
+        settings: Any = None,
     ) -> None:
         self.robot = robot
         self.supply = supply

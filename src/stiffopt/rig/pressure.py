@@ -7,13 +7,14 @@ import sys
 import threading
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import CommandError, DeviceError, InputError
-from stiffopt.rig.device import Clock, Device
-from stiffopt.schema import Schema
+from stiffopt.model.description import RobotDescription
+from stiffopt.rig.device import Clock, Device, DeviceSettings
 
 __all__ = [
     "PressureCommand",
@@ -239,12 +240,12 @@ class Supply(Device):
         """Let all pressure out at once; no pressure is taken until `arm`."""
 
 
-class SupplySettings(Schema):
-    """Base of the settings of a supply in a rig file: how to reach it, and its channels.
+class SupplySettings(DeviceSettings):
+    """Base of a supply's settings in a rig file: how to reach it, and its channels.
 
-    A subclass has the key ``driver``, and ``channels`` with an item for each channel of the robot.
-    Where such an item has ``min`` or ``max``, in Pa, no supply that `device` returns commands less
-    or more, whatever its driver does.
+    A subclass has the key ``channels`` with an item for each channel of the robot. Where such an
+    item has ``min`` or ``max``, in Pa, no supply that `device` returns commands less or more,
+    whatever its driver does.
     """
 
     def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
@@ -284,6 +285,13 @@ class SupplySettings(Schema):
             if low[index] > high[index]:
                 raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
         return PressureLimits(low, high)
+
+    def simulated_rig(self, description: Any, robot: RobotDescription, **options: Any) -> Any:
+        """Return the `Rig` of a whole simulated arm; only for settings that are `simulated`.
+
+        See `stiffopt.rig.assembly.make_rig`, which passes on limits, slew and kind of time.
+        """
+        raise NotImplementedError(f"{type(self).__name__} simulates nothing")
 
     def _make(self, limits: PressureLimits, clock: Clock | None) -> PressureSupply:
         """Return the supply, not yet open, with these limits."""

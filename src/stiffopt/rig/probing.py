@@ -6,9 +6,9 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from stiffopt.rig.device import Device
+from stiffopt.rig.device import Clock, Device, DeviceSettings
 
-__all__ = ["ForceProbe", "ForceSample"]
+__all__ = ["ForceProbe", "ForceSample", "ProbeSettings"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,14 @@ class ForceSample:
     time: float
     force: float
     position: float
+
+
+class ProbeSettings(DeviceSettings):
+    """Base of a probe's settings in a rig file."""
+
+    def device(self, clock: Clock | None = None) -> ForceProbe:
+        """Return the probe, not yet open."""
+        raise NotImplementedError(f"{type(self).__name__} makes no probe")
 
 
 class ForceProbe(Device):

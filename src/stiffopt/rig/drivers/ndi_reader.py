@@ -39,7 +39,7 @@ class LostError(Exception):
     """The device cannot be used, or no more."""
 
 
-class Line:
+class SerialPort:
     """The serial line beside the library, to know why it fails and to shorten its patience."""
 
     def __init__(self, port: str) -> None:
@@ -112,7 +112,7 @@ class Session:
         self.ndi = ndi
         self.port = port
         self.baud = baud
-        self.line = Line(port)
+        self.line = SerialPort(port)
         self.device = ndi.ndiOpen(port)
         if not self.device:
             self.line.close()
