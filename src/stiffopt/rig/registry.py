@@ -76,7 +76,7 @@ def driver_class(kind: str, driver: Any) -> type[DeviceSettings]:
         raise InputError(f"expected the name of a driver, not {shown(driver)}")
     if driver in _BUILT_IN[kind]:
         found = load(_BUILT_IN[kind][driver])
-    elif ":" in driver:
+    elif ":" in driver and driver.split(":")[0].split(".")[0] != "stiffopt":
         found = _load_installed(driver, _installed())
     else:
         found = _load_announced(kind, driver)
@@ -162,13 +162,13 @@ def _specs(module: str) -> Iterator[ModuleSpec]:
 
 def _owns(owner: Distribution, origin: str) -> bool:
     """Say whether an installed package has put this file there, or refers to it if editable."""
-    path = Path(origin).resolve()
-    for file in owner.files or ():
-        place = Path(str(owner.locate_file(file)))
-        if file.name == path.name and place.resolve() == path:
-            return True
-        if file.suffix == ".pth" and place.is_file():  # of an editable install
-            folders = place.read_text(encoding="utf-8").splitlines()
+    path, root = Path(origin).resolve(), Path(str(owner.locate_file(""))).resolve()
+    files = [line.partition(",")[0] for line in (owner.read_text("RECORD") or "").splitlines()]
+    if path.is_relative_to(root) and path.relative_to(root).as_posix() in files:
+        return True
+    for file in files:
+        if file.endswith(".pth") and (root / file).is_file():  # of an editable install
+            folders = (root / file).read_text(encoding="utf-8").splitlines()
             if any(path.is_relative_to(line) for line in folders if Path(line).is_absolute()):
                 return True
     return False
@@ -176,18 +176,17 @@ def _owns(owner: Distribution, origin: str) -> bool:
 
 def _announced(kind: str) -> Iterator[tuple[EntryPoint, Distribution]]:
     """Yield the drivers that installed packages announce for a kind of device."""
+    seen = set()
     for distribution in _installed():
-        for entry in distribution.entry_points:
-            if entry.group == f"stiffopt.{kind}":
+        entries = distribution.entry_points.select(group=f"stiffopt.{kind}")
+        if entries and distribution.name not in seen:  # the first one is the one that is imported
+            seen.add(distribution.name)
+            for entry in entries:
                 yield entry, distribution
 
 
-def _installed() -> Iterator[Distribution]:
-    """Yield the installed packages; the working directory is no place where packages are."""
+def _installed() -> Iterable[Distribution]:
+    """Return the installed packages; the working directory is no place where packages are."""
     here = Path.cwd().resolve()
-    seen = set()
     path = [entry for entry in sys.path if entry and Path(entry).resolve() != here]
-    for distribution in distributions(path=path):
-        if distribution.name not in seen:  # the first one is the one that is imported
-            seen.add(distribution.name)
-            yield distribution
+    return distributions(path=path)
