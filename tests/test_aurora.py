@@ -486,7 +486,7 @@ def test_a_port_without_permission(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(ndi_reader.os, "open", refuse)
     with pytest.raises(ndi_reader.LostError, match=r"no permission to use /dev/ttyUSB0.*dialout"):
-        ndi_reader.Line("/dev/ttyUSB0")
+        ndi_reader.SerialPort("/dev/ttyUSB0")
 
 
 def test_a_port_that_another_program_uses() -> None:

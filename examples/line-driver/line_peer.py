@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socketserver
+import sys
 import time
 from functools import partial
 from threading import Event, Lock, Thread
@@ -47,6 +48,8 @@ class LinePeer(DevicePeer[LineSettings]):
     def close(self) -> None:
         """Stop."""
         self._closing.set()
+        if sys.is_finalizing():  # the threads have ended with the interpreter
+            return
         server, self._server = self._server, None
         if server is not None:
             server.shutdown()

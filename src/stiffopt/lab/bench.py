@@ -6,15 +6,17 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
-from stiffopt.plant.hardware import Frame
-from stiffopt.plant.world import World
 from stiffopt.rig.device import DeviceSettings
+
+if TYPE_CHECKING:  # numba takes its time, and peers need none of it
+    from stiffopt.plant.hardware import Frame
+    from stiffopt.plant.world import World
 
 __all__ = ["FULL_SCALE", "Bench", "DevicePeer", "TrackerFrame"]
 

@@ -43,7 +43,7 @@ _LOOPBACK = ("127.0.0.1", "localhost")
 
 @dataclass(frozen=True)
 class DaqHardware:
-    """What is wired to the device.
+    """What is wired to an emulated NI-DAQ device.
 
     Attributes
     ----------
@@ -60,7 +60,7 @@ class DaqHardware:
 
 
 class _NiError(Exception):
-    """An answer of the driver that is an error: its number and text."""
+    """An error that the server answers with: number and text."""
 
 
 @dataclass

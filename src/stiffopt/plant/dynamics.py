@@ -1,4 +1,4 @@
-"""The motion of the rod: one step in time, many steps, and what is conserved.
+"""Time stepping of the rod: one step, and many steps at given pressures.
 
 With inertia, a variational integrator: the discrete Lagrangian of a step from q0 to q1 is
 
@@ -52,7 +52,7 @@ _REACH = 0.015  # m; turns curvatures into strains
 
 
 class RodState(NamedTuple):
-    """What of an arm changes in time. n coefficients, N nodes.
+    """State of the rod: what changes in time. n coefficients, N nodes.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ def _invert(A: Array, out: Array) -> bool:
 
 
 class Step(NamedTuple):
-    """A step to be taken.
+    """Everything that determines one step but the state that it begins from.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class Step(NamedTuple):
 
 
 class StepBuffers(NamedTuple):
-    """Room for a step: Jacobians, poses and forces. Made once per call."""
+    """Arrays that a step works in: Jacobians, poses and forces. Made once per call."""
 
     jacobian: Array
     rotations: Array

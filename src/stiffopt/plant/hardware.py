@@ -16,22 +16,24 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt import lie
 from stiffopt.plant.jit import jit
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.settings import SimulatedProbeSettings, SimulatedTrackerSettings
+from stiffopt.plant.settings import (
+    FAULT_SIZES,
+    SimulatedProbeSettings,
+    SimulatedTrackerSettings,
+)
 
 __all__ = ["Camera", "Frame", "Regulators", "SimulatedStage", "regulate"]
 
 Array = NDArray[np.float64]
 Compiled = Any  # an array of floats in compiled code; numba infers the rest
 
-_LATE = 0.5  # s, by which the frames of a slow tracker come later
-_AWAY = np.array([0.02, -0.015, 0.01])  # m, by which a wrong tracker is off
 _KEPT = 4096  # frames that wait to be read
 _IMMOBILE = ("off", "stuck")  # faults of a stage that does not move
 _EMPTYING = 0.02  # s; time constant with which a chamber empties through the dump valve
 
 
 class Regulators(NamedTuple):
-    """What regulators do, for n channels.
+    """Parameters of the regulators of n channels.
 
     Attributes
     ----------
@@ -113,7 +115,7 @@ def regulate(
 
 @dataclass(frozen=True)
 class Frame:
-    """A frame of the tracker, in its own terms.
+    """One frame of the camera: the sensor in the tracker's frame.
 
     Attributes
     ----------
@@ -131,7 +133,7 @@ class Frame:
 
 
 class Camera:
-    """Sees the tip of a plant.
+    """Simulated tracking camera: captures the sensor at the tip and sends frames late.
 
     Attributes
     ----------
@@ -176,13 +178,13 @@ class Camera:
         if fault == "missing" or chances[1] < settings.dropouts:
             position, q = np.full(3, np.nan), np.full(4, np.nan)
         elif fault == "wrong":
-            position = position + _AWAY
+            position = position + FAULT_SIZES.tracker_offset
         elif fault == "garbage":
             position, q = position * 1e3 * noise[:3], np.full(4, np.nan)
         if chances[2] < settings.flips or (fault == "flip" and self.count % 2):
             q = -q
         now = self._plant.time
-        arrival = now + settings.latency + (_LATE if fault == "slow" else 0.0)
+        arrival = now + settings.latency + (FAULT_SIZES.frame_delay if fault == "slow" else 0.0)
         if self._last is not None:
             arrival = max(arrival, self._last.delivered)  # none overtakes another
         if fault == "stuck" and self._last is not None:
@@ -238,7 +240,9 @@ class SimulatedStage:
 
     def move(self, position: float, speed: float, fault: str) -> None:
         """Start to move to a place, m, at a speed, m/s."""
-        speed = min(speed, self.settings.speed) / (10 if fault == "slow" else 1)
+        speed = min(speed, self.settings.speed)
+        if fault == "slow":
+            speed *= FAULT_SIZES.stage_speed
         self._target = position
         moves = position != self.position and fault not in _IMMOBILE
         self.speed = speed if moves else 0.0
@@ -284,4 +288,6 @@ class SimulatedStage:
         force = self._plant.contact_force() if self._axis is not None else 0.0
         if fault == "garbage":
             return float("nan") if noise > 0 else 1e6 * noise
-        return (0.5 * force + 0.1 if fault == "wrong" else force) + noise
+        if fault == "wrong":
+            force = FAULT_SIZES.force_gain * force + FAULT_SIZES.force_offset
+        return force + noise

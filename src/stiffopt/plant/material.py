@@ -1,7 +1,7 @@
-"""The silicone: stresses of the fibres of a section, with what they remember.
+"""The silicone: stress in the fibres of a section, with viscosity, creep and hysteresis.
 
-A section is made of fibres along the arm that strain by ``v_z + u_x y - u_y x``. Beside a fibre's
-hyperelastic stress there are, in parallel: a dashpot (Kelvin-Voigt), springs in series with a
+A section is made of fibres along the arm that strain by ``v_z + u_x y - u_y x``. In parallel
+with a fibre's hyperelastic spring there are a dashpot (Kelvin-Voigt), springs in series with a
 dashpot (Maxwell: creep), and springs in series with a slider (Jenkin: hysteresis). Shear and twist
 are linear and have the dashpot alone. Stresses and strains are nominal: per area and length at
 rest.
@@ -24,7 +24,7 @@ _THINNEST = 0.1  # stretch below which the hyperelastic law is continued by its 
 
 
 class SectionMaterial(NamedTuple):
-    """What of the sections does not change in time. S segments, f fibres, n channels.
+    """The sections and their material, constant in time. S segments, f fibres, n channels.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class SectionMaterial(NamedTuple):
 
 
 class FibreMemory(NamedTuple):
-    """What the fibres remember. S segments, g Gauss points, f fibres.
+    """History variables of the fibres. S segments, g Gauss points, f fibres.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class FibreMemory(NamedTuple):
 
 
 class Scheme(NamedTuple):
-    """How a step in time is taken.
+    """Time discretisation of one step.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The simulated arm: a rod whose mechanics are not the optimiser's model.
+"""The plant: a simulated arm whose mechanics differ from the optimiser's model.
 
 The differences are meant: the rod is per reference length and has distributed weight, inertia,
 shear and stretch; its silicone is hyperelastic, creeps and has hysteresis. Pressure acts normal to
@@ -6,8 +6,8 @@ the section: the force p A on each section at the chamber's centre, constant in 
 which is conjugate to the volume that a chamber of constant bore sweeps. (Along the chamber instead
 of normal to the section would change the compliance of a bent arm by about 3 %.)
 
-What the robot file says of its channels, this arm does: their history, between the pressures in
-the chambers and those that act, then their corrections. Silicone and mismatch come on top.
+The channels behave as the robot file says: its history lies between the pressures in the chambers
+and those that act, its corrections come after. Silicone and mismatch come on top.
 """
 
 from __future__ import annotations
@@ -40,10 +40,6 @@ __all__ = ["Energies", "Plant", "SimulationError"]
 
 Array = NDArray[np.float64]
 
-_LONG = 1e9  # s; a step after which viscosity has nothing more to say
-_FIRST_STEP = 0.02  # s
-_SHORTEST = 1e-6  # s
-_TRIES = 400
 _STILL = 1e-3  # s; step for stiffness to motions so fast that nothing creeps or slips
 
 
@@ -53,7 +49,7 @@ class SimulationError(DeviceError):
 
 @dataclass(frozen=True)
 class Energies:
-    """Where the energy is, in J.
+    """Energies of the plant, in J.
 
     Attributes
     ----------
@@ -75,8 +71,30 @@ class Energies:
     load_work: float
 
 
+@dataclass(frozen=True)
+class Settling:
+    """How `Plant.settle` follows a slow arm to rest: by steps of growing length.
+
+    Attributes
+    ----------
+    first, shortest, last : lengths of steps, in s: the first, the one below which it gives up, and
+        the one after which viscosity has no effect any more.
+    growth, cut : factor on the next step after one that has worked, and divisor after a failure.
+    tries : steps at most.
+    viscosity : least viscosity that slows the arm down, over the modulus, in s.
+    """
+
+    first: float = 0.02
+    shortest: float = 1e-6
+    last: float = 1e9
+    growth: float = 3.0
+    cut: float = 5.0
+    tries: int = 400
+    viscosity: float = 0.02
+
+
 class Plant:
-    """An arm in time.
+    """The simulated arm: chamber pressures in, poses out, step by step.
 
     Parameters
     ----------
@@ -92,6 +110,8 @@ class Plant:
     MissingExtraError
         numba is not installed.
     """
+
+    settling = Settling()
 
     def __init__(self, robot: RobotDescription, settings: PlantSettings | None = None) -> None:
         tell_if_new()
@@ -292,21 +312,22 @@ class Plant:
             p = self._past.effective
         acting = self._acting(p[None, :])
         # Viscosity slows an arm without inertia down: steps of growing length follow it to rest.
-        slow = self._material._replace(viscosity=max(self._material.viscosity, 0.02))
+        settling = self.settling
+        slow = self._material._replace(viscosity=max(self._material.viscosity, settling.viscosity))
         self._state.rate[:] = 0.0
         self._state.last_rate[:] = 0.0
-        step = _FIRST_STEP
-        for _ in range(_TRIES):
+        step = settling.first
+        for _ in range(settling.tries):
             scheme = Scheme(step, 1.0, False)
             args = (self._rod, slow, scheme, self._loads(), False, self._state)
             self._state.tangent_of[:] = 0.0
             if dynamics.run(*args, acting):
-                if step >= _LONG:
+                if step >= settling.last:
                     break
-                step *= 3
+                step *= settling.growth
             else:
-                step /= 5
-                if step < _SHORTEST:
+                step /= settling.cut
+                if step < settling.shortest:
                     raise EquilibriumError("the simulated arm finds no equilibrium")
             self._state.rate[:] = 0.0
             self._state.last_rate[:] = 0.0

@@ -294,7 +294,7 @@ def mass_matrix(rod: DiscreteRod, R: Array, J: Array, out: Array) -> None:
 
 
 class RodLoads(NamedTuple):
-    """What pushes on the arm.
+    """Loads on the rod from outside.
 
     Attributes
     ----------

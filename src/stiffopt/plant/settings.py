@@ -7,6 +7,7 @@ its robot file but for the material, whose values are typical of soft silicones.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -35,7 +36,9 @@ from stiffopt.units import (
 )
 
 __all__ = [
+    "FAULT_SIZES",
     "Discretisation",
+    "FaultSizes",
     "LabSettings",
     "Mismatch",
     "PlantLoad",
@@ -56,7 +59,7 @@ Share = Annotated[Ratio, Field(ge=0, le=1)]
 
 
 class SiliconeCreep(Schema):
-    """One Maxwell branch of the silicone, beside its equilibrium modulus.
+    """One Maxwell branch of the silicone, in parallel with its equilibrium modulus.
 
     Attributes
     ----------
@@ -340,6 +343,35 @@ class SimulatedProbeSettings(ProbeSettings):
     speed: Annotated[Speed, Positive] = 0.02
     clearance: Annotated[Length, NotNegative] = 0.001
     noise: Annotated[Force, NotNegative] = 0.0005
+
+
+@dataclass(frozen=True)
+class FaultSizes:
+    """How far the devices are off while a fault is injected, see `stiffopt.plant.world.FAULTS`.
+
+    Attributes
+    ----------
+    lag : added to the time constant of a slow regulator, in s.
+    leak_time : time constant with which a leaking chamber empties, in s.
+    reading_gain, reading_offset : of a supply that reads wrong pressures, and in Pa.
+    frame_delay : by which the frames of a slow tracker arrive later, in s.
+    tracker_offset : by which a wrong tracker is off (3,), in m.
+    stage_speed : of a slow stage, as a share of its speed.
+    force_gain, force_offset : of a force sensor that reads wrong forces, and in N.
+    """
+
+    lag: float = 0.5
+    leak_time: float = 0.3
+    reading_gain: float = 0.7
+    reading_offset: float = 2e4
+    frame_delay: float = 0.5
+    tracker_offset: tuple[float, float, float] = (0.02, -0.015, 0.01)
+    stage_speed: float = 0.1
+    force_gain: float = 0.5
+    force_offset: float = 0.1
+
+
+FAULT_SIZES = FaultSizes()
 
 
 class LabSettings(RigSection):

@@ -27,7 +27,7 @@ __all__ = [
 
 
 class Clock(ABC):
-    """The time of a rig."""
+    """Base of the clocks of a rig."""
 
     @abstractmethod
     def now(self) -> float:
@@ -43,7 +43,7 @@ class Clock(ABC):
 
 
 class SystemClock(Clock):
-    """Real time; changes of the wall clock do not touch it."""
+    """Real time, unaffected by changes of the wall clock."""
 
     def now(self) -> float:
         """Time in s since some moment in the past."""
@@ -57,7 +57,7 @@ class SystemClock(Clock):
 
 
 class Opened(ABC):
-    """Something that `with` opens, and closes at its end."""
+    """Base of what is opened and closed, by `with` or by hand."""
 
     @abstractmethod
     def open(self) -> None:
@@ -81,7 +81,7 @@ class Opened(ABC):
 
 
 class Device(Opened):
-    """Something that is opened once, used and closed.
+    """Base of all devices: opened, used, closed.
 
     A driver's `_open` must leave nothing open when it raises.
     """

@@ -1,9 +1,9 @@
-"""The one interface to pressure, tracking and force, in front of real and simulated devices alike.
+"""The rig: one interface to supply, tracker and probe, and all that a driver needs to import.
 
-A supply sets and reads the pressures of the channels, a tracker tells where the tip is, a probe
-pushes on the tip and feels the force. What all devices of a kind must do (refuse, clamp, vent,
-check, register) is done here, once; a driver only moves data, in the methods that begin with an
-underscore. Everything is in SI: Pa (gauge), m, N, s; poses are those of the tip in the base frame.
+A supply sets and reads the pressures of the channels, a tracker measures the pose of the tip, a
+probe pushes the tip and measures the force. What all devices of a kind must do (refuse, clamp,
+vent, check, register) is done here, once; a driver only moves data, in the methods that begin with
+an underscore. Everything is in SI: Pa (gauge), m, N, s; poses are those of the tip in the base frame.
 
 All times are seconds on the clock of the rig, which never jumps.
 """
@@ -68,7 +68,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Observation:
-    """Everything that is new on a rig.
+    """The latest pressures, and the poses since the observation before.
 
     Attributes
     ----------
@@ -91,7 +91,7 @@ class Rig(Opened):
     Parameters
     ----------
     robot :
-        What the arm is believed to be.
+        Description of the arm.
     supply, tracker, probe :
         The devices; a tracker and a probe need not be there.
     clock :

@@ -1,4 +1,4 @@
-"""Supplies: what sets and reads the pressures, and what no supply may do."""
+"""Pressure supplies: the commands that they take, the limits that they keep, and how they vent."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _SLACK = 1e-6  # of a channel's range
 
 @dataclass(frozen=True)
 class PressureLimits:
-    """What may be commanded, for each channel.
+    """Lowest and highest pressure that may be commanded, for each channel.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class PressureLimits:
 
 @dataclass(frozen=True)
 class PressureReading:
-    """What a supply measures.
+    """Pressures that a supply has measured.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class PressureReading:
 
 @dataclass(frozen=True)
 class PressureCommand:
-    """What a supply shall do, and until when: commands expire.
+    """Pressures to be set, and for how long: commands expire.
 
     Attributes
     ----------
@@ -186,7 +186,7 @@ def total_force(pressures: ArrayLike, areas: ArrayLike) -> float:
 
 
 class Supply(Device):
-    """Whatever sets and reads the pressures of all channels; see `Rig.supply`.
+    """Interface of all that sets and reads the pressures of the channels; see `Rig.supply`.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Probes: what pushes on the tip and feels the force."""
+"""Force probes: devices that push the tip along one axis and measure the force."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["ForceProbe", "ForceSample", "ProbeSettings"]
 
 @dataclass(frozen=True)
 class ForceSample:
-    """What a probe feels.
+    """One measurement of a probe.
 
     Attributes
     ----------

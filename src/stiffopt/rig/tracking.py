@@ -1,4 +1,4 @@
-"""Trackers: where the tip is, and when that was seen."""
+"""Trackers: devices that measure the pose of the tip, with the time of each capture."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class PoseSample:
 
 @dataclass(frozen=True)
 class RawPose:
-    """What a tracker's driver hands over: the sensor in the tracker's frame.
+    """Pose of the sensor in the tracker's frame, as a driver delivers it.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class TrackerSettings(DeviceSettings):
 
 
 class PoseTracker(Device):
-    """Tells where the tip is.
+    """Base of trackers.
 
     A driver calls `_deliver` with what the device sends, from whatever thread; registration, signs
     and sense are seen to here. `read` never waits for the device: a silent device delivers

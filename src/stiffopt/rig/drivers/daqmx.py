@@ -93,7 +93,7 @@ class SilentError(DeviceError):
 
 
 class _LeftTasks:
-    """Tasks that this program could not close, by the address of the server that holds them."""
+    """Tasks that could not be closed, by the address of the server that holds them."""
 
     def __init__(self) -> None:
         self._handles: dict[str, list[Any]] = {}
@@ -112,7 +112,7 @@ _left = _LeftTasks()
 
 
 class Daqmx:
-    """What makes tasks, after closing those that this program has left on the server.
+    """Connection to NI-DAQmx, which makes tasks; it first closes those left from earlier.
 
     Parameters
     ----------
@@ -243,7 +243,7 @@ class InputChannel(NamedTuple):
 
 
 class _Task:
-    """A task with one job; `made` is closed if it cannot be set up."""
+    """A DAQmx task with one job; it is closed again if it cannot be set up."""
 
     def __init__(self, daq: Daqmx, doing: str) -> None:
         self._daq = daq

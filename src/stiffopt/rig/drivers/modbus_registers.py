@@ -223,7 +223,7 @@ class ModbusDumpValve(Schema):
 
 @dataclass(frozen=True)
 class PressureRegister:
-    """A pressure in one or two registers, with everything that is known of it.
+    """The registers of one pressure, and how it is written in them.
 
     Attributes
     ----------

@@ -225,4 +225,4 @@ class OpenIGTLinkTracker(StreamedTracker):
 
 def pyigtl_messages() -> Any:
     """Return the part of pyigtl that packs and unpacks messages."""
-    return library("pyigtl.messages", "pyigtl", OpenIGTLinkSettings.extra)
+    return library("pyigtl", "pyigtl", OpenIGTLinkSettings.extra).messages
