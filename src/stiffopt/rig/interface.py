@@ -3,9 +3,10 @@
 A supply sets and reads the pressures of the channels, a tracker measures the pose of the tip, a
 probe pushes the tip and measures the force. What all devices of a kind must do (refuse, clamp,
 vent, check, register) is done here, once; a driver only moves data, in the methods that begin with
-an underscore. Everything is in SI: Pa (gauge), m, N, s; poses are those of the tip in the base frame.
+an underscore.
 
-All times are seconds on the clock of the rig, which never jumps.
+Everything is in SI: Pa (gauge), m, N, s; poses are those of the tip in the base frame. All times
+are seconds on the clock of the rig, which never jumps.
 """
 
 from __future__ import annotations
