@@ -28,8 +28,7 @@ from stiffopt.rig import drivers
 from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.device import DeviceSettings
 from stiffopt.rig.registry import KINDS, driver_class, driver_names, load
-from stiffopt.safety.link import guarded_rig
-from stiffopt.safety.rigs import open_rig
+from stiffopt.safety.rigs import guarded_rig, open_rig
 from stiffopt.safety.vent import vent_rig
 
 ROOT = Path(__file__).parent.parent
