@@ -1445,7 +1445,7 @@ STEPS = st.tuples(
 )
 
 
-@examples(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@examples(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @example(LIMITS[0], 0.3, 0.0, [("ramp", 0.7, True), ("stall", 1.0, True), ("tick", 0.7, True)], 0)
 @example(LIMITS[1], 0.3, 0.0, [("ramp", 0.2, True), ("halt", 1.0, True), ("ramp", 0.2, False)], 0)
 @example(LIMITS[3], math.inf, -0.07e5, [("ramp", 0.7, True)] * 3, 1)
