@@ -80,6 +80,7 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.rig.drivers.openigtlink": "Drivers aurora and openigtlink",
     "stiffopt.rig.drivers": "Driver probe",
     "stiffopt.rig": "Rig file",
+    "stiffopt.plant": "Rig file",
     "stiffopt.registration": "Rig file",
     "stiffopt.model": "Robot file",
     "stiffopt.optimise": "Task file",

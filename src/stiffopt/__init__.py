@@ -24,10 +24,10 @@ if TYPE_CHECKING:
         SlowWarning,
         StiffoptError,
     )
-    from stiffopt.identify.api import calibrate, validate
-    from stiffopt.identify.calibration import CalibrationResult
-    from stiffopt.identify.comparison import Comparison
+    from stiffopt.identify.calibration import CalibrationResult, calibrate
+    from stiffopt.identify.results import Comparison
     from stiffopt.identify.settings import CalibrationSettings
+    from stiffopt.identify.validation import validate
     from stiffopt.logs import Log, StiffnessTable, read_log, read_mcap_log, read_stiffness_table
     from stiffopt.model.description import RobotDescription
     from stiffopt.model.history import History, Memory

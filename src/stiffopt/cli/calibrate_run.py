@@ -25,13 +25,13 @@ from stiffopt.cli.interrupts import Interruptible
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
 from stiffopt.errors import InputError, StiffoptError
 from stiffopt.files import save_file
-from stiffopt.identify import comparison
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
+from stiffopt.identify.results import together
 from stiffopt.identify.validation import validate as compare_robot
 
 if TYPE_CHECKING:
-    from stiffopt.identify.comparison import Comparison
+    from stiffopt.identify.results import Comparison
     from stiffopt.model.description import RobotDescription
 
 __all__ = ["CalibrateOptions", "Reading", "ValidateOptions", "run_calibrate", "run_validate"]
@@ -171,7 +171,7 @@ def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
         lines.append(f"Tables of stiffness: {tables}.")
     lines.append(f"Model: {result.structure.name}, {result.structure.words}.")
     if names:
-        errors = comparison.together(result.calibrated)
+        errors = together(result.calibrated)
         lines.append(
             f"Error of the tip on these logs: mean {errors.mean * 1e3:.2f} mm, "
             f"95 % below {errors.p95 * 1e3:.2f} mm."

@@ -11,8 +11,7 @@ import numpy as np
 from stiffopt.errors import StiffoptError
 from stiffopt.experiments.stiffness import direction_name
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.comparison import Comparison, Errors, together
-from stiffopt.identify.estimates import Estimate
+from stiffopt.identify.results import Comparison, Errors, FittedEstimate, together
 from stiffopt.identify.unknowns import BASE, SENSOR
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.description import RobotDescription
@@ -202,7 +201,7 @@ def numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextTable]:
     return [TextTable(title, heading, tuple(rows)) for title, rows in groups.items()]
 
 
-def _place(estimate: Estimate) -> tuple[str, str]:
+def _place(estimate: FittedEstimate) -> tuple[str, str]:
     """Under which title a number stands, and what it is called there."""
     if not estimate.key:
         begins = estimate.name.startswith("zero of ") or " at the beginning of " in estimate.name
@@ -212,7 +211,7 @@ def _place(estimate: Estimate) -> tuple[str, str]:
     return title, estimate.name.replace(f", {title}", ",").removesuffix(",")
 
 
-def _number_row(estimate: Estimate, words: str) -> tuple[str, ...]:
+def _number_row(estimate: FittedEstimate, words: str) -> tuple[str, ...]:
     unit, factor = _UNITS.get(estimate.unit, ("", 1.0))
     if estimate.key.endswith(".share"):
         unit, factor = "%", 100.0

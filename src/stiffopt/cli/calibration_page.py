@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from stiffopt.cli import calibration_facts as facts
 from stiffopt.cli.calibration_facts import StiffnessRow, TextTable
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.comparison import Comparison
+from stiffopt.identify.results import Comparison
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots import calibration as plots
 from stiffopt.plots.figures import save_figure

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.comparison import Comparison, Errors, together
+from stiffopt.identify.results import Comparison, Errors, together
 from stiffopt.model.description import RobotDescription
 
 _MM = 1e3  # per m

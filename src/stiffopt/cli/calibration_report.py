@@ -12,8 +12,7 @@ from stiffopt.cli import calibration_facts as facts
 from stiffopt.cli.calibration_facts import TextTable
 from stiffopt.errors import printable
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.comparison import Comparison
-from stiffopt.identify.estimates import TIED
+from stiffopt.identify.results import TIED, Comparison
 from stiffopt.model.description import RobotDescription
 
 _MOST_REMARKS = 8  # of the logs; the report has all

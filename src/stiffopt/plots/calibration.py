@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.identify.choice import Candidate
-from stiffopt.identify.comparison import Comparison
+from stiffopt.identify.results import Comparison
+from stiffopt.identify.structures import Candidate
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots.experiments import CHANNELS, MEASURED, MODEL, _head, _plain
 from stiffopt.plots.figures import _literal, require_matplotlib
