@@ -21,7 +21,7 @@ from stiffopt.model.description import (
     Compensation,
     Corrections,
     Material,
-    PressureLimits,
+    RegulatorLimits,
     Recordings,
     RobotDescription,
     Segment,
@@ -56,7 +56,7 @@ PAGES = [
     *sorted((ROOT / "docs").glob("*.md")),
 ]
 SCHEMAS: list[type[BaseModel]] = [
-    *(RobotDescription, Segment, Chambers, Material, Compensation, PressureLimits),
+    *(RobotDescription, Segment, Chambers, Material, Compensation, RegulatorLimits),
     *(Corrections, History, Play, Creep, Recordings, TrackedBody, Tolerances),
     *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),

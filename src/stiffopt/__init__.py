@@ -124,10 +124,10 @@ _NAMES = {
         *("InputError", "MissingExtraError", "PressureError", "ServiceError"),
         *("SlowWarning", "StiffoptError"),
     ),
-    "stiffopt.identify.api": ("calibrate", "validate"),
-    "stiffopt.identify.calibration": ("CalibrationResult",),
-    "stiffopt.identify.comparison": ("Comparison",),
+    "stiffopt.identify.calibration": ("CalibrationResult", "calibrate"),
+    "stiffopt.identify.results": ("Comparison",),
     "stiffopt.identify.settings": ("CalibrationSettings",),
+    "stiffopt.identify.validation": ("validate",),
     "stiffopt.logs": (
         *("Log", "StiffnessTable", "read_log", "read_mcap_log", "read_stiffness_table"),
     ),
