@@ -8,11 +8,11 @@ from math import degrees, floor, isfinite, log10
 import numpy as np
 
 from stiffopt.cli.tables import TextTable
-from stiffopt.experiments.stiffness import direction_name
+from stiffopt.directions import direction_name
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.results import Comparison, Errors, FittedEstimate, together
-from stiffopt.identify.stiffness_comparison import StiffnessComparison
 from stiffopt.identify.unknowns import BASE, SENSOR
+from stiffopt.identify.validation import StiffnessComparison
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.parameters import Parameter
 from stiffopt.plots.wording import BAR, MM, figures, vector_text

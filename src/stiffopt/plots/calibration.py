@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.experiments.stiffness import direction_name
+from stiffopt.directions import direction_name
 from stiffopt.identify.results import Comparison
-from stiffopt.identify.stiffness_comparison import StiffnessComparison
 from stiffopt.identify.structures import Candidate
+from stiffopt.identify.validation import StiffnessComparison
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots.experiments import CHANNELS, MEASURED, MODEL, _head, _plain
 from stiffopt.plots.figures import _literal, require_matplotlib
