@@ -7,7 +7,7 @@ model need not know.  To add a law, subclass `StrainLaw` and enter it in `STRAIN
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -53,13 +53,34 @@ class SectionGeometry:
         Chamber area of each channel (c,), in m^2: axial force per unit pressure.
     channel_moment : ndarray
         ``int r dA`` over each channel's chambers (c, 2), in m^3.
+
+    All may be symbols too, see `stiffopt.model.layout`.
     """
 
-    area: float
-    centroid: NDArray[np.float64]
-    second_moment: NDArray[np.float64]
-    channel_force: NDArray[np.float64]
-    channel_moment: NDArray[np.float64]
+    area: Any
+    centroid: Any
+    second_moment: Any
+    channel_force: Any
+    channel_moment: Any
+
+    @property
+    def is_eccentric(self) -> bool:
+        """Whether the centroid may lie beside the axis."""
+        return not ca.SX(self.centroid).is_zero()
+
+    def turned(self, azimuth: NDArray[np.float64]) -> "SectionGeometry":
+        """The same section with the lever arms of its channels turned about the axis.
+
+        Parameters
+        ----------
+        azimuth :
+            Of each channel (c,), from x towards y, in rad; empty for none.
+        """
+        if not azimuth.any():
+            return self
+        c, s = np.cos(azimuth), np.sin(azimuth)
+        x, y = self.channel_moment.T
+        return replace(self, channel_moment=np.stack([c * x - s * y, s * x + c * y], axis=1))
 
     @classmethod
     def of(cls, segment: Segment) -> "SectionGeometry":
@@ -135,9 +156,9 @@ class StrainLaw(ABC):
     limit: str
     """What goes wrong where `margin` is not positive, as the end of a sentence."""
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, geometry: SectionGeometry | None = None) -> None:
         self.segment = segment
-        self.geometry = SectionGeometry.of(segment)
+        self.geometry = geometry or SectionGeometry.of(segment)
         self.compensation = segment.compensation or Compensation()
 
     @abstractmethod
@@ -196,18 +217,18 @@ class StrainLaw(ABC):
 
     def _axial_force(self, acting: ca.SX) -> ca.SX:
         """Force of the acting pressures on the section, ``f_z = sum P A_c``, in N."""
-        return ca.dot(ca.DM(self.geometry.channel_force), acting)
+        return ca.dot(ca.SX(self.geometry.channel_force), acting)
 
     def _moment_about_centroid(self, acting: ca.SX) -> ca.SX:
         """Moment (M_x, M_y) of the acting pressures about the section's centroid, in N m."""
         geometry, corrections = self.geometry, self.segment.corrections
-        lever = ca.SX(ca.sparsify(ca.DM(geometry.channel_moment.T)))  # (2, c): int r dA
+        lever = ca.sparsify(ca.SX(geometry.channel_moment.T))  # (2, c): int r dA
         if corrections is not None and len(corrections.azimuth):
             turn = ca.vertcat(*corrections.azimuth).T
             c, s = ca.cos(turn), ca.sin(turn)
             lever = ca.vertcat(c * lever[0, :] - s * lever[1, :], s * lever[0, :] + c * lever[1, :])
-        if geometry.centroid.any():
-            lever -= ca.DM(np.outer(geometry.centroid, geometry.channel_force))
+        if geometry.is_eccentric:
+            lever -= ca.SX(geometry.centroid) @ ca.SX(geometry.channel_force).T
         first = lever @ acting  # (2,): int r P dA
         return ca.vertcat(first[1], -first[0])
 
@@ -219,7 +240,7 @@ class StrainLaw(ABC):
 
     def _about_axis(self, compliance: ca.SX, centroid: ca.SX) -> ca.SX:
         """Move a compliance from the centroid to the backbone axis (eq. 16)."""
-        if not self.geometry.centroid.any():
+        if not self.geometry.is_eccentric:
             return compliance
         A = lie.adjoint(lie.transform(ca.SX.eye(3), ca.vertcat(centroid, 0)))
         return ca.sparsify(A @ compliance @ A.T)
@@ -250,14 +271,14 @@ class LinearLaw(StrainLaw):
         """Section of eqs 8-10; see `StrainLaw.section`."""
         geometry = self.geometry
         area = self.compensation.area * geometry.area
-        inertia = self.compensation.inertia * ca.DM(geometry.second_moment)
+        inertia = self.compensation.inertia * ca.SX(geometry.second_moment)
         acting = self._acting(p)
         E = self._modulus(acting)
         loaded = self._loaded_modulus(acting)
         G = loaded / (2 * (1 + self.segment.material.poisson_ratio))
         force, moment = self._axial_force(acting), self._moment_about_centroid(acting)
         kappa, flexibility = self._bent(
-            ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E,
+            ca.inv_minor(_bending(inertia)) @ moment / E,
             ca.inv_minor(loaded * _bending(inertia)),
         )
         compliance = self._about_axis(
@@ -337,7 +358,7 @@ class NeoHookeanLaw(StrainLaw):
         """Section about the stretched state; see `StrainLaw.section`."""
         geometry = self.geometry
         area = self.compensation.area * geometry.area
-        inertia = self.compensation.inertia * ca.DM(geometry.second_moment)
+        inertia = self.compensation.inertia * ca.SX(geometry.second_moment)
         acting = self._acting(p)
         stretch = neo_hookean_stretch(self._load(acting))
         rise = 1 + 2 * stretch**-3  # E_t / mu
@@ -382,6 +403,6 @@ STRAIN_LAWS: dict[str, type[StrainLaw]] = {
 }
 
 
-def strain_law(segment: Segment) -> StrainLaw:
-    """Strain law that a segment's description names."""
-    return STRAIN_LAWS[segment.strain_law](segment)
+def strain_law(segment: Segment, geometry: SectionGeometry | None = None) -> StrainLaw:
+    """Strain law that a segment's description names; the geometry is the segment's own or given."""
+    return STRAIN_LAWS[segment.strain_law](segment, geometry)

@@ -16,7 +16,7 @@ _MOST_MEASURES = 6  # of more, code takes too long to compile: the general metho
 
 
 class Functions:
-    """Those of `Program`, on the inputs of the tip's shape and the program's parameters.
+    """Those of `Program`, on the inputs of the tip's shape and `Arm.parameters` of the program's.
 
     From the library, or each made in the CasADi VM when it is first asked for.
 
@@ -31,7 +31,7 @@ class Functions:
         self._program = program
         self.library: Library | None = None
         if not robot.is_loaded and len(program.measures) <= _MOST_MEASURES:
-            content = (robot.description.model_dump_json(), program.structure)
+            content = (robot.layout.skeleton, program.structure)
             self.library = library(content, self._symbolic, _SOURCES, daqp=True)
 
     @cached_property

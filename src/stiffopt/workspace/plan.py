@@ -143,7 +143,7 @@ class MapPlan:
 
     def _in_closed_form(self, pressures: Vector) -> tuple[Vector, Vector]:
         """Positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
-        position, stiffness = self._function.many(pressures, np.zeros(0), threads=1)
+        position, stiffness = self._function.many(pressures, self.robot.numbers, threads=1)
         return position[:, :, 0], np.ascontiguousarray(stiffness[:, :, 0].T)
 
     def _at_equilibria(self, pressures: Vector) -> tuple[Vector, Vector]:
@@ -168,9 +168,9 @@ class MapPlan:
             return [self.robot.tip_function(_NAME, self._outputs)]
 
         def make() -> BatchFunction:
-            description = self.robot.description.model_dump_json()
+            content = (_NAME, self.robot.layout.skeleton, self.measures)
             pays = self.total >= _COMPILED_FROM
-            code = library((_NAME, description, self.measures), functions, build_missing=pays)
+            code = library(content, functions, build_missing=pays)
             return interpreted(functions)[_NAME] if code is None else code.function(_NAME)
 
         return self.robot.kept((_NAME, self.measures), make)
