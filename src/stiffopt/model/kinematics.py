@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import casadi as ca
 
 from stiffopt import lie
-from stiffopt.model.actuation import Section, StrainLaw, strain_law
+from stiffopt.model.actuation import Section, StrainLaw
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.laws import strain_law
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.actuation import SectionGeometry, StrainLaw, strain_law
+from stiffopt.model.actuation import SectionGeometry, StrainLaw
 from stiffopt.model.description import RobotDescription, Segment
 from stiffopt.model.kinematics import Actuation
+from stiffopt.model.laws import strain_law
 from stiffopt.model.native_source import dense
 from stiffopt.model.parameters import explicit
 from stiffopt.model.shape import FreeShape

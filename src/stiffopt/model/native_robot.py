@@ -198,12 +198,15 @@ class TipFormulas:
         return dense(ca.Function(name, inputs, ca.cse([ca.densify(part) for part in outputs])))
 
     def tip_pose(self) -> _Ends:
+        """Pose (4, 4)."""
         return self._of_pressures(self._tip.transform)
 
     def tip_jacobian(self) -> _Ends:
+        """Body twist (6, n) per pressure."""
         return self._of_pressures(self._tip.jacobian)
 
     def tip_compliance(self) -> _Ends:
+        """Compliance (6, 6) in tip axes."""
         return self._of_pressures(self._tip.compliance)
 
     def tip_at(self) -> _Ends:
