@@ -48,6 +48,7 @@ def compiled(code_cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         pytest.skip("there is no C compiler")
     monkeypatch.delenv("STIFFOPT_COMPILER")
     monkeypatch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
+    monkeypatch.setenv("STIFFOPT_COMPILE", "wait")
     return code_cache
 
 

@@ -66,7 +66,7 @@ class Planning:
             self._solver = PressureSolver(
                 self._robot, request.task.model_copy(update={"target": exact})
             )
-            self._is_compiled = self._solver.is_compiled
+            self._is_compiled = self._solver.compile()
             self._serial, self._last = request.serial, None
         target = moved_back(request.target, request.offset)
         self._limits = self._left(request.beside)
@@ -134,6 +134,7 @@ class Planning:
 
     def _solved(self, target: Target, guess: Array | None) -> PressureSolution | None:
         """Answer of the optimiser; None if it has none that holds, soon."""
+        self._is_compiled = self._is_compiled or self._solver.is_compiled
         if self._is_compiled:
             return self._solver.solve_at_once(target, guess, self._limits)
         solution = self._solver.solve(target, guess)

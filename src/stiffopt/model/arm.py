@@ -16,15 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError, PressureError, shown
 from stiffopt.model.arguments import dead_and_follower
+from stiffopt.model.batch import BatchFunction, InterpretedFunction
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import checkpoint
 from stiffopt.model.compliance import Frame
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.equilibrium import Equilibrium, Loads, State
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import strain_law
 from stiffopt.model.layout import free_tip_function, layout_of, numbers_of
-from stiffopt.model.native_calls import BatchFunction, InterpretedFunction
-from stiffopt.model.native_robot import TipFunctions
-from stiffopt.model.native_source import dense
 from stiffopt.model.numeric import (
     checked_integer,
     checked_number,
@@ -33,6 +33,7 @@ from stiffopt.model.numeric import (
 )
 from stiffopt.model.shape import FreeShape, Shape
 from stiffopt.model.shooting import SAME_STATION, Shooting
+from stiffopt.model.tip_functions import TipFunctions
 
 Vector = NDArray[np.float64]
 Values = Callable[[Shape], Any]
@@ -407,6 +408,7 @@ class Evaluator:
 
     def __call__(self, p: Vector, *parameters: Vector) -> list[Vector]:
         """Outputs at checked pressures (n,) and parameters, as 2-D arrays."""
+        checkpoint()
         parameters = parameters or (self._arm.numbers,)
         if self._arm.is_loaded:
             self._state = self._arm.settle(p, self._state)

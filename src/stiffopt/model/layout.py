@@ -23,10 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.actuation import SectionGeometry, StrainLaw
-from stiffopt.model.description import RobotDescription, Segment
+from stiffopt.model.codegen import dense
+from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import strain_law
-from stiffopt.model.native_source import dense
 from stiffopt.model.parameters import explicit
 from stiffopt.model.shape import FreeShape
 from stiffopt.schema import Schema
@@ -156,20 +156,21 @@ def free_tip_function(
 
 def is_as_drawn(description: RobotDescription) -> bool:
     """Whether no channel has a gain or an offset, and nothing limits or lengthens by bending."""
-    return not any(
-        set(segment.corrections.gain) - {1.0}
-        or any(segment.corrections.offset)
-        or segment.compensation.bending_radius
-        or segment.compensation.lengthening
-        for segment in explicit(description).segments
-    )
+    for segment in description.segments:
+        corrections = segment.corrections or Corrections()
+        compensation = segment.compensation or Compensation()
+        if set(corrections.gain) - {1.0} or any(corrections.offset):
+            return False
+        if compensation.bending_radius or compensation.lengthening:
+            return False
+    return True
 
 
 def _parts(description: RobotDescription) -> Iterator[tuple[Segment, SectionGeometry]]:
     """Segments with what their formulas need written out, and their geometry as it acts."""
     drawn = is_as_drawn(description)
     for segment in explicit(description).segments:
-        corrections = segment.corrections
+        corrections = segment.corrections or Corrections()
         geometry = SectionGeometry.of(segment).turned(np.array(corrections.azimuth))
         left_out = {"azimuth": (), **({"gain": (), "offset": ()} if drawn else {})}
         corrections = corrections.model_copy(update=left_out)

@@ -277,7 +277,7 @@ def pieces_of(
 
 def mass_per_length(segment: Segment) -> float:
     """Mass of a segment per length at rest, in kg/m."""
-    return (segment.material.density or 0.0) * SectionGeometry.of(segment).area
+    return float((segment.material.density or 0.0) * SectionGeometry.of(segment).area)
 
 
 class Shooting:

@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.native_calls import in_parallel
 from stiffopt.optimise.effort import effort
 from stiffopt.optimise.loaded import LoadedArm, loaded_effort
 from stiffopt.optimise.local import FIRST_RADIUS, INSIDE, LAST_RADIUS, MOST_ITERATIONS, TOUCHING

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError
+from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library, library
 from stiffopt.model.layout import Layout, symbolic_arm
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.native_calls import in_parallel
 from stiffopt.model.rod import rod_functions, rod_pieces
 from stiffopt.optimise.effort import Effort
 from stiffopt.optimise.program import Program

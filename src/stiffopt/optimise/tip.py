@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.compiled import CompiledFunction, Library, library
+from stiffopt.model.compiled import CompiledFunction, Library, compiling_at_once, library
 from stiffopt.model.layout import Layout
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.native_robot import tip_formulas
 from stiffopt.model.rod import rod_functions
+from stiffopt.model.tip_functions import tip_formulas
 from stiffopt.optimise.loaded import LoadedArm
 
 Vector = NDArray[np.float64]
@@ -70,8 +70,9 @@ class TipModel:
     Attributes
     ----------
     is_fast : bool
-        Whether machine code serves the calls; without a compiler the model itself does, from
-        rest each time, which takes milliseconds for a loaded arm.
+        Whether machine code serves the calls, which is compiled when an instance is made; without
+        a compiler the model itself does, from rest each time, which takes milliseconds for a
+        loaded arm.
 
     Raises
     ------
@@ -81,7 +82,8 @@ class TipModel:
 
     def __init__(self, robot: Manipulator) -> None:
         self._robot = robot
-        way = _loaded_way(robot) if robot.is_loaded else _free_way(robot)
+        with compiling_at_once():
+            way = _loaded_way(robot) if robot.is_loaded else _free_way(robot)
         self.is_fast = way is not None
         self._way = way or _no_way
 

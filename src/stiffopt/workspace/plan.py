@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.arguments import Measure, checked_measure
-from stiffopt.model.compiled import BatchFunction, interpreted, library
+from stiffopt.model.compiled import BatchFunction, compiling_at_once, interpreted, library
 from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer, checked_number
@@ -170,7 +170,8 @@ class MapPlan:
         def make() -> BatchFunction:
             content = (_NAME, self.robot.layout.skeleton, self.measures)
             pays = self.total >= _COMPILED_FROM
-            code = library(content, functions, build_missing=pays)
+            with compiling_at_once():
+                code = library(content, functions, build_missing=pays)
             return interpreted(functions)[_NAME] if code is None else code.function(_NAME)
 
         return self.robot.kept((_NAME, self.measures), make)

@@ -15,10 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.arguments import Measure
-from stiffopt.model.compiled import BatchFunction, InterpretedFunction, Library, library
+from stiffopt.model.batch import is_shared
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import (
+    BatchFunction,
+    CompiledFunction,
+    InterpretedFunction,
+    Library,
+    library,
+)
 from stiffopt.model.compliance import held_stiffness
 from stiffopt.model.layout import Layout, symbolic_arm
-from stiffopt.model.native_source import dense
 
 Vector = NDArray[np.float64]
 
@@ -31,6 +38,7 @@ takes, about a second, has then been spent in the VM or is about to be."""
 
 
 _BLOCK = 65_536  # rows
+_WAITING_BLOCK = 8192  # rows, while there is no machine code
 
 _Call = Callable[..., list[Vector]]
 _Ends = tuple[list[ca.SX], list[ca.SX]]  # symbols and expressions
@@ -47,7 +55,7 @@ class TipFunctions:
         self._layout, self._numbers = layout, numbers
         self.interpreted = tip_formulas(layout).interpreted
         self._library: Library | None = None
-        self._looked_up = self._tried = False
+        self._looked_up = False
         self._rows = 0
         self._lock = threading.Lock()
 
@@ -58,8 +66,24 @@ class TipFunctions:
         return self.interpreted(name)(*arguments)
 
     def many(self, name: str, *arguments: Vector) -> list[Vector]:
-        """Results, each (N, r, c), for rows of arguments; see `BatchFunction.many`."""
-        return self._best(name, len(arguments[0])).many(*arguments)
+        """Results, each (N, r, c), for rows of arguments; see `BatchFunction.many`.
+
+        While machine code is made in the background, blocks of rows go to the VM.
+        """
+        count = len(arguments[0])
+        best = self._best(name, count)
+        if isinstance(best, CompiledFunction) or count <= _WAITING_BLOCK:
+            return best.many(*arguments)
+        shapes = best.signature.inputs
+        blocks = []
+        for start in range(0, count, _WAITING_BLOCK):
+            rows = min(_WAITING_BLOCK, count - start)
+            own = [
+                argument if is_shared(argument, shape) else argument[start : start + rows]
+                for argument, shape in zip(arguments, shapes, strict=True)
+            ]
+            blocks.append(self._best(name, rows).many(*own))
+        return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
 
     def evaluate(self, name: str, p: Vector, *parameters: Vector) -> list[Vector]:
         """Value (..., r, c) and margins (..., segments, 1) at pressures (n,) or (N, n)."""
@@ -114,9 +138,9 @@ class TipFunctions:
             return self.interpreted(name)
         with self._lock:
             self._rows += rows
-            missing = self._rows >= COMPILED_FROM and not self._tried
+            missing = self._rows >= COMPILED_FROM
             if self._library is None and (missing or not self._looked_up):
-                self._looked_up, self._tried = True, self._tried or missing
+                self._looked_up = True
                 self._library = library(
                     ("tip", self._layout.skeleton),
                     partial(_tip_functions, self._layout),
