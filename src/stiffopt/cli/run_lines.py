@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.errors import printable
-from stiffopt.safety.lines import json_line
+from stiffopt.safety.messages import json_line
 
 __all__ = ["Display", "Facts", "Lines"]
 

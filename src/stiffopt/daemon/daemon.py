@@ -30,8 +30,8 @@ from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.rig.config import RigDescription, load_rig_description
-from stiffopt.safety.link import guarded_rig
 from stiffopt.safety.realtime import real_time, tidy
+from stiffopt.safety.rigs import guarded_rig
 
 if TYPE_CHECKING:
     from stiffopt.daemon.serving import Server
