@@ -16,6 +16,7 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 os.environ["MPLBACKEND"] = "Agg"
 os.environ["STIFFOPT_COMPILER"] = "none"  # but for tests that ask for `compiled`
+os.environ["STIFFOPT_COMPILE"] = "wait"  # but for tests of code that is made in the background
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -48,7 +49,6 @@ def compiled(code_cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         pytest.skip("there is no C compiler")
     monkeypatch.delenv("STIFFOPT_COMPILER")
     monkeypatch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
-    monkeypatch.setenv("STIFFOPT_COMPILE", "wait")
     return code_cache
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from stiffopt.model import compiler
+from stiffopt.model import compiler as build
 from stiffopt.optimise import prepared as preparation
 
 KINDS = {
@@ -180,7 +180,7 @@ def test_one_structure_is_compiled_once(robot, task, monkeypatch):
     def refuse(*_):
         raise AssertionError("compiled again")
 
-    monkeypatch.setattr(compiler, "compile_library", refuse)
+    monkeypatch.setattr(build, "compile_library", refuse)
     rng = np.random.default_rng(1)
     for _ in range(3):
         assert so.solve_pressure(robot, random_task(robot, rng)).found
