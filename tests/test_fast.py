@@ -296,7 +296,7 @@ def test_threads_may_share_a_robot(robot, task):
 
 def test_without_a_compiler_there_is_one_notice(task, monkeypatch, tmp_path):
     monkeypatch.setenv("STIFFOPT_COMPILER", str(tmp_path / "missing"))
-    monkeypatch.setattr("stiffopt.model.compiled._notified", False)
+    monkeypatch.setattr("stiffopt.model.compiled._notified", set())
     robot = so.load_robot("stiff-flop-2")
     blind = task.model_copy(update={"stiffness": None})
     with pytest.warns(so.SlowWarning, match="was not found") as notices:

@@ -46,6 +46,11 @@ _ADVICE = {
 class Lifecycle:
     """The state of a control loop.
 
+    Parameters
+    ----------
+    in_real_time :
+        Whether ticks have deadlines: then no code is compiled in the background while it is armed.
+
     Attributes
     ----------
     state : State
@@ -54,7 +59,8 @@ class Lifecycle:
         Why, where nobody requested it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, in_real_time: bool = False) -> None:
+        self._in_real_time = in_real_time
         self.state = State.UNCONFIGURED
         self.reason = ""
         self._no_compiler = ExitStack()  # begins in the background while the arm is armed
@@ -76,7 +82,7 @@ class Lifecycle:
             raise CommandError(f"{state} cannot follow {self.state}")
         was_armed = self.armed
         self.state, self.reason = state, reason
-        if self.armed and not was_armed:
+        if self.armed and not was_armed and self._in_real_time:
             self._no_compiler.enter_context(held_off())
         elif not self.armed:
             self._no_compiler.close()

@@ -93,10 +93,15 @@ class Planning:
     def __init__(self, robot: Manipulator, tuning: PlanningTuning | None = None) -> None:
         self._robot, self._tuning = robot, tuning or PlanningTuning()
         self._search = NearestSearch(TipModel(robot), FeedbackTuning().lever)
-        self._serial = -1
+        self._serial, self._is_compiled = -1, False
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
         self._advantage, self._refused = self._tuning.advantage, 0
+
+    def ask_for_code(self) -> None:
+        """Have compiled code for the last task made, which was not while the arm was armed."""
+        if self._serial >= 0 and not self._is_compiled:
+            self._is_compiled = self._solver.is_compiled
 
     def plan(self, request: PlanRequest) -> Plan:
         """Return the plan for a request.
