@@ -32,12 +32,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from results import Section, Verdict, at_most
+from report import Section, Verdict, at_most, table
 from settings import Settings
 
 if TYPE_CHECKING:
     from stiffopt import CalibrationResult, Log, Manipulator, RobotDescription
-    from stiffopt.plant.rig import SimulatedRig
+    from stiffopt.plant.devices import SimulatedRig
     from stiffopt.registration import Registration
     from stiffopt.rig.config import RigDescription
 
@@ -266,9 +266,9 @@ def opened(
 
     `robot` is what the simulated arm is made from, so it is always the file as it was.
     """
-    from stiffopt.rig.assembly import make_rig
+    from stiffopt.safety.rigs import rig_for_programs
 
-    rig: Any = make_rig(description, robot)
+    rig: Any = rig_for_programs(description, robot)
     with rig:
         if file is not None:
             rig.tracker.registration = rig.tracker.registration.then(file.registration)
@@ -367,14 +367,14 @@ def along_a_log(
 ) -> None:
     """Error in % of length along a log of pressures (N, n) that are held one after the other."""
     from stiffopt import CalibrationSettings, read_log, validate
-    from stiffopt.experiments.conductor import GENTLE, Conductor
+    from stiffopt.experiments.conductor import CONDUCTOR, Conductor
     from stiffopt.experiments.coverage import Coverage, round_name
 
     n = pressures.shape[1]
     with opened(description, robots["nominal"]) as rig:
         conductor = Conductor(rig, description.rate)
         conductor.start()
-        coverage = Coverage(np.zeros(n), pressures, np.full(n, GENTLE), 7.0)
+        coverage = Coverage(np.zeros(n), pressures, np.full(n, CONDUCTOR.gentle), 7.0)
         names = [round_name(k + 1) for k in range(len(coverage.rounds))]
         for number in range(1, len(names) + 1):
             coverage.record(conductor, folder, number, {}, lambda done, text: None)
@@ -480,15 +480,32 @@ def judged(result: CalibrationResult, true: dict[str, tuple[str, float]], found:
 # -- targets -----------------------------------------------------------------------------------
 
 
-def places(truth: Truth, high: Array, count: int, rng: np.random.Generator) -> list[Array]:
-    """Poses (4, 4) of the true tip at random pressures, each a step from the one before."""
-    last = truth.settled(np.zeros(len(high)))
-    found: list[Array] = []
+def places(
+    settled: Callable[[Array], Array],
+    high: Array,
+    count: int,
+    up_to: float,
+    rng: np.random.Generator,
+) -> list[tuple[Array, Array]]:
+    """Poses (4, 4) or positions (3,) at rest and their pressures, each a step from the last one.
+
+    Parameters
+    ----------
+    settled : where an arm comes to rest at pressures (n,).
+    high : highest pressures (n,), in Pa; up to this share of them are drawn.
+    """  # fmt: skip
+
+    def position(place: Array) -> Array:
+        return place if place.ndim == 1 else place[:3, 3]
+
+    last = settled(np.zeros(len(high)))
+    found: list[tuple[Array, Array]] = []
     while len(found) < count:
-        pose = truth.settled(rng.uniform(0, TARGETS_UP_TO, len(high)) * high)
-        if STEPS[0] <= np.linalg.norm(pose[:3, 3] - last[:3, 3]) <= STEPS[1]:
-            found.append(pose)
-            last = pose
+        pressures = rng.uniform(0, up_to, len(high)) * high
+        place = settled(pressures)
+        if STEPS[0] <= np.linalg.norm(position(place) - position(last)) <= STEPS[1]:
+            found.append((place, pressures))
+            last = place
     return found
 
 
@@ -508,7 +525,7 @@ def steered(
     loop : its gain may be 0, for none.
     """
     from stiffopt import PressureSolver, Target, Task
-    from stiffopt.experiments.conductor import Conductor, Row
+    from stiffopt.experiments.conductor import Conductor, TrackedFrame
 
     first = Target(position=tuple(wanted[0][1].tolist()))
     solver = PressureSolver(known.model, Task(robot=robot.name, target=first))
@@ -531,7 +548,10 @@ def steered(
             begins = conductor.clock.now() + loop.wait
 
             def correct(
-                row: Row, here: Array = here, inverse: Array = inverse, begins: float = begins
+                row: TrackedFrame,
+                here: Array = here,
+                inverse: Array = inverse,
+                begins: float = begins,
             ) -> None:
                 nonlocal p
                 if row.visible and row.time >= begins:
@@ -540,7 +560,7 @@ def steered(
             conductor.sink = correct if loop.gain else None
             distance = np.empty(count)
             for tick in range(count):
-                conductor.tick(p, loop.slew)
+                conductor.approach(p, loop.slew)
                 tip = rig.world.plant.tip_pose()[:3, 3]
                 distance[tick] = np.linalg.norm(tip - true)
             errors.append(distance)
@@ -567,7 +587,8 @@ def to_targets(
     found: Found,
 ) -> None:
     """Steps from target to target, open loop and with feedback."""
-    poses = places(truth, np.array(robot.pressure_max), count, rng)
+    high = np.array(robot.pressure_max)
+    poses = [pose for pose, _ in places(truth.settled, high, count, TARGETS_UP_TO, rng)]
     for name, known in files.items():
         wanted = [(pose[:3, 3], known.seen(truth.registered(pose))) for pose in poses]
         for what, own in (("open loop", replace(loop, gain=0.0)), ("feedback", loop)):
@@ -703,9 +724,7 @@ def verdicts(name: str, found: Found) -> list[Verdict]:
 
 def markdown(name: str, found: Found) -> str:
     """Table of an arm, and what to know of it."""
-    header = [f"| measure | {' | '.join(COLUMNS)} |", "| --- " * (len(COLUMNS) + 1) + "|"]
-    lines = [f"### {name}", "", *header]
-    lines += ["| " + " | ".join(row) + " |" for row in rows(found)]
+    lines = [f"### {name}", "", *table(("measure", *COLUMNS), rows(found))]
     if found.inside:
         groups = (f"{group} {sum(f)}/{len(f)}" for group, f in found.inside.items())
         lines += ["", "Inside their intervals: " + ", ".join(groups) + "."]
