@@ -31,13 +31,11 @@ from stiffopt.control.journal import EventLog
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon import secret as secret_module
+from stiffopt.daemon.access import check_exposure, is_loopback
 from stiffopt.daemon.client import Client
-from stiffopt.daemon.crowd import MAX_CONNECTIONS
+from stiffopt.daemon.connections import MAX_CONNECTIONS
 from stiffopt.daemon.daemon import STOP_TIME, Daemon
-from stiffopt.daemon.exposure import check_exposure, is_loopback
-from stiffopt.daemon.keeper import Keeper
-from stiffopt.daemon.logged import LogEvents
-from stiffopt.daemon.notify import ServiceManager
+from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret
 from stiffopt.errors import CommandError, DeviceError, FileError, InputError
 from stiffopt.rig.settings import Safety, ServiceSettings
@@ -127,7 +125,7 @@ def test_the_example_for_planners_streams_a_circle(
         exec(compile(code.replace(address[0], str(made.url)), "daemon.md", "exec"), {})
     finally:
         made.loop._listeners.clear()
-        made.loop.listen(made._ticked)
+        made.loop.listen(made._control.ticked)
         client.take_control()
     xy = {tuple(p[:2].round(4)) for p in seen if p is not None}
     assert len(xy) > 40  # it went round
@@ -626,6 +624,7 @@ class Standstill:
         made._control = threading.Thread(
             target=lambda: (made._stopping.wait(60), control()), daemon=True
         )
+        made._control.failure = None  # type: ignore[attr-defined]
         made._control.start()
 
     def __call__(self, name: str) -> Any:

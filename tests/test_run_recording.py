@@ -29,7 +29,7 @@ class Logger:
     """A recording and what is logged into it."""
 
     def __init__(self, folder: Path, name: str = "rig", **options: Any) -> None:
-        from stiffopt.daemon.channels import TelemetryChannels
+        from stiffopt.daemon.topics import TelemetryChannels
 
         context = foxglove.Context()
         self.channels = TelemetryChannels(context, round(WALL * 1e9), 0.03)

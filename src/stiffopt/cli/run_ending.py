@@ -13,7 +13,7 @@ from queue import SimpleQueue
 from typing import Self
 
 from stiffopt.cli.exits import FAULT
-from stiffopt.daemon.parts import Part
+from stiffopt.daemon.calls import Part
 
 __all__ = ["Backstop", "Screen", "leave"]
 

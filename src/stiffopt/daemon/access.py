@@ -1,8 +1,12 @@
-"""Who may speak to the daemon at all: before any request is read."""
+"""Who may speak to the daemon: its hosts, its token, and who can reach it.
+
+What a stranger or a web page may not send is refused before any request is read.
+"""
 
 from __future__ import annotations
 
 import hmac
+import socket
 from collections.abc import Iterable
 from ipaddress import ip_address
 from urllib.parse import urlsplit
@@ -11,10 +15,10 @@ from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from stiffopt.daemon.refusals import RefusedError
+from stiffopt.daemon.reports import RefusalError
 from stiffopt.errors import InputError
 
-__all__ = ["MAX_BODY", "Access", "Token"]
+__all__ = ["MAX_BODY", "MIN_TOKEN", "Access", "Token", "bracketed", "check_exposure", "is_loopback"]
 
 MAX_BODY = 1_000_000
 """Bytes of the longest request."""
@@ -39,24 +43,24 @@ class Token:
         self._secret = text.encode()
 
     def check(self, given: str | None) -> None:
-        """Raise `RefusedError` unless this is the token; the time it takes tells nothing of it."""
+        """Raise `RefusalError` unless this is the token; the time it takes tells nothing of it."""
         if given is None:
-            raise RefusedError(
+            raise RefusalError(
                 401, "no-token", "this needs the token: 'Authorization: Bearer TOKEN'"
             )
         if not hmac.compare_digest(given.encode("utf-8", "replace"), self._secret):
-            raise RefusedError(403, "wrong-token", "that is not this daemon's token")
+            raise RefusalError(403, "wrong-token", "that is not this daemon's token")
 
     def is_shown(self, headers: Headers) -> bool:
         """Return whether the token stands in the header Authorization."""
         try:
             self.check_headers(headers)
-        except RefusedError:
+        except RefusalError:
             return False
         return True
 
     def check_headers(self, headers: Headers) -> None:
-        """Raise `RefusedError` unless the token stands in the header Authorization."""
+        """Raise `RefusalError` unless the token stands in the header Authorization."""
         given = headers.getlist("authorization")
         kind, _, secret = given[0].partition(" ") if len(given) == 1 else ("", "", "")
         self.check(secret.strip() if kind.lower() == "bearer" else None)
@@ -100,7 +104,7 @@ class Access:
                 receive = await _collected(receive, headers)
             elif "authorization" in headers:
                 self._token.check_headers(headers)
-        except RefusedError as refusal:
+        except RefusalError as refusal:
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})  # before accepting: a 403
                 return
@@ -113,7 +117,7 @@ class Access:
         hosts = headers.getlist("host")
         name = _host_name(hosts[0]) if len(hosts) == 1 else ""
         if name not in self._hosts and not _is_address(name):
-            raise RefusedError(
+            raise RefusalError(
                 403,
                 "host",
                 "the header Host names no address of this daemon; use its IP address, localhost, "
@@ -122,7 +126,7 @@ class Access:
         for origin in headers.getlist("origin"):
             scheme, _, place = origin.partition("://")
             if scheme not in ("http", "https") or place.lower() != hosts[0].lower():
-                raise RefusedError(
+                raise RefusalError(
                     403, "origin", "pages of other sites may not speak to this daemon"
                 )
 
@@ -144,7 +148,7 @@ def _is_address(name: str) -> bool:
 
 async def _collected(receive: Receive, headers: Headers) -> Receive:
     """Read the body, if it is not too long, and return what hands it out again."""
-    too_long = RefusedError(413, "too-long", f"the body is longer than {MAX_BODY} bytes")
+    too_long = RefusalError(413, "too-long", f"the body is longer than {MAX_BODY} bytes")
     given = headers.get("content-length", "0")
     if given.isdecimal() and (len(given) > 12 or int(given) > MAX_BODY):
         raise too_long
@@ -170,3 +174,66 @@ def _again(first: Message, receive: Receive) -> Receive:
         return messages.pop() if messages else await receive()
 
     return replayed
+
+
+MIN_TOKEN = 16
+"""Characters of a token that is not easily guessed."""
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine can reach what listens on a host.
+
+    A name is on loopback if all its addresses are; one that has no address is not.
+    """
+    try:
+        found = {host} if _is_address(host) else _addresses(host)
+    except OSError:
+        return False
+    return bool(found) and all(ip_address(address).is_loopback for address in found)
+
+
+def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
+    """Return what to warn of before the control interface listens, as kinds and texts of events.
+
+    Parameters
+    ----------
+    host :
+        Where it will listen.
+    token :
+        Of those who may move the arm.
+    given :
+        Whether a person chose the token; else it was drawn.
+
+    Raises
+    ------
+    InputError
+        The token is too short for a host that other machines can reach.
+    """
+    beyond, short = not is_loopback(host), given and len(token) < MIN_TOKEN
+    if beyond and short:
+        raise InputError(
+            f"the token has {len(token)} characters, too few for the host {host}, which other "
+            f"machines can reach; give one of at least {MIN_TOKEN}, leave the environment variable "
+            "empty so that one is drawn, or listen on 127.0.0.1 (service.token, service.host in "
+            "the rig file)"
+        )
+    if beyond:
+        text = (
+            f"the control interface listens on {host}, beyond this machine and unencrypted: "
+            "whoever can listen in on the network can read the token and move the arm"
+        )
+        return [("exposed", text)]
+    if short:
+        text = f"the token is shorter than {MIN_TOKEN} characters; others here may guess it"
+        return [("token", text)]
+    return []
+
+
+def bracketed(host: str) -> str:
+    """Return a host as it is written in a URL."""
+    return f"[{host}]" if ":" in host else host
+
+
+def _addresses(host: str) -> set[str]:
+    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    return {str(address[0]) for *_, address in found}

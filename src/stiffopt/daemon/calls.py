@@ -1,4 +1,4 @@
-"""Calls to the control loop from the service, which must not wait for it."""
+"""Calls that may hang: each in a thread of its own, and waited for a bounded time only."""
 
 from __future__ import annotations
 
@@ -6,65 +6,52 @@ import asyncio
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 
 from stiffopt.control.requests import Asker, asked_by
-from stiffopt.control.state import Event, Snapshot
-from stiffopt.control.trajectory import Trajectory
-from stiffopt.daemon.refusals import RefusedError
-from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Task
+from stiffopt.daemon.reports import RefusalError
 
-__all__ = ["Commanded", "EventLog", "LoopCalls"]
-
-_WAITING = 8  # calls at once; more than a lively client needs
+__all__ = [
+    "LoopCalls",
+    "Part",
+]
 
 
-class EventLog(Protocol):
-    """What has happened."""
+class Part:
+    """Some work in a thread of its own, which keeps nothing from ending.
 
-    def since(self, index: int, /) -> tuple[list[Event], int]:
-        """Return the events from an index on, and the index after the last one."""
+    Parameters
+    ----------
+    name :
+        Of the thread.
+    work :
+        Is begun at once.
 
-
-class Commanded(Protocol):
-    """What the service needs of a `ControlLoop`; see there.
-
-    The commands return when they are done, or raise `CommandError` or `InputError` and change
-    nothing; one that its `Asker` has given up is not begun any more. `snapshot` and `events` return
-    at once.
+    Attributes
+    ----------
+    error : what the work has raised, if anything.
     """
 
-    @property
-    def events(self) -> EventLog:
-        """What has happened."""
+    def __init__(self, name: str, work: Callable[[], Any]) -> None:
+        self.name = name
+        self.error: BaseException | None = None
+        self._work = work
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
 
-    def arm(self) -> None:
-        """Check everything and steer."""
+    def ends_within(self, seconds: float) -> bool:
+        """Wait for some time at most; return whether the work has ended."""
+        self._thread.join(max(seconds, 0.0))
+        return not self._thread.is_alive()
 
-    def disarm(self) -> None:
-        """Let the pressures down and vent."""
+    def _run(self) -> None:
+        try:
+            self._work()
+        except BaseException as error:
+            self.error = error
 
-    def set_task(self, task: Task) -> None:
-        """Pursue a task."""
 
-    def set_target(self, target: Target) -> None:
-        """Go to another target."""
-
-    def follow_trajectory(self, trajectory: Trajectory) -> None:
-        """Go through waypoints."""
-
-    def hold(self, reason: str = ...) -> None:
-        """Keep the pressures."""
-
-    def vent(self, reason: str = ...) -> None:
-        """Let all pressure out at once."""
-
-    def reset(self) -> None:
-        """Leave the state fault."""
-
-    def snapshot(self) -> Snapshot:
-        """Say how things stand."""
+_WAITING = 8  # calls at once; more than a lively client needs
 
 
 class LoopCalls:
@@ -100,11 +87,11 @@ class LoopCalls:
 
         Raises
         ------
-        RefusedError
+        RefusalError
             It does not return in time, or too many calls are waiting already.
         """
         if self._running >= _WAITING and not urgent:
-            raise RefusedError(503, "busy", "the control loop has too much to do; try again")
+            raise RefusalError(503, "busy", "the control loop has too much to do; try again")
         asker = Asker()
         answer = start(function, *args, asker=None if lasting else asker)
         self._running += 1
@@ -122,7 +109,7 @@ class LoopCalls:
         else:
             outcome = "whether it will still do this is not known: look at the state, or vent"
         late = f"the control loop did not answer within {self._patience:g} s"
-        raise RefusedError(503, "no-answer", f"{late}; {outcome}")
+        raise RefusalError(503, "no-answer", f"{late}; {outcome}")
 
     def _ended(self, answer: asyncio.Future[Any]) -> None:
         self._running -= 1

@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike
 
 from stiffopt.control.state import Event, Snapshot, State
 from stiffopt.control.trajectory import Trajectory, Waypoint
-from stiffopt.daemon.client_stream import ClientStream
+from stiffopt.daemon.client_wire import ClientStream, Wire
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
 from stiffopt.daemon.reports import RobotReport, record_of
-from stiffopt.daemon.wire import Wire
 from stiffopt.errors import CommandError, InputError, ServiceError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task, load_task

@@ -18,32 +18,28 @@ from stiffopt.control.controller import Controller
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
-from stiffopt.daemon.exposure import bracketed, check_exposure
-from stiffopt.daemon.keeper import Keeper
-from stiffopt.daemon.logged import LogEvents
-from stiffopt.daemon.notify import ServiceManager
-from stiffopt.daemon.parts import Part
+from stiffopt.daemon.access import bracketed, check_exposure
+from stiffopt.daemon.calls import Part
+from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
 from stiffopt.files import file_text
-from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.manipulator import load_robot
 from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.rig.config import RigDescription, load_rig_description
-from stiffopt.safety.link import guarded_rig
+from stiffopt.safety.link import GuardLink, guarded_rig
 from stiffopt.safety.realtime import real_time, tidy
 
 if TYPE_CHECKING:
     from stiffopt.daemon.serving import Server
     from stiffopt.daemon.telemetry import Telemetry
 
-__all__ = ["CONTROL_TIME", "STOP_TIME", "Daemon"]
+__all__ = ["CONTROL_TIME", "STOP_TIME", "ControlThread", "Daemon"]
 
 Array = NDArray[np.float64]
 
 _FASTEST = 500.0  # Hz
-_SHAPE = 12  # poses along the arm that Foxglove draws
-_SHARE = 0.02  # of the time, which the control thread needs too
 _TIDY = 10.0  # s between collections of garbage
 _ARMING = 10.0  # s in which an arm that was just connected must become ready
 _AGAIN = 0.2  # s between attempts to arm, in which the tracker sees the tip some times
@@ -86,8 +82,6 @@ class Daemon:
         The model of the arm.
     loop : ControlLoop
         State, events and commands.
-    failure : BaseException or None
-        What ended the control thread, if it was not asked to end.
     trouble : str
         Why it is not certain that the arm is vented, after `stop`; empty if it is.
     hung : tuple of str
@@ -116,7 +110,6 @@ class Daemon:
                 rig, f"{description.rate:g} Hz is too fast; at most {_FASTEST:g} Hz", key="rate"
             )
         self.robot = load_robot(robot_path(description.robot, Path(rig).parent))
-        self.failure: BaseException | None = None
         self.trouble = ""
         self.hung: tuple[str, ...] = ()
         self._folder = os.fspath(log_folder or description.log.folder)
@@ -147,8 +140,8 @@ class Daemon:
             None if self._server is None else self._is_serving,
         )
         self._stopping = threading.Event()
-        self._control: threading.Thread | None = None
-        self._tidied = 0.0
+        self._control: ControlThread | None = None
+        self._hangs = False
         self._log = LogEvents(self.loop)
         self._started = self._stopped = self._recorded = False
         self._stop_begun = float("inf")
@@ -185,6 +178,13 @@ class Daemon:
         """Whether control has ended: asked to, or by `failure`."""
         return self._control is None or not self._control.is_alive()
 
+    @property
+    def failure(self) -> BaseException | None:
+        """What ended the control thread, if it was not asked to end."""
+        if self._hangs:
+            return TimeoutError("the control thread hangs")
+        return None if self._control is None else self._control.failure
+
     # life ----------------------------------------------------------------------------------------
 
     def start(self) -> None:
@@ -210,8 +210,9 @@ class Daemon:
             self._manager.status("connecting to the rig")
             self.loop.configure()
             self._start_telemetry()
-            self.loop.listen(self._ticked)
-            self._control = threading.Thread(target=self._run, name="control", daemon=True)
+            self._control = ControlThread(
+                self.loop, self.link, self._stopping, self._manager, self._telemetry
+            )
             self._control.start()
             self._keeper.start()
         except BaseException:
@@ -313,7 +314,7 @@ class Daemon:
             return
         self._control.join(self._left(CONTROL_TIME))
         if self._control.is_alive():
-            self.failure = TimeoutError("the control thread hangs")
+            self._hangs = True
             self.hung = (*self.hung, "control")
             self.vent("the control thread hangs", patience=0.0)
 
@@ -360,7 +361,7 @@ class Daemon:
         if not service:
             settings = settings.model_copy(update={"foxglove_port": None})
         try:
-            from stiffopt.daemon.telemetry import Telemetry
+            from stiffopt.daemon.telemetry import ArmShape, Telemetry
 
             return Telemetry(
                 self.robot.description,
@@ -369,7 +370,7 @@ class Daemon:
                 self._folder,
                 settings,
                 clock=self._clock,
-                backbone=_Shape(self.robot),
+                backbone=ArmShape(self.robot),
                 about={"rig_file": file_text("rig", self.description)},
             )
         except MissingExtraError as error:
@@ -435,25 +436,55 @@ class Daemon:
             self._warn(kind, text)
         self._secret.write()
 
-    # the control thread --------------------------------------------------------------------------
 
-    def _run(self) -> None:
+class ControlThread(threading.Thread):
+    """Ticks the control loop in real time until it is told to stop, then lets the pressures down.
+
+    Parameters
+    ----------
+    loop, link :
+        The loop, and the link to its guard.
+    stopping :
+        Tells it to stop.
+    manager :
+        Is told in each tick that the loop lives.
+    telemetry :
+        Is handed the state after each tick.
+
+    Attributes
+    ----------
+    failure : BaseException or None
+        What ended it, if it was not told to stop; the loop has vented then.
+    """
+
+    def __init__(
+        self,
+        loop: ControlLoop,
+        link: GuardLink,
+        stopping: threading.Event,
+        manager: ServiceManager,
+        telemetry: Telemetry | None,
+    ) -> None:
+        super().__init__(name="control", daemon=True)
+        self.failure: BaseException | None = None
+        self._loop, self._link, self._stopping = loop, link, stopping
+        self._manager, self._telemetry = manager, telemetry
+        self._tidied = 0.0
+        loop.listen(self.ticked)
+
+    def run(self) -> None:
+        """Tick; see `ControlLoop.run`."""
         try:
             with real_time() as granted:
-                for who, notice, well in (
-                    ("control", granted.notice, not granted.denied),
-                    ("guard", self.link.real_time, not self.link.real_time.startswith("not")),
-                ):
-                    severity = Severity.INFO if well else Severity.WARNING
-                    self.loop.events.add(
-                        self._clock.now(), "real-time", f"{who}: {notice}", severity
-                    )
-                self.loop.run(self._stopping)
+                self._tell("control", granted.notice, well=not granted.denied)
+                notice = self._link.real_time
+                self._tell("guard", notice, well=not notice.startswith("not"))
+                self._loop.run(self._stopping)
         except BaseException as error:  # `run` has vented; whoever waits is told
             self.failure = error
 
-    def _ticked(self, now: Snapshot) -> None:
-        """Pass on what a tick has left; in the control thread."""
+    def ticked(self, now: Snapshot) -> None:
+        """Pass on the state that a tick has left; in this thread."""
         self._manager.watchdog()
         if self._telemetry is not None:
             self._telemetry.put(now)
@@ -461,23 +492,9 @@ class Daemon:
             self._tidied = now.time
             tidy(thoroughly=now.state not in ARMED)
 
-
-class _Shape:
-    """The arm's shape, for telemetry; as often as its share of the interpreter's time permits."""
-
-    def __init__(self, robot: Manipulator) -> None:
-        self._robot = robot
-        self._due = 0.0
-        self._last: Array | None = None
-
-    def __call__(self, pressures: Array) -> Array:
-        """Return poses (m, 4, 4) along the arm, now or a little while ago."""
-        now = time.monotonic()
-        if self._last is None or now >= self._due:
-            self._last = self._robot.backbone(pressures, _SHAPE)
-            ended = time.monotonic()
-            self._due = ended + (ended - now) / _SHARE
-        return self._last
+    def _tell(self, who: str, notice: str, *, well: bool) -> None:
+        severity = Severity.INFO if well else Severity.WARNING
+        self._loop.events.add(self._loop.rig.clock.now(), "real-time", f"{who}: {notice}", severity)
 
 
 def _swings(description: RigDescription) -> bool:

@@ -8,7 +8,7 @@ numbers, NaN and infinities are refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import UnionType
 from typing import (
     Annotated,
@@ -39,7 +39,6 @@ from pydantic.fields import FieldInfo
 
 from stiffopt.control.contents import listed
 from stiffopt.control.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
-from stiffopt.daemon.refusals import sentence
 from stiffopt.documents import document_of
 from stiffopt.errors import InputError, Loc, dotted, shown
 from stiffopt.files import from_document
@@ -60,6 +59,7 @@ __all__ = [
     "TaskText",
     "TrajectoryMessage",
     "message_of",
+    "sentence",
     "task_of",
     "trajectory_of",
 ]
@@ -68,6 +68,7 @@ MAX_MESSAGE = 16_384
 """Characters of the longest message to a stream."""
 _MAX_TEXT = 65_536  # characters of a task file; to read more would keep the control loop waiting
 _MAX_ITEMS = 50  # of a list of descriptions, such as stiffness measures
+_TOLD = 5  # mistakes told at once
 _MAX_NUMBERS = 200  # of a list with one number per channel
 
 _UNITS_IN_NAMES = {"orientation": "orientation_wxyz", "matrix": "matrix_n_per_m"}
@@ -106,6 +107,17 @@ def _valid(adapter: TypeAdapter[ModelT], given: Any, place: Loc) -> ModelT:
     except ValidationError as error:
         mistakes = [{**mistake, "loc": (*place, *mistake["loc"])} for mistake in error.errors()]
         raise InputError(sentence(mistakes)) from None
+
+
+def sentence(mistakes: Sequence[Any]) -> str:
+    """Return what pydantic found wrong as one sentence."""
+    told = []
+    for mistake in mistakes[:_TOLD]:
+        place = dotted([step for step in mistake["loc"] if not str(step).startswith("<")])
+        reason = str(mistake["msg"])
+        told.append(f"{place}: {reason}" if place else reason)
+    more = f"; and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""
+    return "; also ".join(told) + more
 
 
 # Messages from schemas ---------------------------------------------------------------------------

@@ -13,20 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import units
+from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import State
-from stiffopt.daemon.calls import Commanded, LoopCalls, start
+from stiffopt.daemon.calls import LoopCalls, start
 from stiffopt.daemon.lease import ControlLease
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, task_of
-from stiffopt.daemon.refusals import RefusedError, refusal_of
 from stiffopt.daemon.reports import (
+    LEASE_HEADER,
     DoneReport,
     GrantReport,
     LeaseReport,
+    RefusalError,
     RobotReport,
     TaskReport,
+    refusal_of,
     state_json,
 )
-from stiffopt.daemon.wire import LEASE_HEADER
 from stiffopt.errors import CommandError, StiffoptError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.interface import Clock
@@ -56,7 +58,7 @@ class Operations:
 
     def __init__(
         self,
-        loop: Commanded,
+        loop: ControlLoop,
         robot: RobotDescription,
         heartbeat: float,
         clock: Clock,
@@ -111,7 +113,7 @@ class Operations:
     # Control ----------------------------------------------------------------------------------
 
     async def take(self, client: str) -> GrantReport:
-        """Give a client control; raise `RefusedError` if another has it."""
+        """Give a client control; raise `RefusalError` if another has it."""
         await self.watch()  # who had it may be gone
         with _of_lease():
             identity = self.lease.take(client)
@@ -119,12 +121,12 @@ class Operations:
         return GrantReport(lease=identity, heartbeat_s=beat, renew_every_s=beat / 4)
 
     def renew(self, identity: str | None) -> None:
-        """Note that a client was heard; raise `RefusedError` if it does not have control."""
+        """Note that a client was heard; raise `RefusalError` if it does not have control."""
         with _of_lease():
             self.lease.renew(_shown(identity))
 
     def release(self, identity: str | None) -> None:
-        """Take control back; raise `RefusedError` if the client does not have it."""
+        """Take control back; raise `RefusalError` if the client does not have it."""
         with _of_lease():
             self.lease.release(_shown(identity))
 
@@ -235,12 +237,12 @@ def _of_lease() -> Iterator[None]:
     try:
         yield
     except CommandError as error:
-        raise RefusedError(409, "lease", str(error)) from None
+        raise RefusalError(409, "lease", str(error)) from None
 
 
 def _shown(identity: str | None) -> str:
     if identity is None:
-        raise RefusedError(
+        raise RefusalError(
             409, "lease", f"this needs control; take it, and show the lease in '{LEASE_HEADER}'"
         )
     return identity

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
-from stiffopt.daemon.private import make_private
+from stiffopt.daemon.secret import make_private
 from stiffopt.daemon.topics import METADATA
 
 __all__ = ["MIN_FREE", "Recording", "free_bytes"]

@@ -16,20 +16,28 @@ from pydantic import BaseModel, BeforeValidator, Field, create_model
 from stiffopt.control.state import Event, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.messages import TargetMessage, TaskMessage
-from stiffopt.errors import ServiceError, printable
+from stiffopt.errors import CommandError, InputError, ServiceError, StiffoptError, printable
+
+LEASE_HEADER = "Stiffopt-Lease"
+"""Header in which a client shows that it has control."""
+_LONGEST = 1000  # characters of a message
 
 __all__ = [
+    "LEASE_HEADER",
     "DoneReport",
     "ErrorReport",
     "EventsReport",
     "GrantReport",
     "LeaseReport",
+    "RefusalError",
     "RobotReport",
     "StateReport",
     "TaskReport",
+    "error_of",
     "json_of",
     "plain",
     "record_of",
+    "refusal_of",
     "state_json",
 ]
 
@@ -225,3 +233,52 @@ class ErrorReport(BaseModel):
     """Why a request was not done."""
 
     error: Mistake
+
+
+# Refusals ---------------------------------------------------------------------------------------
+
+
+class RefusalError(StiffoptError):
+    """A request that is not done.
+
+    Parameters
+    ----------
+    status :
+        The HTTP status.
+    code :
+        A word for programs.
+    message :
+        A sentence for people.
+    """
+
+    def __init__(self, status: int, code: str, message: str) -> None:
+        super().__init__(status, code, message)
+        self.status = status
+        self.code = code
+        self.message = printable(message)[:_LONGEST]
+
+    def __str__(self) -> str:
+        return self.message
+
+    @property
+    def body(self) -> dict[str, Any]:
+        """What the client is sent."""
+        return {"error": {"code": self.code, "message": self.message}}
+
+
+def refusal_of(error: StiffoptError) -> RefusalError:
+    """Return what a client is told of an error of the control loop."""
+    if isinstance(error, RefusalError):
+        return error
+    if isinstance(error, InputError) and not isinstance(error, CommandError):
+        return RefusalError(422, "input", str(error))
+    return RefusalError(409, "refused", str(error))
+
+
+def error_of(status: int, message: str) -> StiffoptError:
+    """Return the error that a status of the daemon stands for."""
+    if status in (401, 403, 404, 405, 409):
+        return CommandError(message)
+    if status in (413, 422):
+        return InputError(message)
+    return ServiceError(message)

@@ -11,22 +11,23 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.state import Alarm, Event, Snapshot
-from stiffopt.daemon.channels import TelemetryChannels
+from stiffopt.control.loop import ControlLoop
+from stiffopt.control.state import Alarm, Snapshot
 from stiffopt.daemon.recording import Recording
-from stiffopt.daemon.topics import FORMAT
+from stiffopt.daemon.topics import FORMAT, TelemetryChannels
 from stiffopt.errors import MissingExtraError, StiffoptError
 from stiffopt.files import file_text
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.device import Clock
 from stiffopt.rig.settings import ServiceSettings
 
-__all__ = ["EventSource", "Telemetry", "Watched", "about_run"]
+__all__ = ["ArmShape", "Telemetry", "about_run"]
 
 Array = NDArray[np.float64]
 
@@ -36,31 +37,9 @@ _KEPT = 4096  # snapshots that wait; the oldest go first
 _FINEST = 0.01  # s between two ticks that are logged; a faster loop would pay with its punctuality
 _SMOOTH, _OFTEN, _SELDOM = 0.04, 0.1, 1.0  # s between what is not logged in each tick: frames,
 # the arm's shape and the timing, the state
+_SHAPE = 12  # poses along the arm that Foxglove draws
+_SHARE = 0.02  # of the time for the shape; the control thread needs the interpreter too
 _CALM = 10.0  # s after which a loss or a failure is forgotten
-
-
-class EventSource(Protocol):
-    """The events of a loop."""
-
-    def since(self, index: int) -> tuple[list[Event], int]:
-        """Return the events from an index on, and the next index."""
-
-
-class Watched(Protocol):
-    """What telemetry needs of a loop."""
-
-    @property
-    def events(self) -> EventSource:
-        """What has happened."""
-
-    def snapshot(self) -> Snapshot:
-        """How things stand."""
-
-    def add_alarm(self, kind: str, text: str) -> None:
-        """Say what is wrong."""
-
-    def clear_alarm(self, kind: str) -> None:
-        """Say that it is well again."""
 
 
 class Telemetry:
@@ -97,7 +76,7 @@ class Telemetry:
         self,
         robot: RobotDescription,
         name: str,
-        loop: Watched,
+        loop: ControlLoop,
         folder: str | None,
         settings: ServiceSettings,
         *,
@@ -303,6 +282,24 @@ class Telemetry:
             self._loop.add_alarm(kind, text)
         else:
             self._loop.clear_alarm(kind)
+
+
+class ArmShape:
+    """Computes the arm's shape as often as its share of the interpreter's time permits."""
+
+    def __init__(self, robot: Manipulator) -> None:
+        self._robot = robot
+        self._due = 0.0
+        self._last: Array | None = None
+
+    def __call__(self, pressures: Array) -> Array:
+        """Return poses (m, 4, 4) along the arm, now or a little while ago."""
+        now = time.monotonic()
+        if self._last is None or now >= self._due:
+            self._last = self._robot.backbone(pressures, _SHAPE)
+            ended = time.monotonic()
+            self._due = ended + (ended - now) / _SHARE
+        return self._last
 
 
 def about_run(
