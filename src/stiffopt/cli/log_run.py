@@ -1,4 +1,4 @@
-"""What `stiffopt log ...` does: read a recording, write what it says in another form."""
+"""Exports the recording of a run as CSV, or plots it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `stiffopt run`: the closed loop of a rig, until it is ended."""
+"""The command `stiffopt run`: its options and help."""
 
 from typing import Annotated
 

@@ -1,4 +1,4 @@
-"""What `stiffopt run` does: start the daemon, show it, end it in good order."""
+"""Runs the daemon in the foreground: starts it, shows its state, ends it on a signal."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _FAVOURED = -10  # niceness, where permitted: see `_favour`
 
 @dataclass(frozen=True)
 class Options:
-    """The options of the command.
+    """The options of `stiffopt run`.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ def _steered(daemon: Daemon, watch: _Watch, options: Options, seconds: float) ->
 
 
 def _verdict(daemon: Daemon, state: State, refused: str, report: Callable[[str], None]) -> int:
-    """Return the exit code, and say what must be known."""
+    """Return the exit code; report what went wrong."""
     if refused:
         report(refused)
     if daemon.trouble:
@@ -154,7 +154,7 @@ def _verdict(daemon: Daemon, state: State, refused: str, report: Callable[[str],
 
 
 class _Watch:
-    """Shows what a daemon does until it shall end, and while it ends."""
+    """Shows the state of a daemon while it runs and while it ends."""
 
     def __init__(self, daemon: Daemon, display: Display, signals: _Signals, screen: Screen) -> None:
         self.signals = signals
@@ -220,7 +220,7 @@ class _Watch:
 
 
 class _Signals:
-    """Signals that end the program, counted; none of them interrupts what is being done.
+    """Counts the signals that are to end the program, without interrupting it.
 
     Attributes
     ----------
@@ -304,7 +304,7 @@ def _warnings_shown(watch: _Watch) -> Iterator[None]:
 
 
 def _favour() -> None:
-    """Let this process be preferred to others, where that is permitted.
+    """Raise the priority of this process, where that is permitted.
 
     The control thread is real-time, but must wait for whichever thread has the interpreter; that
     one should not in turn have to wait for other programs.

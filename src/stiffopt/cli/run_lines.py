@@ -1,4 +1,4 @@
-"""What `stiffopt run` tells as lines: JSON for programs, plain for people."""
+"""Shows a run as lines on stdout: JSON for programs, plain text for people."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Facts(Protocol):
 
 
 class Display(Protocol):
-    """Where a run is shown, anew after each `period`, in s."""
+    """A way to show a run: as lines or as a live status; updated every `period`, in s."""
 
     period: float
 
@@ -61,7 +61,7 @@ class Display(Protocol):
 
 
 class Lines:
-    """One line for each event and each change of state, on stdout.
+    """Writes a line to stdout for each event and each change of state.
 
     Nothing here waits or fails: a line that nobody takes, because the reader has stopped or is
     gone, is left out, for the arm is more important.

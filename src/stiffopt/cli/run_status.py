@@ -37,7 +37,7 @@ _FACTORS = {"": (1.0, 3), "mm": (1e3, 1), "deg": (180 / math.pi, 1)}  # and deci
 
 
 class LiveStatus:
-    """Shows how things stand, in one place of the terminal.
+    """Shows the state of the loop in one place of the terminal.
 
     A terminal that is gone or fails is no reason to end: nothing is shown then.
 
@@ -119,7 +119,7 @@ def status(
     events: Sequence[Event] = (),
     facts: Facts | None = None,
 ) -> RenderableType:
-    """Return how things stand as something that rich shows.
+    """Return the state of the loop as something that rich can print.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _pressures(now: Snapshot, channels: Sequence[str]) -> Table:
 
 
 def _bar(measured: float, commanded: float, high: float) -> Text:
-    """Return what is measured as a bar against the limit, with a mark where it should be."""
+    """Return the measured pressure as a bar up to its limit, with a mark at the command."""
     share = min(max(measured / high, 0.0), 1.0) if high > 0 else 0.0
     wanted = min(max(commanded / high, 0.0), 1.0) if high > 0 else 0.0
     filled, mark = round(share * _BAR), min(round(wanted * _BAR), _BAR - 1)

@@ -1,6 +1,6 @@
-"""Who may speak to the daemon: its hosts, its token, and who can reach it.
+"""Access control of the HTTP interface: the token, the allowed hosts, and who can reach the port.
 
-What a stranger or a web page may not send is refused before any request is read.
+Requests that a stranger or a foreign web page may not make are refused before they are parsed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _READING = ("GET", "HEAD")
 
 
 class Token:
-    """The secret of those who may move the arm.
+    """The secret that a client shows to be allowed to move the arm.
 
     Raises
     ------
@@ -67,7 +67,7 @@ class Token:
 
 
 class Access:
-    """Refuses, in front of the application, what a stranger or a web page may send.
+    """ASGI middleware that refuses requests of strangers and of foreign web pages.
 
     - A web page that someone on this machine looks at can send requests here. So the request must
       be addressed to this machine by a name that no stranger's name server can hand out, and if
@@ -193,7 +193,7 @@ def is_loopback(host: str) -> bool:
 
 
 def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
-    """Return what to warn of before the control interface listens, as kinds and texts of events.
+    """Return the warnings due before the control interface listens: kinds and texts of events.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Calls that may hang: each in a thread of its own, and waited for a bounded time only."""
+"""Runs calls that may hang in threads of their own, and waits for them for a limited time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = [
 
 
 class Part:
-    """Some work in a thread of its own, which keeps nothing from ending.
+    """A call that runs in a daemon thread, so that the process can end even if it hangs.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ _WAITING = 8  # calls at once; more than a lively client needs
 
 
 class LoopCalls:
-    """Waits for the control loop in threads of their own, and not for ever.
+    """Calls the control loop from asyncio: in a thread per call, and with a time limit.
 
     Parameters
     ----------

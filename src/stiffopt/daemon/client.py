@@ -1,4 +1,4 @@
-"""The daemon's client: the control loop's commands, over the control interface."""
+"""The Python client of the daemon: its methods are the commands of the control loop."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _STEADY = 0.3  # s for which an arm that has settled stays near
 
 
 class Client:
-    """Speaks to a running daemon.
+    """A connection to a running daemon, to read the state of an arm and to command it.
 
     ::
 

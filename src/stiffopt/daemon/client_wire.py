@@ -1,4 +1,4 @@
-"""What goes between a client and the daemon: requests over HTTP, a stream over a WebSocket."""
+"""The client's side of the network: requests over HTTP, states and targets over a WebSocket."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _LOST = "lease"  # the code of a refusal that says that control is not (any long
 
 
 class Wire:
-    """Asks the daemon, and raises what it refuses.
+    """Sends HTTP requests to the daemon; a refusal is raised as an exception.
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ _STATUS = {"input": 422, "too-long": 413, "no-answer": 503, "busy": 503, "intern
 
 
 class ClientStream:
-    """A stream to the daemon; `Client.stream` makes it.
+    """A WebSocket that carries targets to the daemon and states back; see `Client.stream`.
 
     Targets are sent without waiting for the answers. One that is refused raises `CommandError`,
     or `InputError`, at the next `send` or `state`, but for a target that a newer one has

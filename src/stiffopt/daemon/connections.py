@@ -1,6 +1,7 @@
-"""Connections of clients: how many there may be, how long they may idle, and who makes room.
+"""Limits on the connections of clients: how many there may be, and how long they may idle.
 
-Strangers make room for those who have shown the token, never the other way round.
+Where there are too many, connections that have not shown the token are closed first; they never
+take the place of one that has.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _HANDSHAKES = 50.0
 
 
 class Member:
-    """A connection, from when it is accepted until it is lost.
+    """One connection of a client, from when it is accepted until it is lost.
 
     Parameters
     ----------
@@ -68,7 +69,9 @@ class Member:
 
 
 class Crowd:
-    """All connections of a server. All methods are for one event loop.
+    """The connections of a server, and the rule by which one is closed to make room.
+
+    All methods are for one event loop.
 
     Who has not shown the token is a stranger. Where strangers are too many, the first to come is
     dropped. Who has shown it makes room only for others who have: the one that has waited longest
@@ -167,7 +170,7 @@ _REFUSAL = (
 
 
 class BoundedProtocol(H11Protocol):
-    """A connection of a client, of which there are only so many.
+    """An HTTP connection that counts among the `Crowd` and is closed when it idles.
 
     Reading needs no token, so that anyone on this machine may connect. Who connects and says
     nothing, dribbles, or comes again and again must not keep others away, for whom it may be urgent
@@ -254,7 +257,7 @@ class BoundedProtocol(H11Protocol):
 
 
 class StreamProtocol(WebSocketsSansIOProtocol):
-    """A WebSocket, which tells the crowd when it is gone."""
+    """A WebSocket connection that leaves the `Crowd` when it is lost."""
 
     crowd: Crowd
 

@@ -1,4 +1,4 @@
-"""The daemon: the control loop of a rig, and everything around it, in one piece."""
+"""Starts and ends the daemon: guard, control loop, telemetry and network interface of a rig."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _REST_TIME = 2.5
 
 
 class Daemon:
-    """Runs the closed loop of a rig: guard, control, telemetry and the control interface.
+    """The daemon of a rig: guard, control loop, telemetry and the HTTP interface.
 
     Nothing is connected or started before `start`; it is vented and inactive then, until `arm` is
     called here or by a client. `stop`, or the end of a `with` block, lets the pressures down,

@@ -1,4 +1,4 @@
-"""What is looked after while a daemon runs: its guard, its service manager, and what is logged."""
+"""Watches a running daemon: replaces a dead guard, tells systemd, makes events of log records."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = [
 
 
 class ServiceManager:
-    """The service manager that started this process; without one nothing happens.
+    """Notifies systemd, if it started this process: ready, alive, state, stopping.
 
     The environment tells: ``NOTIFY_SOCKET``, and ``WATCHDOG_USEC`` if it wants signs of life.
     Nothing here waits: what the manager does not take at once is lost.
@@ -118,7 +118,7 @@ _LONGEST = 300  # characters of a text, part of which strangers may have written
 
 
 class LogEvents(logging.Handler):
-    """Makes events of what is logged as a warning or worse, so that it is told as all else is.
+    """A logging handler that turns warnings and errors into events of the control loop.
 
     What strangers can provoke must not push everything else out of the events: of each place in the
     code one record a second is taken, and that of a library is never more than a warning.
@@ -167,7 +167,7 @@ class LogEvents(logging.Handler):
 
 
 def _text(record: logging.LogRecord) -> str:
-    """Return what is told of a record, also of one whose arguments do not fit."""
+    """Return the text of a record, even if its arguments do not fit its format."""
     try:
         lines = record.getMessage().splitlines() or [""]
         return lines[0][:_LONGEST] + _where(record)
@@ -177,7 +177,7 @@ def _text(record: logging.LogRecord) -> str:
 
 
 def _where(record: logging.LogRecord) -> str:
-    """Return the error that is told of, and where it came from."""
+    """Return the exception of a record, and the line that raised it."""
     error = record.exc_info[1] if record.exc_info else None
     if error is None:
         return ""
@@ -192,7 +192,7 @@ _GUARD, _SERVICE = "guard", "service"
 
 
 class Keeper:
-    """Looks after a running daemon, in a thread of its own.
+    """A thread that watches the guard and the HTTP interface of a running daemon.
 
     - A guard process that has ended, which is a fault for the loop, is replaced. Its link has
       vented the supply by then, as far as that answers, and has ended a guard that hung.

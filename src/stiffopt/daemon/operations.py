@@ -1,4 +1,4 @@
-"""What a client may ask of the control loop, and what becomes of it."""
+"""The operations behind the HTTP interface: check who has control, then call the control loop."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stiffopt import units
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.state import State
+from stiffopt.control.state import Snapshot, State
 from stiffopt.daemon.calls import LoopCalls, start
 from stiffopt.daemon.lease import ControlLease
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, task_of
@@ -26,8 +26,8 @@ from stiffopt.daemon.reports import (
     RefusalError,
     RobotReport,
     TaskReport,
+    json_of,
     refusal_of,
-    state_json,
 )
 from stiffopt.errors import CommandError, StiffoptError
 from stiffopt.model.description import RobotDescription
@@ -40,7 +40,9 @@ _log = logging.getLogger(__name__)
 
 
 class Operations:
-    """The interface without its wire. All methods are for one event loop.
+    """The daemon's interface without HTTP: reading, control and commands.
+
+    All methods are for one event loop.
 
     Parameters
     ----------
@@ -71,6 +73,7 @@ class Operations:
         self._clock = clock
         self._call = LoopCalls(patience)
         self._task: TaskMessage | None = None  # the last that was accepted, while it matters
+        self._told: tuple[Snapshot, dict[str, Any]] | None = None  # the last state as JSON
         self._settling: asyncio.Task[None] | None = None
 
     def state(self) -> dict[str, Any]:
@@ -79,7 +82,10 @@ class Operations:
         lease = None
         if holder is not None:
             lease = LeaseReport(client=holder.client, expires_in_s=holder.expires_in)
-        return state_json(self.loop.snapshot(), lease)
+        now = self.loop.snapshot()
+        if self._told is None or self._told[0] is not now:  # streams mostly want the same one
+            self._told = (now, json_of(now))
+        return {**self._told[1], "lease": None if lease is None else lease.model_dump()}
 
     def robot_report(self) -> RobotReport:
         """Return what arm this is."""
@@ -192,16 +198,17 @@ class Operations:
     async def command(
         self, identity: str | None, function: Callable[[Any], None], what: Callable[[], Any]
     ) -> DoneReport:
-        """Let the loop do something with what `what` returns, or refuses with `InputError`.
+        """Call a command of the loop with the description that `what` returns.
 
-        That is made in another thread, as it may take long; the others must be heard meanwhile.
+        `what` may raise `InputError`. It is called in another thread, as it may take long, and
+        other clients must be answered meanwhile.
         """
         with self._control(identity):
             await self._asked(lambda: function(what()))
         return self._done()
 
     async def _forgetting(self, identity: str | None, function: Callable[[], None]) -> DoneReport:
-        """Let the loop do something after which there is no task."""
+        """Call a command of the loop after which there is no task."""
         with self._control(identity):
             await self._asked(function)
             self._task = None

@@ -1,4 +1,4 @@
-"""The recording of a run: an MCAP file that outlives a kill, and whose failure hurts nobody.
+"""Writes the recording of a run as MCAP: it survives a kill, and its failure stops nothing else.
 
 foxglove's writer gives up for good, without a word, when its file fails it; so the file that it is
 given is a piece of memory that cannot fail, and what is in there goes to the disk here. A commit
@@ -37,7 +37,7 @@ def free_bytes(folder: str) -> float:
 
 
 class Recording:
-    """Recording of everything that is logged in a context of foxglove, in one file after another.
+    """Records everything that is logged in a context of foxglove, in one file after another.
 
     Nothing here raises after the beginning: `trouble` says what is wrong, and what can be done is
     tried again.
@@ -225,7 +225,7 @@ class _FailedError(Exception):
 
 
 class _Window:
-    """What foxglove has written since the last commit, as the end of a file that it believes in.
+    """A file in memory that holds what foxglove has written since the last commit.
 
     It goes back within a chunk to fill in its length, never further: a commit ends the chunk.
     """

@@ -1,4 +1,4 @@
-"""A run of the daemon, read back from its recording: as it was, and as a log for calibration."""
+"""Reads the recording of a run, and converts it to a log (log v1) for calibration."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RunEvent:
 
 @dataclass(frozen=True)
 class RunSpan:
-    """A time in which something was so: a state with its reason, an alarm with its text."""
+    """An interval of time in which a state, with its reason, or an alarm, with its text, held."""
 
     begin: float
     end: float

@@ -1,7 +1,7 @@
-"""The control interface: HTTP and WebSocket over a control loop.
+"""The HTTP and WebSocket interface of a control loop, as a FastAPI application.
 
-Anyone may read; with the token one may stop the arm; with the token and control one may move it. A
-request that is refused changes nothing.
+Anyone may read; a client with the token may stop the arm; a client with the token and control may
+move it. A request that is refused changes nothing.
 """
 
 from __future__ import annotations

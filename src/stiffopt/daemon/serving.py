@@ -1,4 +1,4 @@
-"""The server of the control interface, in a thread of its own."""
+"""Runs the HTTP interface in uvicorn, in a thread of its own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The WebSocket: states go out at a steady rate, targets come in and are answered."""
+"""The WebSocket of the daemon: sends states at a steady rate, receives targets and answers them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_RATE = 100.0
 
 
 class AccessMessage(BaseModel):
-    """What lets a stream move the arm; what is left out stays as it was."""
+    """The token and the lease that let a stream move the arm; a missing one stays as it was."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -45,7 +45,7 @@ class StreamedTarget(BaseModel):
 
 
 class Stream:
-    """One connection.
+    """One WebSocket connection.
 
     Of targets that come faster than the control loop takes them, only the newest is passed on:
     a stale one would move the arm to where the client no longer wants it.
@@ -217,7 +217,7 @@ def _parsed(text: str | None) -> Any:
 
 
 def _seq(given: Any) -> int | None:
-    """Return the number of a message, if it has one, be it ever so wrong otherwise."""
+    """Return the number of a message, if it has one, even if the rest of it is wrong."""
     seq = given.get("seq") if isinstance(given, dict) else None
     return seq if type(seq) is int and 0 <= seq <= 2**53 else None
 

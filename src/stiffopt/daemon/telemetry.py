@@ -1,7 +1,7 @@
-"""Telemetry: everything a loop says of itself, live for Foxglove and recorded as MCAP.
+"""Telemetry: sends the state of the loop to Foxglove and records it, in a thread of its own.
 
-The loop hands over a snapshot in each tick, which costs it a microsecond; all the rest is done by
-a thread of its own. Whatever fails here is an alarm and never more.
+The loop hands over a snapshot in each tick, which costs it a microsecond. Whatever fails here
+raises an alarm and does nothing else.
 """
 
 from __future__ import annotations
@@ -305,7 +305,7 @@ class ArmShape:
 def about_run(
     robot: RobotDescription, name: str, first: Snapshot, begin: float, offset: int
 ) -> dict[str, str]:
-    """Return what a recording says of itself, so that whoever reads it needs nothing else."""
+    """Return the metadata of a recording: all that a reader needs beside the messages."""
     from stiffopt import __version__
 
     return {

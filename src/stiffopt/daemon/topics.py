@@ -83,7 +83,7 @@ def topic_schemas() -> dict[str, dict[str, Any]]:
 
 
 def encoded(topic: str, time: float, record: Any, **further: Any) -> bytes:
-    """Return the message of a topic that a record of the state gives at a time, in s."""
+    """Return the message of a topic for a record of the state, at a time in s."""
     message: dict[str, Any] = {"time_s": round(time, _TIME_DECIMALS)}
     for entry in _logged(type(record), topic):
         value = _rounded(getattr(record, entry.name), entry)
@@ -107,7 +107,7 @@ def _schema(entry: Entry) -> dict[str, Any]:
 
 
 def _rounded(value: Any, entry: Entry) -> Any:
-    """Return a value as it is logged; None if it is missing."""
+    """Return the value of a field, rounded, as it is logged; None if it is missing."""
     if value is None:
         return None
     match entry.kind:
@@ -141,7 +141,7 @@ _ARM_COLOUR, _TARGET_COLOUR = (0.31, 0.47, 0.65, 0.7), (0.84, 0.15, 0.16, 0.8)
 
 
 class TelemetryChannels:
-    """The topics of a daemon.
+    """Writes snapshots, events and the shape of the arm to the topics of telemetry.
 
     Parameters
     ----------
@@ -302,7 +302,7 @@ def _ball(moment: int, where: Array) -> Any:
 
 
 def _entity(moment: int, name: str, **shapes: Any) -> Any:
-    """Return something to draw in the base frame, which is gone when it is not drawn again."""
+    """Return an entity of the base frame; it disappears unless it is drawn again within 1 s."""
     from foxglove.messages import Duration, SceneEntity
 
     stamp, soon = _timestamp(moment), Duration(1)
@@ -318,7 +318,7 @@ def _target_place(now: Snapshot) -> Array | None:
 
 
 def _target_turn(now: Snapshot) -> Array | None:
-    """Return the target's orientation (4,): that which is asked for, or the least turn to it."""
+    """Return the target's orientation (4,), or the smallest rotation to its direction."""
     if now.target_quaternion is not None:
         return now.target_quaternion
     if now.target_pointing is None:

@@ -1,4 +1,4 @@
-"""Recordings: log v1 (CSV), the same as MCAP, and tables of measured stiffness."""
+"""Logs of an arm over time (CSV "log v1" and MCAP), and tables of measured stiffness (CSV)."""
 
 from stiffopt.logs.layout import LogLayout
 from stiffopt.logs.log import Body, Log, LogRow

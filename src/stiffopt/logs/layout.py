@@ -1,4 +1,4 @@
-"""Which columns a recording has: names of log v1."""
+"""The column names of a log (log v1)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BODY = re.compile(r"([a-z][a-z0-9]*(?:_[a-z0-9]+)*)_(?:[xyz]_m|q[wxyz])")
 
 @dataclass(frozen=True)
 class LogLayout:
-    """Which columns there are.
+    """Which columns a log has.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a recording is in code."""
+"""A log in memory: pressures and poses of an arm over time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Where a tracked body was.
+    """The poses of a tracked body over time.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A recording, in SI units; what is missing is NaN.
+    """A log: pressures and poses over time, in SI units; NaN where a value is missing.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Log:
 
 @dataclass(frozen=True)
 class LogRow:
-    """One row of a recording; see `Log`. What is missing is None or NaN."""
+    """One row of a `Log`; a missing value is None or NaN."""
 
     time: float
     commanded: ArrayLike

@@ -1,4 +1,4 @@
-"""Log v1: CSV to `Log`."""
+"""Reads a log from CSV (log v1)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["log_of_values", "read_log"]
 
 
 def read_log(path: str | os.PathLike[str]) -> Log:
-    """Read a recording (log v1).
+    """Read a log from CSV (log v1).
 
     Parameters
     ----------

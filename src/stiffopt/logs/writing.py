@@ -1,4 +1,4 @@
-"""Log v1, written row by row: whatever happens, at most the last row is lost."""
+"""Writes a log to CSV (log v1) row by row: a crash loses the last row at most."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["LogWriter", "write_log"]
 
 
 class LogWriter:
-    """Appends rows to a recording (log v1). Each row is with the system when `append` returns.
+    """Appends rows to a log (log v1); each is handed to the system when `append` returns.
 
     A file that is there and has the same columns is continued; `last_time` then says where.
 
