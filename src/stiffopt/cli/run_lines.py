@@ -15,7 +15,7 @@ from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import entries
 from stiffopt.daemon.reports import plain
 from stiffopt.errors import printable
-from stiffopt.safety.lines import json_line
+from stiffopt.safety.messages import json_line
 
 __all__ = ["Display", "Facts", "Lines"]
 

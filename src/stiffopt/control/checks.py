@@ -10,8 +10,8 @@ from stiffopt.control.steering import Steering
 from stiffopt.control.tracker_watch import ENOUGH, Sight, TrackerWatch
 from stiffopt.errors import InputError
 from stiffopt.rig.interface import PressureReading, Rig
+from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
-from stiffopt.safety.outlet import Outlet
 
 __all__ = ["check_rig", "check_vented_arm"]
 

@@ -22,7 +22,7 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import Safety
-from stiffopt.safety.outlet import Outlet
+from stiffopt.safety.gate import Outlet
 
 __all__ = ["ControlLoop"]
 

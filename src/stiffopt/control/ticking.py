@@ -17,8 +17,8 @@ from stiffopt.errors import DeviceError, GuardTripped
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig
 from stiffopt.rig.settings import ControlSettings, Safety
 from stiffopt.safety.expected_pressure import Regulation
+from stiffopt.safety.gate import Outlet, let_down
 from stiffopt.safety.monitors import PressureMonitor, Trouble
-from stiffopt.safety.outlet import Outlet, let_down
 
 __all__ = ["Ticking"]
 

@@ -28,8 +28,9 @@ from stiffopt.model.manipulator import load_robot
 from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.rig.config import RigDescription, load_rig_description
-from stiffopt.safety.link import GuardLink, guarded_rig
+from stiffopt.safety.guard_client import GuardLink
 from stiffopt.safety.realtime import real_time, tidy
+from stiffopt.safety.rigs import guarded_rig
 
 if TYPE_CHECKING:
     from stiffopt.daemon.serving import Server

@@ -16,7 +16,7 @@ from typing import Any
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity
 from stiffopt.errors import MissingExtraError, StiffoptError
-from stiffopt.safety.link import GuardLink
+from stiffopt.safety.guard_client import GuardLink
 
 __all__ = [
     "Keeper",
