@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import entries
@@ -17,32 +17,15 @@ from stiffopt.daemon.reports import plain
 from stiffopt.errors import printable
 from stiffopt.safety.messages import json_line
 
-__all__ = ["Display", "Facts", "Lines"]
+if TYPE_CHECKING:
+    from stiffopt.daemon.daemon import Daemon
+
+__all__ = ["Lines", "RunDisplay"]
 
 _LONGEST = 500  # characters of a text: a pipe takes 4096 bytes at once or not at all
 
 
-class Facts(Protocol):
-    """What does not change while a daemon runs."""
-
-    @property
-    def url(self) -> str | None:
-        """Of the control interface."""
-
-    @property
-    def token_file(self) -> object:
-        """Where the token is."""
-
-    @property
-    def recording(self) -> str | None:
-        """The file that is recorded to."""
-
-    @property
-    def foxglove_port(self) -> int | None:
-        """Where Foxglove can connect."""
-
-
-class Display(Protocol):
+class RunDisplay(Protocol):
     """A way to show a run: as lines or as a live status; updated every `period`, in s."""
 
     period: float
@@ -50,7 +33,7 @@ class Display(Protocol):
     def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Show something that is no event of the loop."""
 
-    def begin(self, facts: Facts) -> None:
+    def begin(self, daemon: Daemon) -> None:
         """Show what was started."""
 
     def update(self, now: Snapshot, events: list[Event]) -> None:
@@ -84,13 +67,13 @@ class Lines:
         """Write a line about this moment."""
         self._line(self._now(), str(severity), kind, text)
 
-    def begin(self, facts: Facts) -> None:
+    def begin(self, daemon: Daemon) -> None:
         """Write where everything is."""
         found: dict[str, Any] = {
-            "url": facts.url,
-            "token_file": None if facts.token_file is None else str(facts.token_file),
-            "recording": facts.recording,
-            "foxglove_port": facts.foxglove_port,
+            "url": daemon.url,
+            "token_file": None if daemon.token_file is None else str(daemon.token_file),
+            "recording": daemon.recording,
+            "foxglove_port": daemon.foxglove_port,
         }
         told = {key: value for key, value in found.items() if value is not None}
         words = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in told.items())

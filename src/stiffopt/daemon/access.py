@@ -1,4 +1,4 @@
-"""Access control of the HTTP interface: the token, the allowed hosts, and who can reach the port.
+"""Access control of the HTTP interface: the token and the allowed hosts.
 
 Requests that a stranger or a foreign web page may not make are refused before they are parsed.
 """
@@ -6,9 +6,7 @@ Requests that a stranger or a foreign web page may not make are refused before t
 from __future__ import annotations
 
 import hmac
-import socket
 from collections.abc import Iterable
-from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
@@ -16,9 +14,10 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from stiffopt.daemon.reports import RefusalError
+from stiffopt.daemon.secret import is_address
 from stiffopt.errors import InputError
 
-__all__ = ["MAX_BODY", "MIN_TOKEN", "Access", "Token", "bracketed", "check_exposure", "is_loopback"]
+__all__ = ["MAX_BODY", "Access", "Token"]
 
 MAX_BODY = 1_000_000
 """Bytes of the longest request."""
@@ -116,7 +115,7 @@ class Access:
     def _check_place(self, headers: Headers) -> None:
         hosts = headers.getlist("host")
         name = _host_name(hosts[0]) if len(hosts) == 1 else ""
-        if name not in self._hosts and not _is_address(name):
+        if name not in self._hosts and not is_address(name):
             raise RefusalError(
                 403,
                 "host",
@@ -136,14 +135,6 @@ def _host_name(host: str) -> str:
         return (urlsplit(f"//{host}").hostname or "").rstrip(".")
     except ValueError:
         return ""
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 async def _collected(receive: Receive, headers: Headers) -> Receive:
@@ -174,66 +165,3 @@ def _again(first: Message, receive: Receive) -> Receive:
         return messages.pop() if messages else await receive()
 
     return replayed
-
-
-MIN_TOKEN = 16
-"""Characters of a token that is not easily guessed."""
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach what listens on a host.
-
-    A name is on loopback if all its addresses are; one that has no address is not.
-    """
-    try:
-        found = {host} if _is_address(host) else _addresses(host)
-    except OSError:
-        return False
-    return bool(found) and all(ip_address(address).is_loopback for address in found)
-
-
-def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
-    """Return the warnings due before the control interface listens: kinds and texts of events.
-
-    Parameters
-    ----------
-    host :
-        Where it will listen.
-    token :
-        Of those who may move the arm.
-    given :
-        Whether a person chose the token; else it was drawn.
-
-    Raises
-    ------
-    InputError
-        The token is too short for a host that other machines can reach.
-    """
-    beyond, short = not is_loopback(host), given and len(token) < MIN_TOKEN
-    if beyond and short:
-        raise InputError(
-            f"the token has {len(token)} characters, too few for the host {host}, which other "
-            f"machines can reach; give one of at least {MIN_TOKEN}, leave the environment variable "
-            "empty so that one is drawn, or listen on 127.0.0.1 (service.token, service.host in "
-            "the rig file)"
-        )
-    if beyond:
-        text = (
-            f"the control interface listens on {host}, beyond this machine and unencrypted: "
-            "whoever can listen in on the network can read the token and move the arm"
-        )
-        return [("exposed", text)]
-    if short:
-        text = f"the token is shorter than {MIN_TOKEN} characters; others here may guess it"
-        return [("token", text)]
-    return []
-
-
-def bracketed(host: str) -> str:
-    """Return a host as it is written in a URL."""
-    return f"[{host}]" if ":" in host else host
-
-
-def _addresses(host: str) -> set[str]:
-    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    return {str(address[0]) for *_, address in found}

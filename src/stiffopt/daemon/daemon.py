@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -18,10 +19,9 @@ from stiffopt.control.controller import Controller
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
-from stiffopt.daemon.access import bracketed, check_exposure
 from stiffopt.daemon.calls import Part
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
-from stiffopt.daemon.secret import Secret
+from stiffopt.daemon.secret import Secret, bracketed, check_exposure
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
 from stiffopt.files import file_text
 from stiffopt.model.manipulator import load_robot
@@ -36,25 +36,43 @@ if TYPE_CHECKING:
     from stiffopt.daemon.serving import Server
     from stiffopt.daemon.telemetry import Telemetry
 
-__all__ = ["CONTROL_TIME", "STOP_TIME", "ControlThread", "Daemon"]
+__all__ = ["TIMES", "ControlThread", "Daemon", "DaemonTimes"]
 
 Array = NDArray[np.float64]
 
 _FASTEST = 500.0  # Hz
-_TIDY = 10.0  # s between collections of garbage
-_ARMING = 10.0  # s in which an arm that was just connected must become ready
-_AGAIN = 0.2  # s between attempts to arm, in which the tracker sees the tip some times
-_START = 5.0  # s in which telemetry must have started
 
-STOP_TIME = 15.0
-"""Seconds beyond `Safety.ramp_time` after which a daemon has ended, whatever hangs. What follows
-adds up to less, so that the command has some time left to say what became of it."""
-CONTROL_TIME = 6.0
-"""Seconds beyond the ramp in which the control thread must have ended."""
-_KEEPER_TIME = 0.5
-_VENT_TIME = 1.0
-_SUPPLY_TIME = 3.0
-_REST_TIME = 2.5
+
+@dataclass(frozen=True)
+class DaemonTimes:
+    """How long the parts of a daemon may take, in s.
+
+    Attributes
+    ----------
+    arming : in which an arm that was just connected must become ready to be armed.
+    arming_again : between attempts to arm, in which the tracker sees the tip some times.
+    telemetry : in which telemetry must have started.
+    tidy : between collections of garbage.
+    stop : beyond `Safety.ramp_time`, in which a daemon has ended, whatever hangs. The times below
+        add up to less, so that the command has some time left to report the outcome.
+    control : beyond the ramp, in which the control thread must have ended.
+    keeper, vent, supply, rest : in which the keeper, a direct command to vent, the supply and all
+        other parts must have ended.
+    """
+
+    arming: float = 10.0
+    arming_again: float = 0.2
+    telemetry: float = 5.0
+    tidy: float = 10.0
+    stop: float = 15.0
+    control: float = 6.0
+    keeper: float = 0.5
+    vent: float = 1.0
+    supply: float = 3.0
+    rest: float = 2.5
+
+
+TIMES = DaemonTimes()
 
 
 class Daemon:
@@ -245,7 +263,7 @@ class Daemon:
         InputError
             It cannot be armed, or the task does not suit; it is inactive then.
         """
-        end = time.monotonic() + _ARMING
+        end = time.monotonic() + TIMES.arming
         while True:
             try:
                 self.loop.arm()
@@ -254,7 +272,7 @@ class Daemon:
                 last = self.loop.snapshot().state is State.FAULT or time.monotonic() > end
                 if last or self._stopping.is_set():
                     raise
-            self._stopping.wait(_AGAIN)
+            self._stopping.wait(TIMES.arming_again)
         if task is None:
             return
         try:
@@ -274,14 +292,14 @@ class Daemon:
     def vent(self, reason: str = "asked to", patience: float = 0.5) -> None:
         """Let all pressure out at once, also when the control thread does not answer."""
         if not Part("vent", lambda: self.loop.vent(reason)).ends_within(patience):
-            Part("vent-link", self.link.vent).ends_within(_VENT_TIME)
+            Part("vent-link", self.link.vent).ends_within(TIMES.vent)
 
     def stop(self) -> State:
         """End everything and return the last state.
 
         The pressures are let down and vented first, and the guard, which owns the supply, is ended;
         neither waits for anything else. Then all the rest ends. From `begin_stop` on, or from here
-        if that was not called, this takes `Safety.ramp_time` and less than `STOP_TIME`, whatever
+        if that was not called, this takes `Safety.ramp_time` and less than `TIMES.stop`, whatever
         hangs. To stop twice does nothing.
         """
         if self._stopped:
@@ -289,13 +307,13 @@ class Daemon:
         self._stopped = True
         self.begin_stop()
         self._end_control()
-        self._keeper.stop(_KEEPER_TIME)
+        self._keeper.stop(TIMES.keeper)
         state = self.loop.snapshot().state
         closing = Part("supply", self.link.close)
-        before = CONTROL_TIME + _KEEPER_TIME + _VENT_TIME
-        closing.ends_within(self._left(before + _SUPPLY_TIME, _SUPPLY_TIME))
+        before = TIMES.control + TIMES.keeper + TIMES.vent
+        closing.ends_within(self._left(before + TIMES.supply, TIMES.supply))
         self._end_the_rest()
-        if not closing.ends_within(self._left(before + _SUPPLY_TIME + _REST_TIME)):
+        if not closing.ends_within(self._left(before + TIMES.supply + TIMES.rest)):
             self.trouble = "the guard does not end; whether the supply is vented is not known"
             self.hung = ("supply", *self.hung)
         elif closing.error is not None:
@@ -313,7 +331,7 @@ class Daemon:
         """Wait for the control thread, which lets the pressures down; vent if it hangs."""
         if self._control is None:
             return
-        self._control.join(self._left(CONTROL_TIME))
+        self._control.join(self._left(TIMES.control))
         if self._control.is_alive():
             self._hangs = True
             self.hung = (*self.hung, "control")
@@ -329,7 +347,7 @@ class Daemon:
         if self._server is not None:
             works["service"] = self._end_service
         parts = [Part(name, work) for name, work in works.items()]
-        end = time.monotonic() + _REST_TIME
+        end = time.monotonic() + TIMES.rest
         for part in parts:
             if not part.ends_within(end - time.monotonic()):
                 self.hung = (*self.hung, part.name)
@@ -403,8 +421,10 @@ class Daemon:
             return
         self._recorded = True
         starting = Part("telemetry", self._telemetry.start)
-        if not starting.ends_within(_START):
-            text = f"telemetry has not started within {_START:g} s; control goes on without"
+        if not starting.ends_within(TIMES.telemetry):
+            text = (
+                f"telemetry has not started within {TIMES.telemetry:g} s; control goes on without"
+            )
             self.loop.add_alarm("telemetry", text)
         elif starting.error is not None:
             raise starting.error
@@ -489,7 +509,7 @@ class ControlThread(threading.Thread):
         self._manager.watchdog()
         if self._telemetry is not None:
             self._telemetry.put(now)
-        if now.time - self._tidied > _TIDY:
+        if now.time - self._tidied > TIMES.tidy:
             self._tidied = now.time
             tidy(thoroughly=now.state not in ARMED)
 

@@ -1,7 +1,8 @@
 """The token of those who may move the arm, kept in a file that is this user's alone.
 
 The token is that of the environment, or it is drawn and written to the file. Other users may be
-able to write to the folder, so files and links that they put in its place are found out.
+able to write to the folder, so files and links that they put in its place are found out. A token
+that is too short is refused where other machines can reach the interface.
 """
 
 from __future__ import annotations
@@ -9,21 +10,30 @@ from __future__ import annotations
 import fcntl
 import os
 import secrets
+import socket
 import stat
 from contextlib import suppress
+from ipaddress import ip_address
 from pathlib import Path
 
-from stiffopt.errors import FileError
+from stiffopt.errors import FileError, InputError
 from stiffopt.rig.settings import ServiceSettings
 
 __all__ = [
+    "MIN_TOKEN",
     "Secret",
+    "bracketed",
+    "check_exposure",
     "check_folder",
     "check_mine",
+    "is_address",
+    "is_loopback",
     "make_private",
     "read_mine",
 ]
 
+MIN_TOKEN = 16
+"""Characters of a token that is not easily guessed."""
 _LONGEST = 4096  # bytes of a file that is read whole
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
@@ -211,3 +221,74 @@ class Secret:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+
+
+# Who can reach the interface, and whether the token is good enough for that
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine can reach what listens on a host.
+
+    A name is on loopback if all its addresses are; one that has no address is not.
+    """
+    try:
+        found = {host} if is_address(host) else _addresses(host)
+    except OSError:
+        return False
+    return bool(found) and all(ip_address(address).is_loopback for address in found)
+
+
+def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
+    """Return the warnings due before the control interface listens: kinds and texts of events.
+
+    Parameters
+    ----------
+    host :
+        Where it will listen.
+    token :
+        Of those who may move the arm.
+    given :
+        Whether a person chose the token; else it was drawn.
+
+    Raises
+    ------
+    InputError
+        The token is too short for a host that other machines can reach.
+    """
+    beyond, short = not is_loopback(host), given and len(token) < MIN_TOKEN
+    if beyond and short:
+        raise InputError(
+            f"the token has {len(token)} characters, too few for the host {host}, which other "
+            f"machines can reach; give one of at least {MIN_TOKEN}, leave the environment variable "
+            "empty so that one is drawn, or listen on 127.0.0.1 (service.token, service.host in "
+            "the rig file)"
+        )
+    if beyond:
+        text = (
+            f"the control interface listens on {host}, beyond this machine and unencrypted: "
+            "whoever can listen in on the network can read the token and move the arm"
+        )
+        return [("exposed", text)]
+    if short:
+        text = f"the token is shorter than {MIN_TOKEN} characters; others here may guess it"
+        return [("token", text)]
+    return []
+
+
+def bracketed(host: str) -> str:
+    """Return a host as it is written in a URL."""
+    return f"[{host}]" if ":" in host else host
+
+
+def _addresses(host: str) -> set[str]:
+    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    return {str(address[0]) for *_, address in found}
+
+
+def is_address(name: str) -> bool:
+    """Return whether a host is given as an IP address, and not by name."""
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True

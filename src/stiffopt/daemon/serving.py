@@ -8,8 +8,8 @@ import threading
 import time
 from typing import Any
 
-from stiffopt.daemon.access import bracketed
 from stiffopt.daemon.messages import MAX_MESSAGE
+from stiffopt.daemon.secret import bracketed
 from stiffopt.errors import InputError, MissingExtraError, ServiceError
 
 __all__ = ["Server"]

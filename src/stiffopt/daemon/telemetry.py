@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Alarm, Snapshot
-from stiffopt.daemon.recording import Recording
+from stiffopt.daemon.recording import RunRecording
 from stiffopt.daemon.topics import FORMAT, TelemetryChannels
 from stiffopt.errors import MissingExtraError, StiffoptError
 from stiffopt.files import file_text
@@ -27,19 +28,41 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.device import Clock
 from stiffopt.rig.settings import ServiceSettings
 
-__all__ = ["ArmShape", "Telemetry", "about_run"]
+__all__ = ["ArmShape", "Telemetry", "TelemetryRates", "about_run"]
 
 Array = NDArray[np.float64]
 
-_WAKE = 0.02  # s between two looks at what has come
-_COMMIT = 0.1  # s: what a killed process loses
-_KEPT = 4096  # snapshots that wait; the oldest go first
-_FINEST = 0.01  # s between two ticks that are logged; a faster loop would pay with its punctuality
-_SMOOTH, _OFTEN, _SELDOM = 0.04, 0.1, 1.0  # s between what is not logged in each tick: frames,
-# the arm's shape and the timing, the state
-_SHAPE = 12  # poses along the arm that Foxglove draws
-_SHARE = 0.02  # of the time for the shape; the control thread needs the interpreter too
-_CALM = 10.0  # s after which a loss or a failure is forgotten
+
+@dataclass(frozen=True)
+class TelemetryRates:
+    """How often what is logged, and how much waits; times in s.
+
+    Attributes
+    ----------
+    wake : between two looks at what the loop has handed over.
+    commit : between two writes to the disk: what a killed process loses.
+    queue : snapshots that may wait; the oldest are dropped first.
+    tick : between two snapshots that are logged; to log more would cost the loop its punctuality.
+    frames, shape, state : between messages of the frames, of the arm's shape and the timing, and
+        of the state while it does not change.
+    calm : after which a loss or a failure is forgotten.
+    shape_poses : along the arm that Foxglove draws.
+    shape_share : of the interpreter's time, which the control thread needs too, for the shape.
+    """
+
+    wake: float = 0.02
+    commit: float = 0.1
+    queue: int = 4096
+    tick: float = 0.01
+    frames: float = 0.04
+    shape: float = 0.1
+    state: float = 1.0
+    calm: float = 10.0
+    shape_poses: int = 12
+    shape_share: float = 0.02
+
+
+RATES = TelemetryRates()
 
 
 class Telemetry:
@@ -93,7 +116,7 @@ class Telemetry:
         self.dropped = 0
         self._loop, self._name, self._settings = loop, name, settings
         self._backbone = backbone
-        self._queue: deque[Snapshot] = deque(maxlen=_KEPT)
+        self._queue: deque[Snapshot] = deque(maxlen=RATES.queue)
         self._context = Context()
         begin = clock.now()
         self._offset = wall() - round(begin * 1e9)
@@ -103,7 +126,7 @@ class Telemetry:
         self._recording = (
             None
             if folder is None
-            else Recording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
+            else RunRecording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
         )
         self._server: Any = None
         self._thread: threading.Thread | None = None
@@ -141,7 +164,7 @@ class Telemetry:
 
     def put(self, snapshot: Snapshot) -> None:
         """Hand over a snapshot; called by the control thread in each tick, and never waits."""
-        if len(self._queue) == _KEPT:
+        if len(self._queue) == RATES.queue:
             self.dropped += 1
         self._queue.append(snapshot)
 
@@ -195,7 +218,7 @@ class Telemetry:
             self._attempt(self._channels.log_event, event)
         now = time.monotonic()
         if last or now >= self._due_commit:
-            self._due_commit = now + _COMMIT
+            self._due_commit = now + RATES.commit
             self._commit(now)
         self._look_back(now)
 
@@ -208,7 +231,7 @@ class Telemetry:
             self._tell("telemetry", f"something could not be logged: {error}")
 
     def _run(self) -> None:
-        while not self._stop.wait(_WAKE):
+        while not self._stop.wait(RATES.wake):
             self.work()
 
     def _listen(self) -> None:
@@ -230,22 +253,22 @@ class Telemetry:
 
     def _log(self, now: Snapshot) -> None:
         self._logged = now.time
-        due = on_time = now.time >= self._due_tick - _FINEST / 2
+        due = on_time = now.time >= self._due_tick - RATES.tick / 2
         state = (now.state, now.reason, now.task, _kinds(now.alarms))
         if state != self._last_state or now.time >= self._due_state:
             self._channels.log_state(now)
-            self._last_state, self._due_state = state, now.time + _SELDOM
+            self._last_state, self._due_state = state, now.time + RATES.state
             due = True
         if due:
-            regular = on_time and now.time <= self._due_tick + _FINEST
-            self._due_tick = (self._due_tick if regular else now.time) + _FINEST
+            regular = on_time and now.time <= self._due_tick + RATES.tick
+            self._due_tick = (self._due_tick if regular else now.time) + RATES.tick
             self._channels.log_tick(now)
         self._channels.log_samples(now)  # each of them
         if now.time >= self._due_smooth:
-            self._due_smooth = now.time + _SMOOTH
+            self._due_smooth = now.time + RATES.frames
             self._channels.log_frames(now)
         if now.time >= self._due_often:
-            self._due_often = now.time + _OFTEN
+            self._due_often = now.time + RATES.shape
             self._channels.log_timing(now, self.dropped)
             self._log_arm(now)
 
@@ -264,13 +287,13 @@ class Telemetry:
 
     def _look_back(self, now: float) -> None:
         """Say what was lost, and that all is well when nothing has gone wrong for a while."""
-        if now > self._failed_at + _CALM:
+        if now > self._failed_at + RATES.calm:
             self._tell("telemetry", "")
         if self.dropped > self._dropped_told:
             self._dropped_told, self._dropped_at = self.dropped, now
             text = f"telemetry is too slow; {self.dropped} snapshots were never logged"
             self._tell("telemetry-lost", text)
-        elif now > self._dropped_at + _CALM:
+        elif now > self._dropped_at + RATES.calm:
             self._tell("telemetry-lost", "")
 
     def _tell(self, kind: str, text: str) -> None:
@@ -296,9 +319,9 @@ class ArmShape:
         """Return poses (m, 4, 4) along the arm, now or a little while ago."""
         now = time.monotonic()
         if self._last is None or now >= self._due:
-            self._last = self._robot.backbone(pressures, _SHAPE)
+            self._last = self._robot.backbone(pressures, RATES.shape_poses)
             ended = time.monotonic()
-            self._due = ended + (ended - now) / _SHARE
+            self._due = ended + (ended - now) / RATES.shape_share
         return self._last
 
 
