@@ -25,9 +25,8 @@ import numpy as np
 
 from stiffopt.errors import FileError, InputError
 from stiffopt.logs.layout import LogLayout
-from stiffopt.logs.log import Array, Log, LogRow
+from stiffopt.logs.log import Array, Log, LogRow, log_of_values
 from stiffopt.logs.mcap_reading import McapContents, read_mcap, require_mcap
-from stiffopt.logs.reading import log_of_values
 
 __all__ = ["LOG_METADATA", "McapLogWriter", "read_mcap_log"]
 
