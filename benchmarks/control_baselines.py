@@ -168,7 +168,7 @@ def stiffopt_steering(rig: Rig, robot: RobotDescription, dynamics: str) -> Steer
 
     return Controller(
         load_robot(robot), rig.supply.limits, rig.slew, period=PERIOD,
-        control=rig.settings.control, safety=rig.settings.safety, swings=dynamics == "full",
+        control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from stiffopt.control.requests import Asker, asked_by
+from stiffopt.control.request_queue import Requester, requested_by
 from stiffopt.daemon.reports import RefusalError
 
 __all__ = [
@@ -92,14 +92,14 @@ class LoopCalls:
         """
         if self._running >= _WAITING and not urgent:
             raise RefusalError(503, "busy", "the control loop has too much to do; try again")
-        asker = Asker()
-        answer = start(function, *args, asker=None if lasting else asker)
+        requester = Requester()
+        answer = start(function, *args, requester=None if lasting else requester)
         self._running += 1
         answer.add_done_callback(self._ended)
         try:
             await asyncio.wait([answer], timeout=self._patience)
         finally:  # also where the client has gone
-            never = not answer.done() and asker.give_up()
+            never = not answer.done() and requester.give_up()
         if answer.done():
             return answer.result()
         if lasting:
@@ -118,7 +118,7 @@ class LoopCalls:
 
 
 def start(
-    function: Callable[..., Any], *args: Any, asker: Asker | None = None
+    function: Callable[..., Any], *args: Any, requester: Requester | None = None
 ) -> asyncio.Future[Any]:
     """Call a function in a thread of its own, which does not keep the process from ending.
 
@@ -126,7 +126,7 @@ def start(
     ----------
     function, args :
         What to call.
-    asker :
+    requester :
         Who asks, and may give it up; None: it is done however late.
     """
     events = asyncio.get_running_loop()
@@ -143,7 +143,7 @@ def start(
     def work() -> None:
         result, error = None, None
         try:
-            with asked_by(asker or Asker()):
+            with requested_by(requester or Requester()):
                 result = function(*args)
         except Exception as raised:
             error = raised

@@ -143,8 +143,8 @@ class Daemon:
             period=period,
             control=description.control,
             safety=description.safety,
-            swings=_swings(description),
-            beside=True,
+            vibrates=_vibrates(description),
+            plan_in_process=True,
         )
         self.loop = ControlLoop(
             guarded, self._controller, self.link, safety=description.safety, period=period
@@ -518,7 +518,7 @@ class ControlThread(threading.Thread):
         self._loop.events.add(self._loop.rig.clock.now(), "real-time", f"{who}: {notice}", severity)
 
 
-def _swings(description: RigDescription) -> bool:
+def _vibrates(description: RigDescription) -> bool:
     """Return whether the arm has inertia: all have, but one that is simulated without."""
     simulated, plant = description.supply.driver == "simulated", description.plant
     return not (simulated and plant is not None and plant.dynamics == "quasi-static")
