@@ -23,8 +23,8 @@ from stiffopt.model.description import (
     Compensation,
     Corrections,
     Material,
-    PressureLimits,
     Recordings,
+    RegulatorLimits,
     RobotDescription,
     Segment,
     Tolerances,
@@ -75,7 +75,7 @@ def driver_schemas() -> dict[type[BaseModel], None]:
 
 
 SCHEMAS: list[type[BaseModel]] = [
-    *(RobotDescription, Segment, Chambers, Material, Compensation, PressureLimits),
+    *(RobotDescription, Segment, Chambers, Material, Compensation, RegulatorLimits),
     *(Corrections, History, Play, Creep, Recordings, TrackedBody, Tolerances),
     *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),

@@ -51,8 +51,8 @@ __all__ = [
     "Compensation",
     "Corrections",
     "Material",
-    "PressureLimits",
     "Recordings",
+    "RegulatorLimits",
     "RobotDescription",
     "Segment",
     "Tolerances",
@@ -319,8 +319,8 @@ def _law_class(name: str) -> type[StrainLaw]:
     return law_class(name)
 
 
-class PressureLimits(Schema):
-    """What the regulators may do; one value for all channels or one per channel.
+class RegulatorLimits(Schema):
+    """Limits of the regulators; one value for all channels or one per channel.
 
     Attributes
     ----------
@@ -439,7 +439,7 @@ class RobotDescription(Schema):
     segments: Annotated[Items[Segment], Field(min_length=1, max_length=20)]
     tip_mass: Annotated[Mass, Field(ge=0)] = 0.0
     gravity: Vector[Acceleration] = (0.0, 0.0, 0.0)
-    pressure: PressureLimits
+    pressure: RegulatorLimits
     recordings: Recordings | None = None
     tolerances: Tolerances | None = None
     calibration: Calibration | None = None
