@@ -101,13 +101,14 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
 
 
 def yaml_examples() -> list[object]:
-    """Return every YAML block of the pages that is a whole file."""
+    """Return every YAML block of the pages that is a whole file; an indented one is a part."""
     found: list[object] = []
     for page in PAGES:
         blocks = re.findall(r"^```yaml\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
         found += [
             pytest.param(block, id=f"{page.name}-{number}")
             for number, block in enumerate(blocks, start=1)
+            if not block.startswith(" ")
         ]
     return found
 
