@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from stiffopt.errors import ServiceError as ServiceError
     from stiffopt.errors import SlowWarning as SlowWarning
     from stiffopt.errors import StiffoptError as StiffoptError
-    from stiffopt.identify.api import calibrate as calibrate
-    from stiffopt.identify.api import validate as validate
     from stiffopt.identify.calibration import CalibrationResult as CalibrationResult
-    from stiffopt.identify.comparison import Comparison as Comparison
+    from stiffopt.identify.calibration import calibrate as calibrate
+    from stiffopt.identify.results import Comparison as Comparison
     from stiffopt.identify.settings import CalibrationSettings as CalibrationSettings
+    from stiffopt.identify.validation import validate as validate
     from stiffopt.logs import Log as Log
     from stiffopt.logs import StiffnessTable as StiffnessTable
     from stiffopt.logs import read_log as read_log
@@ -80,10 +80,10 @@ _NAMES = {
         *("InputError", "MissingExtraError", "PressureError", "ServiceError"),
         *("SlowWarning", "StiffoptError"),
     ),
-    "stiffopt.identify.api": ("calibrate", "validate"),
-    "stiffopt.identify.calibration": ("CalibrationResult",),
-    "stiffopt.identify.comparison": ("Comparison",),
+    "stiffopt.identify.calibration": ("CalibrationResult", "calibrate"),
+    "stiffopt.identify.results": ("Comparison",),
     "stiffopt.identify.settings": ("CalibrationSettings",),
+    "stiffopt.identify.validation": ("validate",),
     "stiffopt.logs": (
         *("Log", "StiffnessTable", "read_log", "read_mcap_log", "read_stiffness_table"),
     ),

@@ -26,7 +26,7 @@ from stiffopt.errors import InputError
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
-from stiffopt.identify.comparison import Comparison, Errors, together
+from stiffopt.identify.results import Comparison, Errors, together
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.validation import validate as compare_robot
 from stiffopt.model.description import RobotDescription

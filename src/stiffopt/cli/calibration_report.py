@@ -13,9 +13,8 @@ from stiffopt.cli import calibration_tables as tables
 from stiffopt.cli.tables import MarkdownPage, title
 from stiffopt.errors import printable
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.comparison import Comparison
-from stiffopt.identify.estimates import TIED
-from stiffopt.identify.stiffness_comparison import compare_stiffness
+from stiffopt.identify.results import TIED, Comparison
+from stiffopt.identify.validation import compare_stiffness
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots import calibration as plots
 

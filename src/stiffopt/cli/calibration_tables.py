@@ -10,10 +10,9 @@ import numpy as np
 from stiffopt.cli.tables import TextTable
 from stiffopt.directions import direction_name
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.comparison import Comparison, Errors, together
-from stiffopt.identify.estimates import Estimate
-from stiffopt.identify.stiffness_comparison import StiffnessComparison
+from stiffopt.identify.results import Comparison, Errors, FittedEstimate, together
 from stiffopt.identify.unknowns import BASE, SENSOR
+from stiffopt.identify.validation import StiffnessComparison
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.parameters import Parameter
 from stiffopt.plots.wording import BAR, MM, figures, vector_text
@@ -179,7 +178,7 @@ def fitted_numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextT
     ]
 
 
-def _place(estimate: Estimate) -> tuple[str, str]:
+def _place(estimate: FittedEstimate) -> tuple[str, str]:
     """The title of the table in which a number stands, and its name there."""
     if not estimate.key:
         begins = estimate.name.startswith("zero of ") or " at the beginning of " in estimate.name
@@ -189,7 +188,7 @@ def _place(estimate: Estimate) -> tuple[str, str]:
     return title, estimate.name.replace(f", {title}", ",").removesuffix(",")
 
 
-def _number_row(estimate: Estimate, words: str) -> tuple[str, ...]:
+def _number_row(estimate: FittedEstimate, words: str) -> tuple[str, ...]:
     unit, factor = _UNITS.get(estimate.unit, ("", 1.0))
     if estimate.key.endswith(".share"):
         unit, factor = "%", 100.0

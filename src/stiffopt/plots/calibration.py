@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.directions import direction_name
-from stiffopt.identify.choice import Candidate
-from stiffopt.identify.comparison import Comparison
-from stiffopt.identify.stiffness_comparison import StiffnessComparison
+from stiffopt.identify.results import Comparison
+from stiffopt.identify.structures import Candidate
+from stiffopt.identify.validation import StiffnessComparison
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots.style import (
     BEFORE,
