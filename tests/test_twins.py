@@ -34,7 +34,7 @@ STEP = 2.0**-7  # s; sums of it are exact, and so is what has acted after a dead
 def plant_regulators(lag, slew, dead_steps):
     """The regulators of the simulated arm: returns what takes a step."""
     pytest.importorskip("numba")
-    from stiffopt.plant.regulators import Regulators, regulate
+    from stiffopt.plant.hardware import Regulators, regulate
 
     n = len(lag)
     law = Regulators(STEP, lag, slew, np.full(n, np.inf), np.zeros(n), np.full(n, np.nan), False)
