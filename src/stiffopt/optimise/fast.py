@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.native_calls import in_parallel
 from stiffopt.optimise.effort import effort
 from stiffopt.optimise.loaded import LoadedArm, loaded_effort
 from stiffopt.optimise.local import FIRST_RADIUS, INSIDE, LAST_RADIUS, MOST_ITERATIONS, TOUCHING
@@ -137,7 +137,7 @@ class FastSolver:
             terms=program.n_terms,
             floors=program.n_floors,
             values=len(program.measures),
-            parameters=program.n_parameters,
+            parameters=len(robot.numbers) + program.n_parameters,
             samples=len(table.x),
             nearest=min(2 * tries.screened, len(table.x)),
             screened=tries.screened,
@@ -162,9 +162,10 @@ class FastSolver:
             setup.rod = arm.address
         self._setup = setup
         self._address = ctypes.addressof(setup)
-        targets = len(program.target_parameters)
-        self._targets = slice(0, targets)
-        self._radii = slice(program.n_parameters, program.n_parameters + len(rows))
+        self._numbers = robot.numbers
+        first = len(robot.numbers)
+        self._targets = slice(first, first + len(program.target_parameters))
+        self._radii = slice(setup.parameters, setup.parameters + len(rows))
         limits = self._radii.stop + 2 * n
         self._near = slice(limits + program.n_floors, limits + program.n_floors + _NEAR)
         self._width = self._near.stop + 1 + n
@@ -175,6 +176,7 @@ class FastSolver:
     def row(self, program: Program, lower: Vector, upper: Vector, floors: Vector) -> Vector:
         """Numbers of a task, its target and guess left out."""
         row = np.zeros(self._width)
+        row[: self._targets.start] = self._numbers
         start = self._targets.stop
         row[start : self._radii.start] = program.measure_parameters
         row[self._radii.stop : self._near.start] = np.concatenate([lower, upper, floors])

@@ -164,7 +164,7 @@ class Problem:
 
     def _set_program(self, program: Program) -> None:
         self.program = program
-        self.parameters = program.parameters
+        self.parameters = self.robot.parameters(program.parameters)
         self._functions = functions(self.robot, program)
         self._is_loaded = self.robot.is_loaded
         self._pose = Evaluator(self.robot, self._functions.pose)
