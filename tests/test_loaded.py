@@ -8,7 +8,7 @@ import pytest
 import stiffopt as so
 from independent import ARMS, FLOP, LOPSIDED, Arm, neo_hookean
 from stiffopt.optimise.prepared import prepared
-from stiffopt.optimise.problem import Problem
+from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.solver import PressureSolver
 
 HANGING = (0.0, 0.0, 9.81)
@@ -102,7 +102,8 @@ def test_evaluation_is_that_of_the_model(name):
     solver, _ = kept.fast(program)
     pressures = np.random.default_rng(5).uniform(0, 0.6e5, arm.n)
     found = compiled_point(solver, program, pressures)
-    point = Problem(kept.robot, task).point(pressures / 1e5)
+    problem = PressureProblem(kept.robot, task)
+    point = problem.point(pressures / problem.unit)
     expected = [
         np.concatenate([ball.residual for ball in point.balls]),
         np.concatenate([ball.jacobian for ball in point.balls]),

@@ -20,7 +20,6 @@ from stiffopt.model.kinematics import Actuation
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.native_calls import in_parallel
 from stiffopt.model.rod import Rod, rod
-from stiffopt.optimise.effort import Effort
 from stiffopt.optimise.program import Program
 
 Vector = NDArray[np.float64]
@@ -28,15 +27,7 @@ Vector = NDArray[np.float64]
 _SOURCES = (str(Path(__file__).with_name("native") / "loaded_solver.c"),)
 
 _CHUNK = 8  # equilibria that a thread settles at a time
-_PLACED = Effort(16, 3, 10)
-_LOOSE = Effort(40, 4, 16)
-
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-
-
-def loaded_effort(rows: int) -> Effort:
-    """As `effort`: an evaluation takes a hundred times longer, and weight evens optima out."""
-    return _PLACED if rows >= 3 else _LOOSE
 
 
 class Tip:

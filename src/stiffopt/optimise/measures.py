@@ -15,7 +15,6 @@ from stiffopt import lie
 from stiffopt.model.compliance import held_stiffness, stiffness_block
 from stiffopt.model.shape import FreeShape, Shape, stiffness_along
 from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
-from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 
@@ -109,16 +108,3 @@ class MatrixDistance(Measure):
         if self._match.frame == "base":
             K = tip.rotation @ K @ tip.rotation.T
         return ca.sumsqr(ca.vec(K) - parameters) / ca.sumsqr(parameters)
-
-
-def measures(task: Task) -> tuple[Measure, ...]:
-    """All that a task names: what is maximised, then what is matched, then the floors."""
-    goal = task.stiffness
-    if goal is None:
-        return ()
-    found: list[Measure] = [LogStiffness(measure) for measure in goal.maximise]
-    if isinstance(goal.match, MatchMatrix):
-        found.append(MatrixDistance(goal.match))
-    elif goal.match is not None:
-        found.append(LogStiffness(goal.match))
-    return (*found, *(LogStiffness(floor) for floor in goal.at_least))
