@@ -15,7 +15,7 @@ import pytest
 import stiffopt
 from recordings import UCL, needs_ucl
 from stiffopt.cli import calibrate_run
-from stiffopt.cli.calibration_inputs import fixed_keys, log_names
+from stiffopt.cli.calibration_logs import fixed_keys, log_names
 from stiffopt.cli.main import main
 from stiffopt.errors import FileError
 from stiffopt.files import save_file
@@ -454,7 +454,7 @@ _CALIBRATE = ("calibrate", "--robot", "stiff-flop-1", "--out", "{tmp}/new.yaml")
         ((*_CALIBRATE, "{log}", "{log}"), "is given twice"),
         ((*_CALIBRATE, "{log}", "--model", "best"), "no model 'best'; expected one of auto, st"),
         ((*_CALIBRATE, "{log}", "--strain-law", "mine"), "--strain-law: expected auto or keep"),
-        ((*_CALIBRATE, "{log}", "--fix", "lenght"), "--fix: 'lenght' is nothing that is fitted"),
+        ((*_CALIBRATE, "{log}", "--fix", "lenght"), "--fix: 'lenght' is no parameter of the robot"),
         ((*_CALIBRATE, "{log}", "--pressures", "both"), "expected commanded or measured"),
         ((*_CALIBRATE, "{log}", "--pressures", "measured"), "has no measured pressures"),
         ((*_CALIBRATE, "{log}", "--stiffness", "{log}"), "the column 'direction_x' is missing"),

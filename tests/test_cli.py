@@ -19,9 +19,9 @@ from typer.testing import CliRunner
 import stiffopt
 from stiffopt.cli import exits
 from stiffopt.cli import main as entry
-from stiffopt.cli.answer import Answer
-from stiffopt.cli.inputs import find_tasks
-from stiffopt.cli.records import json_line
+from stiffopt.cli.solve_files import find_tasks
+from stiffopt.cli.solve_records import json_line
+from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.documents import read_document
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.calibration import Calibration, FittedParameter
@@ -158,9 +158,9 @@ stiffness:
   at_least: {value: 0.001 N*m/rad, direction: [0, 0, 1], kind: rotation, boundary: clamped}
 """
     text = run(write("one.yaml", ONE[: ONE.index("stiffness")] + goals)).stdout
-    assert "(asked: 6.000 to 90 %, plain: " in text
+    assert "(required: 6.000 to 90 %, plain: " in text
     assert "against rotation about (0, 0, 1), base axes, clamped" in text
-    assert "N m/rad  (asked: at least 0.001000, plain: " in text
+    assert "N m/rad  (required: at least 0.001000, plain: " in text
 
 
 def test_a_matrix_to_match(write: Write) -> None:
@@ -214,7 +214,7 @@ def test_a_calibrated_robot_says_how_well_it_is_known(tmp_path: Path) -> None:
     assert f"known to   {axes} mm, semi-axes of the tip's 95 % ellipsoid\n" in text
     assert "mostly for the errors of the calibrated parameters\n" in text
     assert f"(95 %: {low:.4g}" in text
-    assert "(asked: at least 0.1000, 95 %: " in text
+    assert "(required: at least 0.1000, 95 %: " in text
     assert "warning" not in text
     assert max(map(len, text.splitlines()[1:])) <= 80
 
@@ -318,7 +318,7 @@ def test_a_bug_is_one_sentence_and_leaves_the_other_files_solved(
 def test_nothing_that_is_not_finite_comes_out() -> None:
     task = stiffopt.Task(robot="stiff-flop-1", target={"position": (0, 0, 0.09)})
     solution = PressureSolution("failed", "", task, stiffness=float("nan"))
-    answer = Answer("a.yaml", stiffopt.load_robot("stiff-flop-1"), solution, (float("inf"),))
+    answer = SolvedTask("a.yaml", stiffopt.load_robot("stiff-flop-1"), solution, (float("inf"),))
     (record,) = lines(json_line(answer))
     assert record["stiffness"] is None
     assert record["stiffnesses_plain"] == [None]
@@ -410,7 +410,7 @@ def test_a_folder_is_its_task_files_by_name(tmp_path: Path, write: Write) -> Non
 def test_a_broken_file_in_a_folder_is_not_skipped(tmp_path: Path, write: Write) -> None:
     write("a.yaml", "format: [")
     write("b.yaml", "robot: stiff-flop-1\n")
-    assert len(find_tasks([str(tmp_path)]).files) == 2
+    assert len(find_tasks([str(tmp_path)]).paths) == 2
     result = run(str(tmp_path))
     assert result.exit_code == 2
     assert "has no 'format'" in result.stderr

@@ -1055,7 +1055,7 @@ def test_no_device_leaves_no_folder(
         (["experiment", "kinematics", "rig.yaml", "--resume", "none"], "holds no experiment"),
         ([*KINEMATICS, "--out", "full"], "is not empty"),
         ([*STIFFNESS, "--directions", "x,w"], "'w' is no direction"),
-        ([*STIFFNESS, "--directions", "x,x"], "a direction is there twice"),
+        ([*STIFFNESS, "--directions", "x,x"], "a direction is given twice"),
         ([*STIFFNESS, "--channel", "7"], "there is no channel 7"),
         ([*STIFFNESS, "--displacement", "3 s"], "--displacement: '3 s'"),
     ],

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from stiffopt.errors import FileError, InputError, Loc, dotted, printable, shown
+from stiffopt.errors import FileError, InputError, Loc, dotted, os_reason, printable, shown
 
-__all__ = ["Document", "document_of", "read_document", "to_yaml", "write_file"]
+__all__ = ["Document", "document_of", "read_document", "to_yaml", "write_file", "write_whole"]
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 20
@@ -70,7 +70,7 @@ def write_file(
 ) -> None:
     """Write data as YAML that `read_document` reads back as they were.
 
-    The file appears whole or not at all: it is written beside its place and then moved there.
+    The file appears whole or not at all, see `write_whole`.
 
     Parameters
     ----------
@@ -82,21 +82,32 @@ def write_file(
         Lines that stand above the data, for people.
     """
     text = "".join(f"# {printable(line)}\n" for line in comment) + to_yaml(data)
+    write_whole(path, text.encode())
+
+
+def write_whole(path: str | os.PathLike[str], content: bytes) -> None:
+    """Write a file that appears whole or not at all: as a temporary file, then moved to its place.
+
+    Raises
+    ------
+    FileError
+        It cannot be written; the file that was there is as it was.
+    """
     target = Path(path)
     try:
         if target.exists() and not target.is_file():
-            target.write_text(text, encoding="utf-8")  # a folder (an error), a pipe, /dev/stdout
+            target.write_bytes(content)  # a folder (an error), a pipe, /dev/stdout
             return
         target = target.resolve()
         with tempfile.TemporaryDirectory(prefix=f".{target.name}.", dir=target.parent) as folder:
             part = Path(folder) / "part"
-            with part.open("w", encoding="utf-8") as stream:
-                stream.write(text)
+            with part.open("wb") as stream:
+                stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())
             part.replace(target)
     except (OSError, ValueError) as error:
-        raise FileError(path, f"cannot be written: {_os_reason(error)}") from None
+        raise FileError(path, f"cannot be written: {os_reason(error)}") from None
 
 
 # Text to data ------------------------------------------------------------------------------------
@@ -111,7 +122,7 @@ def _read_text(path: str) -> str:
     except IsADirectoryError:
         raise FileError(path, "is a folder; expected a file") from None
     except (OSError, ValueError) as error:
-        raise FileError(path, f"cannot be read: {_os_reason(error)}") from None
+        raise FileError(path, f"cannot be read: {os_reason(error)}") from None
     if len(raw) > MAX_BYTES:
         raise FileError(path, f"is larger than {MAX_BYTES // 1_000_000} MB; expected a short file")
     try:
@@ -119,10 +130,6 @@ def _read_text(path: str) -> str:
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         raise FileError(path, "is not UTF-8 text", line=line) from None
-
-
-def _os_reason(error: OSError | ValueError) -> str:
-    return (error.strerror or str(error)).lower() if isinstance(error, OSError) else str(error)
 
 
 _INT = re.compile(r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+")

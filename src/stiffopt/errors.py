@@ -119,6 +119,11 @@ class SlowWarning(UserWarning):
     """Machine code cannot be made or kept here; the same results come more slowly."""
 
 
+def os_reason(error: OSError | ValueError) -> str:
+    """Return why the operating system refused a file, as the end of a sentence."""
+    return (error.strerror or str(error)).lower() if isinstance(error, OSError) else str(error)
+
+
 def shown(value: object) -> str:
     """Return a value as an error message shows it: text in quotes, on one line, never long."""
     if isinstance(value, dict):

@@ -1,15 +1,17 @@
-"""The commands `stiffopt calibrate` and `stiffopt validate`."""
+"""The commands `stiffopt calibrate` and `stiffopt validate`: their options and their help."""
 
 from typing import Annotated
 
 import typer
 
-CALIBRATE_HELP = """\
-Fit a robot file to recordings of the arm, and write how well all of it is then known.
+from stiffopt.cli.options import Json, Quiet
 
-The values of the robot file and its tolerances are where the fit begins and how far it is expected
-to go. Several models are fitted and the one is taken that predicts held-back logs best; of those
-that are as good, the simplest. A LOG is a recording, log v1 (.csv) or MCAP (.mcap), in the order in
+CALIBRATE_HELP = """\
+Fit a robot file to recordings of the arm, and write how well each number in it is then known.
+
+The fit begins at the values of the robot file; its tolerances say how far from them it is expected
+to end. Several models are fitted. The one that predicts held-back logs best is taken; of those that
+are as good, the simplest. A LOG is a recording, log v1 (.csv) or MCAP (.mcap), in the order in
 which they were made.
 """
 
@@ -56,11 +58,16 @@ Sequence = Annotated[
     ),
 ]
 Rezero = Annotated[
-    bool, typer.Option("--rezero", help="Positions are counted anew in each log: fit the shift.")
+    bool,
+    typer.Option(
+        "--rezero", help="The origin of positions differs from log to log: fit a shift for each."
+    ),
 ]
 Pressures = Annotated[
     str,
-    typer.Option(metavar="WHICH", help="commanded or measured: the pressures that lead."),
+    typer.Option(
+        metavar="WHICH", help="commanded or measured: the pressures that drive the model."
+    ),
 ]
 Channels = Annotated[
     str | None,
@@ -74,17 +81,13 @@ Frame = Annotated[
     str | None,
     typer.Option(
         metavar="BODY",
-        help="The tracked body that carries the base, in whose frame all is meant; by default as "
-        "the robot file says, else the tracker.",
+        help="The tracked body that carries the base; poses are taken in its frame. By default as "
+        "the robot file says, else the tracker itself.",
     ),
 ]
 Report = Annotated[
     str | None,
     typer.Option(metavar="DIR", help="Write a page (report.md) with figures into this new folder."),
-]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
-Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Print no tables, notes and progress; errors only.")
 ]
 
 
@@ -146,21 +149,13 @@ def calibrate(
     """Fit a robot file."""
     from stiffopt.cli import calibrate_run  # here, so that --help waits for no numerics
 
-    reading = calibrate_run.Reading(
+    recordings = calibrate_run.RecordingOptions(
         robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame
     )
     options = calibrate_run.CalibrateOptions(
-        reading,
-        out,
-        tuple(stiffness or ()),
-        model,
-        strain_law,
-        tuple(fix or ()),
-        rows,
-        report,
-        as_json,
-        quiet,
-    )
+        recordings, out, tuple(stiffness or ()), model, strain_law, tuple(fix or ()), rows, report,
+        as_json, quiet,
+    )  # fmt: skip
     raise typer.Exit(calibrate_run.run_calibrate(options))
 
 
@@ -179,8 +174,8 @@ def validate(
     """Compare a robot file with recordings."""
     from stiffopt.cli import calibrate_run
 
-    reading = calibrate_run.Reading(
+    recordings = calibrate_run.RecordingOptions(
         robot, tuple(logs), sequence, rezero, pressures, channels, frame
     )
-    options = calibrate_run.ValidateOptions(reading, report, as_json, quiet)
+    options = calibrate_run.ValidateOptions(recordings, report, as_json, quiet)
     raise typer.Exit(calibrate_run.run_validate(options))

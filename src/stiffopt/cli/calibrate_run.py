@@ -1,40 +1,44 @@
-"""What `stiffopt calibrate` and `stiffopt validate` do with their arguments."""
+"""What `stiffopt calibrate` and `stiffopt validate` do: read, fit or compare, write, report."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import degrees, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import numpy as np
 
 import stiffopt
-from stiffopt.cli import calibration_records as records
-from stiffopt.cli.calibration_inputs import (
-    Reading,
+from stiffopt.cli import quantities
+from stiffopt.cli.calibration_logs import (
+    RecordingOptions,
     check_model,
-    check_strain_law,
     fixed_keys,
     read_tables,
 )
-from stiffopt.cli.console import report_error, show, warnings_as_notes, write_line
-from stiffopt.cli.exits import BAD_INPUT, INTERRUPTED, SOLVED
-from stiffopt.cli.experiment_display import Display
-from stiffopt.cli.interrupts import Interruptible
+from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_line
+from stiffopt.cli.exits import Interruptible, exit_code
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
-from stiffopt.errors import InputError, StiffoptError
+from stiffopt.errors import InputError
 from stiffopt.files import save_file
-from stiffopt.identify import comparison
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
+from stiffopt.identify.comparison import Comparison, Errors, together
 from stiffopt.identify.validation import validate as compare_robot
+from stiffopt.model.description import RobotDescription
+from stiffopt.plots.wording import MM
 
-if TYPE_CHECKING:
-    from stiffopt.identify.comparison import Comparison
-    from stiffopt.model.description import RobotDescription
-
-__all__ = ["CalibrateOptions", "Reading", "ValidateOptions", "run_calibrate", "run_validate"]
+__all__ = [
+    "CalibrateOptions",
+    "RecordingOptions",
+    "ValidateOptions",
+    "run_calibrate",
+    "run_validate",
+]
 
 _ENDINGS = (".yaml", ".yml")
 _FEW_ROWS = 600  # while models are compared
@@ -46,7 +50,7 @@ Progress = Callable[[float, float, str], None]
 class CalibrateOptions:
     """The arguments of `stiffopt calibrate`, as they were given."""
 
-    reading: Reading
+    recordings: RecordingOptions
     out: str
     tables: tuple[str, ...]
     model: str
@@ -62,7 +66,7 @@ class CalibrateOptions:
 class ValidateOptions:
     """The arguments of `stiffopt validate`, as they were given."""
 
-    reading: Reading
+    recordings: RecordingOptions
     report: str | None
     as_json: bool
     quiet: bool
@@ -76,11 +80,11 @@ def run_calibrate(options: CalibrateOptions) -> int:
         progress(1, 1, "writing")
         with new_folder(options.report) as folder:
             if folder is not None:
-                from stiffopt.cli import calibration_page
+                from stiffopt.cli.calibration_report import write_calibration
 
-                calibration_page.write_calibration(folder, result, options.out)
+                write_calibration(folder, result, options.out)
             save_file(options.out, "robot", result.robot, _origin(options, result))
-        return lambda: _tell_calibration(result, options)
+        return lambda: _print_calibration(result, options)
 
     return _run(work, quiet=options.quiet)
 
@@ -90,39 +94,35 @@ def run_validate(options: ValidateOptions) -> int:
 
     def work(progress: Progress) -> Callable[[], None]:
         _check_report(options.report)
-        settings = options.reading.settings()
-        robot = options.reading.description()
-        logs = options.reading.read(robot, progress)
+        settings = options.recordings.settings()
+        robot = options.recordings.description()
+        logs = options.recordings.read(robot, progress)
         found = compare_robot(robot, logs, settings, progress)
         with new_folder(options.report) as folder:
             if folder is not None:
-                from stiffopt.cli import calibration_page
+                from stiffopt.cli.calibration_report import write_validation
 
-                calibration_page.write_validation(folder, robot, found)
-        return lambda: _tell_validation(robot, found, options)
+                write_validation(folder, robot, found)
+        return lambda: _print_validation(robot, found, options)
 
     return _run(work, quiet=options.quiet)
 
 
 def _run(work: Callable[[Progress], Callable[[], None]], *, quiet: bool) -> int:
-    """Work with progress, then tell what came of it; return the exit code."""
-    try:
-        display = Display(quiet=quiet)
-        quietly = warnings_as_notes(quiet=quiet)
-        with Interruptible() as interruptible, display.shown(), quietly:
+    """Work with progress, then print the result, as `work` returns it; return the exit code."""
+
+    def whole() -> None:
+        bar = ProgressBar(quiet=quiet)
+        with Interruptible() as interruptible, bar.shown(), warnings_as_notes(quiet=quiet):
 
             def progress(done: float, total: float, words: str) -> None:
                 interruptible.check()
-                display.report(done, total, words)
+                bar.report(done, total, words)
 
-            tell = work(progress)
-        tell()
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    except StiffoptError as error:
-        report_error(str(error))
-        return BAD_INPUT
-    return SOLVED
+            print_result = work(progress)
+        print_result()
+
+    return exit_code(whole)
 
 
 def _calibrated(options: CalibrateOptions, progress: Progress) -> CalibrationResult:
@@ -130,24 +130,24 @@ def _calibrated(options: CalibrateOptions, progress: Progress) -> CalibrationRes
     _check_report(options.report)
     if options.report and Path(options.report).resolve() == Path(options.out).resolve():
         raise InputError(f"{options.out}: the robot file and the report cannot have one name")
-    if not options.reading.logs and not options.tables:
+    if not options.recordings.logs and not options.tables:
         raise InputError(
             "there is nothing to fit to; expected a LOG or a table of stiffness (--stiffness)"
         )
     check_model(options.model)
-    check_strain_law(options.strain_law)
+    quantities.choice("--strain-law", options.strain_law, ("auto", "keep"))
     rows = {}
     if options.rows is not None:
         rows = {"rows": options.rows, "trial_rows": min(options.rows, _FEW_ROWS)}
-    robot = options.reading.description()
-    settings = options.reading.settings(
+    robot = options.recordings.description()
+    settings = options.recordings.settings(
         structure=options.model,
         strain_law=options.strain_law,
         fixed=fixed_keys(options.fix, robot),
         **rows,
     )
     tables = read_tables(options.tables, robot)
-    logs = options.reading.read(robot, progress)
+    logs = options.recordings.read(robot, progress)
     return fit_robot(robot, logs, tables, settings, progress)
 
 
@@ -161,8 +161,8 @@ def _check_report(path: str | None) -> None:
 
 def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
     """Say at the top of the file what it came from."""
-    robot, reading = options.reading.robot, options.reading
-    lines = [f"Calibrated by stiffopt {stiffopt.__version__} from {Path(robot).name}."]
+    recordings = options.recordings
+    lines = [f"Calibrated by stiffopt {stiffopt.__version__} from {Path(recordings.robot).name}."]
     names = [each.name for each in result.calibrated]
     if names:
         lines.append(f"Logs: {', '.join(names)}.")
@@ -171,14 +171,16 @@ def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
         lines.append(f"Tables of stiffness: {tables}.")
     lines.append(f"Model: {result.structure.name}, {result.structure.words}.")
     if names:
-        errors = comparison.together(result.calibrated)
+        errors = together(result.calibrated)
         lines.append(
-            f"Error of the tip on these logs: mean {errors.mean * 1e3:.2f} mm, "
-            f"95 % below {errors.p95 * 1e3:.2f} mm."
+            f"Error of the tip on these logs: mean {errors.mean * MM:.2f} mm, "
+            f"95 % below {errors.p95 * MM:.2f} mm."
         )
-    words = ["the logs are a sequence"] * reading.sequence + ["each log is zeroed"] * reading.rezero
-    if reading.pressures != "commanded":
-        words.append(f"{reading.pressures} pressures lead")
+    words = ["the logs are a sequence"] * recordings.sequence + [
+        "each log has its own origin"
+    ] * recordings.rezero
+    if recordings.pressures != "commanded":
+        words.append(f"{recordings.pressures} pressures drive the model")
     if options.fix:
         words.append(f"not fitted: {', '.join(options.fix)}")
     if words:
@@ -186,22 +188,111 @@ def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
     return lines
 
 
-def _tell_calibration(result: CalibrationResult, options: CalibrateOptions) -> None:
+def _print_calibration(result: CalibrationResult, options: CalibrateOptions) -> None:
     if options.as_json:
-        record = records.calibration(result, options.out, options.report)
+        record = calibration_record(result, options.out, options.report)
         write_line(json.dumps(record, allow_nan=False))
     elif not options.quiet:
-        from stiffopt.cli import calibration_report
+        from stiffopt.cli.calibration_report import calibration
 
-        show(calibration_report.calibration(result, options.out, options.report))
+        show(calibration(result, options.out, options.report))
 
 
-def _tell_validation(
+def _print_validation(
     robot: RobotDescription, found: tuple[Comparison, ...], options: ValidateOptions
 ) -> None:
     if options.as_json:
-        write_line(json.dumps(records.validation(robot, found), allow_nan=False))
+        write_line(json.dumps(validation_record(robot, found), allow_nan=False))
     elif not options.quiet:
-        from stiffopt.cli import calibration_report
+        from stiffopt.cli.calibration_report import validation
 
-        show(calibration_report.validation(robot, found, options.report))
+        show(validation(robot, found, options.report))
+
+
+# -- for programs ---------------------------------------------------------------------------------
+
+
+def validation_record(robot: RobotDescription, found: Sequence[Comparison]) -> dict[str, Any]:
+    """Return errors of all logs together and of each."""
+    return {
+        **_with_outside(robot, found),
+        "robot": robot.name,
+        "remarks": [f"{each.name}: {remark}" for each in found for remark in each.remarks],
+        "logs": {each.name: _with_outside(robot, [each]) for each in found},
+    }
+
+
+def calibration_record(result: CalibrationResult, out: str, report: str | None) -> dict[str, Any]:
+    """Return what a calibration has found."""
+    length = result.before.length
+    return {
+        "robot": result.robot.name,
+        "out": out,
+        "report": report,
+        "model": result.structure.name,
+        "strain_laws": [segment.strain_law for segment in result.robot.segments],
+        "models": [
+            {
+                "name": each.structure.name,
+                "held_back_mean_mm": _number(each.score * MM),
+                "held_back": {name: _errors(e, length) for name, e in each.folds.items()},
+            }
+            for each in result.candidates
+        ],
+        "before": _comparisons(result.nominal, length),
+        "after": _comparisons(result.calibrated, result.robot.length),
+        "held_back": {name: _errors(e, length) for name, e in result.held_back.items()},
+        "parameters": [
+            {
+                "name": each.name,
+                "key": each.key or None,
+                "unit": each.unit,
+                "before": each.before,
+                "value": each.value,
+                "interval_95": [_number(each.low), _number(each.high)],
+                "learnt": each.learnt,
+                "tolerances_from_before": each.far,
+            }
+            for each in result.estimates
+        ],
+        "remarks": list(result.remarks),
+    }
+
+
+def _comparisons(found: Sequence[Comparison], length: float) -> dict[str, Any] | None:
+    if not found:
+        return None
+    logs = {each.name: _errors(each.errors, length) for each in found}
+    return {**_errors(together(found), length), "logs": logs}
+
+
+def _with_outside(robot: RobotDescription, found: Sequence[Comparison]) -> dict[str, Any]:
+    record = _errors(together(found), robot.length)
+    if robot.calibration is None:
+        return {**record, "outside_training_percent": None, "outside_training": None}
+    inside = np.concatenate([each.inside for each in found])
+    beyond = [each.rows(~each.inside) for each in found if not each.inside.all()]
+    return {
+        **record,
+        "outside_training_percent": float(np.mean(~inside) * 100),
+        "outside_training": _errors(together(beyond), robot.length) if beyond else None,
+    }
+
+
+def _errors(errors: Errors, length: float) -> dict[str, Any]:
+    values = {
+        "mean": errors.mean,
+        "median": errors.median,
+        "p95": errors.p95,
+        "max": errors.max,
+    }
+    return {
+        "n": errors.n,
+        "position_error_mm": {name: _number(value * MM) for name, value in values.items()},
+        "position_error_percent_of_length": _number(errors.mean / length * 100),
+        "angle_error_deg": None if errors.angle is None else degrees(errors.angle),
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if isfinite(value) else None

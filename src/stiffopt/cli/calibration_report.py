@@ -1,49 +1,55 @@
-"""What a calibration or a validation has found, for people at a terminal."""
+"""Reports of a calibration and of a validation: for the terminal, and as a page with figures."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from stiffopt.cli import calibration_facts as facts
-from stiffopt.cli.calibration_facts import TextTable
+from stiffopt.cli import calibration_tables as tables
+from stiffopt.cli.tables import MarkdownPage, title
 from stiffopt.errors import printable
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.comparison import Comparison
 from stiffopt.identify.estimates import TIED
+from stiffopt.identify.stiffness_comparison import compare_stiffness
 from stiffopt.model.description import RobotDescription
+from stiffopt.plots import calibration as plots
 
-_MOST_REMARKS = 8  # of the logs; the report has all
+_MOST_REMARKS = 8  # of the logs, at the terminal; the page has all
 _MOST_STIFFNESSES = 30
 _MOST_PAIRS = 3
+_MOST_DRAWN = 60  # measured stiffnesses
+
+# -- the terminal ---------------------------------------------------------------------------------
 
 
 def calibration(result: CalibrationResult, out: str, report: str | None) -> RenderableType:
     """Return what a calibration has found."""
-    blocks: list[RenderableType] = [_title(f"{result.robot.name}: calibration")]
+    blocks: list[RenderableType] = [title(f"{result.robot.name}: calibration")]
     blocks.append(Text(f"  model  {result.structure.name}: {result.structure.words}"))
     if len(result.candidates) > 1:
-        blocks += _block(facts.models(result))
+        blocks += [Text(""), tables.models(result).renderable()]
     if result.calibrated:
-        blocks += _block(facts.before_and_after(result))
+        blocks += [Text(""), tables.before_and_after(result).renderable()]
     if result.held_back:
-        blocks += _block(facts.held_back(result))
+        blocks += [Text(""), tables.held_back(result).renderable()]
     if result.tables:
-        rows = facts.stiffness_rows(result.tables, result.before, result.robot)
-        blocks += _block(facts.stiffnesses(rows[:_MOST_STIFFNESSES]))
+        rows = compare_stiffness(result.tables, result.before, result.robot)
+        blocks += [Text(""), tables.stiffnesses(rows[:_MOST_STIFFNESSES]).renderable()]
         blocks += _more(len(rows) - _MOST_STIFFNESSES, "of these", report)
-    for table in facts.numbers(result, beginnings=False):
-        blocks += _block(table)
+    for table in tables.numbers(result, beginnings=False):
+        blocks += [Text(""), table.renderable()]
     found = [f"{each.name}: {remark}" for each in result.calibrated for remark in each.remarks]
-    blocks += _remarks("What was found in the logs", found, report)
+    blocks += _list("What was found in the logs", found, report)
     own = [remark for remark in result.remarks if remark not in found]
     pairs = [remark for remark in own if remark.startswith(TIED)]
     hidden = pairs[_MOST_PAIRS:]
     kept = [remark for remark in own if remark not in hidden]
-    blocks += _remarks("What to make of it", kept, report, most=None)
+    blocks += _list("What to make of it", kept, report, most=None)
     blocks += _more(len(hidden), f"of '{TIED}'", report)
     blocks += [Text(""), Text(f"  robot file  {printable(out)}")]
     if report is not None:
@@ -55,38 +61,18 @@ def validation(
     robot: RobotDescription, found: Sequence[Comparison], report: str | None
 ) -> RenderableType:
     """Return what a validation has found."""
-    blocks: list[RenderableType] = [_title(f"{robot.name}: validation")]
-    blocks += _block(facts.after_only(robot, found))
-    blocks += _remarks("Training range", facts.ranges(robot, found), report, most=None)
+    blocks: list[RenderableType] = [title(f"{robot.name}: validation")]
+    blocks += [Text(""), tables.after_only(robot, found).renderable()]
+    blocks += _list("Training range", tables.ranges(robot, found), report, most=None)
     remarks = [f"{each.name}: {remark}" for each in found for remark in each.remarks]
-    blocks += _remarks("What was found in the logs", remarks, report)
+    blocks += _list("What was found in the logs", remarks, report)
     if report is not None:
         blocks += [Text(""), Text(f"  report  {printable(report)}/report.md")]
     return Group(*blocks)
 
 
-def _title(text: str) -> Text:
-    return Text(printable(text), "bold")
-
-
-def _block(table: TextTable) -> list[RenderableType]:
-    grid = Table(box=None, padding=(0, 1), pad_edge=False, header_style="dim")
-    for number, heading in enumerate(table.heading):
-        left = number == 0 or heading in ("it has", "worst", "unit", "direction")
-        grid.add_column(
-            heading, justify="left" if left else "right", no_wrap=number > 0 and not left,
-            overflow="fold",
-        )  # fmt: skip
-    for row in table.rows:
-        grid.add_row(*(printable(cell) for cell in row))
-    blocks: list[RenderableType] = [Text(""), Text(f"  {printable(table.title)}", "bold"), grid]
-    if table.remark:
-        blocks.append(Text(f"  {table.remark}", "dim"))
-    return blocks
-
-
-def _remarks(
-    title: str, remarks: Sequence[str], report: str | None, most: int | None = _MOST_REMARKS
+def _list(
+    heading: str, remarks: Sequence[str], report: str | None, most: int | None = _MOST_REMARKS
 ) -> list[RenderableType]:
     if not remarks:
         return []
@@ -97,7 +83,7 @@ def _remarks(
     for remark in shown:
         grid.add_row("  -", printable(remark))
     return [
-        Text(""), Text(f"  {title}", "bold"), grid,
+        Text(""), Text(f"  {heading}", "bold"), grid,
         *_more(len(remarks) - len(shown), "of these", report),
     ]  # fmt: skip
 
@@ -107,3 +93,131 @@ def _more(count: int, what: str, report: str | None) -> list[RenderableType]:
         return []
     where = f"{printable(report)}/report.md has all" if report else "--report DIR tells all"
     return [Text(f"  and {count} more {what}; {where}", "dim")]
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+
+def write_calibration(folder: Path, result: CalibrationResult, out: str) -> None:
+    """Write the page of a calibration and its figures into a folder.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    FileError
+        If a figure cannot be written.
+    """
+    name = result.robot.name
+    page = MarkdownPage(folder, f"{name}: calibration")
+    page.text(
+        f"The robot file `{Path(out).name}` holds all of this. The model is "
+        f"*{result.structure.name}*: {result.structure.words}."
+    )
+    if result.calibrated:
+        page.heading("Errors of the tip")
+        page.table(tables.before_and_after(result))
+        _errors(page, result.robot, result.calibrated, result.nominal)
+    if result.held_back:
+        page.heading("What was held back")
+        page.text("The model fitted to the rest predicts what it has not seen:")
+        page.table(tables.held_back(result))
+    if len(result.candidates) > 1:
+        page.heading("Models")
+        page.table(tables.models(result))
+        page.figure(
+            "models.png", "Errors of each model in what was held back",
+            plots.plot_models(
+                result.candidates, result.structure.name, title=f"{name}: models compared"
+            ),
+        )  # fmt: skip
+    if result.tables:
+        _stiffness(page, result)
+    page.heading("Numbers that were fitted")
+    page.text(
+        "Intervals hold the true value with 95 % probability if the model is right. *Learnt* is "
+        "the share of the robot file's own uncertainty (its variance) that the data removed: near "
+        "0 %, a number is still what the robot file said."
+    )
+    for table in tables.numbers(result, beginnings=True):
+        page.text(f"**{table.title[:1].upper()}{table.title[1:]}**")
+        page.table(table)
+    _remarks(page, result.remarks)
+    page.heading("How to use it")
+    file = Path(out).name
+    page.bullets(
+        [
+            f"Check it on a log of another day: `stiffopt validate --robot {file} LOG...`",
+            f"Solve tasks with it: write `robot: {file}` in the task file. The answer then says "
+            "how well the tip and its stiffness are known.",
+            f'In Python: `robot = stiffopt.load_robot("{file}")` and '
+            "`robot.tip_uncertainty(pressures)`.",
+        ]
+    )
+    page.write()
+
+
+def write_validation(folder: Path, robot: RobotDescription, found: Sequence[Comparison]) -> None:
+    """Write the page of a validation and its figures into a folder.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    FileError
+        If a figure cannot be written.
+    """
+    page = MarkdownPage(folder, f"{robot.name}: validation")
+    page.text("Nothing of the robot was fitted to these logs.")
+    page.heading("Errors of the tip")
+    page.table(tables.after_only(robot, found))
+    page.heading("Training range")
+    page.bullets(tables.ranges(robot, found))
+    page.heading("Figures")
+    _errors(page, robot, found, ())
+    _remarks(page, [f"{each.name}: {remark}" for each in found for remark in each.remarks])
+    page.write()
+
+
+def _errors(
+    page: MarkdownPage,
+    robot: RobotDescription,
+    found: Sequence[Comparison],
+    before: Sequence[Comparison],
+) -> None:
+    name = robot.name
+    body = robot.recordings.frame if robot.recordings is not None else None
+    frame = "the tracker's frame" if body is None else f"the frame of the body '{body}'"
+    page.figure(
+        "errors_over_time.png", "Error of the tip over time",
+        plots.plot_errors_over_time(found, before, title=f"{name}: error of the tip"),
+    )  # fmt: skip
+    page.figure(
+        "errors_over_pressure.png", "Error of the tip over pressure",
+        plots.plot_errors_over_pressure(found, robot, title=f"{name}: error over pressure"),
+    )  # fmt: skip
+    page.figure(
+        "paths.png", "Measured and predicted paths of the tip",
+        plots.plot_paths(found, title=f"{name}: path of the tip", frame=frame),
+    )  # fmt: skip
+    page.figure(
+        "tip_over_time.png", "Measured and predicted tip over time",
+        plots.plot_tip_over_time(found, title=f"{name}: tip over time", frame=frame),
+    )  # fmt: skip
+
+
+def _stiffness(page: MarkdownPage, result: CalibrationResult) -> None:
+    rows = compare_stiffness(result.tables, result.before, result.robot)
+    page.heading("Stiffness")
+    page.table(tables.stiffnesses(rows))
+    if rows:
+        page.figure(
+            "stiffness.png", "Stiffness, measured and predicted",
+            plots.plot_stiffnesses(rows[:_MOST_DRAWN], title=f"{result.robot.name}: stiffness"),
+        )  # fmt: skip
+
+
+def _remarks(page: MarkdownPage, remarks: Sequence[str]) -> None:
+    if remarks:
+        page.heading("Remarks")
+        page.bullets(remarks)

@@ -1,8 +1,7 @@
-"""Where output goes: answers to stdout, errors, notes and progress to stderr.
+"""What is printed, and where: answers to stdout; errors, notes and progress to stderr.
 
-Nothing that is printed is markup: a path may hold brackets.
-
-rich is imported when something is shown, not before: JSON and help need none of it.
+Nothing that is printed is markup, for a path may hold brackets. rich is imported when something is
+shown and not before: JSON and help need none of it.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from time import monotonic
 from typing import TYPE_CHECKING, TextIO
 
 from stiffopt.errors import SlowWarning, printable
@@ -19,6 +19,9 @@ from stiffopt.errors import SlowWarning, printable
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.progress import Progress
+
+
+_REFRESH = 0.1  # s, between two changes of a progress bar
 
 
 class Closed(Exception):  # noqa: N818 - no error: the reader has had enough
@@ -110,63 +113,81 @@ def warnings_as_notes(*, quiet: bool) -> Iterator[None]:
         yield
 
 
-class Work:
-    """Progress of long work, shown on stderr while it lasts and only on a terminal."""
+class ProgressBar:
+    """What goes on, how much of it is done and how long the rest takes.
 
-    def __init__(self, total: int, *, quiet: bool) -> None:
-        self._progress = None if quiet or not sys.stderr.isatty() else _progress(total)
+    It is shown on stderr, on a terminal only, and is gone when the work is done.
+    """
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._wanted = not quiet and sys.stderr is not None and sys.stderr.isatty()
+        self._progress: Progress | None = None
+        self._is_shown = False
+        self._shown_at = 0.0
 
     @contextmanager
-    def step(self, file: str) -> Iterator[None]:
-        """Show that a file is being solved; the display is gone when it is done."""
+    def shown(self) -> Iterator[None]:
+        """Context in which progress is shown once there is some."""
         try:
-            with self._shown(file):
-                yield
+            yield
         finally:
-            if self._progress is not None:
-                self._progress.advance(self._progress.task_ids[0])
+            self._stop()
 
     @contextmanager
-    def drawing(self, file: str) -> Iterator[None]:
-        """Show that its picture is being drawn."""
-        with self._shown(f"{file}: drawing"):
-            yield
+    def hidden(self) -> Iterator[None]:
+        """Context without the bar, in which something else may be printed or asked."""
+        self._stop()
+        yield
 
-    @contextmanager
-    def _shown(self, description: str) -> Iterator[None]:
-        if self._progress is None:
-            yield
+    def report(self, done: float, total: float | None, text: str) -> None:
+        """Show how far the work is; `total` is None where nobody knows."""
+        if not self._wanted:
             return
-        self._progress.update(self._progress.task_ids[0], description=printable(description))
-        self._progress.start()
-        try:
-            yield
-        finally:
+        now = monotonic()
+        if self._is_shown and now - self._shown_at < _REFRESH and done != total:
+            return
+        self._shown_at = now
+        if self._progress is None:
+            self._progress = _progress(is_counted=total is not None)
+            self._progress.add_task("", total=total, completed=int(done))
+        self._progress.update(
+            self._progress.task_ids[0], completed=done, total=total, description=printable(text)
+        )
+        if not self._is_shown:
+            self._progress.start()
+            self._is_shown = True
+
+    def _stop(self) -> None:
+        if self._progress is not None:
             self._progress.stop()
+        self._is_shown = False
 
 
-def _progress(total: int) -> Progress:
+def _progress(*, is_counted: bool) -> Progress:
     from rich.progress import (
         BarColumn,
-        MofNCompleteColumn,
         Progress,
+        ProgressColumn,
         SpinnerColumn,
+        TaskProgressColumn,
         TextColumn,
         TimeElapsedColumn,
+        TimeRemainingColumn,
     )
 
-    console = console_on(stderr=True)
-    count = [BarColumn(bar_width=24), MofNCompleteColumn()] if total > 1 else []
-    progress = Progress(
+    columns: list[ProgressColumn] = [
         SpinnerColumn(),
         TextColumn("{task.description}", markup=False),
-        *count,
         TimeElapsedColumn(),
-        console=console,
+    ]
+    if is_counted:
+        columns[2:2] = [BarColumn(bar_width=24), TaskProgressColumn()]
+        columns += [TextColumn("gone,"), TimeRemainingColumn(), TextColumn("to go")]
+    return Progress(
+        *columns,
+        console=console_on(stderr=True),
         transient=True,
         redirect_stdout=False,
         redirect_stderr=False,
-        disable=not console.is_terminal,
+        speed_estimate_period=120.0,
     )
-    progress.add_task("", total=total)
-    return progress

@@ -1,15 +1,12 @@
-"""The commands `stiffopt experiment ...`: the paper's experiments on any rig."""
+"""The commands `stiffopt experiment ...`: their options and their help."""
 
 from typing import Annotated
 
 import typer
 
-experiment_app = typer.Typer(
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    help="Do the paper's experiments on a rig, real or simulated.",
-)
+from stiffopt.cli.options import Json, Quiet, RigArgument, command_group
+
+experiment_app = command_group(help="Do the paper's experiments on a rig, real or simulated.")
 
 _CODES = """
 \b
@@ -53,7 +50,6 @@ Examples:
   stiffopt experiment stiffness rig/sim.yaml --resume k
 {_CODES}"""
 
-RigFile = Annotated[str, typer.Argument(metavar="RIG", help="A rig file (.yaml).")]
 Out = Annotated[
     str | None,
     typer.Option(
@@ -74,19 +70,11 @@ Repetitions = Annotated[
     int | None, typer.Option(metavar="N", min=1, max=1000, help="By default 5.")
 ]
 NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
-Quiet = Annotated[
-    bool, typer.Option("--quiet", "-q", help="Print no report, notes and progress; errors only.")
-]
-
-
-@experiment_app.callback()
-def _experiment() -> None:
-    pass
 
 
 @experiment_app.command("kinematics", help=KINEMATICS_HELP, epilog=_KINEMATICS_EPILOG)
 def kinematics(
-    rig: RigFile,
+    rig: RigArgument,
     out: Out = None,
     pressures: Annotated[
         str | None,
@@ -127,9 +115,7 @@ def kinematics(
     resume: Resume = None,
     model: Model = None,
     no_plot: NoPlot = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object in SI units instead of a report.")
-    ] = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Do Experiment 1."""
@@ -139,13 +125,15 @@ def kinematics(
         "pressures": pressures, "period": period, "repetitions": repetitions, "poses": poses,
         "settle": settle, "max": most,
     }  # fmt: skip
-    options = experiment_run.Options(rig, out, resume, model, not no_plot, quiet, given, as_json)
+    options = experiment_run.ExperimentOptions(
+        rig, out, resume, model, not no_plot, quiet, given, as_json
+    )
     raise typer.Exit(experiment_run.run("kinematics", options))
 
 
 @experiment_app.command("stiffness", help=STIFFNESS_HELP, epilog=_STIFFNESS_EPILOG)
 def stiffness(
-    rig: RigFile,
+    rig: RigArgument,
     out: Out = None,
     pressures: Annotated[
         str | None,
@@ -195,5 +183,5 @@ def stiffness(
         "displacement": displacement, "force": force, "steps": steps, "repetitions": repetitions,
         "settle": settle,
     }  # fmt: skip
-    options = experiment_run.Options(rig, out, resume, model, not no_plot, quiet, given)
+    options = experiment_run.ExperimentOptions(rig, out, resume, model, not no_plot, quiet, given)
     raise typer.Exit(experiment_run.run("stiffness", options))

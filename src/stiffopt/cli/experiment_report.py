@@ -1,13 +1,14 @@
-"""What an experiment has found, for people: on the terminal and as Markdown."""
+"""Reports of experiments: for the terminal, as a Markdown page, and as JSON."""
 
 from dataclasses import dataclass
 from math import isfinite
+from pathlib import Path
 from typing import Any
 
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
+from stiffopt.cli.tables import MarkdownPage, TextTable, labelled, title
 from stiffopt.errors import printable
 from stiffopt.experiments import (
     CoverageResult,
@@ -18,47 +19,60 @@ from stiffopt.experiments import (
 from stiffopt.experiments.slope import Estimate
 from stiffopt.experiments.stiffness import direction_name
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.plots.wording import figures
-
-_BAR = 1e-5  # per Pa
-_MM = 1e3  # per m
+from stiffopt.plots.wording import BAR, MM, figures
 
 
 @dataclass(frozen=True)
-class Facts:
-    """A title, lines of label and text, and a table with its heading and a remark."""
+class ExperimentReport:
+    """What an experiment found: a title, lines with a label each, and a table."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
-    heading: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    remark: str
+    table: TextTable
+
+    def renderable(self, folder: str) -> RenderableType:
+        """Return the report for the terminal."""
+        lines = [(label, printable(text)) for label, text in (*self.lines, ("folder", folder))]
+        return Group(title(self.title), labelled(lines), Text(""), self.table.renderable())
+
+    def write(self, folder: Path) -> None:
+        """Write the report as a Markdown page into a folder.
+
+        Raises
+        ------
+        FileError
+            It cannot be written.
+        """
+        page = MarkdownPage(folder, self.title)
+        page.bullets([f"{label}: {text}" for label, text in self.lines])
+        page.table(self.table)
+        page.write()
 
 
-def kinematics_facts(
+def kinematics_report(
     result: KinematicsResult,
     coverage: CoverageResult | None,
     settings: KinematicsSettings,
     model: Manipulator,
-) -> Facts:
-    """Return what a kinematics experiment has found, in the combined poses too if there are any."""
+) -> ExperimentReport:
+    """Return the report of a kinematics experiment, and of its combined poses if there are any."""
     found: list[KinematicsResult | CoverageResult] = [result]
 
     def row(label: str, errors: list[float]) -> tuple[str, ...]:
-        cells = [(f"{e * _MM:.2f}", f"{e / result.length * 100:.1f}") for e in errors]
+        cells = [(f"{e * MM:.2f}", f"{e / result.length * 100:.1f}") for e in errors]
         return label, *(text for cell in cells for text in cell)
 
-    peaks = ", ".join(f"{p * _BAR:g}" for p in settings.pressures)
+    peaks = ", ".join(f"{p * BAR:g}" for p in settings.pressures)
     heading: tuple[str, ...] = ("tip error", "mm", "% of length")
     remark = "distance of the model's tip from the measured one, at the measured pressures"
     if coverage is not None:
         found.append(coverage)
         heading += ("combined: mm", "% of length")
         remark += "; combined: at the end of each pose"
-    return Facts(
+    return ExperimentReport(
         title=f"{settings.rig}: kinematics",
         lines=(
-            ("model", f"{model.description.name}, {model.length * _MM:g} mm long"),
+            ("model", f"{model.description.name}, {model.length * MM:g} mm long"),
             (
                 "sequence",
                 f"each of {settings.channels} channels to {peaks} bar, {result.time[-1]:.0f} s",
@@ -69,13 +83,16 @@ def kinematics_facts(
             *(("DOUBT", doubt) for doubt in result.doubts),
             *_combined_doubts(coverage, settings),
         ),
-        heading=heading,
-        rows=(
-            row("mean", [each.mean for each in found]),
-            row("95th percentile", [each.p95 for each in found]),
-            row("largest", [each.worst for each in found]),
+        table=TextTable(
+            "",
+            heading,
+            (
+                row("mean", [each.mean for each in found]),
+                row("95th percentile", [each.p95 for each in found]),
+                row("largest", [each.worst for each in found]),
+            ),
+            remark,
         ),
-        remark=remark,
     )
 
 
@@ -85,7 +102,7 @@ def kinematics_record(
     settings: KinematicsSettings,
     model: Manipulator,
 ) -> dict[str, Any]:
-    """Return what a kinematics experiment has found, for JSON, in SI units."""
+    """Return the results of a kinematics experiment for JSON, in SI units."""
 
     def errors(found: KinematicsResult | CoverageResult) -> dict[str, float]:
         return {
@@ -120,12 +137,12 @@ def _combined(
 ) -> tuple[tuple[str, str], ...]:
     if coverage is None:
         return ()
-    low, high = coverage.pressures.min() * _BAR, coverage.pressures.max() * _BAR
+    low, high = coverage.pressures.min() * BAR, coverage.pressures.max() * BAR
     return (
         (
             "combined poses",
             f"{len(coverage.errors)} of {settings.poses}, all channels, {_bar(low)} to "
-            f"{_bar(high)} bar; the tip moved by {coverage.speed.mean() * _MM:.2f} mm in the last "
+            f"{_bar(high)} bar; the tip moved by {coverage.speed.mean() * MM:.2f} mm in the last "
             "second",
         ),
     )
@@ -148,11 +165,11 @@ def _combined_doubts(
 def _spread(result: KinematicsResult) -> tuple[tuple[str, str], ...]:
     if result.repetitions < 2:
         return ()
-    return (("repetitions", f"differ by {result.repeatability * _MM:.2f} mm in the mean"),)
+    return (("repetitions", f"differ by {result.repeatability * MM:.2f} mm in the mean"),)
 
 
-def stiffness_facts(result: StiffnessResult, model: Manipulator) -> Facts:
-    """Return what a stiffness experiment has found."""
+def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentReport:
+    """Return the report of a stiffness experiment."""
     settings = result.settings
     names = [direction_name(direction) for direction in settings.directions]
     heading = ["bar"]
@@ -160,21 +177,24 @@ def stiffness_facts(result: StiffnessResult, model: Manipulator) -> Facts:
         heading += [f"{name} (N/m)", "model"]
     rows = []
     for pressure in settings.pressures:
-        row = [f"{pressure * _BAR:g}"]
+        row = [f"{pressure * BAR:g}"]
         for direction in settings.directions:
             cell = next(c for c in result.along(direction) if c.pressure == pressure)
             row += [_estimate(cell.estimate), figures(cell.model)]
         rows.append(tuple(row))
-    return Facts(
+    return ExperimentReport(
         title=f"{settings.rig}: stiffness",
         lines=(
             ("model", f"{model.description.name}, boundary free"),
             ("channel", f"{settings.channel} of {settings.channels}"),
             ("repetitions", f"{settings.repetitions}"),
         ),
-        heading=tuple(heading),
-        rows=tuple(rows),
-        remark="+-: 95 % confidence of the mean over the repetitions",
+        table=TextTable(
+            "",
+            tuple(heading),
+            tuple(rows),
+            "+-: 95 % confidence interval of the mean over the repetitions",
+        ),
     )
 
 
@@ -182,29 +202,3 @@ def _estimate(estimate: Estimate | None) -> str:
     if estimate is None:
         return "no contact"
     return f"{figures(estimate.value)} +- {estimate.half_width:.2g}"
-
-
-def markdown(facts: Facts) -> str:
-    """Return facts as a Markdown page."""
-    lines = [f"# {facts.title}", ""]
-    lines += [f"- {label}: {text}" for label, text in facts.lines]
-    lines += ["", f"| {' | '.join(facts.heading)} |", f"|{' --- |' * len(facts.heading)}"]
-    lines += [f"| {' | '.join(row)} |" for row in facts.rows]
-    lines += ["", f"{facts.remark[:1].upper()}{facts.remark[1:]}.", ""]
-    return "\n".join(lines)
-
-
-def renderable(facts: Facts, folder: str) -> RenderableType:
-    """Return facts for the terminal."""
-    grid = Table.grid(padding=(0, 2), pad_edge=False)
-    grid.add_column(no_wrap=True, style="dim")
-    grid.add_column(overflow="fold")
-    for label, text in (*facts.lines, ("folder", folder)):
-        grid.add_row(f"  {label}", printable(text))
-    table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="bold")
-    for number, heading in enumerate(facts.heading):
-        table.add_column(heading, justify="right" if number else "left", no_wrap=True)
-    for row in facts.rows:
-        table.add_row(*row)
-    title = Text(printable(facts.title), "bold")
-    return Group(title, grid, Text(""), table, Text(f"  {facts.remark}", "dim"))

@@ -1,21 +1,33 @@
-"""What `stiffopt experiment` does with its arguments."""
+"""What `stiffopt experiment` does: check everything, move the arm, vent it, report and draw."""
 
 import json
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from stiffopt.cli import experiment_report, quantities
-from stiffopt.cli.console import report_error, report_note, show, warnings_as_notes, write_line
-from stiffopt.cli.exits import BAD_INPUT, FAULT, INTERRUPTED, SOLVED
-from stiffopt.cli.experiment_display import Display
-from stiffopt.cli.interrupts import Interruptible
-from stiffopt.cli.stopping import Stopping
-from stiffopt.errors import DeviceError, FileError, InputError, StiffoptError
+from stiffopt.cli.console import (
+    ProgressBar,
+    report_error,
+    report_note,
+    show,
+    warnings_as_notes,
+    write_line,
+)
+from stiffopt.cli.exits import (
+    BAD_INPUT,
+    FAULT,
+    INTERRUPTED,
+    SOLVED,
+    InterruptBetweenSteps,
+    Interruptible,
+)
+from stiffopt.errors import DeviceError, InputError, StiffoptError
 from stiffopt.experiments import (
     KinematicsSettings,
     StiffnessSettings,
@@ -46,14 +58,14 @@ from stiffopt.logs import require_mcap, write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
 
-REPORT, FIGURE, TABLE = "report.md", "figure.png", "stiffness.csv"
+FIGURE, TABLE = "figure.png", "stiffness.csv"
 POSES_FIGURE = "poses.png"
 
 Settings = KinematicsSettings | StiffnessSettings
 
 
 @dataclass(frozen=True)
-class Options:
+class ExperimentOptions:
     """The arguments of a command; `given` are those that say what is done, None where absent."""
 
     rig: str
@@ -88,7 +100,7 @@ class _Plan:
         return not missing_series(self.folder, self.settings)
 
 
-def run(experiment: str, options: Options) -> int:
+def run(experiment: str, options: ExperimentOptions) -> int:
     """Do an experiment, or go on with it; report and draw; return the exit code."""
     try:
         with Interruptible(), warnings_as_notes(quiet=options.quiet):
@@ -102,7 +114,7 @@ def run(experiment: str, options: Options) -> int:
         with warnings_as_notes(quiet=options.quiet):
             _do(plan, options)
             with Interruptible():
-                _tell(plan, options)
+                _report(plan, options)
     except KeyboardInterrupt:
         _say_where(experiment, plan, options)
         return INTERRUPTED
@@ -130,7 +142,7 @@ class _NoRigError(StiffoptError):
 # -- before anything moves ------------------------------------------------------------------------
 
 
-def _planned(experiment: str, options: Options) -> _Plan:
+def _planned(experiment: str, options: ExperimentOptions) -> _Plan:
     if options.plot:
         from stiffopt.plots import require_matplotlib
 
@@ -178,9 +190,9 @@ def _rig(path: str) -> tuple[Rig, str, float, str]:
 
 
 def _settings(
-    experiment: str, options: Options, rig: Rig, name: str, log_folder: str
+    experiment: str, options: ExperimentOptions, rig: Rig, name: str, log_folder: str
 ) -> tuple[Settings, Path]:
-    """What shall be done, and where."""
+    """The settings of the experiment, and the folder in which it is recorded."""
     schema = KinematicsSettings if experiment == "kinematics" else StiffnessSettings
     given = {key: value for key, value in options.given.items() if value is not None}
     if options.resume is not None:
@@ -238,15 +250,20 @@ def _read(key: str, value: str | int) -> Any:
 # -- on the rig -----------------------------------------------------------------------------------
 
 
-def _do(plan: _Plan, options: Options) -> None:
+def _do(plan: _Plan, options: ExperimentOptions) -> None:
     if plan.is_complete:
         if not options.quiet:
             report_note(f"{plan.folder} is complete; nothing was left to do")
         return
-    stopping, display = Stopping(), Display(quiet=options.quiet)
+    interrupt, bar = InterruptBetweenSteps(), ProgressBar(quiet=options.quiet)
     common: dict[str, Any] = {
-        "rate": plan.rate, "progress": display.report, "check": stopping.check,
+        "rate": plan.rate, "progress": bar.report, "check": interrupt.check,
     }  # fmt: skip
+
+    @contextmanager
+    def waiting_for_a_person() -> Iterator[None]:
+        with bar.hidden(), interrupt.at_once():
+            yield
 
     def work() -> list[str]:
         if isinstance(plan.settings, KinematicsSettings):
@@ -256,13 +273,13 @@ def _do(plan: _Plan, options: Options) -> None:
             plan.folder,
             plan.settings,
             plan.model,
-            aside=lambda: display.aside(stopping.at_once()),
+            aside=waiting_for_a_person,
             **common,
         )
 
-    with alone_in(plan.folder), stopping.handled(), display.shown():
+    with alone_in(plan.folder), interrupt.handled(), bar.shown():
         _open(plan)
-        notes = _on_rig(plan.rig, work, stopping)
+        notes = _on_rig(plan.rig, work, interrupt)
     if not options.quiet:
         for note in notes:
             report_note(note)
@@ -278,7 +295,7 @@ def _open(plan: _Plan) -> None:
         raise _NoRigError(str(error)) if isinstance(error, DeviceError) else error from error
 
 
-def _on_rig(rig: Rig, work: Callable[[], list[str]], stopping: Stopping) -> list[str]:
+def _on_rig(rig: Rig, work: Callable[[], list[str]], interrupt: InterruptBetweenSteps) -> list[str]:
     """Work, and vent and close the rig whatever happens."""
     failure: BaseException | None = None
     notes: list[str] = []
@@ -286,7 +303,7 @@ def _on_rig(rig: Rig, work: Callable[[], list[str]], stopping: Stopping) -> list
         notes = work()
     except BaseException as error:
         failure = error
-    stopping.hold()
+    interrupt.hold()
     try:
         rig.close()
     except StiffoptError as error:
@@ -299,7 +316,7 @@ def _on_rig(rig: Rig, work: Callable[[], list[str]], stopping: Stopping) -> list
     return notes
 
 
-def _say_where(experiment: str, plan: _Plan, options: Options) -> None:
+def _say_where(experiment: str, plan: _Plan, options: ExperimentOptions) -> None:
     if not options.quiet:
         report_note(
             f"what was recorded is in {plan.folder}; go on with: "
@@ -310,52 +327,47 @@ def _say_where(experiment: str, plan: _Plan, options: Options) -> None:
 # -- afterwards -----------------------------------------------------------------------------------
 
 
-def _tell(plan: _Plan, options: Options) -> None:
+def _report(plan: _Plan, options: ExperimentOptions) -> None:
     """Evaluate, report, draw."""
     if isinstance(plan.settings, KinematicsSettings):
-        _tell_kinematics(plan, plan.settings, options)
+        _report_kinematics(plan, plan.settings, options)
     else:
-        _tell_stiffness(plan, plan.settings, options)
+        _report_stiffness(plan, plan.settings, options)
 
 
-def _tell_kinematics(plan: _Plan, settings: KinematicsSettings, options: Options) -> None:
+def _report_kinematics(
+    plan: _Plan, settings: KinematicsSettings, options: ExperimentOptions
+) -> None:
     folder, model = plan.folder, plan.model
     result = evaluate_kinematics(read_recordings(folder, settings), model)
     coverage = evaluate_coverage(read_rounds(folder, round_count(settings.poses)), model)
-    facts = experiment_report.kinematics_facts(result, coverage, settings, model)
-    _write(folder / REPORT, experiment_report.markdown(facts))
+    report = experiment_report.kinematics_report(result, coverage, settings, model)
+    report.write(folder)
     if options.plot:
         from stiffopt.plots import save_figure
         from stiffopt.plots.experiments import plot_coverage, plot_kinematics
 
-        save_figure(plot_kinematics(result, title=facts.title), folder / FIGURE)
+        save_figure(plot_kinematics(result, title=report.title), folder / FIGURE)
         if coverage is not None:
-            title = f"{facts.title}, combined poses"
+            title = f"{report.title}, combined poses"
             save_figure(plot_coverage(coverage, title=title), folder / POSES_FIGURE)
     if options.as_json:
         record = experiment_report.kinematics_record(result, coverage, settings, model)
         write_line(json.dumps({**record, "folder": str(folder)}, allow_nan=False))
     elif not options.quiet:
-        show(experiment_report.renderable(facts, str(folder)))
+        show(report.renderable(str(folder)))
 
 
-def _tell_stiffness(plan: _Plan, settings: StiffnessSettings, options: Options) -> None:
+def _report_stiffness(plan: _Plan, settings: StiffnessSettings, options: ExperimentOptions) -> None:
     folder, model = plan.folder, plan.model
     result = evaluate_stiffness(folder, settings, model)
     write_stiffness_table(folder / TABLE, result.table())
-    facts = experiment_report.stiffness_facts(result, model)
-    _write(folder / REPORT, experiment_report.markdown(facts))
+    report = experiment_report.stiffness_report(result, model)
+    report.write(folder)
     if options.plot:
         from stiffopt.plots import save_figure
         from stiffopt.plots.experiments import plot_stiffness
 
-        save_figure(plot_stiffness(result, title=facts.title), folder / FIGURE)
+        save_figure(plot_stiffness(result, title=report.title), folder / FIGURE)
     if not options.quiet:
-        show(experiment_report.renderable(facts, str(folder)))
-
-
-def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None
+        show(report.renderable(str(folder)))

@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from stiffopt.cli.console import report_error, report_note, write_line
-from stiffopt.cli.exits import BAD_INPUT, INTERRUPTED, SOLVED
-from stiffopt.cli.interrupts import Interruptible
-from stiffopt.cli.outputs import check, check_new_file
+from stiffopt.cli.exits import BAD_INPUT, INTERRUPTED, SOLVED, Interruptible
+from stiffopt.cli.outputs import check_new_file, check_picture
 from stiffopt.errors import FileError, StiffoptError
 
 __all__ = ["export", "plot"]
@@ -57,7 +56,7 @@ def plot(recording: str, out: str | None, *, quiet: bool) -> int:
         from stiffopt.plots.run import plot_run
 
         path = _beside(recording, ".png") if out is None else out
-        check(None, path, [recording])
+        check_picture(path)
         run = read_run(recording)
         if not run.complete and not quiet:
             report_note(f"{recording} was cut short or damaged; what is whole was drawn")

@@ -1,10 +1,9 @@
-"""Entry points: `stiffopt` with its commands, and `solve-pressure`, which is `stiffopt solve`."""
+"""The two programs: `stiffopt` with its commands, and `solve-pressure`, its command `solve`."""
 
 import gc
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
 
 import typer
 
@@ -22,28 +21,17 @@ from stiffopt.cli.experiment import experiment_app
 from stiffopt.cli.lab import LAB_EPILOG, LAB_HELP, lab
 from stiffopt.cli.log import log_app
 from stiffopt.cli.map import map_app
+from stiffopt.cli.options import Version, command_group
 from stiffopt.cli.robots import robots
 from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
 from stiffopt.cli.solve import HELP, examples, solve
 from stiffopt.cli.vent import VENT_EPILOG, VENT_HELP, vent
-from stiffopt.cli.version import print_version
 
 __all__ = ["app", "main", "solve_pressure_app", "solve_pressure_main"]
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 
-
-def _application() -> typer.Typer:
-    # no rich markup: a path may hold brackets, and help is read in pipes too
-    return typer.Typer(
-        add_completion=False,
-        pretty_exceptions_enable=False,
-        rich_markup_mode=None,
-        context_settings=_SETTINGS,
-    )
-
-
-app = _application()
+app = command_group(context_settings=_SETTINGS)
 app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
 app.command("robots")(robots)
 app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
@@ -55,19 +43,12 @@ app.command("calibrate", help=CALIBRATE_HELP, epilog=CALIBRATE_EPILOG)(calibrate
 app.command("validate", help=VALIDATE_HELP, epilog=VALIDATE_EPILOG)(validate)
 app.command("lab", help=LAB_HELP, epilog=LAB_EPILOG)(lab)
 
-solve_pressure_app = _application()
+solve_pressure_app = command_group(context_settings=_SETTINGS)
 solve_pressure_app.command("solve-pressure", help=HELP, epilog=examples("solve-pressure"))(solve)
 
 
 @app.callback()
-def _stiffopt(
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=print_version, is_eager=True, help="Print the version and exit."
-        ),
-    ] = False,
-) -> None:
+def _stiffopt(version: Version = False) -> None:
     """Run a fluidic soft arm stiff where it matters."""
 
 

@@ -1,18 +1,29 @@
-"""The commands `stiffopt map ...`.
-
-`workspace` samples where the tip can be and how stiff, `arm` maps the stiffness along an arm.
-"""
+"""The commands `stiffopt map workspace` and `stiffopt map arm`: their options and their help."""
 
 from typing import Annotated
 
 import typer
 
-map_app = typer.Typer(
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    help="Map an arm: where its tip can be, how stiff it is there, and how stiff along its length.",
+from stiffopt.cli.options import (
+    BoundaryOption,
+    FrameOption,
+    Json,
+    Quiet,
+    RobotArgument,
+    command_group,
 )
+
+map_app = command_group(
+    help="Map an arm: where its tip can be, how stiff it is there, and how stiff along its length."
+)
+
+_CODES = """
+\b
+Exit codes:
+  0    the map is complete
+  2    bad input, or the map cannot be made or written
+  130  interrupted (Ctrl-C)
+"""
 
 HELP = """\
 Sample the pressures of an arm and map its workspace.
@@ -23,31 +34,18 @@ ROBOT is the name of a built-in robot or a robot file. With --out, the map is ke
 the same command continues a run that was interrupted.
 """
 
-_EPILOG = """\
+_EPILOG = f"""\
 \b
 Examples:
   stiffopt map workspace stiff-flop-2 --out map.zarr --samples 10000000 --plot map.png
   stiffopt map workspace my-arm.yaml --levels 6 --cell '5 mm' --direction x --direction 0,1,1
   stiffopt map workspace stiff-flop-3 --out map.zarr --scheduler tcp://10.0.0.5:8786
-
-\b
-Exit codes:
-  0    the map is complete
-  2    bad input, or the map cannot be made or written
-  130  interrupted (Ctrl-C)
-"""
-
-
-@map_app.callback()
-def _map() -> None:
-    pass
+{_CODES}"""
 
 
 @map_app.command("workspace", help=HELP, epilog=_EPILOG)
 def workspace(
-    robot: Annotated[
-        str, typer.Argument(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml).")
-    ],
+    robot: RobotArgument,
     out: Annotated[
         str | None,
         typer.Option(metavar="FILE.zarr", help="Keep the map in this folder, a Zarr group."),
@@ -77,12 +75,8 @@ def workspace(
     kind: Annotated[
         str, typer.Option(metavar="KIND", help="translation or rotation.")
     ] = "translation",
-    boundary: Annotated[
-        str, typer.Option(metavar="BOUNDARY", help="free, guided or clamped.")
-    ] = "free",
-    frame: Annotated[
-        str, typer.Option(metavar="FRAME", help="base or tip: the axes of the directions.")
-    ] = "base",
+    boundary: BoundaryOption = "free",
+    frame: FrameOption = "base",
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the quasi-random samples.")] = 0,
     scheduler: Annotated[
         str | None,
@@ -92,20 +86,19 @@ def workspace(
         str | None,
         typer.Option(metavar="FILE.png", help="Draw sections through the workspace."),
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object in SI units instead of a table.")
-    ] = False,
+    as_json: Json = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a map that is in the folder of --out.")
     ] = False,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Print no table, notes and progress; errors only.")
-    ] = False,
+    quiet: Quiet = False,
 ) -> None:
     """Map a workspace."""
-    from stiffopt.cli.map_run import MapOptions, run  # here, so that --help waits for no numerics
+    from stiffopt.cli.map_workspace import (  # here, so that --help waits for no numerics
+        WorkspaceOptions,
+        run,
+    )
 
-    options = MapOptions(
+    options = WorkspaceOptions(
         robot, out, samples, levels, cell, direction, kind, boundary, frame, seed, scheduler,
         plot, as_json, overwrite, quiet,
     )  # fmt: skip
@@ -120,26 +113,18 @@ then the first two. With --over 1,2 instead the stiffness of the tip over the pr
 channels. ROBOT is the name of a built-in robot or a robot file.
 """
 
-_ARM_EPILOG = """\
+_ARM_EPILOG = f"""\
 \b
 Examples:
   stiffopt map arm stiff-flop-1 --plot arm.png
   stiffopt map arm stiff-flop-2 --channels 1 --channels 4 --pressures '0:1.5:0.5 bar'
   stiffopt map arm stiff-flop-1 --over 1,2 --plot tip.png --csv tip.csv
-
-\b
-Exit codes:
-  0    the map is complete
-  2    bad input, or the map cannot be made or written
-  130  interrupted (Ctrl-C)
-"""
+{_CODES}"""
 
 
 @map_app.command("arm", help=ARM_HELP, epilog=_ARM_EPILOG)
 def arm(
-    robot: Annotated[
-        str, typer.Argument(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml).")
-    ],
+    robot: RobotArgument,
     channels: Annotated[
         list[str] | None,
         typer.Option(
@@ -166,22 +151,14 @@ def arm(
         int | None,
         typer.Option(metavar="K", min=2, help="With --over: of each channel; by default 31."),
     ] = None,
-    boundary: Annotated[
-        str, typer.Option(metavar="BOUNDARY", help="free, guided or clamped.")
-    ] = "free",
-    frame: Annotated[
-        str, typer.Option(metavar="FRAME", help="base or tip: the axes of the directions.")
-    ] = "base",
+    boundary: BoundaryOption = "free",
+    frame: FrameOption = "base",
     plot: Annotated[str | None, typer.Option(metavar="FILE.png", help="Draw the map.")] = None,
     csv: Annotated[
         str | None, typer.Option(metavar="FILE.csv", help="Write the map as a table, in SI units.")
     ] = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object in SI units instead of a table.")
-    ] = False,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", help="Print no table, notes and progress; errors only.")
-    ] = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
 ) -> None:
     """Map the stiffness along an arm."""
     from stiffopt.cli.map_arm import ArmOptions, run

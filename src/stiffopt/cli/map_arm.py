@@ -1,31 +1,28 @@
-"""What `stiffopt map arm` does with its arguments."""
+"""What `stiffopt map arm` does: map the stiffness along an arm, print, write and draw it."""
 
 import csv
+import io
 import json
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
-from stiffopt.cli import outputs, quantities
-from stiffopt.cli.console import report_error, show, warnings_as_notes, write_line
-from stiffopt.cli.exits import BAD_INPUT, INTERRUPTED, SOLVED
-from stiffopt.cli.experiment_display import Display
-from stiffopt.cli.interrupts import Interruptible
-from stiffopt.errors import FileError, InputError, StiffoptError, printable
+from stiffopt.cli import quantities
+from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_line
+from stiffopt.cli.exits import Interruptible, exit_code
+from stiffopt.cli.outputs import check_ending, check_picture, check_writable
+from stiffopt.cli.tables import number_table, title
+from stiffopt.documents import write_whole
+from stiffopt.errors import InputError
 from stiffopt.experiments.arm_map import ArmMap, TipMap, map_arm, map_tip
 from stiffopt.experiments.stiffness import direction_name
 from stiffopt.model.compliance import Boundary, Frame
 from stiffopt.model.manipulator import load_robot
-from stiffopt.plots.wording import figures
-
-_BAR = 1e-5  # per Pa
-_MM = 1e3  # per m
+from stiffopt.plots.wording import BAR, MM, figures
 
 
 @dataclass(frozen=True)
@@ -48,12 +45,13 @@ class ArmOptions:
 
 def run(options: ArmOptions) -> int:
     """Make a map; print, write and draw it; return the exit code."""
-    try:
+
+    def work() -> None:
         _check(options)
-        display = Display(quiet=options.quiet)
+        progress = ProgressBar(quiet=options.quiet)
         quietly = warnings_as_notes(quiet=options.quiet)
-        with Interruptible() as interruptible, display.shown(), quietly:
-            found = _mapped(options, display, interruptible)
+        with Interruptible() as interruptible, progress.shown(), quietly:
+            found = _mapped(options, progress, interruptible)
         if options.csv is not None:
             _write_csv(options.csv, found)
         if options.plot is not None:
@@ -61,41 +59,34 @@ def run(options: ArmOptions) -> int:
         if options.as_json:
             write_line(json.dumps(_record(found), allow_nan=False))
         elif not options.quiet:
-            show(_summary(found))
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    except StiffoptError as error:
-        report_error(str(error))
-        return BAD_INPUT
-    return SOLVED
+            show(_arm_summary(found) if isinstance(found, ArmMap) else _tip_summary(found))
+
+    return exit_code(work)
 
 
 def _check(options: ArmOptions) -> None:
-    outputs.check(None, options.plot, (options.robot,))
+    check_picture(options.plot)
     if options.csv is not None:
-        if not options.csv.lower().endswith(".csv"):
-            raise FileError(options.csv, "expected a name that ends in .csv")
-        folder = os.path.dirname(options.csv) or os.curdir
-        if not os.path.isdir(folder):
-            raise FileError(options.csv, f"cannot be written: there is no folder '{folder}'")
+        check_ending(options.csv, (".csv",))
+        check_writable(options.csv)
     alone = {
         "--channels": options.channels, "--pressures": options.pressures,
         "--points": options.points,
     }  # fmt: skip
     for name, value in alone.items():
         if options.over is not None and value is not None:
-            raise InputError(f"{name} says nothing of a map over two pressures (--over)")
+            raise InputError(f"{name} has no meaning for a map over two pressures (--over)")
     if options.over is None and options.levels is not None:
         raise InputError("--levels is for a map over two pressures; give --over too")
 
 
-def _mapped(options: ArmOptions, display: Display, interruptible: Interruptible) -> ArmMap | TipMap:
+def _mapped(options: ArmOptions, bar: ProgressBar, interruptible: Interruptible) -> ArmMap | TipMap:
     robot = load_robot(options.robot)
     boundary, frame = cast(Boundary, options.boundary), cast(Frame, options.frame)
 
     def progress(done: float, total: float) -> None:
         interruptible.check()
-        display.report(done, total, "stiffness")
+        bar.report(done, total, "stiffness")
 
     if options.over is not None:
         return map_tip(
@@ -125,48 +116,38 @@ def _draw(found: ArmMap | TipMap, path: str) -> None:
 # -- for people -----------------------------------------------------------------------------------
 
 
-def _summary(found: ArmMap | TipMap) -> RenderableType:
-    return _arm_summary(found) if isinstance(found, ArmMap) else _tip_summary(found)
-
-
-def _table(*headings: str) -> Table:
-    table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="bold")
-    for number, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if number else "left", no_wrap=True)
-    return table
-
-
 def _arm_summary(found: ArmMap) -> RenderableType:
     names = [direction_name(tuple(direction)) for direction in found.directions]
     headings = [f"{name}: {what}" for name in names for what in ("tip", "middle")]
-    table = _table("channels", "bar", *headings)
+    table = number_table("channels", "bar", *headings)
     middle = found.middle
     for group, stiffness in zip(found.groups, found.stiffness, strict=True):
         for level, values in zip(found.pressures, stiffness, strict=True):
             cells = [figures(values[at, k]) for k in range(len(names)) for at in (-1, middle)]
-            table.add_row(",".join(map(str, group)), f"{level * _BAR:.3g}", *cells)
+            table.add_row(",".join(map(str, group)), f"{level * BAR:.3g}", *cells)
     note = (
-        f"N/m, {found.boundary}, axes of the {found.frame}; "
-        f"middle: at {found.at[middle] * _MM:g} mm"
+        f"N/m, {found.boundary}, axes of the {found.frame}; middle: at {found.at[middle] * MM:g} mm"
     )
-    title = f"{printable(found.robot)}: stiffness along the arm"
-    return Group(Text(title, "bold"), table, Text(f"  {note}", "dim"))
+    heading = title(f"{found.robot}: stiffness along the arm")
+    return Group(heading, table, Text(f"  {note}", "dim"))
 
 
 def _tip_summary(found: TipMap) -> RenderableType:
     a, b = found.channels
-    table = _table("direction", "least", f"at p{a}, p{b} (bar)", "greatest", f"at p{a}, p{b} (bar)")
+    table = number_table(
+        "direction", "least", f"at p{a}, p{b} (bar)", "greatest", f"at p{a}, p{b} (bar)"
+    )
     for k, direction in enumerate(found.directions):
         values = found.stiffness[:, :, k]
         cells = []
         for place in (np.argmin(values), np.argmax(values)):
             i, j = np.unravel_index(place, values.shape)
-            at = f"{found.first[i] * _BAR:.3g}, {found.second[j] * _BAR:.3g}"
+            at = f"{found.first[i] * BAR:.3g}, {found.second[j] * BAR:.3g}"
             cells += [figures(values[i, j]), at]
         table.add_row(direction_name(tuple(direction)), *cells)
     note = f"N/m, {found.boundary}, axes of the {found.frame}"
-    title = f"{printable(found.robot)}: stiffness of the tip over channels {a} and {b}"
-    return Group(Text(title, "bold"), table, Text(f"  {note}", "dim"))
+    heading = title(f"{found.robot}: stiffness of the tip over channels {a} and {b}")
+    return Group(heading, table, Text(f"  {note}", "dim"))
 
 
 # -- for programs ---------------------------------------------------------------------------------
@@ -201,11 +182,9 @@ def _record(found: ArmMap | TipMap) -> dict[str, Any]:
 
 def _write_csv(path: str, found: ArmMap | TipMap) -> None:
     rows = _arm_rows(found) if isinstance(found, ArmMap) else _tip_rows(found)
-    try:
-        with open(path, "w", encoding="utf-8", newline="") as stream:
-            csv.writer(stream, lineterminator="\n").writerows(rows)
-    except OSError as error:
-        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    write_whole(path, text.getvalue().encode())
 
 
 def _arm_rows(found: ArmMap) -> Iterator[list[str]]:

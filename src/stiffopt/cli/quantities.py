@@ -1,4 +1,4 @@
-"""Quantities on the command line: lists and ranges with a unit, directions by name."""
+"""Values of options: quantities with units, lists and ranges of them, directions, channels."""
 
 import re
 
@@ -16,6 +16,12 @@ def quantity(option: str, text: str, unit: str, what: str) -> float:
         return parse_quantity(text, unit, what)
     except InputError as error:
         raise InputError(f"{option}: {error}") from None
+
+
+def choice(option: str, text: str, allowed: tuple[str, ...]) -> None:
+    """Raise `InputError` if a word is not one of those that an option allows."""
+    if text not in allowed:
+        raise InputError(f"{option}: expected {' or '.join(allowed)}, not {shown(text)}")
 
 
 def pressures(option: str, text: str) -> tuple[float, ...]:
@@ -38,7 +44,7 @@ def pressures(option: str, text: str) -> tuple[float, ...]:
     ]
     if separator == ",":
         if len(set(parts)) < len(parts):
-            raise InputError(f"{option}: a pressure is there twice")
+            raise InputError(f"{option}: a pressure is given twice")
         return tuple(parts)
     if len(parts) != 3:
         raise InputError(f"{option}: a range has a start, an end and a step; {example}")
@@ -47,7 +53,7 @@ def pressures(option: str, text: str) -> tuple[float, ...]:
         raise InputError(f"{option}: a range goes up, in steps above 0; {example}")
     count = int((end - start) / step * (1 + 1e-9)) + 1
     if count > _MOST:
-        raise InputError(f"{option}: that are {count} pressures; at most {_MOST} make sense")
+        raise InputError(f"{option}: these are {count} pressures; at most {_MOST} are allowed")
     return tuple(round(start + step * k, 6) for k in range(count))
 
 
@@ -57,7 +63,7 @@ def directions(option: str, text: str) -> tuple[tuple[float, ...], ...]:
     Raises
     ------
     InputError
-        A name is unknown, or there twice.
+        A name is unknown, or given twice.
     """
     found = []
     for part in text.split(","):
@@ -70,8 +76,30 @@ def directions(option: str, text: str) -> tuple[tuple[float, ...], ...]:
         sign = -1.0 if name.startswith("-") else 1.0
         found.append(tuple(sign * component + 0.0 for component in vector))
     if len(set(found)) < len(found):
-        raise InputError(f"{option}: a direction is there twice")
+        raise InputError(f"{option}: a direction is given twice")
     return tuple(found)
+
+
+def direction(option: str, text: str) -> tuple[float, ...]:
+    """Return a vector from ``x``, ``y``, ``z`` or three numbers such as ``0,0.6,0.8``.
+
+    Raises
+    ------
+    InputError
+        It is neither.
+    """
+    if text.strip() in _AXES:
+        return _AXES[text.strip()]
+    try:
+        parts = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        parts = ()
+    if len(parts) != 3:
+        raise InputError(
+            f"{option}: {shown(text)} is no direction; expected x, y, z or three numbers "
+            "such as 0,0.6,0.8"
+        )
+    return parts
 
 
 def channels(option: str, text: str) -> tuple[int, ...]:
@@ -80,12 +108,12 @@ def channels(option: str, text: str) -> tuple[int, ...]:
     Raises
     ------
     InputError
-        Something else is there, or one twice.
+        Something else stands there, or a channel is given twice.
     """
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
         raise InputError(f"{option}: {shown(text)} are no channels; expected numbers such as 1,2")
     found = tuple(int(part) for part in parts)
     if len(set(found)) < len(found):
-        raise InputError(f"{option}: a channel is there twice")
+        raise InputError(f"{option}: a channel is given twice")
     return found

@@ -1,4 +1,4 @@
-"""The command `stiffopt robots`."""
+"""The command `stiffopt robots`: a table of the robots that come with stiffopt."""
 
 from typing import TYPE_CHECKING
 
@@ -10,14 +10,10 @@ if TYPE_CHECKING:
 
 def robots() -> None:
     """List the robots that come with stiffopt; a task file names one of them or a robot file."""
-    from rich.table import Table
-
+    from stiffopt.cli.tables import number_table
     from stiffopt.model.robot_files import builtin_robots, load_description
 
-    table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="bold")
-    table.add_column("robot", no_wrap=True)
-    for heading in ("segments", "channels", "length", "pressures", "gravity, m/s^2"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = number_table("robot", "segments", "channels", "length", "pressures", "g in m/s^2")
     for name in builtin_robots():
         table.add_row(name, *_columns(load_description(name)))
     show(table)

@@ -1,10 +1,10 @@
-"""The command `solve-pressure`, which is `stiffopt solve` too."""
+"""The command `solve-pressure`, also `stiffopt solve`: its options and its help."""
 
 from typing import Annotated
 
 import typer
 
-from stiffopt.cli.version import print_version
+from stiffopt.cli.options import Quiet, Version
 
 HELP = """\
 Find the chamber pressures that reach a tip pose and do best by its stiffness.
@@ -86,19 +86,14 @@ def solve(
             metavar="N", min=0, help="Of the global search: the same seed, the same answer."
         ),
     ] = 0,
-    quiet: Annotated[
-        bool,
-        typer.Option("--quiet", "-q", help="Print no tables, notes and progress; errors only."),
-    ] = False,
-    version: Annotated[
-        bool,
-        typer.Option(
-            "--version", callback=print_version, is_eager=True, help="Print the version and exit."
-        ),
-    ] = False,
+    quiet: Quiet = False,
+    version: Version = False,
 ) -> None:
     """Solve task files."""
-    from stiffopt.cli.solve_run import Options, run  # here, so that --help waits for no numerics
+    from stiffopt.cli.solve_run import (  # here, so that --help waits for no numerics
+        SolveOptions,
+        run,
+    )
 
-    options = Options(as_json, out, plot, pareto, seed, quiet)
+    options = SolveOptions(as_json, out, plot, pareto, seed, quiet)
     raise typer.Exit(run(tasks, options))

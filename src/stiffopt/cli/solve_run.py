@@ -1,37 +1,37 @@
-"""What `solve-pressure` does with its arguments, file by file.
+"""What `solve` does: solve one task file after the other, print, write and draw what is found.
 
 The tables need rich, so their module is imported where one is printed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
 from traceback import extract_tb
 from typing import TYPE_CHECKING
 
-from stiffopt.cli import exits, outputs, records
-from stiffopt.cli.answer import Answer, answer_file
+from stiffopt.cli import exits, solve_files, solve_records
 from stiffopt.cli.console import (
     Closed,
-    Work,
+    ProgressBar,
     report_error,
     report_note,
     show,
     warnings_as_notes,
     write_line,
 )
-from stiffopt.cli.inputs import Inputs, find_tasks
-from stiffopt.cli.interrupts import Interruptible
+from stiffopt.cli.exits import Interruptible
+from stiffopt.cli.solved_task import SolvedTask, solve_file
 from stiffopt.errors import StiffoptError
 
 if TYPE_CHECKING:
-    from stiffopt.cli.report import Row
+    from stiffopt.cli.solve_report import SummaryRow
 
 
 @dataclass(frozen=True)
-class Options:
+class SolveOptions:
     """The options of the command."""
 
     as_json: bool = False
@@ -47,31 +47,32 @@ class Options:
         return not self.as_json and not self.quiet
 
 
-def run(tasks: Sequence[str], options: Options) -> int:
+def run(tasks: Sequence[str], options: SolveOptions) -> int:
     """Solve task files and folders of them; print, write and draw; return the exit code."""
-    inputs = find_tasks(tasks)
+    tasks_found = solve_files.find_tasks(tasks)
+    files = tasks_found.paths
     try:
-        to_write = outputs.check(options.out, options.plot, inputs.files)
+        if options.out is not None:
+            solve_files.check_result_file(options.out, files)
+        pictures = solve_files.picture_names(options.plot, files)
     except StiffoptError as error:
         report_error(str(error))
         return exits.BAD_INPUT
     with Interruptible() as interrupts, warnings_as_notes(quiet=options.quiet):
-        return _run_checked(inputs, to_write, options, interrupts)
+        batch = _Batch(options, len(files), interrupts)
+        for bad in tasks_found.errors:
+            batch.complain(bad.path, str(bad))
+        for note in tasks_found.skipped if not options.quiet else ():
+            report_note(note)
+        return _solve_all(batch, files, pictures)
 
 
-def _run_checked(
-    inputs: Inputs, to_write: outputs.FilesToWrite, options: Options, interrupts: Interruptible
-) -> int:
-    batch = _Batch(options, Work(len(inputs.files), quiet=options.quiet), interrupts)
-    for bad in inputs.errors:
-        batch.complain(bad.path, str(bad))
-    for note in inputs.skipped if not options.quiet else ():
-        report_note(note)
+def _solve_all(batch: _Batch, files: Sequence[str], pictures: Sequence[str | None]) -> int:
     try:
-        for file, picture in zip(inputs.files, to_write.plots, strict=True):
+        for file, picture in zip(files, pictures, strict=True):
             batch.solve(file, picture)
         batch.summarise()
-        batch.write(to_write.out)
+        batch.write()
     except Closed:
         return exits.CLOSED_PIPE
     return exits.CLOSED_PIPE if batch.reader_left else exits.most_serious(batch.codes)
@@ -79,22 +80,27 @@ def _run_checked(
 
 @dataclass
 class _Batch:
-    """What became of the files so far."""
+    """The files that were solved so far, and their exit codes."""
 
-    options: Options
-    work: Work
+    options: SolveOptions
+    total: int
     interrupts: Interruptible
-    answers: list[Answer] = field(default_factory=list)
-    rows: list[Row] = field(default_factory=list)
+    solved: list[SolvedTask] = field(default_factory=list)
+    rows: list[SummaryRow] = field(default_factory=list)
     codes: list[int] = field(default_factory=list)
     reader_left: bool = False
 
+    def __post_init__(self) -> None:
+        self._progress = ProgressBar(quiet=self.options.quiet)
+        self._number = 0  # of the file that is being solved, counted from 1
+
     def solve(self, file: str, picture: str | None) -> None:
-        """Answer one file, or report what is wrong with it."""
+        """Solve one file, or report what is wrong with it."""
         begin = perf_counter()
+        self._number += 1
         try:
-            with self.work.step(file):
-                answer = answer_file(file, seed=self.options.seed, pareto=self.options.pareto)
+            with self._showing(file):
+                solved = solve_file(file, seed=self.options.seed, pareto=self.options.pareto)
             self.interrupts.check()
         except StiffoptError as error:
             self.interrupts.check()
@@ -105,58 +111,67 @@ class _Batch:
             self.interrupts.check()
             self.complain(file, f"{file}: {_bug(error)}", exits.FAILED)
         else:
-            self._take(answer, perf_counter() - begin)
+            self._take(solved, perf_counter() - begin)
             if picture is not None:
-                self._draw(answer, picture)
+                self._draw(solved, picture)
 
     def complain(self, file: str, message: str, code: int = exits.BAD_INPUT) -> None:
-        """Report a file that has no answer."""
+        """Report a file that could not be solved."""
         report_error(message)
         self.codes.append(code)
         if self.options.tables:
-            from stiffopt.cli.report import Row
+            from stiffopt.cli.solve_report import SummaryRow
 
-            self.rows.append(Row(file, "bad input" if code == exits.BAD_INPUT else "failed"))
+            self.rows.append(SummaryRow(file, "bad input" if code == exits.BAD_INPUT else "failed"))
 
     def summarise(self) -> None:
         """Print one line a file, where there are several."""
         if len(self.rows) > 1:
-            from stiffopt.cli.report import summary
+            from stiffopt.cli.solve_report import summary
 
             self._print(lambda: show(summary(self.rows)))
 
-    def write(self, path: str | None) -> None:
+    def write(self) -> None:
         """Write the result file."""
-        if path is None:
+        if self.options.out is None:
             return
         try:
-            outputs.write_results(path, self.answers)
+            solve_files.write_results(self.options.out, self.solved)
         except StiffoptError as error:
             report_error(str(error))
             self.codes.append(exits.BAD_INPUT)
 
-    def _take(self, answer: Answer, seconds: float) -> None:
-        self.answers.append(answer)
-        self.codes.append(exits.OF_STATUS[answer.solution.status])
-        if self.options.as_json:
-            self._print(lambda: write_line(records.json_line(answer)))
-        if self.options.tables:
-            from stiffopt.cli.report import Row, block
+    @contextmanager
+    def _showing(self, text: str) -> Iterator[None]:
+        """Show on which file work goes on, and how many are done where there are several."""
+        with self._progress.shown():
+            several = self.total > 1
+            words = f"{text} ({self._number} of {self.total})" if several else text
+            self._progress.report(self._number - 1, self.total if several else None, words)
+            yield
 
-            self.rows.append(Row.of(answer, seconds))
-            self._print(lambda: show(block(answer)))
-        if answer.complaint:
-            report_error(f"{answer.file}: {answer.complaint}")
+    def _take(self, solved: SolvedTask, seconds: float) -> None:
+        self.solved.append(solved)
+        self.codes.append(exits.OF_STATUS[solved.solution.status])
+        if self.options.as_json:
+            self._print(lambda: write_line(solve_records.json_line(solved)))
+        if self.options.tables:
+            from stiffopt.cli.solve_report import SummaryRow, block
+
+            self.rows.append(SummaryRow.of(solved, seconds))
+            self._print(lambda: show(block(solved)))
+        if solved.complaint:
+            report_error(f"{solved.file}: {solved.complaint}")
             self.codes.append(exits.BAD_INPUT)
 
-    def _draw(self, answer: Answer, picture: str) -> None:
-        """Draw an answer; where that fails the answer still stands."""
+    def _draw(self, solved: SolvedTask, picture: str) -> None:
+        """Draw a solved task; where that fails the solution is still reported."""
         try:
-            with self.work.drawing(answer.file):
-                outputs.draw(answer, picture)
+            with self._showing(f"{solved.file}: drawing"):
+                solve_files.draw(solved, picture)
         except StiffoptError as error:
-            report_error(f"no picture of {answer.file}: {error}")
-            if answer.solution.pressures is not None:
+            report_error(f"no picture of {solved.file}: {error}")
+            if solved.solution.pressures is not None:
                 self.codes.append(exits.BAD_INPUT)
 
     def _print(self, printing: Callable[[], None]) -> None:

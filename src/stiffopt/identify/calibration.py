@@ -18,12 +18,14 @@ from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.setup import Setup, named, started
-from stiffopt.identify.structure import STRAIN_LAWS, STRUCTURES, Structure
+from stiffopt.identify.structure import STRUCTURES, Structure
 from stiffopt.identify.unknowns import BASE
 from stiffopt.identify.validation import compare, placements, recordings_of
 from stiffopt.logs import Log, StiffnessTable
+from stiffopt.model.actuation import StrainLaw
 from stiffopt.model.calibration import Calibration, FittedParameter
-from stiffopt.model.description import Recordings, RobotDescription
+from stiffopt.model.description import Recordings, RobotDescription, Segment
+from stiffopt.model.laws import strain_laws
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.registration import Placement, Registration
@@ -119,7 +121,7 @@ def calibrate(
     structures = _structures(settings)
     for key in settings.fixed:
         Parameter(key).value(description)  # raises if there is no such number
-    laws = _other_laws(description) if settings.strain_law == "auto" else []
+    laws = other_laws(description) if settings.strain_law == "auto" else []
     teller = _Teller(progress, len(structures) + len(laws))
     recordings = recordings_of(description, logs, settings)
     setup = Setup.of(description, recordings, tables, settings)
@@ -147,7 +149,10 @@ def calibrate(
         others = [chosen]
         for law in laws:
             structure = replace(
-                chosen.structure, strain_law=law, name=f"{chosen.structure.name}, {law}"
+                chosen.structure,
+                strain_law=law.name,
+                name=f"{chosen.structure.name}, {law.name}",
+                words=f"{chosen.structure.words}; {law.words}",
             )
             others.append(_candidate(setup, structure, (near,), teller))
         candidates += others[1:]
@@ -170,16 +175,21 @@ def _candidate(
     return Candidate(structure, found, held_back_errors(found, settings.settle, teller))
 
 
-def _other_laws(description: RobotDescription) -> list[str]:
-    """Strain laws that the robot could have instead of its own."""
-    segments = description.segments
-    own = {segment.strain_law for segment in segments}
-    soft = all(segment.material.poisson_ratio == 0.5 for segment in segments)
-    return (
-        [law for law in STRAIN_LAWS if law not in own and (soft or law != "neo-hookean")]
-        if len(own) == 1
-        else []
-    )
+def other_laws(description: RobotDescription) -> list[type[StrainLaw]]:
+    """Strain laws that all segments of a robot could have instead of their own, simplest first."""
+    own = {segment.strain_law for segment in description.segments}
+    if len(own) != 1:
+        return []
+    found = []
+    for name, law in strain_laws().items():
+        try:
+            for segment in description.segments:
+                Segment(**segment.model_dump() | {"strain_law": name, "law": None})
+        except InputError:  # the law cannot describe such a segment
+            continue
+        if name not in own:
+            found.append(law)
+    return found
 
 
 class _Teller:

@@ -10,6 +10,7 @@ import numpy as np
 
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.unknowns import BASE, SENSOR
+from stiffopt.model.parameters import Parameter
 
 __all__ = ["TIED", "Estimate", "doubts", "estimates"]
 
@@ -21,25 +22,11 @@ _FAR = 3.0  # deviations from the robot file
 _TILT = np.radians(8.0)  # of base or sensor, that is doubted whatever the tolerance
 _NORMAL = 1.959963984540054
 
-_EXPERIMENTS = (
-    ("compensation.stiffness", "'stiffopt experiment stiffness', whose table is fitted too"),
-    ("material.youngs_modulus", "'stiffopt experiment stiffness', whose table is fitted too"),
-    ("compensation.area", "all channels of the segment at the same pressure, in steps"),
-    ("corrections.gain", "each channel alone, to its highest pressure"),
-    ("corrections.azimuth", "each channel alone, with the tip's orientation recorded"),
-    ("corrections.offset", "small pressures, near zero"),
-    ("corrections.dead_band", "small pressures, near zero, in slow ramps"),
-    ("compensation.modulus_per_pressure", "several channels at once, to high pressures"),
-    ("compensation.bending_radius", "each channel alone, to its highest pressure"),
-    ("compensation.lengthening", "each channel alone, to its highest pressure"),
-    ("length", "a calliper, or the tip's orientation recorded while it bends far"),
-    ("history.lag", "steps of pressure, logged at 10 Hz or more"),
-    ("history.dead_time", "steps of pressure, logged at 10 Hz or more"),
-    ("history.play", "the same pressures reached from below and from above"),
-    (BASE, "the base tracked too, or touched with a pointer"),
-    (SENSOR, "the tip's orientation recorded while it bends in all directions"),
-)
-"""For the beginning of a key (or of a name) what would tell."""
+_PLACED = {
+    BASE: "the base tracked too, or touched with a pointer",
+    SENSOR: "the tip's orientation recorded while it bends in all directions",
+}
+"""What recordings would tell where these are."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +112,6 @@ def doubts(found: Fit, listed: Sequence[Estimate]) -> list[str]:
 
 
 def _experiment(estimate: Estimate) -> str:
-    key = estimate.key.partition("].")[2]
-    for beginning, experiment in _EXPERIMENTS:
-        if (key and key.startswith(beginning)) or estimate.name.startswith(beginning):
-            return experiment
-    return ""
+    if estimate.key:
+        return Parameter(estimate.key).number.experiment
+    return next((text for name, text in _PLACED.items() if estimate.name.startswith(name)), "")

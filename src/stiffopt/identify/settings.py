@@ -20,8 +20,8 @@ class CalibrationSettings(Schema):
     ----------
     structure : name of a model of `STRUCTURES`, or ``auto``: the one that predicts held-back
         logs (of a single log, held-back parts) best; of those that are as good, the simplest.
-    strain_law : ``auto``: the robot file's, unless another of `STRAIN_LAWS` predicts what is held
-        back clearly better; or ``keep``.
+    strain_law : ``auto``: the robot file's, unless another law of `stiffopt.model.laws` predicts
+        what is held back clearly better; or ``keep``.
     sequence : whether the logs follow each other, so that each begins in the state in which the
         one before it ended.
     rezero : whether positions are counted anew in each log.

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.history import Creep, History, Play
+from stiffopt.model.laws import law_class
 
 __all__ = ["STRUCTURES", "Structure"]
-
-STRAIN_LAWS = ("paper", "rest-length", "neo-hookean")
 
 _LAG = 0.3  # s, where the robot file does not say
 _DEAD_TIME = 0.05  # s
@@ -68,8 +67,9 @@ class Structure:
 
     def _segment(self, segment: Segment, seen: float, fine: bool) -> Segment:
         update: dict[str, object] = {"history": self._history(segment, seen, fine)}
-        if self.strain_law:
-            update["strain_law"] = self.strain_law
+        if self.strain_law and self.strain_law != segment.strain_law:
+            keys = law_class(self.strain_law).Keys
+            update |= {"strain_law": self.strain_law, "law": keys() if keys is not None else None}
         given = segment.compensation or Compensation()
         if not given.modulus_per_pressure:  # a robot file that softens says how
             given = given.model_copy(update={"modulus_law": "exponential"})

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.model.laws import law_class
 from stiffopt.model.parameters import Parameter
 
 __all__ = ["BASE", "SENSOR", "Unknown", "history_unknowns", "placement_unknowns", "shape_unknowns"]
@@ -24,7 +25,6 @@ Array = NDArray[np.float64]
 _AXES = ("x", "y", "z")
 BASE = "base in the tracker's frame"
 SENSOR = "sensor on the tip"
-_LARGEST_SHARE = 0.9
 _SIDE = 0.6  # deviation; all between -1 and 1 are about as likely
 
 
@@ -56,29 +56,30 @@ class Unknown:
 def shape_unknowns(
     description: RobotDescription, names: Sequence[str], tolerances: Tolerances
 ) -> list[Unknown]:
-    """Unknowns of all segments that have one of these names, for example ``corrections.gain``."""
+    """Unknowns of the equilibrium of all segments.
+
+    Parameters
+    ----------
+    description : RobotDescription
+        The robot from which the fit begins.
+    names : sequence of str
+        Keys of a segment without indices, such as ``corrections.gain``. Of the material and the
+        compensation those count that the segment's strain law lets be fitted; the law's own numbers
+        come after them.
+    tolerances : Tolerances
+        How well the robot file is known.
+    """
     found = []
     for s, segment in enumerate(description.segments):
-        for name in names:
-            field = name.rpartition(".")[2]
+        law = law_class(segment.strain_law)
+        for name in (*names, *law.fitted_numbers()):
+            owner, _, field = name.rpartition(".")
+            if owner in ("material", "compensation") and name not in law.fitted_keys:
+                continue
             keys = [f"segments[{s}].{name}"]
-            if name.startswith("corrections.") and field != "dead_band":
+            if owner == "corrections" and field != "dead_band":
                 keys = [f"{keys[0]}[{c}]" for c in range(segment.n_channels)]
-            for key in keys:
-                parameter = Parameter(key)
-                low, high = -math.inf, math.inf
-                if field == "softening":
-                    low, high = _between(parameter.value(description), 0.0, 1.0)
-                found.append(
-                    Unknown(
-                        parameter.name,
-                        "" if parameter.is_positive else parameter.unit,
-                        float(getattr(tolerances, field)),
-                        low,
-                        high,
-                        parameter,
-                    )
-                )
+            found += [_of_parameter(Parameter(key), description, tolerances) for key in keys]
     return found
 
 
@@ -94,24 +95,22 @@ def history_unknowns(description: RobotDescription, tolerances: Tolerances) -> l
         names += [f"memory[{c}]" for c in range(len(history.memory))]
         names += [f"play[{j}].share" for j in range(len(history.play))]
         names += [f"creep[{j}].share" for j in range(len(history.creep))]
-        for name in names:
-            parameter = Parameter(f"segments[{s}].history.{name}")
-            value = parameter.value(description)
-            low, high = -math.inf, math.inf
-            if name == "dead_time":
-                deviation, low = tolerances.dead_time, -value
-            elif name.startswith("lag"):
-                deviation = tolerances.lag
-            elif name.startswith("memory"):
-                deviation = tolerances.memory
-            elif name.startswith("creep"):
-                deviation = tolerances.creep_share
-                low, high = _between(value, 0.0, _LARGEST_SHARE)
-            else:
-                deviation, (low, high) = tolerances.share, _between(value, 0.0, _LARGEST_SHARE)
-            unit = "" if parameter.is_positive else parameter.unit
-            found.append(Unknown(parameter.name, unit, deviation, low, high, parameter))
+        parameters = [Parameter(f"segments[{s}].history.{name}") for name in names]
+        found += [_of_parameter(each, description, tolerances) for each in parameters]
     return found
+
+
+def _of_parameter(
+    parameter: Parameter, description: RobotDescription, tolerances: Tolerances
+) -> Unknown:
+    number = parameter.number
+    tolerance = number.tolerance
+    deviation = tolerance if isinstance(tolerance, float) else getattr(tolerances, tolerance)
+    if number.positive:
+        return Unknown(parameter.name, "", float(deviation), parameter=parameter)
+    value = parameter.value(description)
+    low, high = number.low - value, number.high - value
+    return Unknown(parameter.name, number.unit, float(deviation), low, high, parameter)
 
 
 def placement_unknowns(name: str, position: Array, angle: Array, turns: bool) -> list[Unknown]:
@@ -125,11 +124,6 @@ def placement_unknowns(name: str, position: Array, angle: Array, turns: bool) ->
         Unknown(f"{name}, about {axis}", "rad", float(d))
         for axis, d in zip(_AXES, angle, strict=True)
     ]
-
-
-def _between(value: float, low: float, high: float) -> tuple[float, float]:
-    """Bounds of the coordinate of a value that lies between two others."""
-    return low - value, high - value
 
 
 def side_unknowns(description: RobotDescription, name: str) -> list[Unknown]:

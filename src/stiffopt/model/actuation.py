@@ -2,9 +2,11 @@
 
 A strain law says what a segment does without any load: the strain of its backbone and the
 compliance of its section, both constant along the segment.  Laws use different length
-conventions on paper; here both results are **per reference length**, so that the rest of the
-model need not know.  To add a law, subclass `StrainLaw` and enter it in `STRAIN_LAWS`.
+conventions on paper; here both results are **per length at rest**, so that the rest of the model
+need not know.  The laws themselves stand in `stiffopt.model.laws`, one file each.
 """
+
+from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -15,7 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.model.calibration import FittedNumber
 from stiffopt.model.description import Compensation, Segment
+from stiffopt.schema import BadKeyError, Schema
 
 NORM_SMOOTHING = 0.01
 """Rounding of the cone sqrt(p.p) at zero pressure, in Pa (see `smooth_norm`)."""
@@ -23,7 +27,7 @@ NORM_SMOOTHING = 0.01
 
 @dataclass(frozen=True)
 class Section:
-    """What a strain law answers for one segment, per reference length.
+    """What a strain law answers for one segment, per length at rest.
 
     Attributes
     ----------
@@ -62,7 +66,7 @@ class SectionGeometry:
     channel_moment: NDArray[np.float64]
 
     @classmethod
-    def of(cls, segment: Segment) -> "SectionGeometry":
+    def of(cls, segment: Segment) -> SectionGeometry:
         """Integrate over the section of a segment (eqs 8 and 10)."""
         chambers = segment.chambers
         angles = np.asarray(chambers.angles)
@@ -108,8 +112,8 @@ def onset(p: ca.SX, dead_band: ca.SX | float) -> ca.SX:
     return w * (logarithm - np.log1p(np.exp(-2.0)))
 
 
-def _bending(second_moment: ca.SX) -> ca.SX:
-    """Turn ``int r r^T dA`` into the matrix that maps (kappa_x, kappa_y) to (M_x, M_y) / E.
+def bending_matrix(second_moment: ca.SX) -> ca.SX:
+    """Turn ``int r r^T dA`` (2, 2) into the matrix that maps (kappa_x, kappa_y) to (M_x, M_y) / E.
 
     The strain of a fibre at (x, y) is ``y kappa_x - x kappa_y`` and it adds ``(y, -x)`` to
     the moment.
@@ -130,15 +134,92 @@ def _limited(kappa: ca.SX, radius: ca.SX | float) -> tuple[ca.SX, ca.SX]:
 
 
 class StrainLaw(ABC):
-    """Free strain and compliance of one segment's section as a function of its pressures."""
+    """Free strain and compliance of one segment's section as a function of its pressures.
 
-    limit: str
-    """What goes wrong where `margin` is not positive, as the end of a sentence."""
+    A subclass that has a `name` is a law that robot files can name; it is registered where it is
+    defined.
+
+    Attributes
+    ----------
+    name : str
+        In robot files, ``strain_law: NAME``.
+    words : str
+        What the law assumes, in a few words, for reports.
+    limit : str
+        What goes wrong where `margin` is not positive, as the end of a sentence.
+    Keys : type of Schema or None
+        Keys of the robot file that only this law has, as ``law: {...}`` of a segment. Those whose
+        annotation holds a `FittedNumber` may be fitted by calibration, which begins at their
+        defaults where it tries the law on an arm whose file names another.
+    fitted_keys : tuple of str
+        Which keys of a segment's `material` and `compensation` calibration may fit under this law.
+    complexity : int
+        Calibration tries simple laws first, and of laws that predict alike takes the simplest.
+    """
+
+    name: ClassVar[str]
+    words: ClassVar[str]
+    limit: ClassVar[str]
+    Keys: ClassVar[type[Schema] | None] = None
+    fitted_keys: ClassVar[tuple[str, ...]] = (
+        "material.youngs_modulus",
+        "compensation.area",
+        "compensation.stiffness",
+        "compensation.modulus_per_pressure",
+        "compensation.bending_radius",
+        "compensation.lengthening",
+    )
+    complexity: ClassVar[int] = 3
+    registered: ClassVar[dict[str, type[StrainLaw]]] = {}
+    """Laws that were defined so far, by name; `stiffopt.model.laws.strain_laws` returns all."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "name" not in vars(cls):
+            return
+        for other in cls.registered.values():
+            if other.__qualname__ == cls.__qualname__ and other.__module__ == cls.__module__:
+                continue  # the module is read again
+            if other.name == cls.name:
+                raise TypeError(f"there are two strain laws of the name {cls.name!r}")
+            for key, number in cls.fitted_numbers().items():
+                if other.fitted_numbers().get(key, number) != number:
+                    raise TypeError(f"the strain laws {cls.name!r} and {other.name!r} share {key}")
+        cls.registered[cls.name] = cls
 
     def __init__(self, segment: Segment) -> None:
         self.segment = segment
         self.geometry = SectionGeometry.of(segment)
         self.compensation = segment.compensation or Compensation()
+        self.keys: Any = segment.law or (self.Keys() if self.Keys is not None else None)
+
+    @classmethod
+    def fitted_numbers(cls) -> dict[str, FittedNumber]:
+        """Return what calibration must know of the law's own keys that it may fit, by key."""
+        fields = cls.Keys.model_fields if cls.Keys is not None else {}
+        return {
+            f"law.{key}": number
+            for key, field in fields.items()
+            for number in field.metadata
+            if isinstance(number, FittedNumber)
+        }
+
+    @classmethod
+    def check(cls, segment: Segment) -> None:
+        """Refuse a segment that the law cannot describe, when its description is made.
+
+        Raises
+        ------
+        BadKeyError
+            It names the key of the segment that is to blame.
+        """
+        if cls.Keys is not None and segment.law is None:
+            fields = cls.Keys.model_fields.items()
+            missing = [key for key, field in fields if field.is_required()]
+            if missing:
+                raise BadKeyError(
+                    "law", f"the strain law '{cls.name}' needs the keys {', '.join(missing)} here"
+                )
 
     @abstractmethod
     def section(self, p: ca.SX) -> Section:
@@ -223,165 +304,3 @@ class StrainLaw(ABC):
             return compliance
         A = lie.adjoint(lie.transform(ca.SX.eye(3), ca.vertcat(centroid, 0)))
         return ca.sparsify(A @ compliance @ A.T)
-
-
-class LinearLaw(StrainLaw):
-    """Linear fibres with compensation coefficients lambda (eqs 8-10).
-
-    ``lambda_E = E + slope |p|``, ``lambda_A = a A``, ``lambda_I = i I``; elongation
-    ``f_z l / (E A)``; curvature ``M / (E I)`` and compliance per the length that the subclass
-    names.  Where the centroid is off the axis, which the paper does not treat, all this holds for
-    the line of centroids, and the compensated second moment is that about the centroid.
-
-    Loads meet the modulus ``stiffness (E + softening slope |p|)``, the paper's own where both
-    factors are 1.  Where there is a least bending radius R, the curvature is
-    ``kappa / sqrt(1 + R^2 |kappa|^2)`` instead, and loads meet the derivative of that by the
-    moment.  See `stiffopt.model.description.Compensation`.
-    """
-
-    limit = "the pressure drives the compensated modulus of this segment to zero"
-    _per_deformed_length: ClassVar[bool]
-
-    def margin(self, p: ca.SX) -> ca.SX:
-        """Compensated modulus over a thousandth of the nominal one, less one."""
-        return self._modulus_margin(p)
-
-    def section(self, p: ca.SX) -> Section:
-        """Section of eqs 8-10; see `StrainLaw.section`."""
-        geometry = self.geometry
-        area = self.compensation.area * geometry.area
-        inertia = self.compensation.inertia * ca.DM(geometry.second_moment)
-        acting = self._acting(p)
-        E = self._modulus(acting)
-        loaded = self._loaded_modulus(acting)
-        G = loaded / (2 * (1 + self.segment.material.poisson_ratio))
-        force, moment = self._axial_force(acting), self._moment_about_centroid(acting)
-        kappa, flexibility = self._bent(
-            ca.inv_minor(_bending(ca.SX(inertia))) @ moment / E,
-            ca.inv_minor(loaded * _bending(inertia)),
-        )
-        compliance = self._about_axis(
-            self._compliance_about_centroid(
-                shear=G * area,
-                axial=loaded * area,
-                flexibility=flexibility,
-                torsion=G * ca.trace(inertia),
-            ),
-            ca.SX(geometry.centroid),
-        )
-        c = geometry.centroid
-        stretch = self._lengthened(1 + force / (E * area), kappa)  # of the line of centroids
-        if self._per_deformed_length:
-            strain = stretch * ca.vertcat(0, 0, 1 + kappa[1] * c[0] - kappa[0] * c[1], kappa, 0)
-            return Section(strain, stretch * compliance)
-        along = stretch + kappa[1] * c[0] - kappa[0] * c[1]
-        return Section(ca.vertcat(0, 0, along, kappa, 0), compliance)
-
-
-class PaperLaw(LinearLaw):
-    """The paper's law: linear, per *deformed* length.
-
-    So are its curvature and, integrated over deformed length, the compliance of eq. 17 (slip 8 of
-    the notes); per length at rest both gain the stretch as a factor.
-    """
-
-    _per_deformed_length = True
-
-
-class RestLengthLaw(LinearLaw):
-    """The paper's formulas per length at *rest*, as linear fibres have it.
-
-    A fibre's stress follows its length over that at rest, whatever the others do; so stretch and
-    bending do not mix.
-    """
-
-    _per_deformed_length = False
-
-
-class NeoHookeanLaw(StrainLaw):
-    """Incompressible neo-Hookean section, per reference length.
-
-    With ``mu = E / 3`` and chambers of constant bore (fibre-reinforced), the pressure force N
-    stretches the section by the positive root of ``lambda - lambda^-2 = N / (mu A)``.  The
-    section shrinks by ``a = lambda^-1/2``, the lever arms of the chambers with it.  About that
-    state the section has (per reference length, in shrunk axes)
-
-    * axial stiffness ``E_t A`` with the tangent modulus ``E_t = mu (1 + 2 lambda^-3)``,
-    * bending stiffness ``E_t I a^2``, moment ``a sum P A_c r``,
-    * shear stiffness ``mu A`` and torsional stiffness ``mu J a^2``,
-
-    exact for the strain to first order in curvature, and for the compliance where the segment
-    is straight; the coupling of stretch and bending that grows with curvature is left out.
-
-    Compensation coefficients mean what they mean in `LinearLaw`: E, A and I are the compensated
-    ones, loads meet the stiffnesses above with mu of the loaded modulus, the bending radius limits
-    the curvature per reference length, and lengthening adds to the stretch of the shape alone.
-    """
-
-    limit = "the pressure brings this segment beyond the neo-Hookean law's range"
-    _lowest_load = -1.8  # the closed-form root below is real down to -3 / 2^(2/3) = -1.89
-
-    def _load(self, acting: ca.SX) -> ca.SX:
-        """Axial load N / (mu A) of the acting pressures."""
-        mu = self._modulus(acting) / 3
-        return self._axial_force(acting) / (mu * (self.compensation.area * self.geometry.area))
-
-    def margin(self, p: ca.SX) -> ca.SX:
-        """Distance of the axial load from the largest compression, or that of `LinearLaw`."""
-        margin = self._load(self._acting(p)) - self._lowest_load
-        if ca.SX(self.compensation.modulus_per_pressure).is_zero():
-            return margin
-        return ca.fmin(margin, self._modulus_margin(p))
-
-    def section(self, p: ca.SX) -> Section:
-        """Section about the stretched state; see `StrainLaw.section`."""
-        geometry = self.geometry
-        area = self.compensation.area * geometry.area
-        inertia = self.compensation.inertia * ca.DM(geometry.second_moment)
-        acting = self._acting(p)
-        stretch = neo_hookean_stretch(self._load(acting))
-        rise = 1 + 2 * stretch**-3  # E_t / mu
-        shrink = 1 / ca.sqrt(stretch)
-        mu, loaded = self._modulus(acting) / 3, self._loaded_modulus(acting) / 3
-        omega, flexibility = self._bent(
-            ca.inv_minor(mu * rise * _bending(inertia) / stretch)
-            @ (shrink * self._moment_about_centroid(acting)),
-            ca.inv_minor(loaded * rise * _bending(inertia) / stretch),
-        )
-        centroid = shrink * ca.SX(geometry.centroid)
-        compliance = self._about_axis(
-            self._compliance_about_centroid(
-                shear=loaded * area,
-                axial=loaded * rise * area,
-                flexibility=flexibility,
-                torsion=loaded * ca.trace(inertia) / stretch,
-            ),
-            centroid,
-        )
-        along = self._lengthened(stretch, omega) + omega[1] * centroid[0] - omega[0] * centroid[1]
-        return Section(ca.vertcat(0, 0, along, omega, 0), compliance)
-
-
-def neo_hookean_stretch(load: ca.SX) -> ca.SX:
-    """Stretch of an incompressible neo-Hookean bar: ``lambda - lambda^-2 = load``.
-
-    The one positive root of ``lambda^3 - load lambda^2 - 1 = 0`` by Cardano's formula, real
-    for ``load > -3 / 2^(2/3)``.
-    """
-    third = load / 3
-    half_q = third**3 + 0.5
-    root = half_q + ca.sqrt(third**3 + 0.25)
-    u = root ** (1 / 3)
-    return third + u + third**2 / u
-
-
-STRAIN_LAWS: dict[str, type[StrainLaw]] = {
-    "paper": PaperLaw,
-    "rest-length": RestLengthLaw,
-    "neo-hookean": NeoHookeanLaw,
-}
-
-
-def strain_law(segment: Segment) -> StrainLaw:
-    """Strain law that a segment's description names."""
-    return STRAIN_LAWS[segment.strain_law](segment)

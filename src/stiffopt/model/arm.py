@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError, PressureError, shown
-from stiffopt.model.actuation import strain_law
 from stiffopt.model.arguments import dead_and_follower
 from stiffopt.model.compliance import Frame
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.equilibrium import Equilibrium, Loads, State
 from stiffopt.model.kinematics import Actuation
+from stiffopt.model.laws import strain_law
 from stiffopt.model.native_calls import BatchFunction, InterpretedFunction
 from stiffopt.model.native_robot import TipFunctions
 from stiffopt.model.native_source import dense

@@ -1,9 +1,11 @@
-"""What a calibration leaves in the robot file beside the values: how well they are known."""
+"""How well the numbers of a robot file are known: before a calibration, and after one."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +15,48 @@ from stiffopt.errors import shown
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Angle, Length, Number, Pressure
 
-__all__ = ["Calibration", "FittedParameter"]
+__all__ = ["Calibration", "FittedNumber", "FittedParameter", "SIUnit"]
 
 Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits
-_SLACK = 0.02  # of the recorded pressures; so little beyond them is not beyond
+_SLACK = 0.02  # of the highest recorded pressure, by which others may exceed what was recorded
+
+
+SIUnit = Literal["", "m", "rad", "Pa", "s"]
+
+
+@dataclass(frozen=True)
+class FittedNumber:
+    """What calibration must know of a kind of number in robot files to fit it.
+
+    The fit moves a *coordinate* that is zero at the value of the robot file: the logarithm of the
+    ratio for what must stay positive, else the difference.
+
+    Attributes
+    ----------
+    words : str
+        What people call it.
+    unit : str
+        Of the value, in SI; empty for a plain number.
+    tolerance : float or str
+        Standard deviation of the coordinate before the fit: relative for what is positive, else in
+        the unit of the value. Text is the key of a robot file's `tolerances` that has it.
+    positive : bool
+        Whether the coordinate is a logarithm; the fit must then begin above zero.
+    low, high : float
+        Bounds of the value; of what is positive they have no effect.
+    experiment : str
+        What recordings would tell the number, as the end of a sentence.
+    """
+
+    words: str
+    unit: SIUnit
+    tolerance: float | str
+    positive: bool = False
+    low: float = -math.inf
+    high: float = math.inf
+    experiment: str = ""
 
 
 class FittedParameter(Schema):
@@ -42,14 +80,14 @@ class Calibration(Schema):
 
     Attributes
     ----------
-    logs : names of what it was fitted to.
-    parameters : that were fitted.
+    logs : names of the recordings it was fitted to.
+    parameters : the numbers that were fitted.
     correlation : of their errors, one row for each.
-    position_residual, angle_residual : root mean square of what the model leaves of the recorded
-        positions (each axis) and angles.
-    pressure_min, pressure_max : between which each channel was recorded, in Pa.
-    pressure_norm : largest norm that was recorded of each segment's pressures, in Pa.
-        Where nothing is said of what was recorded, everything counts as recorded.
+    position_residual, angle_residual : root mean square of the difference between the recorded
+        positions (each axis) and angles and those of the model.
+    pressure_min, pressure_max : lowest and highest recorded pressure of each channel, in Pa.
+    pressure_norm : largest recorded norm of each segment's pressures, in Pa.
+        Where these three are missing, all pressures count as recorded.
     """
 
     logs: Items[str] = ()

@@ -11,15 +11,25 @@ import itertools
 import math
 import re
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    BeforeValidator,
+    Discriminator,
+    Field,
+    SerializeAsAny,
+    Tag,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from stiffopt.errors import InputError, shown
 from stiffopt.model.calibration import Calibration
 from stiffopt.model.history import History
 from stiffopt.registration import Placement, Registration
-from stiffopt.schema import BadKeyError, Items, Schema, Vector
+from stiffopt.schema import BadKeyError, Items, Schema, Vector, explain
 from stiffopt.units import (
     Acceleration,
     Angle,
@@ -32,6 +42,9 @@ from stiffopt.units import (
     PressureRate,
     Ratio,
 )
+
+if TYPE_CHECKING:
+    from stiffopt.model.actuation import StrainLaw
 
 __all__ = [
     "Chambers",
@@ -180,8 +193,10 @@ class Segment(Schema):
     corrections : of the channels, or None for none.
     history : how the shape lags behind the pressures, or None if it does not.
     connector : rigid length after the segment, in m.
-    strain_law : how pressures strain the segment: ``paper``, linear per deformed length;
-        ``rest-length``, the same per length at rest; or ``neo-hookean``.
+    strain_law : how pressures strain the segment, by the name of a law of `stiffopt.model.laws`:
+        ``paper``, linear per deformed length; ``rest-length``, the same per length at rest;
+        ``neo-hookean``; or any other that is registered.
+    law : the keys that only this law has, or None; of the type `StrainLaw.Keys`.
     """
 
     length: PositiveLength
@@ -196,12 +211,40 @@ class Segment(Schema):
     corrections: Corrections | None = None
     history: History | None = None
     connector: Annotated[Length, Field(ge=0)] = 0.0
-    strain_law: Literal["paper", "rest-length", "neo-hookean"] = "paper"
+    strain_law: str = "paper"
+    law: SerializeAsAny[Schema] | None = Field(None, exclude_if=lambda keys: keys is None)
 
     @property
     def n_channels(self) -> int:
         """Number of pressures that act on this segment."""
         return len(self.channels)
+
+    @field_validator("strain_law")
+    @classmethod
+    def _is_registered(cls, name: str) -> str:
+        _law_class(name)
+        return name
+
+    @field_validator("law", mode="plain")
+    @classmethod
+    def _read_law(cls, value: Any, info: ValidationInfo) -> Schema | None:
+        """Read the keys of the law by the schema that the law has for them."""
+        name = info.data.get("strain_law")
+        if name is None:  # there is no such law, which is told at that key
+            return None
+        keys = _law_class(name).Keys
+        if value is None:
+            return None
+        if keys is None:
+            raise InputError(f"the strain law {shown(name)} has no keys of its own; remove this")
+        if isinstance(value, keys):
+            return value
+        try:
+            return keys.model_validate(value, context=info.context)
+        except ValidationError as error:
+            loc, reason = explain(keys, error.errors()[0], None)
+            told = BadKeyError(".".join(map(str, loc)), reason) if loc else InputError(reason)
+            raise told from None
 
     @model_validator(mode="after")
     def _check(self) -> Segment:
@@ -219,12 +262,7 @@ class Segment(Schema):
                     f"corrections.{name}",
                     f"has {len(values)} values; expected {self.n_channels}, one for each channel",
                 )
-        if self.strain_law == "neo-hookean" and self.material.poisson_ratio != 0.5:
-            raise BadKeyError(
-                "material.poisson_ratio",
-                "the neo-hookean law is incompressible; expected 0.5, "
-                f"not {self.material.poisson_ratio:g}",
-            )
+        _law_class(self.strain_law).check(self)
         return self
 
     def _check_walls(self) -> None:
@@ -273,6 +311,12 @@ class Segment(Schema):
                 raise BadKeyError(
                     "channels", f"chamber {chamber} is fed by no channel; expected one"
                 )
+
+
+def _law_class(name: str) -> type[StrainLaw]:
+    from stiffopt.model.laws import law_class  # laws are made for segments
+
+    return law_class(name)
 
 
 class PressureLimits(Schema):

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import casadi as ca
 
 from stiffopt import lie
-from stiffopt.model.actuation import Section, strain_law
+from stiffopt.model.actuation import Section
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.laws import strain_law
 
 
 @dataclass(frozen=True)

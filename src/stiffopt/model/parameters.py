@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError, shown
 from stiffopt.model.actuation import Section
+from stiffopt.model.calibration import FittedNumber, SIUnit
 from stiffopt.model.description import (
     Compensation,
     Corrections,
@@ -28,56 +29,88 @@ from stiffopt.model.description import (
 )
 from stiffopt.model.history import History
 from stiffopt.model.kinematics import Actuation
+from stiffopt.model.laws import law_class, strain_laws
 from stiffopt.schema import Schema
 
-__all__ = ["Parameter", "Unit", "parametric", "with_values"]
+__all__ = ["Parameter", "fitted_numbers", "parametric", "with_values"]
 
 Vector = NDArray[np.float64]
-Unit = Literal["", "m", "rad", "Pa", "s"]
 _SchemaT = TypeVar("_SchemaT", bound=Schema)
 _Path = tuple[str | int, ...]
 
 _STEP = re.compile(r"([a-z_]+)|\[(\d{1,4})\]")
 
 
-@dataclass(frozen=True)
-class _Kind:
-    """What is known of a key whatever the robot.
+_LARGEST_SHARE = 0.9  # of one operator of a history, that a fit may reach
+_ALONE = "each channel alone, to its highest pressure"
+_PUSHED = "'stiffopt experiment stiffness', whose table is fitted too"
+_STEPS = "steps of pressure, logged at 10 Hz or more"
+_BOTH_WAYS = "the same pressures reached from below and from above"
+_NUMBERS = {
+    "length": FittedNumber(
+        "rest length", "m", "length", positive=True,
+        experiment="a calliper, or the tip's orientation recorded while it bends far",
+    ),
+    "material.youngs_modulus": FittedNumber(
+        "Young's modulus", "Pa", "youngs_modulus", positive=True, experiment=_PUSHED
+    ),
+    "compensation.modulus_per_pressure": FittedNumber(
+        "change of modulus with pressure", "", "modulus_per_pressure",
+        experiment="several channels at once, to high pressures",
+    ),
+    "compensation.area": FittedNumber(
+        "factor on the area", "", "area", positive=True,
+        experiment="all channels of the segment at the same pressure, in steps",
+    ),
+    "compensation.inertia": FittedNumber("factor on the second moment of area", "", "area", True),
+    "compensation.stiffness": FittedNumber(
+        "factor on the stiffness", "", "stiffness", positive=True, experiment=_PUSHED
+    ),
+    "compensation.softening": FittedNumber(
+        "share of softening", "", "softening", low=0.0, high=1.0
+    ),
+    "compensation.bending_radius": FittedNumber(
+        "least bending radius", "m", "bending_radius", positive=True, experiment=_ALONE
+    ),
+    "compensation.lengthening": FittedNumber(
+        "lengthening by bending", "", "lengthening", experiment=_ALONE
+    ),
+    "corrections.dead_band": FittedNumber(
+        "dead band", "Pa", "dead_band", positive=True,
+        experiment="small pressures, near zero, in slow ramps",
+    ),
+    "corrections.gain": FittedNumber("gain", "", "gain", positive=True, experiment=_ALONE),
+    "corrections.offset": FittedNumber(
+        "offset", "Pa", "offset", experiment="small pressures, near zero"
+    ),
+    "corrections.azimuth": FittedNumber(
+        "azimuth", "rad", "azimuth",
+        experiment="each channel alone, with the tip's orientation recorded",
+    ),
+    "history.dead_time": FittedNumber(
+        "dead time", "s", "dead_time", low=0.0, experiment=_STEPS
+    ),
+    "history.lag": FittedNumber("lag", "s", "lag", positive=True, experiment=_STEPS),
+    "history.lag_falling": FittedNumber(
+        "lag when falling", "s", "lag", positive=True, experiment=_STEPS
+    ),
+    "history.memory": FittedNumber("memory", "", "memory", positive=True),
+    "history.play.share": FittedNumber(
+        "share of play", "", "share", low=0.0, high=_LARGEST_SHARE, experiment=_BOTH_WAYS
+    ),
+    "history.creep.share": FittedNumber(
+        "share of creep", "", "creep_share", low=0.0, high=_LARGEST_SHARE
+    ),
+}  # fmt: skip
+"""Keys of a segment that can be parameters, without their indices; laws add their own."""
 
-    Attributes
-    ----------
-    unit : in SI.
-    positive : its coordinate is a logarithm.
-    words : what people call it.
-    """
 
-    unit: Unit
-    positive: bool
-    words: str
-
-
-_KINDS = {
-    "length": _Kind("m", True, "rest length"),
-    "material.youngs_modulus": _Kind("Pa", True, "Young's modulus"),
-    "compensation.modulus_per_pressure": _Kind("", False, "change of modulus with pressure"),
-    "compensation.area": _Kind("", True, "factor on the area"),
-    "compensation.inertia": _Kind("", True, "factor on the second moment of area"),
-    "compensation.stiffness": _Kind("", True, "factor on the stiffness"),
-    "compensation.softening": _Kind("", False, "share of softening"),
-    "compensation.bending_radius": _Kind("m", True, "least bending radius"),
-    "compensation.lengthening": _Kind("", False, "lengthening by bending"),
-    "corrections.dead_band": _Kind("Pa", True, "dead band"),
-    "corrections.gain": _Kind("", True, "gain"),
-    "corrections.offset": _Kind("Pa", False, "offset"),
-    "corrections.azimuth": _Kind("rad", False, "azimuth"),
-    "history.dead_time": _Kind("s", False, "dead time"),
-    "history.lag": _Kind("s", True, "lag"),
-    "history.lag_falling": _Kind("s", True, "lag when falling"),
-    "history.memory": _Kind("", True, "memory"),
-    "history.play.share": _Kind("", False, "share of play"),
-    "history.creep.share": _Kind("", False, "share of creep"),
-}
-"""Keys of a segment that can be parameters, without their indices."""
+def fitted_numbers() -> dict[str, FittedNumber]:
+    """Return every key of a segment that can be a parameter, without indices."""
+    found = dict(_NUMBERS)
+    for law in strain_laws().values():
+        found |= law.fitted_numbers()
+    return found
 
 
 @dataclass(frozen=True)
@@ -105,13 +138,16 @@ class Parameter:
         return tuple(steps)
 
     @property
-    def _kind(self) -> _Kind:
+    def number(self) -> FittedNumber:
+        """What calibration knows of numbers of this kind."""
         name = ".".join(step for step in self._path[2:] if isinstance(step, str))
-        if name not in _KINDS:
+        numbers = fitted_numbers() if name.startswith("law.") else _NUMBERS
+        if name not in numbers:
             raise InputError(
-                f"{shown(self.key)} cannot be a parameter; of a segment, {', '.join(_KINDS)} can"
+                f"{shown(self.key)} cannot be a parameter; of a segment, "
+                f"{', '.join(fitted_numbers())} can"
             )
-        return _KINDS[name]
+        return numbers[name]
 
     @property
     def segment(self) -> int:
@@ -121,14 +157,14 @@ class Parameter:
         return index
 
     @property
-    def unit(self) -> Unit:
+    def unit(self) -> SIUnit:
         """SI unit of its value; empty for a plain number."""
-        return self._kind.unit
+        return self.number.unit
 
     @property
     def is_positive(self) -> bool:
         """Whether its coordinate is the logarithm of its value over the nominal one."""
-        return self._kind.positive
+        return self.number.positive
 
     @property
     def is_history(self) -> bool:
@@ -144,7 +180,7 @@ class Parameter:
             place += f" channel {last + 1}"
         elif isinstance(self._path[-2], int) and len(self._path) > 3:
             place += f" number {self._path[-2] + 1}"
-        return f"{self._kind.words}, {place}"
+        return f"{self.number.words}, {place}"
 
     def value(self, description: RobotDescription) -> float:
         """Return its value in SI.
@@ -213,6 +249,9 @@ def explicit(description: RobotDescription) -> RobotDescription:
             "corrections": corrections,
             "history": segment.history or History(),
         }
+        keys = law_class(segment.strain_law).Keys
+        if keys is not None:
+            update["law"] = segment.law or keys()
         return segment.model_copy(update=update)
 
     segments = tuple(spelled(segment) for segment in description.segments)

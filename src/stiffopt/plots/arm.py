@@ -10,8 +10,7 @@ from stiffopt import lie
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
-from stiffopt.plots.style import MM
-from stiffopt.plots.wording import direction_text, figures, unit_text
+from stiffopt.plots.wording import MM, direction_text, figures, unit_text
 
 Vector = NDArray[np.float64]
 

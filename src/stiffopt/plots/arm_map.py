@@ -10,7 +10,7 @@ from stiffopt.experiments.stiffness import direction_name
 from stiffopt.plots.experiments import N_PER_CM
 from stiffopt.plots.figures import _literal, require_matplotlib
 from stiffopt.plots.scales import label_logarithmic, make_logarithmic, round_steps
-from stiffopt.plots.style import BAR, MM
+from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.experiments.stiffness import direction_name
 from stiffopt.identify.choice import Candidate
 from stiffopt.identify.comparison import Comparison
+from stiffopt.identify.stiffness_comparison import StiffnessComparison
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots.experiments import CHANNELS, MEASURED, MODEL, _head, _plain
 from stiffopt.plots.figures import _literal, require_matplotlib
 from stiffopt.plots.scales import label_logarithmic, make_logarithmic
-from stiffopt.plots.style import BAR, MM, RANGE
+from stiffopt.plots.style import RANGE
+from stiffopt.plots.wording import BAR, MM, vector_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
-    "MeasuredStiffness",
     "plot_errors_over_pressure",
     "plot_errors_over_time",
     "plot_models",
@@ -49,17 +50,6 @@ _PAUSE = 1.0  # s
 _FLAT = 0.25  # an axis shows at least this share of what the widest of x, y and z does
 _LINE = 0.2  # inches, of a legend
 _LEGEND = 75  # characters beside each other in a legend
-
-
-@dataclass(frozen=True)
-class MeasuredStiffness:
-    """A measured stiffness with its standard uncertainty and what the robot says of it, in N/m."""
-
-    label: str
-    measured: float
-    sigma: float
-    before: float | None
-    after: float | None
 
 
 # -- over time ------------------------------------------------------------------------------------
@@ -317,7 +307,7 @@ def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "m
     return figure
 
 
-def plot_stiffnesses(rows: Sequence[MeasuredStiffness], *, title: str = "stiffness") -> Figure:
+def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiffness") -> Figure:
     """Draw measured stiffnesses with their 95 % intervals, and what the robot says of them.
 
     Raises
@@ -348,7 +338,7 @@ def plot_stiffnesses(rows: Sequence[MeasuredStiffness], *, title: str = "stiffne
             x, places, mark, markersize=5.5, markerfacecolor="none", markeredgewidth=1.4,
             color=colour, label=label,
         )  # fmt: skip
-    axes.set_yticks(places, [row.label for row in rows], fontsize=8.5)
+    axes.set_yticks(places, [_label(row) for row in rows], fontsize=8.5)
     axes.invert_yaxis()
     axes.set_xlabel("stiffness (N/m)")
     known = np.concatenate(shown)
@@ -363,6 +353,12 @@ def plot_stiffnesses(rows: Sequence[MeasuredStiffness], *, title: str = "stiffne
     _plain(axes)
     _head(figure, title, "measured, and at the same pressures predicted")
     return figure
+
+
+def _label(row: StiffnessComparison) -> str:
+    pressures = vector_text(pressure * BAR for pressure in row.pressures)
+    label = f"{direction_name(row.direction)} at {pressures} bar"
+    return label if row.boundary == "free" else f"{label}, {row.boundary}"
 
 
 # -- parts ----------------------------------------------------------------------------------------

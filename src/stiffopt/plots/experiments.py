@@ -10,7 +10,7 @@ from stiffopt.experiments.stiffness import direction_name
 from stiffopt.experiments.stiffness_result import StiffnessResult
 from stiffopt.plots.figures import _literal, require_matplotlib
 from stiffopt.plots.scales import make_logarithmic
-from stiffopt.plots.style import BAR, MM
+from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

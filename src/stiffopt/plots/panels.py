@@ -9,8 +9,7 @@ import numpy as np
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
-from stiffopt.plots.style import BAR, MM
-from stiffopt.plots.wording import least_maximised, unit_text
+from stiffopt.plots.wording import BAR, MM, least_maximised, unit_text
 
 _MOST_LABELS = 15  # pressures with a number on their bar
 

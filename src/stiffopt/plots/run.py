@@ -15,7 +15,8 @@ from stiffopt.plots.experiments import AXES, CHANNELS, _head, _legend, _plain
 from stiffopt.plots.figures import _literal, require_matplotlib
 from stiffopt.plots.run_timeline import SHADES, draw_timeline, timeline_rows
 from stiffopt.plots.scales import make_logarithmic
-from stiffopt.plots.style import BAR, MM, TARGET
+from stiffopt.plots.style import TARGET
+from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,9 +11,6 @@ INSIDE = "#4e79a7"
 RANGE = "#e9ecef"
 LOAD = "#111111"
 
-MM = 1e3  # per m
-BAR = 1e-5  # per Pa
-
 
 def colour(segment: int) -> str:
     """Return the colour of a segment, counted from 0."""

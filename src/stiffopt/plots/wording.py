@@ -5,6 +5,11 @@ from collections.abc import Iterable
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 
+MM = 1e3
+"""Millimetres per metre."""
+BAR = 1e-5
+"""Bar per pascal."""
+
 
 def least_maximised(solution: PressureSolution) -> float | None:
     """Return the smallest of the stiffnesses that a task maximises: what its trade-off is about."""

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.plots.figures import _literal, require_matplotlib
-from stiffopt.plots.style import MM
-from stiffopt.plots.wording import unit_text
+from stiffopt.plots.wording import MM, unit_text
 from stiffopt.workspace import WorkspaceMap
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Answer: what is printed, written and drawn about one task."""
+"""A solved task: the solution with all that is printed, written and drawn beside it."""
 
 import os
 from dataclasses import dataclass, replace
@@ -13,19 +13,19 @@ from stiffopt.optimise.task import Task, load_task
 
 
 @dataclass(frozen=True)
-class Answer:
-    """A solved (or not) task file.
+class SolvedTask:
+    """A task file and what became of it, whether it could be solved or not.
 
     Attributes
     ----------
     file : the task file as the user named it.
     robot : the arm under the task's load.
     solution : of the task.
-    plain : the task's stiffnesses at the stiffness-blind solution; empty where there is none.
-    uncertainty : how well the tip is known there, or None if the robot was not calibrated.
-    intervals : of the task's stiffnesses, 95 %; empty where there is no `uncertainty`.
-    front : the trade-off, or None if it was not asked for or cannot be had.
-    complaint : why there is no trade-off although it was asked for.
+    plain : the task's stiffnesses at a solution that ignores stiffness; empty without one.
+    uncertainty : how well the tip is known there, or None for a robot without calibration.
+    intervals : 95 % intervals of the task's stiffnesses; empty where there is no `uncertainty`.
+    front : the trade-off between tip error and stiffness; None without --pareto or if it failed.
+    complaint : why there is no trade-off although --pareto was given; else empty.
     """
 
     file: str
@@ -44,11 +44,11 @@ class Answer:
 
     @property
     def name(self) -> str:
-        """What to call the task: its file's name without folder and ending."""
+        """The name of the task file without folder and ending."""
         return os.path.splitext(os.path.basename(self.file))[0]
 
 
-def answer_file(file: str, *, seed: int, pareto: int | None) -> Answer:
+def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
     """Solve a task file.
 
     Parameters
@@ -79,16 +79,16 @@ def answer_file(file: str, *, seed: int, pareto: int | None) -> Answer:
     return _with_front(answer, pareto, seed)
 
 
-def _solved(file: str, solver: PressureSolver) -> Answer:
+def _solved(file: str, solver: PressureSolver) -> SolvedTask:
     try:
         solution = solver.solve()
     except EquilibriumError as error:
         solution = PressureSolution("failed", str(error), solver.task)
-    answer = Answer(file, solver.robot, solution, _plain(solver, solution))
+    answer = SolvedTask(file, solver.robot, solution, _plain(solver, solution))
     return _with_uncertainty(answer)
 
 
-def _with_uncertainty(answer: Answer) -> Answer:
+def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
     pressures = answer.solution.pressures
     if answer.robot.description.calibration is None or pressures is None:
         return answer
@@ -105,7 +105,7 @@ def _with_uncertainty(answer: Answer) -> Answer:
 
 
 def _plain(solver: PressureSolver, solution: PressureSolution) -> tuple[float, ...]:
-    """Stiffnesses that a solver blind for them would have got."""
+    """The task's stiffnesses at the pressures of a solver that does not look at stiffness."""
     if not solution.found or not solution.stiffnesses:
         return ()
     try:
@@ -117,7 +117,7 @@ def _plain(solver: PressureSolver, solution: PressureSolution) -> tuple[float, .
         return ()
 
 
-def _with_front(answer: Answer, n: int, seed: int) -> Answer:
+def _with_front(answer: SolvedTask, n: int, seed: int) -> SolvedTask:
     try:
         return replace(answer, front=tuple(pareto_front(answer.robot, answer.task, n, seed=seed)))
     except (InputError, EquilibriumError) as error:

@@ -1,54 +1,28 @@
-"""What a calibration or a validation has found, as tables of text for the terminal and the page."""
+"""What a calibration or a validation found, as tables for the terminal and for the page."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import degrees, floor, isfinite, log10
 
 import numpy as np
 
-from stiffopt.errors import StiffoptError
+from stiffopt.cli.tables import TextTable
 from stiffopt.experiments.stiffness import direction_name
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.comparison import Comparison, Errors, together
 from stiffopt.identify.estimates import Estimate
+from stiffopt.identify.stiffness_comparison import StiffnessComparison
 from stiffopt.identify.unknowns import BASE, SENSOR
-from stiffopt.logs import StiffnessTable
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter
-from stiffopt.plots.wording import figures
+from stiffopt.plots.wording import BAR, MM, figures, vector_text
 
-__all__ = [
-    "StiffnessRow",
-    "TextTable",
-    "after_only",
-    "before_and_after",
-    "held_back",
-    "models",
-    "numbers",
-    "ranges",
-    "stiffness_rows",
-    "stiffnesses",
-]
-
-_MM, _BAR = 1e3, 1e-5  # per m, per Pa
 _UNITS = {"Pa": ("kPa", 1e-3), "m": ("mm", 1e3), "rad": ("deg", 180 / np.pi), "s": ("s", 1.0)}
 _ALL = "all"
 _NORMAL = 1.96  # standard deviations of a 95 % interval
 _OTHERS = "base in the tracker's frame, and sensors (moves from the robot file)"
 _BEGIN = "how the logs begin"
-
-
-@dataclass(frozen=True)
-class TextTable:
-    """A table of text with its title; the first column is words, the others are numbers."""
-
-    title: str
-    heading: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    remark: str = ""
 
 
 # -- errors of the tip ----------------------------------------------------------------------------
@@ -141,8 +115,8 @@ def _beyond(robot: RobotDescription, found: Comparison) -> str:
     worst = int(np.argmax(over))
     if over[worst] > 0.02 * seen.max():
         return (
-            f" ({robot.channel_name(worst)} goes to {highest[worst] * _BAR:.2f} bar, it was "
-            f"recorded to {seen[worst] * _BAR:.2f} bar)"
+            f" ({robot.channel_name(worst)} goes to {highest[worst] * BAR:.2f} bar, it was "
+            f"recorded to {seen[worst] * BAR:.2f} bar)"
         )
     return " (combinations of pressures that are higher together, or below what was recorded)"
 
@@ -170,6 +144,7 @@ def models(result: CalibrationResult) -> TextTable:
         ("model", "it has", "mean mm", "worst"),
         tuple(rows),
         "the simplest of those that predict about as well as the best is chosen",
+        words=("it has", "worst"),
     )
 
 
@@ -199,7 +174,9 @@ def numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextTable]:
         if title != _BEGIN or beginnings:
             groups.setdefault(title, []).append(_number_row(each, words))
     heading = ("", "robot file", "fitted", "95 % interval", "unit", "learnt")
-    return [TextTable(title, heading, tuple(rows)) for title, rows in groups.items()]
+    return [
+        TextTable(title, heading, tuple(rows), words=("unit",)) for title, rows in groups.items()
+    ]
 
 
 def _place(estimate: Estimate) -> tuple[str, str]:
@@ -236,56 +213,7 @@ def _plain(value: float, places: int) -> str:
 # -- stiffness ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class StiffnessRow:
-    """A measured stiffness beside what the robot says of it, in N/m.
-
-    `before` and `after` are None where the model has none.
-    """
-
-    pressures: str
-    direction: str
-    boundary: str
-    measured: float
-    sigma: float
-    before: float | None
-    after: float | None
-
-
-def stiffness_rows(
-    tables: Sequence[StiffnessTable], before: RobotDescription, after: RobotDescription
-) -> list[StiffnessRow]:
-    """All rows of tables in which something was measured."""
-    arms = [Manipulator(before), Manipulator(after)]
-    rows = []
-    for table in tables:
-        for i in np.flatnonzero(np.isfinite(table.stiffness)):
-            p, d, boundary = table.pressures[i], table.directions[i], table.boundaries[i]
-            values = [_stiffness(arm, p, d, boundary) for arm in arms]
-            bars = ", ".join(f"{round(each * _BAR, 3) + 0.0:g}" for each in p)
-            rows.append(
-                StiffnessRow(
-                    f"({bars})",
-                    direction_name((float(d[0]), float(d[1]), float(d[2]))),
-                    boundary,
-                    float(table.stiffness[i]),
-                    float(table.sigma[i]),
-                    *values,
-                )
-            )
-    return rows
-
-
-def _stiffness(
-    arm: Manipulator, pressures: np.ndarray, direction: np.ndarray, boundary: str
-) -> float | None:
-    try:
-        return float(arm.stiffness(pressures, direction, boundary=boundary))  # type: ignore[arg-type]
-    except StiffoptError:  # it buckles there, or its law ends
-        return None
-
-
-def stiffnesses(rows: Sequence[StiffnessRow]) -> TextTable:
+def stiffnesses(rows: Sequence[StiffnessComparison]) -> TextTable:
     """Stiffness, measured and predicted."""
 
     def text(value: float | None) -> str:
@@ -296,8 +224,8 @@ def stiffnesses(rows: Sequence[StiffnessRow]) -> TextTable:
         ("pressures (bar)", "direction", "measured", "before", "after", "off by"),
         tuple(
             (
-                row.pressures,
-                f"{row.direction}, {row.boundary}",
+                vector_text(pressure * BAR for pressure in row.pressures),
+                f"{direction_name(row.direction)}, {row.boundary}",
                 f"{figures(row.measured)} +- {_two(_NORMAL * row.sigma)}",
                 text(row.before),
                 text(row.after),
@@ -305,7 +233,8 @@ def stiffnesses(rows: Sequence[StiffnessRow]) -> TextTable:
             )
             for row in rows
         ),
-        "+-: 95 % of what was measured; off by: after, relative to the measured value",
+        "+-: 95 % interval of the measurement; off by: after, relative to the measured value",
+        words=("direction",),
     )
 
 
@@ -313,7 +242,7 @@ def stiffnesses(rows: Sequence[StiffnessRow]) -> TextTable:
 
 
 def _millimetres(value: float) -> str:
-    return _decimals(value * _MM, 2)
+    return _decimals(value * MM, 2)
 
 
 def _decimals(value: float, places: int) -> str:

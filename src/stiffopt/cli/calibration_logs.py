@@ -1,4 +1,4 @@
-"""What a calibration and a validation read: the robot, logs and tables, as options say."""
+"""What `calibrate` and `validate` read: the robot, recordings of it and tables of stiffness."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ from stiffopt.logs import (
 from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
 
-_PRESSURES = ("commanded", "measured")
 _MCAP = ".mcap"
 _SEGMENT = re.compile(r"segments\[\d+\]\.")
 
 
 @dataclass(frozen=True)
-class Reading:
-    """Options of both commands: which robot, which logs, and how these are read."""
+class RecordingOptions:
+    """Options of both commands: which robot, which recordings of it, and how these are read."""
 
     robot: str
     logs: tuple[str, ...]
@@ -42,22 +41,19 @@ class Reading:
     frame: str | None
 
     def settings(self, **others: Any) -> CalibrationSettings:
-        """Return settings that say so, and others.
+        """Return the settings of a calibration that these options and others make.
 
         Raises
         ------
         InputError
-            There is no such kind of pressures.
+            The option --pressures is neither ``commanded`` nor ``measured``.
         """
-        if self.pressures not in _PRESSURES:
-            raise InputError(
-                f"--pressures: expected {' or '.join(_PRESSURES)}, not {shown(self.pressures)}"
-            )
+        quantities.choice("--pressures", self.pressures, ("commanded", "measured"))
         given = {"sequence": self.sequence, "rezero": self.rezero, "pressures": self.pressures}
         return CalibrationSettings(**given, **others)
 
     def description(self) -> RobotDescription:
-        """Return the robot, which reads logs as the options say.
+        """Return the robot, with the channels and the frame that the options name.
 
         Raises
         ------
@@ -104,12 +100,12 @@ class Reading:
 
 
 def log_names(paths: Sequence[str]) -> list[str]:
-    """Return a name for each file: its own, with so many folders before it that none is twice.
+    """Return a name for each file: its own, with as many folders as tell it from the others.
 
     Raises
     ------
     FileError
-        A file is there twice.
+        A file is given twice.
     """
     parts = [Path(path).resolve().parts for path in paths]
     for i, each in enumerate(parts):
@@ -147,13 +143,7 @@ def read_tables(paths: Sequence[str], robot: RobotDescription) -> list[Stiffness
 
 
 def check_model(name: str) -> None:
-    """Refuse a model that is not there.
-
-    Raises
-    ------
-    InputError
-        There is none of this name.
-    """
+    """Raise `InputError` if there is no model of this name."""
     names = ["auto", *(structure.name for structure in STRUCTURES)]
     if name not in names:
         raise InputError(
@@ -161,25 +151,13 @@ def check_model(name: str) -> None:
         )
 
 
-def check_strain_law(which: str) -> None:
-    """Refuse what is neither ``auto`` nor ``keep``.
-
-    Raises
-    ------
-    InputError
-        It is neither.
-    """
-    if which not in ("auto", "keep"):
-        raise InputError(f"--strain-law: expected auto or keep, not {shown(which)}")
-
-
 def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]:
-    """Return the keys that are meant by whole keys, keys without an index, or their ends.
+    """Return the parameters that --fix names: by whole keys, without an index, or by their ends.
 
     Raises
     ------
     InputError
-        None is meant by one of them.
+        One of them names no parameter that is fitted.
     """
     known = _fitted_keys(robot)
     found: list[str] = []
@@ -194,7 +172,7 @@ def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]
         if not meant:
             ends = dict.fromkeys(re.sub(r"\[\d+\]", "", _SEGMENT.sub("", key)) for key in known)
             raise InputError(
-                f"--fix: {shown(text)} is nothing that is fitted to the robot '{robot.name}'; "
+                f"--fix: {shown(text)} is no parameter of the robot '{robot.name}' that is fitted; "
                 f"expected a key such as {known[0]}, or one of {', '.join(ends)} for all of them"
             )
         found += meant
@@ -202,7 +180,7 @@ def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]
 
 
 def _fitted_keys(robot: RobotDescription) -> list[str]:
-    """Keys of all that some model fits."""
+    """Keys of all parameters that some model fits."""
     tolerances = robot.tolerances or Tolerances()
     keys: dict[str, None] = {}
     for structure in STRUCTURES:

@@ -1,4 +1,4 @@
-"""An answer as data: a line of JSON in SI units, and an entry of a result file with its units."""
+"""A solved task as data: a line of JSON in SI units, or an entry of a result file with units."""
 
 import json
 import math
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stiffopt.cli.answer import Answer
+from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.optimise.solution import PressureSolution, Sensitivities
 from stiffopt.plots.wording import least_maximised
 from stiffopt.units import format_quantity
@@ -15,15 +15,15 @@ from stiffopt.units import format_quantity
 Record = dict[str, Any]
 
 
-def json_line(answer: Answer) -> str:
-    """Return an answer as one line of strict JSON: no NaN, no infinity."""
-    return json.dumps(_strict(_json_record(answer)), allow_nan=False)
+def json_line(solved: SolvedTask) -> str:
+    """Return a solved task as one line of strict JSON: no NaN, no infinity."""
+    return json.dumps(_strict(_json_record(solved)), allow_nan=False)
 
 
-def _json_record(answer: Answer) -> Record:
-    solution = answer.solution
+def _json_record(solved: SolvedTask) -> Record:
+    solution = solved.solution
     record: Record = {
-        "task": answer.file,
+        "task": solved.file,
         "status": solution.status,
         "found": solution.found,
         "pressures_pa": solution.pressures,
@@ -34,11 +34,11 @@ def _json_record(answer: Answer) -> Record:
         "stiffness": solution.stiffness,
         "stiffness_unit": solution.stiffness_unit,
         "stiffnesses": solution.stiffnesses,
-        "stiffnesses_plain": answer.plain,
-        "stiffness_interval": _interval(answer),
+        "stiffnesses_plain": solved.plain,
+        "stiffness_interval": _interval(solved),
         "matrix_distance": solution.matrix_distance,
-        "tip_uncertainty_m": _semi_axes(answer),
-        "inside_recorded_range": None if answer.uncertainty is None else answer.uncertainty.inside,
+        "tip_uncertainty_m": _semi_axes(solved),
+        "inside_recorded_range": None if solved.uncertainty is None else solved.uncertainty.inside,
         "compliance": solution.compliance,
         "active_bounds": solution.active_bounds,
         "freedom": solution.freedom,
@@ -47,14 +47,14 @@ def _json_record(answer: Answer) -> Record:
         "solve_time_s": solution.timings.get("total"),
         "message": solution.message,
     }
-    if answer.front is not None:
-        record["pareto"] = [_json_point(point) for point in answer.front]
+    if solved.front is not None:
+        record["pareto"] = [_json_point(point) for point in solved.front]
     return record
 
 
-def _interval(answer: Answer) -> tuple[float, float] | None:
+def _interval(solved: SolvedTask) -> tuple[float, float] | None:
     """95 % interval of the task's first stiffness, or None where nothing is known of it."""
-    return answer.intervals[0] if answer.intervals else None
+    return solved.intervals[0] if solved.intervals else None
 
 
 def _json_sensitivities(solution: PressureSolution) -> Record | None:
@@ -108,27 +108,27 @@ def _strict(value: Any) -> Any:
 # -- the result file ------------------------------------------------------------------------
 
 
-def result_record(answer: Answer) -> Record:
-    """Return an answer as the entry of a result file: quantities as text with their units."""
-    solution = answer.solution
+def result_record(solved: SolvedTask) -> Record:
+    """Return a solved task as the entry of a result file: quantities as text with their units."""
+    solution = solved.solution
     record: Record = {
-        "task": answer.file,
-        "robot": answer.robot.description.name,
+        "task": solved.file,
+        "robot": solved.robot.description.name,
         "status": solution.status,
         "message": solution.message or None,
         "pressures": _quantities(solution.pressures, "Pa", "bar"),
         "tip": _tip(solution),
-        "uncertainty": _uncertainty(answer),
+        "uncertainty": _uncertainty(solved),
         "position_error": _quantity(solution.position_error, "m", "mm"),
         "angle_error": _quantity(solution.angle_error, "rad", "deg"),
-        "stiffness": _stiffnesses(answer),
+        "stiffness": _stiffnesses(solved),
         "matrix_distance": solution.matrix_distance,
         "compliance": _compliance(solution),
         "active_bounds": list(solution.active_bounds) or None,
         "freedom": solution.freedom if solution.pressures is not None else None,
         "confidence": None if solution.confidence is None else asdict(solution.confidence),
         "worth": _worth(solution),
-        "pareto": None if answer.front is None else [_point(point) for point in answer.front],
+        "pareto": None if solved.front is None else [_point(point) for point in solved.front],
         "solve_time": _quantity(solution.timings.get("total"), "s"),
     }
     return {key: _without_none(value) for key, value in record.items() if value is not None}
@@ -143,14 +143,14 @@ def _tip(solution: PressureSolution) -> Record | None:
     }
 
 
-def _semi_axes(answer: Answer) -> Any:
+def _semi_axes(solved: SolvedTask) -> Any:
     """Semi-axes (3,) of the tip's ellipsoid in m; None where no calibration saw positions."""
-    known = answer.uncertainty
+    known = solved.uncertainty
     return None if known is None or not known.semi_axes.any() else known.semi_axes
 
 
-def _uncertainty(answer: Answer) -> Record | None:
-    known = answer.uncertainty
+def _uncertainty(solved: SolvedTask) -> Record | None:
+    known = solved.uncertainty
     if known is None:
         return None
     return {
@@ -160,10 +160,10 @@ def _uncertainty(answer: Answer) -> Record | None:
     }
 
 
-def _stiffnesses(answer: Answer) -> list[Record] | None:
-    solution = answer.solution
-    plain = answer.plain or (None,) * len(solution.stiffnesses)
-    intervals = answer.intervals or (None,) * len(solution.stiffnesses)
+def _stiffnesses(solved: SolvedTask) -> list[Record] | None:
+    solution = solved.solution
+    plain = solved.plain or (None,) * len(solution.stiffnesses)
+    intervals = solved.intervals or (None,) * len(solution.stiffnesses)
     return [
         {
             "value": _quantity(value, measure.unit),

@@ -1,4 +1,4 @@
-"""An answer for people: a block of text for each task, and a summary of several."""
+"""Solved tasks for people: a block of text for each task, and a table of several."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -11,12 +11,15 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from stiffopt.cli.answer import Answer
-from stiffopt.cli.records import priced
+from stiffopt.cli.solve_records import priced
+from stiffopt.cli.solved_task import SolvedTask
+from stiffopt.cli.tables import labelled, number_table
 from stiffopt.errors import printable
 from stiffopt.optimise.goal import AtLeast, MatchMatrix, MatchValue, StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots.wording import (
+    BAR,
+    MM,
     direction_text,
     figures,
     gain_text,
@@ -26,7 +29,6 @@ from stiffopt.plots.wording import (
 )
 
 _COLOURS = {"solved": "green", "unreachable": "yellow", "failed": "red", "bad input": "red"}
-_BAR = 1e-5  # per Pa
 _PARTS = {
     "parameters": "the errors of the calibrated parameters",
     "hysteresis": "hysteresis: it matters where the arm was before",
@@ -37,54 +39,49 @@ Vector = NDArray[Any]
 Line = tuple[str, RenderableType]
 
 
-def block(answer: Answer) -> RenderableType:
+def block(solved: SolvedTask) -> RenderableType:
     """Return all there is to say about one task, at least 80 columns wide."""
-    solution = answer.solution
+    solution = solved.solution
     heading = Text.assemble(
-        (printable(answer.file), "bold"),
+        (printable(solved.file), "bold"),
         "  ",
         (solution.status, f"bold {_COLOURS[solution.status]}"),
         f"  {solution.timings.get('total', 0.0):.2f} s",
     )
-    grid = Table.grid(padding=(0, 2), pad_edge=False)
-    grid.add_column(no_wrap=True, style="dim")
-    grid.add_column(overflow="fold")
-    for label, content in _lines(answer):
-        grid.add_row(f"  {label}", content)
-    return Group(heading, grid, "")
+    return Group(heading, labelled(_lines(solved)), "")
 
 
-def _lines(answer: Answer) -> Iterable[Line]:
-    solution = answer.solution
+def _lines(solved: SolvedTask) -> Iterable[Line]:
+    solution = solved.solution
     if solution.message:
         message = solution.message.removeprefix("unreachable: ")
         yield "note", Text(message, style=_COLOURS[solution.status])
-    yield "robot", Text(_robot(answer))
+    yield "robot", Text(_robot(solved))
     if solution.pressures is None or solution.tip_pose is None:
         return
-    yield "pressures", _pressures(answer, solution.pressures)
+    yield "pressures", _pressures(solved, solution.pressures)
     yield from _tip(solution, solution.tip_pose)
-    yield from _uncertainty(answer)
-    yield from _stiffnesses(answer)
+    yield from _uncertainty(solved)
+    yield from _stiffnesses(solved)
     yield from _worth(solution)
     if solution.confidence is not None and solution.confidence.reached:
         yield "search", Text(str(solution.confidence))
-    if answer.front is not None:
-        yield "trade-off", _front(answer)
+    if solved.front is not None:
+        yield "trade-off", _front(solved)
 
 
-def _robot(answer: Answer) -> str:
-    robot = answer.robot
+def _robot(solved: SolvedTask) -> str:
+    robot = solved.robot
     segments = "1 segment" if robot.n_segments == 1 else f"{robot.n_segments} segments"
     loaded = ", in equilibrium under gravity or load" if robot.is_loaded else ""
     name = printable(robot.description.name)
-    return f"{name}, {segments}, {robot.length * 1e3:g} mm, {robot.n_pressures} channels{loaded}"
+    return f"{name}, {segments}, {robot.length * MM:g} mm, {robot.n_pressures} channels{loaded}"
 
 
-def _pressures(answer: Answer, pressures: Vector) -> RenderableType:
+def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
     """Pressures in bar, a row for each segment; those at a limit say so."""
-    description = answer.robot.description
-    active = answer.solution.active_bounds
+    description = solved.robot.description
+    active = solved.solution.active_bounds
     table = Table.grid(padding=(0, 2), pad_edge=False)
     widest = max(segment.n_channels for segment in description.segments)
     table.add_row("", *(Text(f"channel {k + 1}", "dim") for k in range(widest)))
@@ -102,18 +99,18 @@ def _pressures(answer: Answer, pressures: Vector) -> RenderableType:
 
 def _pressure(value: float, at: str) -> Text:
     return Text.assemble(
-        (f"{value * _BAR + 0.0:.3f} bar", "bold"), (f" {at}" if at else "", "yellow")
+        (f"{value * BAR + 0.0:.3f} bar", "bold"), (f" {at}" if at else "", "yellow")
     )
 
 
 def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
-    x, y, z = (f"{value * 1e3 + 0.0:.3f}" for value in pose[:3, 3])
+    x, y, z = (f"{value * MM + 0.0:.3f}" for value in pose[:3, 3])
     yield "tip at", Text(f"({x}, {y}, {z}) mm, pointing {vector_text(pose[:3, 2])}")
     tolerance = solution.task.target.tolerance
     if solution.position_error is not None:
         yield (
             "tip error",
-            _error(solution.position_error * 1e3, tolerance.position * 1e3, "mm", "position"),
+            _error(solution.position_error * MM, tolerance.position * MM, "mm", "position"),
         )
     if solution.angle_error is not None:
         label = "" if solution.position_error is not None else "tip error"
@@ -131,9 +128,9 @@ def _error(value: float, tolerance: float, unit: str, what: str) -> Text:
     )
 
 
-def _uncertainty(answer: Answer) -> Iterable[Line]:
-    """How well the calibration knows the tip there."""
-    known = answer.uncertainty
+def _uncertainty(solved: SolvedTask) -> Iterable[Line]:
+    """How well the tip's position is known from the calibration."""
+    known = solved.uncertainty
     if known is None:
         return
     if not known.semi_axes.any():
@@ -142,7 +139,7 @@ def _uncertainty(answer: Answer) -> Iterable[Line]:
             Text("the calibration saw no positions, so that the tip's error is unknown"),
         )
         return
-    axes = " x ".join(f"{value * 1e3:.2f}" for value in known.semi_axes)
+    axes = " x ".join(f"{value * MM:.2f}" for value in known.semi_axes)
     yield (
         "known to",
         Text.assemble(
@@ -161,11 +158,11 @@ def _uncertainty(answer: Answer) -> Iterable[Line]:
         )
 
 
-def _stiffnesses(answer: Answer) -> Iterable[Line]:
-    solution = answer.solution
+def _stiffnesses(solved: SolvedTask) -> Iterable[Line]:
+    solution = solved.solution
     goal = solution.task.stiffness
-    plain = answer.plain or (None,) * len(solution.stiffnesses)
-    intervals = answer.intervals or (None,) * len(solution.stiffnesses)
+    plain = solved.plain or (None,) * len(solution.stiffnesses)
+    intervals = solved.intervals or (None,) * len(solution.stiffnesses)
     for number, (measure, value, blind, ends) in enumerate(
         zip(solution.task.measures, solution.stiffnesses, plain, intervals, strict=False)
     ):
@@ -191,7 +188,7 @@ def _stiffness(
     plain: float | None,
     interval: tuple[float, float] | None,
 ) -> Text:
-    remarks = [_demand(measure)]
+    remarks = [_condition(measure)]
     if interval is not None:
         remarks.append("95 %: {} to {}".format(*map(figures, interval)))
     if plain is not None:
@@ -210,12 +207,12 @@ def _meaning(measure: StiffnessMeasure) -> str:
     return f"against {measure.kind} {direction}, {measure.frame} axes, {measure.boundary}"
 
 
-def _demand(measure: StiffnessMeasure) -> str:
-    """What the task asks of the value."""
+def _condition(measure: StiffnessMeasure) -> str:
+    """What the task says that the value must be."""
     if isinstance(measure, AtLeast):
-        return f"asked: at least {figures(measure.value)}"
+        return f"required: at least {figures(measure.value)}"
     if isinstance(measure, MatchValue):
-        return f"asked: {figures(measure.value)} to {measure.tolerance * 100:g} %"
+        return f"required: {figures(measure.value)} to {measure.tolerance * 100:g} %"
     return ""
 
 
@@ -233,14 +230,14 @@ def _worth(solution: PressureSolution) -> Iterable[Line]:
     for name, value in sorted(given.per_bound.items(), key=lambda item: -item[1]):
         moved = "raised" if name.endswith("max") else "lowered"
         if value:
-            offers.append((value / _BAR, f"bar by which {name} is {moved}"))
+            offers.append((value / BAR, f"bar by which {name} is {moved}"))
     for number, (value, per) in enumerate(offers):
         text = Text.assemble((f"{value:+.3g} {unit}", "bold"), f" per {per}")
         yield "" if number else "worth", text
 
 
-def _front(answer: Answer) -> RenderableType:
-    front = answer.front or ()
+def _front(solved: SolvedTask) -> RenderableType:
+    front = solved.front or ()
     if not front:
         return Text("none: the target is out of reach at every tolerance that was tried")
     unit = unit_text(front[0].stiffness_unit)
@@ -259,7 +256,7 @@ def _front(answer: Answer) -> RenderableType:
             *_errors(point),
             f"{figures(value)} {unit}",
             gain_text(value, first),
-            _list(answer, point),
+            _list(solved, point),
         )
     return table
 
@@ -267,24 +264,24 @@ def _front(answer: Answer) -> RenderableType:
 def _errors(solution: PressureSolution) -> list[str]:
     cells = []
     if solution.position_error is not None:
-        cells.append(f"{solution.position_error * 1e3:.2f} mm")
+        cells.append(f"{solution.position_error * MM:.2f} mm")
     if solution.angle_error is not None:
         cells.append(f"{degrees(solution.angle_error):.2f} deg")
     return cells
 
 
-def _list(answer: Answer, solution: PressureSolution) -> str:
+def _list(solved: SolvedTask, solution: PressureSolution) -> str:
     """All pressures on one line, segments apart."""
     values = [] if solution.pressures is None else list(solution.pressures)
     groups = []
-    for segment in answer.robot.description.segments:
+    for segment in solved.robot.description.segments:
         mine, values = values[: segment.n_channels], values[segment.n_channels :]
-        groups.append(" ".join(f"{value * _BAR + 0.0:.2f}" for value in mine))
+        groups.append(" ".join(f"{value * BAR + 0.0:.2f}" for value in mine))
     return " | ".join(groups)
 
 
 @dataclass(frozen=True)
-class Row:
+class SummaryRow:
     """A task in the summary."""
 
     file: str
@@ -296,32 +293,31 @@ class Row:
     time: str = ""
 
     @classmethod
-    def of(cls, answer: Answer, seconds: float) -> "Row":
+    def of(cls, solved: SolvedTask, seconds: float) -> "SummaryRow":
         """Return the row of an answer that took so long altogether."""
-        solution = answer.solution
+        solution = solved.solution
         position, angle = solution.position_error, solution.angle_error
         unit = unit_text(solution.stiffness_unit)
         return cls(
-            answer.file,
+            solved.file,
             solution.status,
-            "" if position is None else f"{position * 1e3:.3f}",
+            "" if position is None else f"{position * MM:.3f}",
             "" if angle is None else f"{degrees(angle):.2f}",
             "" if solution.stiffness is None else f"{figures(solution.stiffness)} {unit}",
-            gain_text(solution.stiffnesses[0], answer.plain[0]) if answer.plain else "",
+            gain_text(solution.stiffnesses[0], solved.plain[0]) if solved.plain else "",
             f"{seconds:.1f}",
         )
 
 
-def summary(rows: Sequence[Row]) -> RenderableType:
+def summary(rows: Sequence[SummaryRow]) -> RenderableType:
     """Return one line for each task and how many came to what."""
     names = [os.path.basename(row.file) for row in rows]
     if len(set(names)) < len(rows):
         names = [row.file for row in rows]
-    table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="bold")
-    table.add_column("task", overflow="fold")
-    table.add_column("status", no_wrap=True)
-    for heading in ("error mm", "deg", "stiffness", "gain", "time s"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = number_table("task", "status", "error mm", "deg", "stiffness", "gain", "time s")
+    table.columns[0].no_wrap = False
+    table.columns[0].overflow = "fold"
+    table.columns[1].justify = "left"
     for name, row in zip(names, rows, strict=True):
         table.add_row(
             Text(printable(name)),
@@ -331,6 +327,6 @@ def summary(rows: Sequence[Row]) -> RenderableType:
     return Group(table, "", Text(_counts(rows)))
 
 
-def _counts(rows: Sequence[Row]) -> str:
+def _counts(rows: Sequence[SummaryRow]) -> str:
     counts = {status: sum(row.status == status for row in rows) for status in _COLOURS}
     return f"{len(rows)} tasks: " + ", ".join(f"{n} {name}" for name, n in counts.items() if n)

@@ -1,0 +1,180 @@
+"""Files of `solve`: task files that are read, result files and figures that are written."""
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from stiffopt.cli.outputs import check_ending, check_picture, check_writable
+from stiffopt.cli.solve_records import result_record
+from stiffopt.cli.solved_task import SolvedTask
+from stiffopt.documents import read_document, write_file
+from stiffopt.errors import FileError, os_reason
+
+RESULT_FORMAT = "stiffopt-result/1"
+_YAML = (".yaml", ".yml")
+
+
+@dataclass(frozen=True)
+class TaskFiles:
+    """Task files in the order in which they are solved, and folders and files that hold no task.
+
+    Attributes
+    ----------
+    paths : of the task files, as the user would write them.
+    skipped : notes about files in folders that are no task files.
+    errors : about folders that cannot be used.
+    """
+
+    paths: tuple[str, ...]
+    skipped: tuple[str, ...] = ()
+    errors: tuple[FileError, ...] = ()
+
+
+def find_tasks(named: Iterable[str]) -> TaskFiles:
+    """Replace each folder by the task files in it, sorted by name; subfolders are left alone.
+
+    A file in a folder is left out, with a note, only if its `format` says that it is something
+    else, a robot file for example.  One that cannot be read or says nothing may be a task file
+    with a mistake in it, and is kept.
+    """
+    files: list[str] = []
+    skipped: list[str] = []
+    errors: list[FileError] = []
+    for name in named:
+        if not os.path.isdir(name):
+            files.append(name)
+            continue
+        try:
+            tasks, others = _in_folder(name)
+        except FileError as error:
+            errors.append(error)
+        else:
+            files.extend(tasks)
+            skipped.extend(others)
+    return TaskFiles(tuple(files), tuple(skipped), tuple(errors))
+
+
+def _in_folder(folder: str) -> tuple[list[str], list[str]]:
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError as error:
+        raise FileError(folder, f"cannot be read: {os_reason(error)}") from None
+    paths = [
+        os.path.join(folder, name)
+        for name in names
+        if name.endswith(_YAML) and not name.startswith(".")
+    ]
+    paths = [path for path in paths if not os.path.isdir(path)]
+    kinds = {path: _other_kind(path) for path in paths}
+    tasks = [path for path, kind in kinds.items() if kind is None]
+    if not tasks:
+        raise FileError(folder, "has no task files (*.yaml); expected at least one")
+    return tasks, [f"{path}: skipped, a {kind} file" for path, kind in kinds.items() if kind]
+
+
+def _other_kind(path: str) -> str | None:
+    """Return the kind of a stiffopt file that is no task file, None for all else."""
+    try:
+        given = read_document(Path(path)).data.get("format")
+    except FileError:
+        return None
+    if not isinstance(given, str) or not given.startswith("stiffopt-"):
+        return None
+    kind = given.removeprefix("stiffopt-").partition("/")[0]
+    return None if kind in ("task", "") else kind
+
+
+def check_result_file(path: str, tasks: Sequence[str]) -> None:
+    """Check the path of --out before any long work is done.
+
+    Raises
+    ------
+    FileError
+        It cannot be written, has the wrong ending, or is a file of another kind.
+    """
+    check_writable(path)
+    if os.path.exists(path) and not os.path.isfile(path):
+        return  # a pipe, a terminal
+    check_ending(path, _YAML)
+    if not os.path.exists(path):
+        return
+    if any(os.path.exists(task) and os.path.samefile(path, task) for task in tasks):
+        raise FileError(path, "is one of the tasks; give --out another name")
+    if not _is_result_file(path):
+        raise FileError(
+            path, f"exists and is no result file ('format: {RESULT_FORMAT}'); give another name"
+        )
+
+
+def _is_result_file(path: str) -> bool:
+    """Whether a file may be overwritten: it begins as a result file does, or is empty."""
+    kind = RESULT_FORMAT.partition("/")[0]
+    try:
+        with open(path, "rb") as stream:
+            start = stream.read(64)
+    except OSError as error:
+        raise FileError(path, f"cannot be read: {os_reason(error)}") from None
+    return not start or start.startswith(f"format: {kind}/".encode())
+
+
+def picture_names(plot: str | None, tasks: Sequence[str]) -> tuple[str | None, ...]:
+    """Return the file of each task's figure, which can be written; None without --plot.
+
+    Of one task it is FILE.png itself, of several FILE-<task>.png.
+
+    Raises
+    ------
+    FileError
+        One cannot be written, or has the wrong ending.
+    MissingExtraError
+        matplotlib is not installed.
+    """
+    if plot is None:
+        return (None,) * len(tasks)
+    stem, ending = os.path.splitext(plot)
+    names: list[str] = []
+    for task in tasks:
+        name = first = f"{stem}-{Path(task).stem}"
+        count = 1
+        while f"{name}{ending}" in names:  # a task of the same name in another folder
+            count += 1
+            name = f"{first}-{count}"
+        names.append(f"{name}{ending}")
+    if len(tasks) == 1:
+        names = [plot]
+    for name in names:
+        check_picture(name)
+    return tuple(names)
+
+
+def write_results(path: str, solved: Sequence[SolvedTask]) -> None:
+    """Write the result file.
+
+    Raises
+    ------
+    FileError
+        It cannot be written.
+    """
+    results = [result_record(each) for each in solved]
+    write_file(path, {"format": RESULT_FORMAT, "results": results})
+
+
+def draw(solved: SolvedTask, path: str) -> None:
+    """Draw a solved task.
+
+    Raises
+    ------
+    InputError
+        There is nothing to draw, as the solver failed, or the file cannot be written.
+    """
+    from stiffopt.plots import plot_solution, save_figure
+
+    figure = plot_solution(
+        solved.robot,
+        solved.solution,
+        front=solved.front,
+        plain=solved.plain[0] if solved.plain else None,
+        title=solved.name,
+    )
+    save_figure(figure, path)

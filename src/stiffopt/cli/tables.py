@@ -1,0 +1,144 @@
+"""Tables of text, for the terminal and for a Markdown page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from stiffopt.documents import write_whole
+from stiffopt.errors import printable
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """A table of text with a title above and a remark below it.
+
+    Attributes
+    ----------
+    title : empty for none.
+    heading : of each column.
+    rows : a cell for each heading.
+    remark : what headings or numbers mean, as the end of a sentence.
+    words : headings of the columns that hold words; all but the first and these hold numbers, which
+        stand to the right and are never broken.
+    """
+
+    title: str
+    heading: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    remark: str = ""
+    words: tuple[str, ...] = ()
+
+    def holds_words(self, column: int) -> bool:
+        """Whether a column holds words rather than numbers."""
+        return column == 0 or self.heading[column] in self.words
+
+    def renderable(self) -> RenderableType:
+        """Return the table for the terminal."""
+        table = number_table()
+        for number, heading in enumerate(self.heading):
+            words = self.holds_words(number)
+            table.add_column(
+                heading, justify="left" if words else "right", no_wrap=not words, overflow="fold"
+            )
+        for row in self.rows:
+            table.add_row(*map(printable, row))
+        parts: list[RenderableType] = [Text(f"  {printable(self.title)}", "bold")] * bool(
+            self.title
+        )
+        parts.append(table)
+        if self.remark:
+            parts.append(Text(f"  {self.remark}", "dim"))
+        return Group(*parts)
+
+
+def number_table(*headings: str) -> Table:
+    """Return an empty table without lines; the first column is words, the others are numbers."""
+    table = Table(box=None, padding=(0, 1), pad_edge=False, header_style="bold")
+    for number, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if number else "left", no_wrap=True)
+    return table
+
+
+def labelled(lines: Iterable[tuple[str, RenderableType]]) -> Table:
+    """Return lines with a label each."""
+    grid = Table.grid(padding=(0, 2), pad_edge=False)
+    grid.add_column(no_wrap=True, style="dim")
+    grid.add_column(overflow="fold")
+    for label, content in lines:
+        grid.add_row(f"  {label}", content)
+    return grid
+
+
+def title(text: str) -> Text:
+    """Return the title of all that is printed."""
+    return Text(printable(text), "bold")
+
+
+class MarkdownPage:
+    """A page that grows, and the folder in which it is written with its figures."""
+
+    def __init__(self, folder: Path, title: str) -> None:
+        self._folder = folder
+        self._lines = [f"# {title}", ""]
+
+    def heading(self, text: str) -> None:
+        """Begin a section."""
+        self._lines += [f"## {text}", ""]
+
+    def text(self, text: str) -> None:
+        """Add a paragraph, which may hold Markdown."""
+        self._lines += [text, ""]
+
+    def bullets(self, items: Sequence[str]) -> None:
+        """Add a list of plain text; what stands between backticks is code."""
+        self._lines += [*(f"- {_escaped(item)}" for item in items), ""]
+
+    def table(self, table: TextTable) -> None:
+        """Add a table and its remark, without its title."""
+        columns = range(len(table.heading))
+        align = "".join(" --- |" if table.holds_words(i) else " ---: |" for i in columns)
+        self._lines += [f"| {' | '.join(table.heading)} |", f"|{align}"]
+        self._lines += [f"| {' | '.join(map(_cell, row))} |" for row in table.rows]
+        self._lines.append("")
+        if table.remark:
+            self.text(f"{table.remark[:1].upper()}{table.remark[1:]}.")
+
+    def figure(self, name: str, alt: str, figure: Figure) -> None:
+        """Write a figure into the folder and show it."""
+        from stiffopt.plots import save_figure
+
+        save_figure(figure, self._folder / name)
+        self._lines += [f"![{alt}]({name})", ""]
+
+    def write(self, name: str = "report.md") -> None:
+        """Write the page into the folder.
+
+        Raises
+        ------
+        FileError
+            It cannot be written.
+        """
+        write_whole(self._folder / name, "\n".join(self._lines).encode())
+
+
+def _escaped(text: str) -> str:
+    """Text that Markdown leaves as it is; what is between backticks, it does anyway."""
+    parts = text.split("`")
+    parts[::2] = [
+        part.replace("*", r"\*").replace("_", r"\_").replace("<", "&lt;") for part in parts[::2]
+    ]
+    return "`".join(parts)
+
+
+def _cell(text: str) -> str:
+    return _escaped(text).replace("|", r"\|")
