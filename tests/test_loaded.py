@@ -79,7 +79,7 @@ def compiled_point(solver, program, pressures):
     point.argtypes = [ctypes.c_void_p] * 5
     rows, terms, floors = setup.rows, setup.terms, setup.floors
     values = np.zeros(n + (rows + terms + floors) * (1 + n))
-    radii = np.array([term.radius for term in program.terms])
+    radii = np.array([constraint.radius for constraint in program.constraints(1.0)])
     parameters = np.array(program.parameters)
     assert point(
         ctypes.addressof(setup), parameters.ctypes.data, radii.ctypes.data,

@@ -44,7 +44,8 @@ def program(kind, number=0, name="stiff-flop-2"):
     """A random task's problem, and pressures to start from."""
     task = case(robot(name), kind, SEED, number)
     problem = PressureProblem(robot(name), task)
-    return problem, np.array(list(starts(problem, Prepared(robot(name), task, 0).samples).candidates))
+    table = Prepared(robot(name), task, 0).samples
+    return problem, np.array(list(starts(problem, table).candidates))
 
 
 def feasible(problem, point):

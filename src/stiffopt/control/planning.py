@@ -14,7 +14,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt import lie
 from stiffopt.control.closest import closest
 from stiffopt.control.plans import Plan, Request
 from stiffopt.model.manipulator import Manipulator
@@ -173,20 +172,7 @@ def moved_back(target: Target, offset: Array) -> Target:
     offset :
         In m and rad (rotation vector), base axes.
     """
-    update: dict[str, object] = {"tolerance": _EXACT}
-    if target.position is not None:
-        update["position"] = tuple(
-            None if axis is None else axis - float(shift)
-            for axis, shift in zip(target.position, offset[:3], strict=True)
-        )
-    back = lie.exp(np.concatenate([np.zeros(3), -offset[3:]]))[:3, :3]
-    if target.pointing is not None:
-        update["pointing"] = tuple((back @ np.array(target.pointing)).tolist())
-    if target.orientation is not None:
-        rotation = back @ lie.rotation_from_quaternion(np.array(target.orientation))
-        q = lie.quaternion_from_rotation(rotation)
-        update["orientation"] = tuple((q if q[0] >= 0 else -q).tolist())
-    return target.model_copy(update=update)
+    return target.moved_back(offset).model_copy(update={"tolerance": _EXACT})
 
 
 def _shift(last: Plan, target: Target) -> Array:

@@ -154,9 +154,8 @@ def _source_texts(sources: Sequence[str]) -> list[bytes]:
 def _own_code() -> str:
     """Hash of the code that functions come from; the version is part of it."""
     root = Path(__file__).parent.parent
-    files = [
-        file for folder in (root, root / "model", root / "optimise") for file in folder.glob("*.py")
-    ]
+    files = [*root.glob("*.py")]
+    files += [file for part in ("model", "optimise") for file in (root / part).rglob("*.py")]
     total = hashlib.sha256()
     for file in sorted(files):
         total.update(f"{file.relative_to(root)}\0".encode())

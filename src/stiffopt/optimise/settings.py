@@ -5,7 +5,7 @@ distances mean the same for a channel of 0.2 bar and for one of 10 bar.  The met
 (folder ``native``) are given the same values.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 
@@ -94,10 +94,10 @@ class SearchSettings:
     general_starts_loaded : starts of the general method for an arm under gravity or a load.
     """
 
-    placed: Effort = Effort(64, 4, 32)
-    loose: Effort = Effort(256, 8, 64)
-    loaded_placed: Effort = Effort(16, 3, 10)
-    loaded_loose: Effort = Effort(40, 4, 16)
+    placed: Effort = field(default=Effort(64, 4, 32))
+    loose: Effort = field(default=Effort(256, 8, 64))
+    loaded_placed: Effort = field(default=Effort(16, 3, 10))
+    loaded_loose: Effort = field(default=Effort(40, 4, 16))
     covered: float = 0.02
     same_optimum: float = 1e-3
     unlike: float = 0.2

@@ -81,6 +81,8 @@ class Term(ABC):
     annotation :
         Pydantic type of the value there: a `Schema`, or one of the types of `stiffopt.units` and
         `stiffopt.directions`.  Those define how it is written in files and messages too.
+    example :
+        A value as in a task file that the built-in arm stiff-flop-2 can meet, for tests.
     name : str
         In results: ``<name>_error`` or, of an inequality, ``<name>_margin``.  A task has one term
         of a name at most.
@@ -100,6 +102,7 @@ class Term(ABC):
 
     key: ClassVar[str]
     annotation: ClassVar[Any]
+    example: ClassVar[Any]
     name: ClassVar[str]
     unit: ClassVar[str] = "m"
     has_stations: ClassVar[bool] = False

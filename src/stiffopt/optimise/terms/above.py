@@ -1,6 +1,6 @@
 """The tip stays above a plane, that is, on the side to which the plane's normal points."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 
@@ -29,6 +29,7 @@ class AboveTerm(Term):
 
     key = name = "above"
     annotation = Plane
+    example: ClassVar[Any] = {"point": ["0 mm", "0 mm", "185 mm"], "normal": [0.2, 0, 1]}
     is_inequality = True
 
     @property

@@ -1,7 +1,7 @@
 """Orientation of the tip: the rotation from the wanted one."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -16,6 +16,7 @@ class OrientationTerm(Term):
     key = "orientation"
     annotation = Quaternion
     name, unit = "angle", "rad"
+    example: ClassVar[Any] = [0.98, 0.17, 0.1, 0.0]
     order = 2
     size = 3
 

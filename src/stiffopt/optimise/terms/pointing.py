@@ -1,7 +1,7 @@
 """Direction of the tip's z axis: its angle to a unit vector."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -23,6 +23,7 @@ class PointingTerm(Term):
     key = "pointing"
     annotation = Direction
     name, unit = "angle", "rad"
+    example: ClassVar[Any] = [0.1, -0.2, 0.9]
     order = 1
     size = 2
 

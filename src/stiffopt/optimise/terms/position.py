@@ -1,7 +1,7 @@
 """The tip's position, along the base axes that are not free."""
 
 from collections.abc import Hashable
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, PlainSerializer
 
@@ -36,6 +36,7 @@ class PositionTerm(Term):
 
     key = name = "position"
     annotation = Annotated[Vector[Coordinate] | None, AfterValidator(_all_free_is_none)]
+    example: ClassVar[Any] = ["-30 mm", "free", "190 mm"]
     order = 0
 
     def __init__(self, value: tuple[float | None, ...], tolerance: Tolerance) -> None:
