@@ -210,7 +210,7 @@ def test_whoever_adds_a_key_decides_whether_messages_and_steering_know_it() -> N
     """A key that is new here needs a word in `daemon.messages` and a meaning in `control`."""
     known: dict[type[BaseModel], set[str]] = {
         Task: {"robot", "target", "stiffness", "load", "pressure", "source"},
-        Target: {"position", "pointing", "orientation", "tolerance"},
+        Target: {"position", "pointing", "orientation", "above", "tolerance"},
         Tolerance: {"position", "angle"},
         StiffnessGoal: {"maximise", "at_least", "match"},
         StiffnessMeasure: {"direction", "frame", "kind", "boundary"},

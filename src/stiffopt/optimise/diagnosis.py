@@ -32,7 +32,8 @@ def closest_configurations(
     """
     xs = list(candidates)
     terms = problem.program.terms
-    stage = problem.changed(problem.objective, floors=False, **{t.name: inf for t in terms})
+    free = {term.name: inf for term in terms}
+    stage = problem.changed(problem.objective, free, floors=False)
     results: list[LocalResult] = []
     for term in sorted(terms, key=lambda t: (not t.is_inequality, -t.order)):
         stage = stage.changed(problem.closest(term.name))
@@ -42,7 +43,7 @@ def closest_configurations(
         ball = [b for b in results[0].point.balls if b.name == term.name]
         least = max(b.error for b in ball)
         allowed = max(term.radius, least * (1 + 1e-6) + 1e-7)
-        stage = stage.changed(stage.objective, **{term.name: allowed})
+        stage = stage.changed(stage.objective, {term.name: allowed})
     return results
 
 
@@ -88,7 +89,8 @@ def no_freedom_message(task: Task, n_pressures: int, sensitivities: Sensitivitie
 
 def unreachable_message(judgement: Judgement, task: Task, holding: list[str]) -> str:
     """Say how far the closest configuration is and what holds it back."""
-    away, beyond = [], []
+    away: list[str] = []
+    beyond: list[str] = []
     for term in task.target.terms:
         value = judgement.errors[term.name]
         if not term.holds(value):

@@ -8,7 +8,7 @@ method.
 
 import ctypes
 from collections.abc import Iterator
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict
 from itertools import chain, pairwise
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from stiffopt.optimise.loaded import LoadedArm
 from stiffopt.optimise.program import Program, pressure_ranges
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.search import effort
-from stiffopt.optimise.settings import DESCENT, REACH, SEARCH
+from stiffopt.optimise.settings import DESCENT, REACH, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
 
 Vector = NDArray[np.float64]
@@ -38,7 +38,7 @@ _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 def _mirrored(settings: Any) -> ctypes.Structure:
     """Settings as the structure in C that has the same fields."""
     kinds = {float: _double, int: _integer}
-    values = asdict(settings) if is_dataclass(settings) else settings._asdict()
+    values = settings._asdict() if isinstance(settings, Effort) else asdict(settings)
     fields = [(name, kinds[type(value)]) for name, value in values.items()]
     kind = type(type(settings).__name__, (ctypes.Structure,), {"_fields_": fields})
     found: ctypes.Structure = kind(**values)

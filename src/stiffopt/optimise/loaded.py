@@ -20,6 +20,7 @@ from stiffopt.model.kinematics import Actuation
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.native_calls import in_parallel
 from stiffopt.model.rod import Rod, rod
+from stiffopt.model.shape import PointOfArm
 from stiffopt.optimise.program import Program
 
 Vector = NDArray[np.float64]
@@ -59,6 +60,10 @@ class Tip:
         """Compliance (6, 6) in the tip's axes."""
         X = ca.diagcat(self.rotation, self.rotation)
         return X.T @ self.base_compliance @ X
+
+    def station(self, at: float) -> PointOfArm:
+        """Not known of the tip alone."""
+        raise NotImplementedError
 
     def flexibility(self, wrench: ca.SX) -> ca.SX:
         """``w' C w`` of a wrench (6,) in the tip's axes."""

@@ -8,7 +8,7 @@ structure of the task (`stiffopt.optimise.program`) and stay with the robot.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -64,7 +64,8 @@ class Ball:
     def pull(self) -> Vector:
         """Gradient (n,) of the error, which is not zero."""
         if self.constraint.one_sided:
-            return self.jacobian[0]
+            row: Vector = self.jacobian[0]
+            return row
         gradient: Vector = self.residual / self.error @ self.jacobian
         return gradient
 
@@ -333,17 +334,17 @@ class PressureProblem:
     # -- similar programs -------------------------------------------------------------------
 
     def changed(
-        self, objective: Objective, floors: bool = True, **radii: float
+        self, objective: Objective, radii: Mapping[str, float] | None = None, floors: bool = True
     ) -> "PressureProblem":
-        """The same program with another objective, without floors, or with other radii.
+        """The same program with another objective, without floors, or with other radii by name.
 
-        An infinite radius frees a ball.
+        An infinite radius frees a term.
         """
         other = copy(self)
         other.objective = objective
         if not floors:
             other.floors = np.zeros(0)
-        other.radii = {**self.radii, **radii}
+        other.radii = {**self.radii, **(radii or {})}
         other._set_constraints()
         return other
 

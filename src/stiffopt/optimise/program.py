@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.shape import Shape
-from stiffopt.optimise.goal import MatchMatrix, StiffnessGoal
+from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.measures import LogStiffness, MatrixDistance, Measure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.term import Term
@@ -114,7 +114,7 @@ class Program:
             first, aim = tuple(LogStiffness(measure) for measure in goal.maximise), "maximise"
         elif goal is not None and isinstance(goal.match, MatchMatrix):
             first, aim = (MatrixDistance(goal.match),), "match matrix"
-        elif goal is not None and goal.match is not None:
+        elif goal is not None and isinstance(goal.match, MatchValue):
             first, aim = (LogStiffness(goal.match),), "match value"
             wanted = math.log(goal.match.value)
         return cls(terms, (*first, *floors), aim, len(floors), wanted, reference)

@@ -1,7 +1,6 @@
 """From a task to the stiffest pressures: global search, judgement and diagnosis."""
 
 from collections.abc import Iterable
-from itertools import islice
 from time import perf_counter
 from typing import Any
 
@@ -245,8 +244,8 @@ class PressureSolver:
                 return self._first_that_holds(problem, again)
         results = results[:1]
         if self.robot.is_loaded:  # what is found need not be what is reached from rest
-            sampled = (diagnosis.unimproved(problem, x) for x in islice(candidates, _JUDGED))
-            results = [*results[:_JUDGED], *sampled]
+            as_they_are = (diagnosis.unimproved(problem, x) for x in candidates[:_JUDGED])
+            results = [*results[:_JUDGED], *as_they_are]
         judged = []
         for result in results:
             try:

@@ -39,7 +39,7 @@ class AboveTerm(Term):
 
     @property
     def _height(self) -> float:
-        return sum(n * p for n, p in zip(self.value.normal, self.value.point, strict=True))
+        return float(sum(n * p for n, p in zip(self.value.normal, self.value.point, strict=True)))
 
     def residual(self, tip: Any, parameters: Any) -> Any:
         """``n . (r - point)``; see `Term.residual`."""
