@@ -10,7 +10,6 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.optimise.goal import MatchMatrix, MatchValue
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.search import search
@@ -104,30 +103,7 @@ def unreachable_message(judgement: Judgement, task: Task, holding: list[str]) ->
     return f"unreachable: the closest configuration is {' and '.join(misses)}; {held}"
 
 
-def demands_message(judgement: Judgement, task: Task) -> str:
+def demands_message(judgement: Judgement) -> str:
     """Say which stiffness cannot be had at the pose, and the best that can."""
-    goal = task.stiffness
-    if goal is None:
-        return ""
-    parts = []
-    match = goal.match
-    first = len(goal.maximise) + isinstance(match, MatchValue)
-    if isinstance(match, MatchValue):
-        value = judgement.stiffnesses[0]
-        if abs(value / match.value - 1) > match.tolerance:
-            parts.append(f"{match.value:.4g} {_unit(match.unit)} asked for, {value:.4g} is nearest")
-    if isinstance(match, MatchMatrix) and judgement.matrix_distance is not None:
-        parts.append(
-            f"the nearest stiffness matrix is {judgement.matrix_distance:.3g} away (relative "
-            f"Frobenius distance, {match.tolerance:.3g} allowed)"
-        )
-    for floor, value in zip(goal.at_least, judgement.stiffnesses[first:], strict=True):
-        if value < floor.value:
-            parts.append(
-                f"at least {floor.value:.4g} {_unit(floor.unit)} asked for, {value:.4g} is the most"
-            )
-    return f"unreachable: the pose can be had, but not this stiffness there: {'; '.join(parts)}"
-
-
-def _unit(unit: str) -> str:
-    return unit.replace("*", " ")
+    missed = "; ".join(judgement.shortfalls)
+    return f"unreachable: the pose can be had, but not this stiffness there: {missed}"

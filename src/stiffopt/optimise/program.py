@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.shape import Shape
-from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
-from stiffopt.optimise.measures import LogStiffness, MatrixDistance, Measure
+from stiffopt.optimise.goal import StiffnessGoal
+from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.term import Term
 
@@ -32,7 +32,7 @@ _SOME_PRESSURE = 2.25e-7
 """Weight of the mean square pressure where a stiffness is matched: of all that match as well the
 one with less pressure."""
 
-Aim = Literal["maximise", "match value", "match matrix", "least pressure"]
+Aim = Literal["maximise", "match", "least pressure"]
 
 
 def pressure_ranges(description: RobotDescription) -> Vector:
@@ -87,8 +87,6 @@ class Program:
         What is maximised, or matched, then the floors.
     aim : what is done with those that are no floors.
     n_floors : int
-    wanted : float
-        Logarithm of the value to match.
     reference : float
         Pressure in Pa that is one unit of mean square pressure.
     """
@@ -97,7 +95,6 @@ class Program:
     measures: tuple[Measure, ...]
     aim: Aim
     n_floors: int
-    wanted: float = 0.0
     reference: float = BAR
 
     @classmethod
@@ -105,19 +102,12 @@ class Program:
         cls, target: Target, goal: StiffnessGoal | None, description: RobotDescription
     ) -> "Program":
         """Program of a task on a robot."""
-        terms, wanted = target.terms, 0.0
         reference = float(pressure_ranges(description).max())
-        floors = tuple(LogStiffness(floor) for floor in goal.at_least) if goal else ()
-        first: tuple[Measure, ...] = ()
-        aim: Aim = "least pressure"
-        if goal is not None and goal.maximise:
-            first, aim = tuple(LogStiffness(measure) for measure in goal.maximise), "maximise"
-        elif goal is not None and isinstance(goal.match, MatchMatrix):
-            first, aim = (MatrixDistance(goal.match),), "match matrix"
-        elif goal is not None and isinstance(goal.match, MatchValue):
-            first, aim = (LogStiffness(goal.match),), "match value"
-            wanted = math.log(goal.match.value)
-        return cls(terms, (*first, *floors), aim, len(floors), wanted, reference)
+        if goal is None:
+            return cls(target.terms, (), "least pressure", 0, reference)
+        aim: Aim = "maximise" if goal.maximise else "match" if goal.match else "least pressure"
+        measures = (*goal.first, *goal.at_least)
+        return cls(target.terms, measures, aim, len(goal.at_least), reference)
 
     @cached_property
     def structure(self) -> ProgramStructure:
@@ -141,10 +131,9 @@ class Program:
 
     @cached_property
     def measure_parameters(self) -> tuple[float, ...]:
-        """Parameters of the measures, then `wanted` and `reference`."""
+        """Parameters of the measures, then `reference`."""
         return (
             *(float(value) for measure in self.measures for value in measure.parameters),
-            self.wanted,
             self.reference,
         )
 
@@ -219,7 +208,7 @@ class Program:
         """
         values, gradients = self._values(tip, parameters), self._gradients(tip, parameters)
         first = len(self.measures) - self.n_floors
-        terms, slopes = self._terms(values[:first], gradients[:first, :], tip, parameters[-2:])
+        terms, slopes = self._terms(values[:first], gradients[:first, :], tip, parameters)
         parts = (terms, slopes.T, values[first:], gradients[first:, :].T)
         return [*self.pose(tip, parameters), *(ca.densify(part) for part in parts)]
 
@@ -228,7 +217,7 @@ class Program:
         values = self._values(tip, parameters)
         first = len(self.measures) - self.n_floors
         none = type(tip.pressures)(first, tip.pressures.numel())
-        terms, _ = self._terms(values[:first], none, tip, parameters[-2:])
+        terms, _ = self._terms(values[:first], none, tip, parameters)
         return [ca.densify(terms), ca.densify(values[first:])]
 
     def judge(self, tip: Shape, parameters: Any) -> list[Any]:
@@ -251,11 +240,11 @@ class Program:
         return ca.densify(ca.vertcat(*found))
 
     def _values(self, tip: Shape, parameters: Any) -> Any:
-        found = [m.value(tip, own) for m, own in self._own_parameters(parameters)]
+        found = [m.formula(tip, own) for m, own in self._own_parameters(parameters)]
         return ca.vertcat(*found) if found else type(tip.pressures)(0, 1)
 
     def _gradients(self, tip: Shape, parameters: Any) -> Any:
-        found = [m.gradient(tip, own) for m, own in self._own_parameters(parameters)]
+        found = [m.formula_gradient(tip, own) for m, own in self._own_parameters(parameters)]
         return ca.vertcat(*found) if found else type(tip.pressures)(0, tip.pressures.numel())
 
     def _own_parameters(self, parameters: Any) -> Iterator[tuple[Measure, Any]]:
@@ -265,16 +254,15 @@ class Program:
             yield measure, parameters[start:end]
             start = end
 
-    def _terms(self, values: Any, gradients: Any, tip: Shape, last: Any) -> tuple[Any, Any]:
-        """Terms of the objective and their gradients, from the last two parameters."""
+    def _terms(self, values: Any, gradients: Any, tip: Shape, parameters: Any) -> tuple[Any, Any]:
+        """Terms of the objective and their gradients."""
         if self.aim == "maximise":
             return -values, -gradients
-        wanted, reference = last[0], last[1]
+        reference = parameters[-1]
         x = tip.pressures / reference
         mean_square, slope = ca.sumsqr(x) / x.numel(), 2 / reference / x.numel() * x.T
         if self.aim == "least pressure":
             return mean_square, slope
-        mismatch, slopes = values, gradients
-        if self.aim == "match value":
-            mismatch, slopes = (values - wanted) ** 2, 2 * (values - wanted) * gradients
-        return mismatch + _SOME_PRESSURE * mean_square, slopes + _SOME_PRESSURE * slope
+        measure, own = next(self._own_parameters(parameters))
+        mismatch, factor = measure.mismatch(values, own)
+        return mismatch + _SOME_PRESSURE * mean_square, factor * gradients + _SOME_PRESSURE * slope

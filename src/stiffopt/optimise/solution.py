@@ -13,7 +13,6 @@ from stiffopt import lie
 from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.functions import functions
-from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.task import Task
 
@@ -258,18 +257,17 @@ class Judgement(NamedTuple):
     matrix_distance: float | None
     pose_holds: bool
     limits_hold: bool
-    demands_hold: bool
+    shortfalls: tuple[str, ...]
 
     @property
     def holds(self) -> bool:
         """Whether everything that the task asks for is so."""
-        return self.pose_holds and self.limits_hold and self.demands_hold
+        return self.pose_holds and self.limits_hold and not self.shortfalls
 
     @classmethod
     def of(
         cls,
         program: Program,
-        goal: StiffnessGoal | None,
         numbers: tuple[list[float], Vector, Vector, list[float]],
         within: bool,
     ) -> "Judgement":
@@ -277,7 +275,7 @@ class Judgement(NamedTuple):
 
         Parameters
         ----------
-        program, goal : of the task
+        program : of the task
         numbers : tuple
             Residuals (m,), tip pose (4, 4), compliance (6, 6), values of the measures (k,).
         within : bool
@@ -286,27 +284,20 @@ class Judgement(NamedTuple):
         residuals, tip_pose, compliance, values = numbers
         errors = program.errors(residuals)
         holds = all(term.holds(errors[term.name]) for term in program.terms)
-        stiffnesses = [math.exp(value) for value in values]
-        distance, demands = None, True
-        if goal is not None:
-            if program.aim == "match matrix" and isinstance(goal.match, MatchMatrix):
-                distance = math.sqrt(values[0])
-                demands = distance <= goal.match.tolerance
-                stiffnesses = stiffnesses[1:]
-            elif isinstance(goal.match, MatchValue):
-                demands = abs(stiffnesses[0] / goal.match.value - 1) <= goal.match.tolerance
-            floored = stiffnesses[len(stiffnesses) - len(goal.at_least) :]
-            for floor, value in zip(goal.at_least, floored, strict=True):
-                demands = demands and value >= floor.value
+        judged = [
+            math.exp(value) if measure.is_stiffness else math.sqrt(value)
+            for measure, value in zip(program.measures, values, strict=True)
+        ]
+        pairs = list(zip(program.measures, judged, strict=True))
         return cls(
             tip_pose=tip_pose,
             errors=errors,
             compliance=compliance,
-            stiffnesses=tuple(stiffnesses),
-            matrix_distance=distance,
+            stiffnesses=tuple(value for measure, value in pairs if measure.is_stiffness),
+            matrix_distance=next((v for measure, v in pairs if not measure.is_stiffness), None),
             pose_holds=holds,
             limits_hold=within,
-            demands_hold=bool(demands),
+            shortfalls=tuple(m.shortfall(value) for m, value in pairs if not m.holds(value)),
         )
 
 
@@ -329,7 +320,7 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     lower, upper = task.pressure_bounds(robot.description)
     within = are_within(pressures, lower, upper)
     numbers = (residuals.ravel().tolist(), pose.T, compliance.T, values.ravel().tolist())
-    return Judgement.of(program, task.stiffness, numbers, within)
+    return Judgement.of(program, numbers, within)
 
 
 def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str, tuple[int, int]]:

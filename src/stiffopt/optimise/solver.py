@@ -146,7 +146,7 @@ class PressureSolver:
             return None
         p = answer.pressures
         within = are_within(p, self._prepared.lower, self._prepared.upper)
-        judgement = Judgement.of(program, task.stiffness, answer.judged, within)
+        judgement = Judgement.of(program, answer.judged, within)
         if not judgement.holds:
             return None
 
@@ -310,7 +310,7 @@ class PressureSolver:
         if not judgement.pose_holds:
             message = diagnosis.unreachable_message(judgement, task, self._holding(result, active))
         elif not judgement.holds:
-            message = diagnosis.demands_message(judgement, task)
+            message = diagnosis.demands_message(judgement)
         elif freedom == 0 and task.stiffness is not None:
             message = diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
         return Explanation(message, tuple(active), freedom, sensitivities)
@@ -337,10 +337,7 @@ class PressureSolver:
             return None
         gradient = None
         if problem.task.measures:
-            first = problem.task.measures[0]
-            gradient = self.robot.stiffness_gradient(
-                pressures, first.direction, first.kind, first.boundary, first.frame
-            )
+            gradient = problem.task.measures[0].stiffness_gradient(self.robot, pressures)
         scale = result.objective.gain(result.point)
 
         per_tolerance: dict[str, float] = {}
