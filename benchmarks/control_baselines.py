@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from stiffopt.control.steering import Standing, Steering
+    from stiffopt.control.state import SteeringStatus
+    from stiffopt.control.steering import Steering
     from stiffopt.control.trajectory import Trajectory
     from stiffopt.model.description import RobotDescription
     from stiffopt.optimise.target import Target
@@ -143,18 +144,13 @@ class IntegralFeedback:
         at_limit = (wanted <= self._limits.low) | (wanted >= self._limits.high)
         return Move(self._commanded.copy(), sound=True, saturated=at_limit)
 
-    def standing(self, now: float) -> Standing:
+    def standing(self, now: float) -> SteeringStatus:
         """It knows of the tip what the model says."""
-        from stiffopt.control.steering import Standing
+        from stiffopt.control.state import SteeringStatus
 
-        n, nowhere, nan = self._limits.n, np.full(3, np.nan), float("nan")
-        tip = self._tip.at(self._commanded).pose[:3, 3]
-        return Standing(
-            plan=np.full(n, nan), tip_position=tip, tip_quaternion=np.full(4, nan),
-            seen_position=nowhere, seen_time=self._seen, target_position=None,
-            target_quaternion=None, target_pointing=None, position_error=nan, angle_error=nan,
-            stiffness=nan, best_stiffness=nan, disturbance=np.zeros(3), wrench=np.full(6, nan),
-            task="",
+        return SteeringStatus(
+            plan=np.full(self._limits.n, np.nan), disturbance=np.zeros(3),
+            tip_position=self._tip.at(self._commanded).pose[:3, 3], seen_age=now - self._seen,
         )  # fmt: skip
 
     def notices(self) -> tuple[Any, ...]:
@@ -172,7 +168,7 @@ def stiffopt_steering(rig: Rig, robot: RobotDescription, dynamics: str) -> Steer
 
     return Controller(
         load_robot(robot), rig.supply.limits, rig.slew, period=PERIOD,
-        control=rig.settings.control, safety=rig.settings.safety, swings=dynamics == "full",
+        control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
     )  # fmt: skip
 
 

@@ -63,7 +63,7 @@ class Soak:
         self.period = 1 / description.rate
         steering = Controller(
             robot, self.rig.supply.limits, self.rig.slew, period=self.period,
-            control=description.control, safety=description.safety, swings=False,
+            control=description.control, safety=description.safety, vibrates=False,
         )  # fmt: skip
         gate = SafetyGate(
             self.rig.supply, slew=self.rig.slew, safety=description.safety,

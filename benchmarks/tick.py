@@ -42,7 +42,7 @@ class Recorder:
 def wait_for_plan(steering: Any) -> None:
     """Until the planner, which compiles first, has an answer; a minute at most."""
     end = time.monotonic() + 60.0
-    while steering._aim() is None:
+    while steering.replanner.latest() is None:
         if time.monotonic() > end:
             raise RuntimeError("the planner has no answer")
         time.sleep(0.05)
@@ -64,7 +64,7 @@ def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.nd
     control = description.control.model_copy(update={"solver": solver})
     steering = Controller(
         robot, rig.supply.limits, rig.slew, period=period, control=control,
-        safety=description.safety, beside=True,
+        safety=description.safety, plan_in_process=True,
     )  # fmt: skip
     gate = SafetyGate(
         rig.supply, slew=rig.slew, safety=description.safety,
@@ -86,7 +86,7 @@ def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.nd
         position = Target(position=target)
         if target == TARGETS[0]:
             steering.set_task(task)
-            steering._ask(0.0)
+            steering.move(0.0)
             wait_for_plan(steering)
         else:
             steering.set_target(position)

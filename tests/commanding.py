@@ -34,11 +34,10 @@ from stiffopt.rig.interface import (
     Rig,
 )
 from stiffopt.rig.settings import Safety
-from stiffopt.safety.frames import Answer, CommandFrame, Message, Request
-from stiffopt.safety.gate import SafetyGate
+from stiffopt.safety.gate import Applied, SafetyGate
 from stiffopt.safety.goal import GoalFollower, GoalSupply, TickingClock
 from stiffopt.safety.guard import Guard
-from stiffopt.safety.outlet import Applied
+from stiffopt.safety.messages import CommandFrame, GuardAnswer, GuardRequest, Message
 
 Array = NDArray[np.float64]
 
@@ -410,7 +409,7 @@ class Wire:
         self.clock = clock
         self.until = clock.now()
         self.coming: list[Message] = []
-        self.answers: list[Answer] = []
+        self.answers: list[GuardAnswer] = []
 
     def wake_for(self, descriptors: object) -> None: ...
 
@@ -422,7 +421,7 @@ class Wire:
         return come
 
     def send(self, message: Message) -> bool:
-        if isinstance(message, Answer):
+        if isinstance(message, GuardAnswer):
             self.answers.append(message)
         return True
 
@@ -447,11 +446,11 @@ class Stream(Way):
         )
         self.number = 0
 
-    def request(self, do: str, **about: Any) -> Answer:
+    def request(self, do: str, **about: Any) -> GuardAnswer:
         self.number += 1
-        return self.say(Request(self.number, do, about))
+        return self.say(GuardRequest(self.number, do, about))
 
-    def say(self, message: Message) -> Answer:
+    def say(self, message: Message) -> GuardAnswer:
         self.channel.coming.append(message)
         self.guard.step()
         if self.channel.answers[-1].error:
@@ -554,7 +553,7 @@ class Loop(Stream):
     def _trips(self) -> int:
         return self.channel.answers[-1].trips if self.channel.answers else 0
 
-    def _done(self, do: str, **about: Any) -> Answer:
+    def _done(self, do: str, **about: Any) -> GuardAnswer:
         from stiffopt.errors import DeviceError
 
         answer = self.request(do, **about)

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.steering import Move, Notice, Seen, Standing
+from stiffopt.control.state import SteeringStatus
+from stiffopt.control.steering import Move, Notice, Seen
 from stiffopt.control.trajectory import Trajectory
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
@@ -101,24 +102,16 @@ class FakeSteering:
         p = self.p if self.override is None else self.override(self.p)
         return Move(p, self.sound, np.zeros(self.n, dtype=bool))
 
-    def standing(self, now: float) -> Standing:
+    def standing(self, now: float) -> SteeringStatus:
         self.accident("standing")
-        return Standing(
+        return SteeringStatus(
             plan=self.wanted,
             tip_position=self.tip,
             tip_quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
             seen_position=np.full(3, np.nan) if self.latest is None else self.latest.position,
-            seen_time=-np.inf if self.latest is None else self.latest.time,
-            target_position=None,
-            target_quaternion=None,
-            target_pointing=None,
-            position_error=float("nan"),
-            angle_error=float("nan"),
-            stiffness=float("nan"),
-            best_stiffness=float("nan"),
+            seen_age=np.inf if self.latest is None else now - self.latest.time,
             disturbance=np.zeros(3),
             wrench=np.zeros(6),
-            task="",
         )
 
     def notices(self) -> tuple[Notice, ...]:

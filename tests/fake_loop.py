@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stiffopt.control.requested import check_task
+from stiffopt.control.checks import check_task
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.rig.interface import Clock, PressureLimits
 

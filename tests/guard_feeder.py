@@ -15,8 +15,8 @@ import numpy as np
 
 from stiffopt.errors import DeviceError
 from stiffopt.rig.interface import PressureCommand
-from stiffopt.safety.link import guarded_rig
 from stiffopt.safety.realtime import real_time
+from stiffopt.safety.rigs import guarded_rig
 
 PERIOD, RISE, PRESSURE = 0.01, 15, 0.4e5  # s, ticks, Pa
 

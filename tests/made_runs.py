@@ -131,7 +131,13 @@ def snapshot(
         best_stiffness=22.0,
         alarms=alarms,
         task="stiff-x",
-        timing=Timing(ticks=7, overruns=2, tick_time=3e-4, lateness=((1e-4, 1e-3), (90, 9, 1))),
+        timing=Timing(
+            ticks=7,
+            overruns=2,
+            tick_time=3e-4,
+            lateness_edges=(1e-4, 1e-3),
+            lateness_counts=(90, 9, 1),
+        ),
         samples=samples,
         rejected=rejected,
     )

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.optimize import lsq_linear, minimize
 
 from stiffopt.control.allocation import SOLVERS, Allocation
-from stiffopt.control.demand import Demand
+from stiffopt.control.feedback import TrackingRows
 
 BAR = 1e5
 KEPT_NEAR = 0.3e-3  # m/bar
@@ -48,7 +48,7 @@ class Case:
         J, v, G = ca.SX.sym("J", t, n), ca.SX.sym("v", t), ca.SX.sym("G", 3, n)
         low = self.low if low is None else low
         high = self.high if high is None else high
-        system = Demand([J, v, G], [J, G], J, v, G, t)
+        system = TrackingRows([J, v, G], [J, G], J, v, G, t)
         return Allocation(system, low, high, self.step, tip_step, solver)
 
     def answer(self, allocation):

@@ -21,7 +21,7 @@ from stiffopt.safety import claim as claim_module
 from stiffopt.safety import gate as gate_module
 from stiffopt.safety.claim import Claim, address_of
 from stiffopt.safety.gate import SafetyGate
-from stiffopt.safety.vent_line import Peer
+from stiffopt.safety.vent_line import SocketPeer
 
 HOLDER = """
 import sys, time
@@ -343,9 +343,9 @@ def test_a_gate_says_which_guard_has_its_supply(name: str, monkeypatch: pytest.M
     Time(monkeypatch)
     asked: list[str] = []
 
-    def guards_of(endpoint: str) -> list[Peer]:
+    def guards_of(endpoint: str) -> list[SocketPeer]:
         asked.append(endpoint)
-        return [Peer(77, 54321)]
+        return [SocketPeer(77, 54321)]
 
     monkeypatch.setattr(gate_module, "guards_of", guards_of)
     with pytest.raises(DeviceError, match=r"is commanded by process 77 \(user 54321\); only one"):

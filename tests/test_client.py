@@ -19,14 +19,14 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from fake_loop import FakeLoop
-from stiffopt.control.state import Alarm, Severity, State, Timing
+from stiffopt.control.state import Alarm, Severity, Snapshot, State, Timing
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.daemon import connections, crowd
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.client_stream import ClientStream
 from stiffopt.daemon.crowd import MAX_CONNECTIONS, MAX_STREAMS, Crowd, Member
 from stiffopt.daemon.messages import MAX_MESSAGE
-from stiffopt.daemon.reports import StateReport
+from stiffopt.daemon.reports import record_of
 from stiffopt.daemon.service import create_app
 from stiffopt.daemon.serving import Server
 from stiffopt.errors import CommandError, InputError, MissingExtraError, ServiceError
@@ -292,7 +292,7 @@ def test_a_state_comes_back_as_it_was(loop: FakeLoop, server: Server) -> None:
         seen_age=0.03,
         wrench=np.arange(6.0),
         alarms=(Alarm("disk", "full", 3.0),),
-        timing=Timing(7, 1, 0.002, ((0.001, 0.01), (5, 1, 1))),
+        timing=Timing(7, 1, 0.002, (0.001, 0.01), (5, 1, 1)),
     )
     with Client(server.url) as reader:  # without a token
         state = reader.state()
@@ -741,5 +741,5 @@ def test_the_stream_sends_states_without_a_token_at_a_limited_rate(server: Serve
         for _ in range(30):
             message = json.loads(socket.recv(timeout=20))
             assert message["type"] == "state"
-            assert StateReport.model_validate(message["state"]).state is State.INACTIVE
+            assert record_of(Snapshot, message["state"]).state is State.INACTIVE
         assert time.monotonic() - begin > 0.2  # 100 Hz at most

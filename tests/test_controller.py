@@ -74,7 +74,7 @@ class Bench:
         self.controller = Controller(
             so.load_robot(robot), self.limits, self.slew, period=period,
             control=control or ControlSettings(), safety=self.description.safety,
-            swings=dynamics == "full",
+            vibrates=dynamics == "full",
         )  # fmt: skip
         self.controller.check()
         self.rig.open()
@@ -214,7 +214,7 @@ def test_trajectory_is_followed():
     for _ in range(10):
         bench.run(0.3)
         now = bench.rig.clock.now()
-        wanted = np.array(bench.controller._course.at(now).position)
+        wanted = np.array(bench.controller.replanner.pursuit.course.at(now).position)
         worst = max(worst, float(np.linalg.norm(bench.tip[:3, 3] - wanted)))
         assert bench.controller.standing(now).task == "trajectory"
     assert worst < 2e-3

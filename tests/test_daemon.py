@@ -27,7 +27,7 @@ import pytest
 from examples import blocks
 from fake_loop import FakeLoop, ManualClock
 from running import ONE, TWO, patient_rig, wait_for, with_simulator
-from stiffopt.control.journal import EventLog
+from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon import secret as secret_module
@@ -348,7 +348,7 @@ def test_the_unit_restarts_vented_and_lets_the_pressures_down() -> None:
 
 
 def test_what_libraries_log_becomes_events_and_never_a_flood() -> None:
-    events, now = EventLog(), [0.0]
+    events, now = EventBuffer(), [0.0]
     loop: Any = SimpleNamespace(events=events, rig=SimpleNamespace(clock=ManualClock()))
     handler = LogEvents(loop, lambda: now[0])
     handler.attach()
@@ -377,7 +377,7 @@ def test_what_libraries_log_becomes_events_and_never_a_flood() -> None:
 
 
 def test_what_cannot_be_put_into_words_does_not_hurt_who_logs_it() -> None:
-    events = EventLog()
+    events = EventBuffer()
     loop: Any = SimpleNamespace(events=events, rig=SimpleNamespace(clock=ManualClock()))
 
     class OddError(Exception):

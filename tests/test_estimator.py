@@ -14,8 +14,9 @@ import pytest
 from scipy.linalg import block_diag, expm
 
 from stiffopt import lie
-from stiffopt.control.estimator import EstimatorSettings, TipEstimator
-from stiffopt.control.vibration import Vibration
+from stiffopt.control.estimator import TipEstimator
+from stiffopt.control.tuning import EstimatorTuning
+from stiffopt.control.vibration import BendingMode
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample
 
@@ -25,8 +26,8 @@ BASE = np.array([0.01, 0.0, 0.18])
 # m/Pa: the first channel moves the tip along x, the second along y and a little along z
 J = np.array([[3e-7, 0.0], [0.0, 3e-7], [0.0, 0.5e-7]])
 SHARES = np.array([0.9, 0.6])
-SWINGING = Vibration(MASS, SHARES)
-PLAIN = EstimatorSettings(model_error=0.0, frequency_error=0.0, damping=ZETA)
+SWINGING = BendingMode(MASS, SHARES)
+PLAIN = EstimatorTuning(model_error=0.0, frequency_error=0.0, damping=ZETA)
 
 
 def tip_at(p, rotation=None):
@@ -117,7 +118,7 @@ def test_late_and_jittered_samples_give_truth_without_noise():
     assert np.abs(truth.eta[0]).max() > 1e-4  # there is a swing to be estimated
     assert np.abs(errors[300:]).max() < 3e-5
     assert estimator.estimate.offset == pytest.approx(truth.offset, abs=3e-5)
-    assert estimator.estimate.swing[:2] == pytest.approx(truth.eta[0], abs=3e-5)
+    assert estimator.estimate.vibration[:2] == pytest.approx(truth.eta[0], abs=3e-5)
     assert estimator.estimate.speed[:2] == pytest.approx(truth.eta[1], abs=3e-4)
     assert estimator.omega == pytest.approx(OMEGA, rel=1e-9)
 
@@ -179,7 +180,7 @@ def test_errors_are_as_small_as_the_theory_allows():
 def test_arm_that_does_not_swing():
     truth = Truth()
     truth.F = np.zeros((2, 2))
-    estimator = TipEstimator(PERIOD, 2, None, EstimatorSettings())
+    estimator = TipEstimator(PERIOD, 2, None, EstimatorTuning())
     rng = np.random.default_rng(4)
     errors = []
     for k in range(1, 500):
@@ -190,7 +191,7 @@ def test_arm_that_does_not_swing():
             late = BASE + J @ pressures(k - 3) + truth.offset + rng.normal(0, 5e-5, 3)
             estimator.take([sample((k - 3) * PERIOD, late)])
         errors.append(estimator.estimate.position - true)
-    assert not estimator.estimate.swing.any()
+    assert not estimator.estimate.vibration.any()
     assert np.sqrt((np.array(errors)[200:] ** 2).mean()) < 6e-5
     assert estimator.omega == math.inf
 
@@ -281,7 +282,7 @@ def test_carrying_corrections_on_is_a_replay(late):
         estimator.advance(now, truth.p, tip_at(truth.p))
         replay.tick(now, truth.p)
         if k == 1:
-            estimator._look_at_mode(tip_at(truth.p))
+            estimator._update_mode(tip_at(truth.p))
         if k % 3 == 0:
             seen[k] = truth.position + rng.normal(0, 5e-5, 3)
         if k - late in seen:
@@ -291,7 +292,7 @@ def test_carrying_corrections_on_is_a_replay(late):
                 replay.see((k - late) * PERIOD, seen[k - late])
         if k % 11 == 0 and k > 30:
             e = estimator.estimate
-            found = np.concatenate([e.swing, e.speed, e.offset])
+            found = np.concatenate([e.vibration, e.speed, e.offset])
             assert found == pytest.approx(replay.answer(), abs=1e-9)
 
 
@@ -332,7 +333,7 @@ def settled(ticks=200, settings=PLAIN, vibration=SWINGING):
 
 def state(estimator):
     e = estimator.estimate
-    return np.concatenate([e.swing, e.speed, e.offset, e.turn])
+    return np.concatenate([e.vibration, e.speed, e.offset, e.turn])
 
 
 def test_old_samples_are_left_out():
@@ -450,7 +451,7 @@ def test_offset_of_the_orientation_is_found_and_its_sign_does_not_matter():
     off = turned(np.array([0.05, -0.08, 0.03]))
     answers = []
     for signs in ([1.0], [-1.0], [1.0, -1.0]):
-        estimator, truth = TipEstimator(PERIOD, 2, SWINGING, EstimatorSettings()), Truth()
+        estimator, truth = TipEstimator(PERIOD, 2, SWINGING, EstimatorTuning()), Truth()
         for k in range(1, 80):
             truth.run(np.zeros(2), PERIOD)
             estimator.advance(k * PERIOD, np.zeros(2), tip_at(np.zeros(2)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from stiffopt.control.gains import Gains, regulator
+from stiffopt.control.feedback import GainSchedule, lqr_gains
 
 LAG, DAMPING, PERIOD = 0.06, 0.04, 0.01
 HANGING = (6.0, 10.0, 14.0)  # rad/s, of the arms there are
@@ -61,13 +61,13 @@ def test_riccati_equation_by_running_the_recursion(omega, period):
         S = after
         if done:
             break
-    found = regulator(omega, DAMPING, LAG, period, weight)
+    found = lqr_gains(omega, DAMPING, LAG, period, weight)
     assert found == pytest.approx(K[0], rel=1e-5, abs=1e-8)
 
 
 @pytest.mark.parametrize("omega", [2.5, 6.0, 10.0, 14.0, 30.0])
 def test_damping_increases(omega):
-    gains = Gains(PERIOD, LAG, DAMPING, 1.0)
+    gains = GainSchedule(PERIOD, LAG, DAMPING, 1.0)
     with_ = damping_of(poles(omega, gains.at(omega), 0))
     without = damping_of(poles(omega, np.zeros(3), 0))
     assert without == pytest.approx(DAMPING, rel=0.01)
@@ -80,32 +80,32 @@ def test_damping_increases(omega):
 @pytest.mark.parametrize("lag", [0.06, 0.03, 0.12])
 def test_stays_stable_with_dead_time_and_wrong_models(period, dead_steps, omega, off, lag):
     """Without any prediction; even then, the swing is damped better than by itself."""
-    gain = Gains(period, LAG, DAMPING, 1.0).at(omega)
+    gain = GainSchedule(period, LAG, DAMPING, 1.0).at(omega)
     found = poles(omega * off, gain, dead_steps, period=period, lag=lag)
     assert np.abs(found).max() < 1
     assert damping_of(found, period) > 1.3 * DAMPING
 
 
 def test_tables_in_between_are_the_regulator_itself():
-    gains = Gains(PERIOD, LAG, DAMPING, 1.0)
+    gains = GainSchedule(PERIOD, LAG, DAMPING, 1.0)
     for omega in (2.0, 3.7, 11.3, 47.0, 199.0):
         assert gains.at(omega) == pytest.approx(
-            regulator(omega, DAMPING, LAG, PERIOD, 1.0), rel=0.02, abs=2e-3
+            lqr_gains(omega, DAMPING, LAG, PERIOD, 1.0), rel=0.02, abs=2e-3
         )
 
 
 def test_outside_the_table_the_nearest_counts():
-    gains = Gains(PERIOD, LAG, DAMPING, 1.0)
+    gains = GainSchedule(PERIOD, LAG, DAMPING, 1.0)
     assert np.array_equal(gains.at(0.1), gains.at(2.0))
     assert np.array_equal(gains.at(1e4), gains.at(200.0))
 
 
 def test_cheaper_effort_is_stronger():
-    mild, strong = (regulator(10.0, DAMPING, LAG, PERIOD, weight) for weight in (10.0, 0.1))
+    mild, strong = (lqr_gains(10.0, DAMPING, LAG, PERIOD, weight) for weight in (10.0, 0.1))
     assert np.linalg.norm(strong) > 2 * np.linalg.norm(mild)
 
 
 def test_regulators_without_lag():
-    gain = Gains(PERIOD, 0.0, DAMPING, 1.0).at(10.0)
+    gain = GainSchedule(PERIOD, 0.0, DAMPING, 1.0).at(10.0)
     assert np.isfinite(gain).all()
     assert np.abs(poles(10.0, gain, 1, lag=1e-3)).max() < 1

@@ -14,9 +14,9 @@ from fake_supply import HIGH, SLEW, FakeSupply, HandClock
 from stiffopt.errors import CommandError, DeviceError
 from stiffopt.rig.interface import PressureCommand, PressureLimits
 from stiffopt.rig.settings import Safety
-from stiffopt.safety.gate import SafetyGate
-from stiffopt.safety.goal import LONGEST, GoalFollower, GoalSupply, TickingClock, check_goal
-from stiffopt.safety.outlet import let_down
+from stiffopt.safety.gate import SafetyGate, let_down
+from stiffopt.safety.goal import GoalFollower, GoalSupply, TickingClock, check_goal
+from stiffopt.safety.settings import COMMANDS
 
 Array = NDArray[np.float64]
 
@@ -357,14 +357,26 @@ def test_a_share_of_pressures_with_a_low_limit_above_zero() -> None:
 LIMITS = PressureLimits(np.zeros(3), HIGH)
 
 
-@pytest.mark.parametrize("valid_for", [math.nextafter(0.0, 1.0), 1e-3, 0.5, 60.0, LONGEST])
+@pytest.mark.parametrize(
+    "valid_for", [math.nextafter(0.0, 1.0), 1e-3, 0.5, 60.0, COMMANDS.longest_goal]
+)
 def test_goals_that_are_valid_for_long_enough(valid_for: float) -> None:
     goal = PressureCommand(np.full(3, 1e4), 0.0, valid_for)
     np.testing.assert_array_equal(check_goal(goal, 0.0, LIMITS), [1e4] * 3)
 
 
 @pytest.mark.parametrize(
-    "valid_for", [math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, math.nextafter(LONGEST, 1e9), 1e5]
+    "valid_for",
+    [
+        math.nan,
+        math.inf,
+        -math.inf,
+        0.0,
+        -0.0,
+        -1.0,
+        math.nextafter(COMMANDS.longest_goal, 1e9),
+        1e5,
+    ],
 )
 def test_goals_that_are_not_valid_for_any_such_time(valid_for: float) -> None:
     bench = Bench().pressed(1e4, 1e4, 1e4)
@@ -392,9 +404,9 @@ def test_goals_that_have_expired_or_are_from_the_future(age: float) -> None:
 
 def test_the_longest_goal_is_kept_that_long() -> None:
     bench = Bench(command_timeout=10.0).pressed(1e4, 1e4, 1e4)
-    bench.goal(1e4, 1e4, 1e4, valid_for=LONGEST)
+    bench.goal(1e4, 1e4, 1e4, valid_for=COMMANDS.longest_goal)
     for _ in range(400):
-        bench.hand.t += LONGEST / 400 - 1e-6
+        bench.hand.t += COMMANDS.longest_goal / 400 - 1e-6
         bench.follower.tick()
         np.testing.assert_array_equal(bench.device.commanded, [1e4] * 3)
     bench.clock.sleep(RAMP + 1.0)

@@ -36,22 +36,22 @@ from stiffopt.rig.interface import (
 from stiffopt.rig.settings import Safety
 from stiffopt.safety import guard as guard_module
 from stiffopt.safety import hosted
-from stiffopt.safety.frames import (
-    Answer,
-    Channel,
+from stiffopt.safety.gate import Applied, SafetyGate
+from stiffopt.safety.goal import GoalFollower
+from stiffopt.safety.guard import Guard, main
+from stiffopt.safety.hosted import HostedDevices, Owned, owned
+from stiffopt.safety.messages import (
     CommandFrame,
+    GuardAnswer,
+    GuardChannel,
+    GuardNotice,
+    GuardRequest,
     Message,
-    Poses,
-    Request,
-    Word,
+    TrackedPoses,
     unpack,
 )
-from stiffopt.safety.gate import SafetyGate
-from stiffopt.safety.goal import GoalFollower
-from stiffopt.safety.guard import FIRST_COMMAND, Guard, main
-from stiffopt.safety.hosted import Owned, SimulatedRest, owned
-from stiffopt.safety.outlet import Applied
-from stiffopt.safety.vent_line import Peer
+from stiffopt.safety.settings import GUARD
+from stiffopt.safety.vent_line import SocketPeer
 
 TIMEOUT = 0.05
 SILENT = "no command had come for 50 ms: the program that commands, or this computer, was late"
@@ -166,21 +166,21 @@ class Scene:
         )
         self._number = 0
 
-    def request(self, do: str, **about: Any) -> Request:
+    def request(self, do: str, **about: Any) -> GuardRequest:
         self._number += 1
-        return Request(self._number, do, about)
+        return GuardRequest(self._number, do, about)
 
     def command(self, pressure: float = 2e4, age: float = 0.0) -> CommandFrame:
         self._number += 1
         now = self.clock.time - age
         return CommandFrame(self._number, now, now, 0.1, np.full(2, pressure))
 
-    def step(self, *messages: Message) -> list[Answer]:
+    def step(self, *messages: Message) -> list[GuardAnswer]:
         """Let the guard take messages; return its answers."""
         self.channel.coming += messages
         before = len(self.channel.sent)
         self.guard.step()
-        return [m for m in self.channel.sent[before:] if isinstance(m, Answer)]
+        return [m for m in self.channel.sent[before:] if isinstance(m, GuardAnswer)]
 
     def pressed(self) -> Scene:
         """Armed and under pressure."""
@@ -261,7 +261,7 @@ def test_silence_vents_in_time(capsys: pytest.CaptureFixture[str]) -> None:
         scene.step()
         scene.clock.time += 1e-4
     assert TIMEOUT < scene.clock.time - silent_since < TIMEOUT + 2e-3
-    (told,) = [m for m in scene.channel.sent if isinstance(m, Answer) and m.tripped]
+    (told,) = [m for m in scene.channel.sent if isinstance(m, GuardAnswer) and m.tripped]
     assert (told.sequence, told.tripped, told.trips, told.armed) == (0, SILENT, 1, False)
     assert told.commanded.tolist() == [0, 0]
     assert f"vented: {SILENT}" in capsys.readouterr().err
@@ -286,10 +286,10 @@ def test_nothing_but_commands_feeds() -> None:
 def test_the_first_command_may_take_longer_but_not_for_ever() -> None:
     scene = Scene()
     scene.step(scene.request("arm"))
-    scene.clock.time += 0.9 * FIRST_COMMAND
+    scene.clock.time += 0.9 * GUARD.first_command
     scene.step()
     assert scene.outlet.did == ["arm"]
-    scene.clock.time += 0.2 * FIRST_COMMAND
+    scene.clock.time += 0.2 * GUARD.first_command
     scene.step()
     assert scene.outlet.did == ["arm", "vent"]
 
@@ -343,7 +343,7 @@ def wired() -> tuple[Scene, socket.socket]:
     scene = Scene()
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     theirs.settimeout(5)
-    scene.channel = channel = Channel(ours)  # type: ignore[assignment]
+    scene.channel = channel = GuardChannel(ours)  # type: ignore[assignment]
     scene.guard._channel = channel  # type: ignore[assignment]
     return scene, theirs
 
@@ -355,10 +355,10 @@ def test_messages_that_make_no_sense_are_refused_and_counted_and_feed_nobody(
     deep = b"R[1, " + 30000 * b"["
     junk = [deep, b'R["x", "read", {}]', b'R[-1, "arm", {}]', b"", b"C", b"Q" * 9]
 
-    def heard() -> list[Answer]:
+    def heard() -> list[GuardAnswer]:
         scene.guard.step()
         answers = [unpack(loop.recv(1 << 16))]
-        return [a for a in answers if isinstance(a, Answer)]
+        return [a for a in answers if isinstance(a, GuardAnswer)]
 
     with loop:
         loop.send(scene.request("arm").pack())
@@ -391,7 +391,7 @@ def test_what_is_answered_fits_into_a_packet() -> None:
         loop.send(b"R" + json.dumps([7, word, {}], ensure_ascii=False).encode())
         scene.guard.step()
         answer = unpack(loop.recv(1 << 16))
-        assert isinstance(answer, Answer)
+        assert isinstance(answer, GuardAnswer)
         assert answer.sequence == 7
         assert answer.error.startswith("the guard does not know")
         assert not scene.channel.closed
@@ -603,18 +603,20 @@ class GoalScene:
     def time(self, moment: float) -> None:
         self.hand.t = moment
 
-    def step(self, *messages: Message) -> list[Answer]:
+    def step(self, *messages: Message) -> list[GuardAnswer]:
         self.channel.coming += messages
         before = len(self.channel.sent)
         self.guard.step()
-        return [m for m in self.channel.sent[before:] if isinstance(m, Answer)]
+        return [m for m in self.channel.sent[before:] if isinstance(m, GuardAnswer)]
 
-    def ask(self, do: str, **about: Any) -> Answer:
+    def ask(self, do: str, **about: Any) -> GuardAnswer:
         self.number += 1
-        (answer,) = self.step(Request(self.number, do, about))
+        (answer,) = self.step(GuardRequest(self.number, do, about))
         return answer
 
-    def command(self, pressure: float, valid_for: float = 100.0, *, goal: bool = True) -> Answer:
+    def command(
+        self, pressure: float, valid_for: float = 100.0, *, goal: bool = True
+    ) -> GuardAnswer:
         self.number += 1
         given = np.full(3, pressure)
         frame = CommandFrame(self.number, self.time, self.time, valid_for, given, goal)
@@ -645,7 +647,7 @@ class FakeLine:
     def descriptors(self) -> list[int]:
         return [71, 72]
 
-    def asked(self) -> list[FakeCaller]:
+    def wanting_to_vent(self) -> list[FakeCaller]:
         calls, self.calls = self.calls, []
         return calls
 
@@ -655,7 +657,7 @@ class FakeLine:
 
 class FakeCaller:
     def __init__(self) -> None:
-        self.peer = Peer(7, 54321)
+        self.peer = SocketPeer(7, 54321)
         self.answers: list[str] = []
 
     def answer(self, error: str = "") -> None:
@@ -878,7 +880,7 @@ def test_the_poses_of_a_hosted_tracker_are_forwarded() -> None:
     scene = Scene(epoch=900.0, hosted=rest)
     rest.new = [sample(i) for i in range(450)]
     scene.step()
-    packets = [m for m in scene.channel.sent if isinstance(m, Poses)]
+    packets = [m for m in scene.channel.sent if isinstance(m, TrackedPoses)]
     assert [len(packet.samples) for packet in packets] == [200, 200, 50]
     first = packets[0].samples[0]
     assert (first.time, first.received, first.frame) == (910.0, 910.5, 0)
@@ -889,12 +891,12 @@ def test_the_poses_of_a_hosted_tracker_are_forwarded() -> None:
     assert last.quaternion.tolist() == [1.0, 0, 0, 0]
     assert scene.channel.waits[-1] < 0.005
     scene.step()
-    assert len([m for m in scene.channel.sent if isinstance(m, Poses)]) == 3
+    assert len([m for m in scene.channel.sent if isinstance(m, TrackedPoses)]) == 3
 
 
 def test_what_is_not_for_the_guard_is_left() -> None:
     scene = Scene().pressed()
-    assert scene.step(Word("ready"), scene.command())[0].armed
+    assert scene.step(GuardNotice("ready"), scene.command())[0].armed
 
 
 def test_only_a_simulation_knows_the_truth() -> None:
@@ -941,7 +943,7 @@ def test_to_close_vents_and_ends_quietly(capsys: pytest.CaptureFixture[str]) -> 
     scene.channel.coming = [scene.request("close")]
     assert scene.guard.serve() == 0
     assert scene.outlet.did == ["vent", "vent", "close"]
-    assert isinstance(scene.channel.sent[-1], Answer)
+    assert isinstance(scene.channel.sent[-1], GuardAnswer)
     assert capsys.readouterr().err == ""
 
 
@@ -1034,7 +1036,7 @@ class Process:
         self.outlet = FakeOutlet()
         self.error: Exception | None = None
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.channel, self._descriptor = Channel(ours), theirs.detach()
+        self.channel, self._descriptor = GuardChannel(ours), theirs.detach()
         monkeypatch.setattr(guard_module, "owned", self._owned)
         stdin = io.TextIOWrapper(io.BytesIO(pickle.dumps(("rig", "robot"))))
         monkeypatch.setattr(sys, "stdin", stdin)
@@ -1069,16 +1071,16 @@ def process(monkeypatch: pytest.MonkeyPatch) -> Iterator[Process]:
 
 
 def test_the_process_opens_guards_and_ends(process: Process) -> None:
-    code, said = process.run(Request(1, "arm"), Request(2, "close"))
+    code, said = process.run(GuardRequest(1, "arm"), GuardRequest(2, "close"))
     assert code == 0
     assert process.outlet.did == ["open", "arm", "vent", "vent", "close"]
     notice, ready, armed, closed = said
-    assert notice == Word("notice", {"text": "this takes its time"})
-    assert isinstance(ready, Word)
+    assert notice == GuardNotice("notice", {"text": "this takes its time"})
+    assert isinstance(ready, GuardNotice)
     assert ready.kind == "ready"
     assert "real-time: " in ready.about["real_time"]
-    assert isinstance(armed, Answer)
-    assert isinstance(closed, Answer)
+    assert isinstance(armed, GuardAnswer)
+    assert isinstance(closed, GuardAnswer)
     assert armed.armed
     assert not closed.armed
     assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
@@ -1089,7 +1091,7 @@ def test_the_process_says_what_it_has_to_say_as_it_is_told(
     process: Process, more: Sequence[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     process.outlet.fail["close"] = [DeviceError("no answer")]
-    assert process.run(Request(1, "close"), more=more)[0] == 1
+    assert process.run(GuardRequest(1, "close"), more=more)[0] == 1
     said = capsys.readouterr().err
     assert (json.loads(said)["level"] == "error") if more else said.startswith("stiffopt guard: ")
 
@@ -1101,7 +1103,7 @@ def test_the_process_leaves_at_sigterm(process: Process, monkeypatch: pytest.Mon
         signal.raise_signal(signal.SIGTERM)
 
     monkeypatch.setattr(process.outlet, "arm", arm)
-    assert process.run(Request(1, "arm"))[0] == 0
+    assert process.run(GuardRequest(1, "arm"))[0] == 0
     assert process.outlet.did == ["open", "arm", "vent", "close"]
 
 
@@ -1112,7 +1114,9 @@ def test_the_process_says_why_it_cannot_start(process: Process, error: Exception
     process.error = error
     code, said = process.run()
     assert code == 1
-    assert said[1] == Word("failed", {"kind": type(error).__name__, "args": list(error.args)})
+    assert said[1] == GuardNotice(
+        "failed", {"kind": type(error).__name__, "args": list(error.args)}
+    )
 
 
 def test_the_file_is_a_program(process: Process, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -1174,7 +1178,7 @@ def test_a_simulated_rig_is_hosted_whole() -> None:
 def test_an_arm_that_cannot_be_followed_shows_no_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     description = load_rig_description(RIGS / "sim.yaml")
     rig = make_rig(description, load_description("stiff-flop-1"), real_time=True)
-    rest = SimulatedRest(rig)
+    rest = HostedDevices(rig)
 
     def fail() -> None:
         raise DeviceError("buckled")
@@ -1184,7 +1188,7 @@ def test_an_arm_that_cannot_be_followed_shows_no_poses(monkeypatch: pytest.Monke
     monkeypatch.setattr(rig.tracker, "_poll", fail)
     assert rest.poses() == ()
     rig.tracker = None
-    assert SimulatedRest(rig).poses() == ()
+    assert HostedDevices(rig).poses() == ()
 
 
 def test_of_a_real_rig_only_the_supply_is_owned() -> None:
@@ -1203,12 +1207,16 @@ def test_of_a_real_rig_only_the_supply_is_owned() -> None:
     "message",
     [
         CommandFrame(3, 1.0, 2.0, 0.5, np.array([1e5, np.nan])),
-        Answer(4, np.array([1.0, 2.0]), np.array([3.0, np.nan]), 5.0, True, True, True, 6, 7),
-        Answer(4, np.zeros(9), np.ones(9), 5.0, tripped="a", refused="b", error="µ", value=[[1.5]]),
-        Request(5, "inject", {"device": "supply", "channel": None}),
-        Word("ready", {"real_time": "yes"}),
-        Poses((sample(3), PoseSample(1.0, 2.0, 4, np.full(3, np.nan), np.array([1.0, 0, 0, 0])))),
-        Poses(()),
+        GuardAnswer(4, np.array([1.0, 2.0]), np.array([3.0, np.nan]), 5.0, True, True, True, 6, 7),
+        GuardAnswer(
+            4, np.zeros(9), np.ones(9), 5.0, tripped="a", refused="b", error="µ", value=[[1.5]]
+        ),
+        GuardRequest(5, "inject", {"device": "supply", "channel": None}),
+        GuardNotice("ready", {"real_time": "yes"}),
+        TrackedPoses(
+            (sample(3), PoseSample(1.0, 2.0, 4, np.full(3, np.nan), np.array([1.0, 0, 0, 0])))
+        ),
+        TrackedPoses(()),
     ],
 )
 def test_messages_arrive_as_they_were_sent(message: Message) -> None:
@@ -1220,7 +1228,7 @@ def test_messages_arrive_as_they_were_sent(message: Message) -> None:
 
 def _plain(message: Any) -> Any:
     parts = dict(vars(message))
-    if isinstance(message, Poses):
+    if isinstance(message, TrackedPoses):
         parts["samples"] = [vars(s) for s in message.samples]
     return parts
 
@@ -1233,7 +1241,7 @@ def _plain(message: Any) -> Any:
      b'R[1, ["read"], {}]', b'R[1, "read", []]', b'R[1, "read", {}, 2]', b'W["ready", 1]',
      b"W[1, {}]", b"R" + 30000 * b"[", b"R" + 30000 * b'{"a":', b"W" + 30000 * b"[",
      b"R[" + 9000 * b"1" + b', "read", {}]', b"P" + np.full(10, np.inf).tobytes(),
-     Answer(1, np.zeros(2), np.zeros(2), 0.0).pack()[:-3],
+     GuardAnswer(1, np.zeros(2), np.zeros(2), 0.0).pack()[:-3],
      CommandFrame(1, 0.0, 0.0, 0.0, np.zeros(2)).pack()[:-3]],
 )  # fmt: skip
 def test_a_broken_packet_is_no_message(packet: bytes) -> None:
@@ -1241,10 +1249,10 @@ def test_a_broken_packet_is_no_message(packet: bytes) -> None:
         unpack(packet)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
-        channel = Channel(ours)
+        channel = GuardChannel(ours)
         theirs.send(packet)
-        theirs.send(Word("ready").pack())
-        assert channel.receive(1.0) == [Word("ready")]
+        theirs.send(GuardNotice("ready").pack())
+        assert channel.receive(1.0) == [GuardNotice("ready")]
         assert channel.broken == 1
         assert not channel.closed
         channel.close()
@@ -1254,11 +1262,11 @@ def test_a_broken_packet_is_no_message(packet: bytes) -> None:
 def test_whatever_comes_is_a_message_or_left_out(seed: int) -> None:
     draw = np.random.default_rng(seed)
     good = [
-        Request(5, "arm", {"told": 0}).pack(),
-        Word("ready").pack(),
-        Poses((sample(3),)).pack(),
+        GuardRequest(5, "arm", {"told": 0}).pack(),
+        GuardNotice("ready").pack(),
+        TrackedPoses((sample(3),)).pack(),
         CommandFrame(1, 0.0, 0.0, 0.0, np.zeros(2)).pack(),
-        Answer(1, np.zeros(2), np.zeros(2), 0.0).pack(),
+        GuardAnswer(1, np.zeros(2), np.zeros(2), 0.0).pack(),
     ]
     for _ in range(3000):
         packet = bytearray(good[draw.integers(len(good))])
@@ -1279,7 +1287,7 @@ def test_who_sends_without_end_keeps_nobody_from_the_rest() -> None:
         def recv(self, _: int) -> bytes:
             return b"X"
 
-    channel = Channel(Endless())  # type: ignore[arg-type]
+    channel = GuardChannel(Endless())  # type: ignore[arg-type]
     assert channel.receive() == []
     assert channel.broken == 1000
 
@@ -1287,14 +1295,14 @@ def test_who_sends_without_end_keeps_nobody_from_the_rest() -> None:
 def test_a_channel_that_nobody_reads_waits_for_nothing() -> None:
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with theirs:
-        channel = Channel(ours)
+        channel = GuardChannel(ours)
         for _ in range(100000):
-            if not channel.send(Word("ready")):
+            if not channel.send(GuardNotice("ready")):
                 break
         else:
             raise AssertionError("it took everything")
         assert not channel.closed
-    assert not channel.send(Word("ready"))
+    assert not channel.send(GuardNotice("ready"))
     assert channel.closed
     assert channel.receive(5.0) == []
     channel.close()
@@ -1303,9 +1311,9 @@ def test_a_channel_that_nobody_reads_waits_for_nothing() -> None:
 def test_a_closed_end_is_noticed() -> None:
     for unread in (False, True):
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        channel = Channel(ours)
+        channel = GuardChannel(ours)
         if unread:
-            assert channel.send(Word("ready"))
+            assert channel.send(GuardNotice("ready"))
         theirs.close()
         assert channel.receive(5.0) == []
         assert channel.closed

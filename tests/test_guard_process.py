@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from statistics import median
 from threading import Event, Thread
@@ -25,9 +26,11 @@ from stiffopt.model.robot_files import load_description
 from stiffopt.plant.settings import PlantSettings
 from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.interface import PressureCommand, Rig
-from stiffopt.safety import exchange, guard_process
-from stiffopt.safety.link import GuardLink, guarded_rig
-from stiffopt.safety.outlet import Applied
+from stiffopt.safety import guard_client
+from stiffopt.safety.gate import Applied
+from stiffopt.safety.guard_client import GuardLink
+from stiffopt.safety.rigs import guarded_rig
+from stiffopt.safety.settings import CLIENT
 
 HERE = Path(__file__).parent
 RIGS = HERE.parent / "rig"
@@ -439,7 +442,7 @@ def test_content_of_a_rig_file_needs_its_robot() -> None:
 
 STUB = """
 import socket, sys, time
-from stiffopt.safety.frames import Word
+from stiffopt.safety.messages import GuardNotice
 end = socket.socket(fileno=int(sys.argv[1]))
 {}
 """
@@ -461,7 +464,8 @@ def stubbed(folder: Path, monkeypatch: pytest.MonkeyPatch, body: str) -> GuardLi
         ("", DeviceError, "ended before it was ready"),
         ("time.sleep(60)", DeviceError, "was not ready within 0.2 s"),
         (
-            "end.send(Word('failed', {'kind': 'MissingExtraError', 'args': ['a', 'b']}).pack())",
+            "about = {'kind': 'MissingExtraError', 'args': ['a', 'b']}\n"
+            "end.send(GuardNotice('failed', about).pack())",
             MissingExtraError,
             "needs a",
         ),
@@ -474,9 +478,8 @@ def test_a_guard_that_does_not_start(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    if body.startswith("time"):
-        monkeypatch.setattr(guard_process, "_START", 0.2)
-    monkeypatch.setattr(guard_process, "_END", 0.2)
+    start = 0.2 if body.startswith("time") else CLIENT.start
+    monkeypatch.setattr(guard_client, "CLIENT", replace(CLIENT, start=start, end=0.2))
     link = stubbed(tmp_path, monkeypatch, body)
     with pytest.raises(error, match=text):
         link.open()
@@ -486,12 +489,11 @@ def test_a_guard_that_does_not_start(
 def test_what_takes_its_time_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The guard's notice comes while it is not ready; then this one says no more."""
     body = (
-        "end.send(Word('notice', {'text': 'the simulator is being made'}).pack())\n"
-        "end.send(Word('ready', {'real_time': 'no'}).pack())\n"
+        "end.send(GuardNotice('notice', {'text': 'the simulator is being made'}).pack())\n"
+        "end.send(GuardNotice('ready', {'real_time': 'no'}).pack())\n"
         "time.sleep(60)"
     )
-    monkeypatch.setattr(exchange, "_ANSWER", 0.2)
-    monkeypatch.setattr(guard_process, "_END", 0.2)
+    monkeypatch.setattr(guard_client, "CLIENT", replace(CLIENT, answer=0.2, end=0.2))
     link = stubbed(tmp_path, monkeypatch, body)
     with (
         pytest.warns(SlowWarning, match="is being made"),

@@ -14,8 +14,8 @@ import pytest
 from made_runs import BEGIN, PERIOD, FakeLoop, N, event, samples_between, snapshot, ticks, tip_at
 from stiffopt.cli.main import main
 from stiffopt.control.state import Alarm, Severity, State
+from stiffopt.daemon.run_log import RecordedRun, read_run
 from stiffopt.logs import LogLayout, LogRow, McapLogWriter, read_log
-from stiffopt.logs.run_log import Run, read_run
 from test_telemetry import recorded
 
 pytest.importorskip("foxglove")
@@ -167,7 +167,7 @@ def test_help_waits_for_no_numerics() -> None:
 # The page -----------------------------------------------------------------------------------------
 
 
-def page(run: Run) -> Any:
+def page(run: RecordedRun) -> Any:
     pytest.importorskip("matplotlib")
     from stiffopt.plots.run import plot_run
 
@@ -184,7 +184,7 @@ def test_the_page_shows_what_happened(run_file: Path) -> None:
     ]  # fmt: skip
     x = figure.axes[0]
     drawn = {line.get_label(): np.asarray(line.get_ydata()) for line in x.lines}
-    np.testing.assert_allclose(drawn["estimate"], run.tip[:, 0] * 1e3)
+    np.testing.assert_allclose(drawn["estimate"], run.tip_position[:, 0] * 1e3)
     np.testing.assert_allclose(drawn["target"], 20.0)
     assert "target" not in {line.get_label() for line in figure.axes[1].lines}  # that axis is free
     timeline = [text.get_text() for text in figure.axes[-1].get_yticklabels()]

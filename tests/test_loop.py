@@ -12,12 +12,11 @@ import pytest
 
 from fake_control import Hang
 from simulated_loop import PERIOD, TASK, Lab
-from stiffopt.control.journal import Alarms, EventLog
-from stiffopt.control.lifecycle import Lifecycle
+from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.requests import Asker, asked_by
+from stiffopt.control.request_queue import Requester, requested_by
 from stiffopt.control.state import Severity, State
-from stiffopt.control.timing import LatenessHistogram, Punctuality
+from stiffopt.control.timing import TickTiming
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.rig.settings import Safety
@@ -398,11 +397,11 @@ def test_what_was_given_up_is_not_done_later(served: bool) -> None:
     with running(lab) if served else nullcontext():
         while served and lab.loop.snapshot().timing.ticks < 5:
             pass
-        first, second, patient = Asker(), Asker(), Asker()
-        told: dict[Asker, str] = {}
+        first, second, patient = Requester(), Requester(), Requester()
+        told: dict[Requester, str] = {}
 
-        def ask(asker: Asker, request: Callable[[], None]) -> None:
-            with asked_by(asker):
+        def ask(asker: Requester, request: Callable[[], None]) -> None:
+            with requested_by(asker):
                 try:
                     request()
                 except CommandError as error:
@@ -431,16 +430,16 @@ def test_what_was_given_up_is_not_done_later(served: bool) -> None:
 
 
 def test_nothing_is_begun_by_one_who_gave_up_before() -> None:
-    lab, asker = Lab(), Asker()
+    lab, asker = Lab(), Requester()
     assert asker.give_up()
-    with asked_by(asker), pytest.raises(CommandError, match="it is not done"):
+    with requested_by(asker), pytest.raises(CommandError, match="it is not done"):
         lab.loop.set_target(TASK.target)
     assert "set_target" not in lab.steering.calls
     lab.loop.set_target(TASK.target)  # of somebody else
 
 
 def test_an_arming_whose_checks_take_too_long_moves_nothing() -> None:
-    lab, asker = Lab(ready=False), Asker()
+    lab, asker = Lab(ready=False), Requester()
     lab.loop.configure()
     lab.ticks(60)
 
@@ -449,7 +448,7 @@ def test_an_arming_whose_checks_take_too_long_moves_nothing() -> None:
             asker.give_up()
 
     lab.steering.accident = give_up
-    with asked_by(asker), pytest.raises(CommandError, match="longer than anybody waited"):
+    with requested_by(asker), pytest.raises(CommandError, match="longer than anybody waited"):
         lab.loop.arm()
     assert lab.state is State.INACTIVE
     assert not lab.gate.armed
@@ -517,10 +516,11 @@ def test_an_interrupt_vents_on_its_way_out() -> None:
 
 
 def test_lateness_is_counted_by_size() -> None:
-    histogram = LatenessHistogram()
+    timing = TickTiming(0.01)
     for lateness in (-1.0, 0.0, 1e-6, 1.5e-6, 3e-4, 0.5, 0.6, 100.0):
-        histogram.add(lateness)
-    counted = dict(zip((*histogram.edges, np.inf), histogram.counts, strict=True))
+        timing.begin(0.0, lateness)
+    edges, counts = timing.statistics().lateness
+    counted = dict(zip((*edges, np.inf), counts, strict=True))
     assert {edge: n for edge, n in counted.items() if n} == {
         1e-6: 3,
         2e-6: 1,
@@ -531,18 +531,18 @@ def test_lateness_is_counted_by_size() -> None:
 
 
 def test_due_times_are_never_in_the_past() -> None:
-    punctuality = Punctuality(0.01)
-    assert punctuality.next_due(1.0, 1.005) == pytest.approx(1.01)
-    assert punctuality.missed == 0
-    assert punctuality.next_due(1.0, 1.034) == pytest.approx(1.04)
-    assert punctuality.missed == 3
+    timing = TickTiming(0.01)
+    assert timing.next_due(1.0, 1.005) == pytest.approx(1.01)
+    assert timing.missed == 0
+    assert timing.next_due(1.0, 1.034) == pytest.approx(1.04)
+    assert timing.missed == 3
 
 
 # What it tells -----------------------------------------------------------------------------------
 
 
 def test_events_are_told_once_and_the_oldest_go_first() -> None:
-    log = EventLog(kept=3)
+    log = EventBuffer(size=3)
     assert log.since(0) == ([], 0)
     for number in range(5):
         log.add(float(number), "tick", str(number))
@@ -554,7 +554,7 @@ def test_events_are_told_once_and_the_oldest_go_first() -> None:
 
 
 def test_an_alarm_is_an_event_when_it_comes_and_when_it_goes() -> None:
-    log = EventLog()
+    log = EventBuffer()
     alarms = Alarms(log)
     alarms.set(1.0, "wet", "it rains", Severity.ERROR)
     alarms.set(2.0, "wet", "it pours")

@@ -13,12 +13,14 @@ import pytest
 from simulated_loop import PERIOD, TASK, Lab
 from stiffopt.control.state import State
 from stiffopt.control.steering import Notice
-from stiffopt.control.tracker_watch import BACK
+from stiffopt.control.tuning import TrackerTuning
 from stiffopt.errors import CommandError, InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange
 from stiffopt.rig.interface import PoseTracker, PressureCommand, PressureReading, RawPose
+
+BACK = TrackerTuning().back
 
 FRAME = 0.025  # s, between samples of the tracker
 LATENCY = 0.025  # s

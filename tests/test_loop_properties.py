@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from fake_control import FakeSteering
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.state import State
-from stiffopt.control.steering import Move, Notice, Seen, Standing
+from stiffopt.control.state import State, SteeringStatus
+from stiffopt.control.steering import Move, Notice, Seen
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
@@ -291,7 +291,7 @@ class Whim:
                 p = p * chance.uniform(-1e3, 1e3)
         return Move(p, sound, self.unsaturated)
 
-    def standing(self, now: float) -> Standing:
+    def standing(self, now: float) -> SteeringStatus:
         self._fail()
         return self.nowhere
 

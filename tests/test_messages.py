@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pydantic import BaseModel
 
 from simulated_loop import TASK, Lab
+from stiffopt.control.checks import check_target, check_task, check_trajectory
 from stiffopt.control.contents import contents, differences
-from stiffopt.control.requested import check_target, check_task, check_trajectory
 from stiffopt.control.state import State
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.daemon.messages import (
     TargetMessage,
     TaskMessage,
     TrajectoryMessage,
+    message_of,
     task_of,
     trajectory_of,
 )
@@ -32,10 +33,16 @@ from stiffopt.optimise.goal import (
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task, load_task
 from stiffopt.rig.interface import PressureLimits
+from stiffopt.schema import Items, Schema, Vector
+from stiffopt.units import Length, Number, Speed, TranslationalStiffness
 
 PROBLEMS = Path(__file__).resolve().parent.parent / "problems"
 LIMITS = PressureLimits([0.0] * 3, [1.5e5] * 3)  # type: ignore[arg-type]
 X = (1.0, 0.0, 0.0)
+MESSAGES: tuple[type[Schema], ...] = (
+    *(Task, Target, Tolerance, StiffnessGoal, StiffnessMeasure, AtLeast, MatchValue, MatchMatrix),
+    *(Load, PressureRange, Waypoint, Trajectory),
+)
 
 
 class GentleTarget(Target):
@@ -194,7 +201,7 @@ def test_too_much_for_a_message_is_refused_as_input() -> None:
 @pytest.mark.parametrize("path", sorted(PROBLEMS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_problem_survives_its_message(path: Path) -> None:
     given = load_task(path)
-    sent = json.loads(json.dumps(TaskMessage.of(given, "the arm").model_dump()))
+    sent = json.loads(json.dumps(TaskMessage.of(given, robot="the arm").model_dump()))
     assert task_of(sent, "the arm") == given.model_copy(update={"robot": "the arm", "source": None})
     assert not differences(contents(given), contents(task_of({**sent, "robot": None}, given.robot)))
 
@@ -206,24 +213,96 @@ def test_a_trajectory_survives_its_message() -> None:
     assert trajectory_of(sent) == given
 
 
-def test_whoever_adds_a_key_decides_whether_messages_and_steering_know_it() -> None:
-    """A key that is new here needs a word in `daemon.messages` and a meaning in `control`."""
-    known: dict[type[BaseModel], set[str]] = {
-        Task: {"robot", "target", "stiffness", "load", "pressure", "source"},
-        Target: {"position", "pointing", "orientation", "above", "tolerance"},
-        Tolerance: {"position", "angle"},
-        StiffnessGoal: {"maximise", "at_least", "match"},
-        StiffnessMeasure: {"direction", "frame", "kind", "boundary"},
-        AtLeast: {"direction", "frame", "kind", "boundary", "value"},
-        MatchValue: {"direction", "frame", "kind", "boundary", "value", "tolerance"},
-        MatchMatrix: {"unit", "matrix", "frame", "boundary", "tolerance"},
-        Load: {"force", "moment", "frame"},
-        PressureRange: {"min", "max"},
-        Waypoint: {"time", "target"},
-        Trajectory: {"waypoints"},
+EVERYTHING: list[Schema] = [
+    Task(
+        robot="stiff-flop-1",
+        target=Target(
+            position=(0.01, None, 0.1),
+            pointing=(0.0, 0.6, 0.8),
+            above={"point": (0.0, 0.01, 0.1), "normal": (0.0, 0.6, 0.8)},
+            tolerance=Tolerance(position=2e-3, angle=0.3),
+        ),
+        stiffness=StiffnessGoal(
+            maximise=[
+                StiffnessMeasure(direction=X, frame="tip", kind="rotation", boundary="guided")
+            ],
+            at_least=[
+                AtLeast(direction=X, frame="tip", kind="rotation", boundary="clamped", value=9.0)
+            ],
+        ),
+        load=Load(force=(0.0, 0.1, -0.02), moment=(1e-3, 0.0, 0.0), frame="tip"),
+        pressure=PressureRange(min=1e3, max=(None, 1.2e5, 1e5)),
+    ),
+    task(
+        target=Target(orientation=(0.6, 0.0, 0.8, 0.0)),
+        stiffness=StiffnessGoal(
+            match=MatchValue(
+                direction=X, frame="tip", kind="rotation", boundary="guided", value=9.0,
+                tolerance=0.1,
+            )
+        ),
+    ),
+    goal(
+        match=MatchMatrix(
+            matrix=((100.0, 1.0, 0.0), (1.0, 100.0, 0.0), (0.0, 0.0, 900.0)),
+            frame="tip", boundary="clamped", tolerance=0.2,
+        )
+    ),
+    Trajectory(waypoints=[Waypoint(time=t, target=TASK.target) for t in (0.0, 0.5)]),
+]  # fmt: skip
+"""Descriptions in which each field has another value than by default, once at least."""
+
+
+def schemas_in(value: Any) -> Iterator[Schema]:
+    """Yield a description and those in it."""
+    if isinstance(value, Schema):
+        yield value
+        value = [getattr(value, name) for name in type(value).model_fields]
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from schemas_in(item)
+
+
+def test_every_field_of_every_schema_survives_its_message() -> None:
+    for given in EVERYTHING:
+        sent = json.loads(json.dumps(message_of(type(given)).of(given).model_dump()))
+        message = message_of(type(given)).model_validate(sent)
+        assert message.read() == given
+    seen = {
+        (type(each), name)
+        for given in EVERYTHING
+        for each in schemas_in(given)
+        for name, info in type(each).model_fields.items()
+        if info.is_required() or getattr(each, name) != info.default
     }
-    for model, keys in known.items():
-        assert set(model.model_fields) == keys, model.__name__
+    assert {model for model, _ in seen} == set(MESSAGES)
+    for model in MESSAGES:
+        unsaid = {"source"} if model is Task else {"unit"} if model is MatchMatrix else set()
+        wanted = {(model, name) for name in model.model_fields if name not in unsaid}
+        assert wanted <= seen, f"EVERYTHING lacks {wanted - seen}"
+        assert set(message_of(model).names) == {name for _, name in wanted}
+
+
+class Obstacle(Schema):
+    distance: Length = 0.01
+    normal: Vector[Number]
+
+
+class Rich(Schema):
+    stiffening: TranslationalStiffness | None = None
+    obstacles: Items[Obstacle] = ()
+    speeds: Items[Speed | None]
+
+
+def test_a_field_that_is_new_is_in_its_message_with_its_unit() -> None:
+    given = Rich(stiffening=3.0, obstacles=[Obstacle(normal=X)], speeds=(0.1, None))
+    sent = message_of(Rich).of(given).model_dump()
+    assert sent == {
+        "stiffening_n_per_m": 3.0,
+        "obstacles": [{"distance_m": 0.01, "normal": [1.0, 0.0, 0.0]}],
+        "speeds_m_per_s": [0.1, None],
+    }
+    assert message_of(Rich).model_validate(sent).read() == given
 
 
 def test_differences_are_named_by_their_place() -> None:

@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from stiffopt.control.steering import Seen
-from stiffopt.control.tracker_watch import BACK, ENOUGH, Sight, TrackerWatch
+from stiffopt.control.tracker_watch import Sight, TrackerWatch
+from stiffopt.control.tuning import TrackerTuning
 from stiffopt.model.history import History
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
@@ -598,8 +599,8 @@ def test_1_it_is_back_after_a_run_without_three_missing_frames(bad: int) -> None
         good += is_good and watched.frame > frame
         if sight is Sight.SEEN:
             break
-        assert good < BACK
-    assert good == BACK
+        assert good < TrackerTuning().back
+    assert good == TrackerTuning().back
 
 
 @pytest.mark.parametrize(("interval", "latency"), [(0.002, 0.001), (0.01, 0.0), (0.1, 0.3)])
@@ -665,7 +666,7 @@ def test_5_rejected_samples_in_a_row() -> None:
 def test_what_is_usual_is_learned_from_enough_samples() -> None:
     watched = Watched()
     assert watched.tick(**NOTHING) is Sight.SEEN  # it is given time
-    while watched.watch.samples < ENOUGH:
+    while watched.watch.samples < TrackerTuning().enough:
         watched.tick()
     interval, age = watched.watch.usual
     assert interval == pytest.approx(0.025)

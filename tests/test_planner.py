@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 import stiffopt as so
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
-from stiffopt.control.planning import Planning, moved_back
-from stiffopt.control.plans import Request
+from stiffopt.control.planning import Planning, PlanRequest, model_target
 from stiffopt.errors import StiffoptError
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
@@ -40,8 +39,8 @@ def request(robot, serial=1, offset=(0,) * 6, p=PRESSURES, **changes):
     target = Target(position=(float(position[0]), float(position[1]), None))
     goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
     task = Task(robot=ROBOT, target=target, stiffness=goal)
-    changes.setdefault("beside", np.zeros(3))
-    return Request(serial, task, target, np.array(offset, dtype=float), **changes)
+    changes.setdefault("pressure_offset", np.zeros(3))
+    return PlanRequest(serial, task, target, np.array(offset, dtype=float), **changes)
 
 
 def wait_for(condition, seconds=60.0):
@@ -53,7 +52,7 @@ def wait_for(condition, seconds=60.0):
 
 
 @pytest.fixture
-def beside(robot):
+def in_process(robot):
     planners = []
 
     def make(**options):
@@ -78,7 +77,7 @@ def test_offset_put_on_what_the_model_reaches_is_the_target(seed):
     position = rng.normal(size=3) * 0.1
 
     target = Target(position=tuple(position), orientation=(w, x, y, z))
-    model = moved_back(target, offset)
+    model = model_target(target, offset)
     assert np.array(model.position) + offset[:3] == pytest.approx(position, abs=1e-15)
     w, x, y, z = model.orientation
     assert w >= 0
@@ -86,7 +85,7 @@ def test_offset_put_on_what_the_model_reaches_is_the_target(seed):
     assert (arm * aim.inv()).magnitude() < 1e-12
 
     pointing = aim.as_matrix()[:, 2]
-    model = moved_back(Target(pointing=tuple(pointing)), offset)
+    model = model_target(Target(pointing=tuple(pointing)), offset)
     assert model.position is None
     assert turn.apply(model.pointing) == pytest.approx(pointing, abs=1e-12)
     assert np.linalg.norm(model.pointing) == pytest.approx(1.0, abs=1e-12)
@@ -94,14 +93,14 @@ def test_offset_put_on_what_the_model_reaches_is_the_target(seed):
 
 def test_free_axes_stay_free_and_nothing_is_changed_in_place():
     target = Target(position=(0.01, None, 0.1))
-    model = moved_back(target, np.array([1e-3, 2e-3, 3e-3, 0, 0, 0]))
+    model = model_target(target, np.array([1e-3, 2e-3, 3e-3, 0, 0, 0]))
     assert model.position == pytest.approx((0.009, None, 0.097))
     assert target.position == (0.01, None, 0.1)
 
 
 def test_model_is_asked_to_be_exact():
     target = Target(position=(0, 0, 0.1), tolerance={"position": "5 mm", "angle": "10 deg"})
-    assert moved_back(target, np.zeros(6)).tolerance.position <= 1e-5
+    assert model_target(target, np.zeros(6)).tolerance.position <= 1e-5
 
 
 # -- plans ------------------------------------------------------------------------------------
@@ -134,7 +133,7 @@ def test_small_changes_of_the_offset_change_the_plan_little(robot):
 
 @pytest.mark.usefixtures("compiled")
 @pytest.mark.parametrize("off", [-0.4, 0.2])
-def test_plans_leave_what_is_beside_the_commands_within_the_limits(off):
+def test_plans_leave_room_for_the_pressure_offset_within_the_limits(off):
     """Of an arm that creeps, say: what acts is not what is commanded, and only that has limits."""
     arm = so.load_robot("stiff-flop-2-hanging")
     position = arm.tip_pose(0.5 * arm.pressure_max)[:3, 3]
@@ -142,19 +141,19 @@ def test_plans_leave_what_is_beside_the_commands_within_the_limits(off):
     task = Task(
         robot="stiff-flop-2-hanging", target=Target(position=tuple(position)), stiffness=goal
     )
-    free = Planning(arm).plan(Request(1, task, task.target, np.zeros(6), np.zeros(6)))
-    beside = np.full(6, off * BAR)
+    free = Planning(arm).plan(PlanRequest(1, task, task.target, np.zeros(6), np.zeros(6)))
+    offset = np.full(6, off * BAR)
     planning = Planning(arm)
-    plan = planning.plan(Request(1, task, task.target, np.zeros(6), beside))
-    command = plan.pressures - beside
+    plan = planning.plan(PlanRequest(1, task, task.target, np.zeros(6), offset))
+    command = plan.pressures - offset
     assert plan.reached
     assert np.all(command >= arm.pressure_min - 1)
     assert np.all(command <= arm.pressure_max + 1)
     assert np.all(plan.pressures >= arm.pressure_min - 1)
     assert np.all(plan.pressures <= arm.pressure_max + 1)
     # the stiffest within these limits, by a solver that was made for them
-    lower = np.maximum(arm.pressure_min, arm.pressure_min + beside)
-    upper = np.minimum(arm.pressure_max, arm.pressure_max + beside)
+    lower = np.maximum(arm.pressure_min, arm.pressure_min + offset)
+    upper = np.minimum(arm.pressure_max, arm.pressure_max + offset)
     tighter = task.model_copy(
         update={"pressure": PressureRange(min=tuple(lower), max=tuple(upper))}
     )
@@ -162,15 +161,15 @@ def test_plans_leave_what_is_beside_the_commands_within_the_limits(off):
     assert plan.stiffness == pytest.approx(own.stiffness, rel=5e-3)
     assert plan.stiffness < free.stiffness * (1 - 1e-3)
     # and next to the plan before, as in the loop
-    again = planning.plan(Request(1, task, task.target, np.zeros(6), 1.1 * beside))
-    assert np.all(again.pressures - 1.1 * beside <= arm.pressure_max + 1)
-    assert np.all(again.pressures - 1.1 * beside >= arm.pressure_min - 1)
+    again = planning.plan(PlanRequest(1, task, task.target, np.zeros(6), 1.1 * offset))
+    assert np.all(again.pressures - 1.1 * offset <= arm.pressure_max + 1)
+    assert np.all(again.pressures - 1.1 * offset >= arm.pressure_min - 1)
 
 
 def test_target_that_cannot_be_reached_has_a_plan_that_says_why(robot):
     asked = request(robot)
     far = asked.target.model_copy(update={"position": (0.2, 0.0, None)})
-    plan = Planning(robot).plan(Request(1, asked.task, far, np.zeros(6), np.zeros(3)))
+    plan = Planning(robot).plan(PlanRequest(1, asked.task, far, np.zeros(6), np.zeros(3)))
     assert not plan.reached
     assert "away" in plan.message
     assert np.isfinite(plan.pressures).all()
@@ -181,49 +180,49 @@ def test_target_that_cannot_be_reached_has_a_plan_that_says_why(robot):
     assert position[0] > edge - 3e-3
 
 
-def test_inline_and_process_have_the_same_plan(robot, beside):
-    inline, beside = InlinePlanner(robot), beside()
+def test_inline_and_process_have_the_same_plan(robot, in_process):
+    inline, process = InlinePlanner(robot), in_process()
     assert inline.latest() is None
-    assert beside.latest() is None
+    assert process.latest() is None
     for serial in (1, 2):
         asked = request(robot, serial, p=PRESSURES * (1 - 0.3 * (serial - 1)))
-        inline.ask(asked)
-        beside.ask(asked)
-        wait_for(lambda s=serial: beside.latest() is not None and beside.latest().serial == s)
-        one, other = inline.latest(), beside.latest()
+        inline.request(asked)
+        process.request(asked)
+        wait_for(lambda s=serial: process.latest() is not None and process.latest().serial == s)
+        one, other = inline.latest(), process.latest()
         assert one.pressures == pytest.approx(other.pressures, abs=1.0)
         assert one.stiffness == pytest.approx(other.stiffness, rel=1e-9)
-    assert inline.notices() == beside.notices() == ()
+    assert inline.notices() == process.notices() == ()
     inline.close()
 
 
 def ready(planner):
     """Whether the process is up and has nothing to do."""
     planner.latest()
-    return planner._begun is None
+    return planner._busy_since is None
 
 
-def test_asking_does_not_wait_and_the_newest_counts(robot, beside):
-    planner = beside()
+def test_asking_does_not_wait_and_the_newest_counts(robot, in_process):
+    planner = in_process()
     wait_for(lambda: ready(planner))
     os.kill(planner._process.pid, signal.SIGSTOP)
     start = time.monotonic()
-    planner.ask(request(robot, 1))
-    planner.ask(request(robot, 2, anew=True))
-    planner.ask(request(robot, 2))
+    planner.request(request(robot, 1))
+    planner.request(request(robot, 2, search=True))
+    planner.request(request(robot, 2))
     assert time.monotonic() - start < 10
     assert planner.latest() is None
-    assert planner._wanted.anew  # it was wanted, and is not lost with the request that was replaced
+    assert planner._waiting.search  # not lost with the request that was replaced
     os.kill(planner._process.pid, signal.SIGCONT)
     wait_for(lambda: planner.latest() is not None and planner.latest().serial == 2)
 
 
-def test_slow_planner_is_an_alarm_until_it_answers(robot, beside):
-    planner = beside(patience=0.01)
-    planner.ask(request(robot))
+def test_slow_planner_is_an_alarm_until_it_answers(robot, in_process):
+    planner = in_process(patience=0.01)
+    planner.request(request(robot))
     wait_for(lambda: planner.latest() is not None)
     os.kill(planner._process.pid, signal.SIGSTOP)
-    planner.ask(request(robot, p=0.9 * PRESSURES))
+    planner.request(request(robot, p=0.9 * PRESSURES))
     wait_for(planner.notices)
     (notice,) = planner.notices()
     assert notice.standing
@@ -233,12 +232,12 @@ def test_slow_planner_is_an_alarm_until_it_answers(robot, beside):
     assert planner.notices() == ()
 
 
-def test_a_new_task_that_takes_its_time_is_said_to_do_so(robot, beside):
+def test_a_new_task_that_takes_its_time_is_said_to_do_so(robot, in_process):
     """Nothing is wrong, but the arm does not move, and somebody waits."""
-    planner = beside()
+    planner = in_process()
     wait_for(lambda: ready(planner))
     os.kill(planner._process.pid, signal.SIGSTOP)
-    planner.ask(request(robot))
+    planner.request(request(robot))
     assert planner.notices() == ()
     wait_for(planner.notices)
     (notice,) = planner.notices()
@@ -267,44 +266,44 @@ def failing(monkeypatch, error):
 def test_inline_failure_keeps_the_plan_and_says_so(robot, monkeypatch):
     failing(monkeypatch, StiffoptError("no luck"))
     planner = InlinePlanner(robot)
-    planner.ask(request(robot, 1))
+    planner.request(request(robot, 1))
     before = planner.latest()
-    planner.ask(request(robot, 13))
+    planner.request(request(robot, 13))
     assert planner.latest() is before
     (notice,) = planner.notices()
     assert notice.kind == "planner"
     assert notice.standing
     assert "no luck" in notice.text
-    planner.ask(request(robot, 14))
+    planner.request(request(robot, 14))
     assert planner.latest().serial == 14
     assert planner.notices() == ()
 
 
-def test_a_failure_keeps_the_plan_and_the_next_request_is_answered(robot, beside):
-    planner = beside()
-    planner.ask(request(robot, 1))
+def test_a_failure_keeps_the_plan_and_the_next_request_is_answered(robot, in_process):
+    planner = in_process()
+    planner.request(request(robot, 1))
     wait_for(lambda: planner.latest() is not None)
     before = planner.latest()
-    planner.ask(replace(request(robot, 13), target=None))  # nothing that anyone asks
+    planner.request(replace(request(robot, 13), target=None))  # nothing that anyone asks
     wait_for(lambda: planner.latest() is before and planner.notices())
     (notice,) = planner.notices()
     assert (notice.kind, notice.standing) == ("planner", True)
     assert "failed" in notice.text
-    planner.ask(request(robot, 14))
+    planner.request(request(robot, 14))
     wait_for(lambda: planner.latest().serial == 14)
     assert planner.notices() == ()
 
 
-def test_26_planner_that_dies_keeps_the_plan_and_is_started_again(robot, beside):
-    planner = beside()
-    planner.ask(request(robot, 1))
+def test_26_planner_that_dies_keeps_the_plan_and_is_started_again(robot, in_process):
+    planner = in_process()
+    planner.request(request(robot, 1))
     wait_for(lambda: planner.latest() is not None)
     before, process = planner.latest(), planner._process
     process.kill()
     process.wait()
 
     def told():
-        planner.ask(request(robot, 13))
+        planner.request(request(robot, 13))
         return planner.notices()
 
     wait_for(told)
@@ -314,7 +313,7 @@ def test_26_planner_that_dies_keeps_the_plan_and_is_started_again(robot, beside)
     assert "died" in notice.text
 
     def recovered():
-        planner.ask(request(robot, 14))
+        planner.request(request(robot, 14))
         return planner.latest().serial == 14
 
     wait_for(recovered)
@@ -327,7 +326,7 @@ def test_close_ends_the_process_and_asking_after_that_does_nothing(robot):
     planner = ProcessPlanner(robot)
     planner.close()
     assert planner._process.poll() is not None
-    planner.ask(request(robot))
+    planner.request(request(robot))
     assert planner._process.poll() is not None
     assert planner.latest() is None
     planner.close()

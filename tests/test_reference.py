@@ -12,8 +12,8 @@ BAR = 1e5
 SLEW = np.array([5 * BAR, 5 * BAR])
 
 
-def made(period=0.01, lag=0.06, rate=12.0, omega=10.0, damping=0.04, beside=0):
-    reference = Reference(period, SLEW, lag, damping, beside)
+def made(period=0.01, lag=0.06, rate=12.0, omega=10.0, damping=0.04, extra=0):
+    reference = Reference(period, SLEW, lag, damping, extra)
     reference.rate, reference.omega = rate, omega
     return reference
 
@@ -110,7 +110,7 @@ def test_slew_is_kept_by_path_and_by_all_channels_together():
 
 
 def test_what_goes_with_the_pressures_is_on_the_same_way():
-    reference = made(beside=1)
+    reference = made(extra=1)
     goal = np.array([1.0 * BAR, 0.5 * BAR, 7e-3])
     for _ in range(40):
         reference.advance(goal)

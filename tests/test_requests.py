@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from fake_control import FakeSteering
 from simulated_loop import TASK, Lab
-from stiffopt.control import requested
+from stiffopt.control import checks
+from stiffopt.control.checks import limited_range
 from stiffopt.control.controller import Controller
-from stiffopt.control.requested import tightened
 from stiffopt.control.state import State
 from stiffopt.control.steering import Move
 from stiffopt.control.trajectory import MAX_WAYPOINTS, Course, Trajectory, Waypoint
@@ -388,7 +388,7 @@ def test_an_accident_while_a_request_is_checked_is_a_refusal(
     def fail(*_: object) -> None:
         raise ZeroDivisionError("oh")
 
-    monkeypatch.setattr(requested, "understood", fail)
+    monkeypatch.setattr(checks, "understood", fail)
     with pytest.raises(CommandError, match="nothing has changed: unexpected ZeroDivisionError"):
         getattr(armed.loop, request_for)(given_)
     assert not ask(armed, lambda: getattr(armed.loop, request_for)(given_))
@@ -447,9 +447,12 @@ def controller() -> Controller:
 
 def held(controller: Controller) -> list[Any]:
     """Return all that a request may change."""
-    named = ("_serial", "_task", "_target", "_course", "_measure", "_unit", "_asked_at", "_search")
-    inside = [getattr(controller, name) for name in named]
-    return [*inside, controller._asked.tolist(), controller._allocation._high.tolist()]
+    replanner = controller.replanner
+    named = ("_serial", "_requested_at", "_search", "pursuit")
+    inside = [getattr(replanner, name) for name in named]
+    parts = [vars(replanner.pursuit)[name] for name in ("task", "target", "course", "unit")]
+    prescribed = replanner.pursuit.prescribed.tolist()
+    return [*inside, *parts, prescribed, controller._allocation._high.tolist()]
 
 
 def test_a_controller_that_refuses_is_as_before(controller: Controller) -> None:
@@ -495,27 +498,27 @@ LIMITS = PressureLimits(np.array([-2e4, 0.0, 1e4]), np.array([1.5e5, 1.2e5, 1.0e
 )
 def test_limits_beyond_those_of_the_rig_are_refused(low: Any, high: Any, words: str) -> None:
     with pytest.raises(InputError) as caught:
-        tightened(PressureRange.model_construct(min=low, max=high), LIMITS)
+        limited_range(PressureRange.model_construct(min=low, max=high), LIMITS)
     assert words in str(caught.value)
 
 
 def test_limits_are_tightened_and_rounding_is_no_mistake() -> None:
-    found = tightened(PressureRange(max=(None, 5e4, None), min=(1e4, None, None)), LIMITS)
+    found = limited_range(PressureRange(max=(None, 5e4, None), min=(1e4, None, None)), LIMITS)
     assert found == PressureRange(min=(1e4, 0.0, 1e4), max=(1.5e5, 5e4, 1.0e5))
     off = 0.9 * LIMITS.slack
     rounded = PressureRange(
         min=tuple((LIMITS.low - off).tolist()), max=tuple((LIMITS.high + off).tolist())
     )
-    assert tightened(rounded, LIMITS) == tightened(PressureRange(), LIMITS)
+    assert limited_range(rounded, LIMITS) == limited_range(PressureRange(), LIMITS)
     LIMITS.check(LIMITS.high + off)  # a command has the same slack
     for sign in (-1, 1):
         values = (LIMITS.low if sign < 0 else LIMITS.high) + sign * 1.1 * LIMITS.slack
         with pytest.raises(CommandError):
             LIMITS.check(values)
         with pytest.raises(InputError):
-            tightened(PressureRange(min=tuple(values.tolist())), LIMITS)
+            limited_range(PressureRange(min=tuple(values.tolist())), LIMITS)
         with pytest.raises(InputError):
-            tightened(PressureRange(max=tuple(values.tolist())), LIMITS)
+            limited_range(PressureRange(max=tuple(values.tolist())), LIMITS)
 
 
 def test_a_controller_takes_a_task_at_the_limits_but_for_rounding(controller: Controller) -> None:

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from stiffopt.errors import DeviceError
 from stiffopt.safety import rescue
 from stiffopt.safety.claim import Claim
 from stiffopt.safety.rescue import GuardWatch, vent_directly
+from stiffopt.safety.settings import CLIENT
 
 PATIENCE = 20.0  # s, that a test waits for another thread on a busy machine
 
@@ -117,7 +119,7 @@ def test_to_vent_directly_claims_opens_vents_and_gives_back(supply: FakeSupply) 
 def test_what_somebody_else_has_claimed_is_vented_all_the_same(
     supply: FakeSupply, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rescue, "_CLAIM", 0.01)
+    monkeypatch.setattr(rescue, "CLIENT", replace(CLIENT, claim=0.01))
     held = Claim(lambda: supply.endpoints)
     held.take()
     assert not vent_directly(supply)  # it says that somebody else may raise the pressure again
@@ -155,7 +157,9 @@ def test_a_guard_that_lives_is_asked_and_left_alone(
 def test_after_a_guard_that_was_killed_the_supply_is_vented(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rescue, "PING_PERIOD", 1000.0)  # the kernel says so at once
+    monkeypatch.setattr(
+        rescue, "CLIENT", replace(CLIENT, ping=1000.0)
+    )  # the kernel says so at once
     guard = ProcessGuard()
     assert guard.pid is not None
     assert guard.process is not None
@@ -175,7 +179,7 @@ def test_it_is_noticed_also_where_the_kernel_does_not_tell(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(os, "pidfd_open")
-    monkeypatch.setattr(rescue, "PING_PERIOD", 0.01)
+    monkeypatch.setattr(rescue, "CLIENT", replace(CLIENT, ping=0.01))
     guard = FakeGuard()
     watch = watching(guard, supply)
     wait_for(lambda: guard.pings)
@@ -229,7 +233,7 @@ def test_it_is_tried_until_the_supply_can_be_vented(
     watching: Callable[..., GuardWatch],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(rescue, "_AGAIN", 1e-3)
+    monkeypatch.setattr(rescue, "CLIENT", replace(CLIENT, rescue_retry=1e-3))
     failures = [error] * 5
     told: list[str] = []
 
@@ -251,7 +255,7 @@ def test_it_is_tried_until_the_supply_can_be_vented(
 def test_it_is_tried_until_nobody_wants_it_any_more(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rescue, "_AGAIN", 0.0)
+    monkeypatch.setattr(rescue, "CLIENT", replace(CLIENT, rescue_retry=0.0))
     supply.dead = "before"
     guard = FakeGuard()
     guard.alive = False
@@ -266,7 +270,7 @@ def test_it_is_tried_until_nobody_wants_it_any_more(
 def test_a_thread_that_wants_to_vent_tries_by_itself(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rescue, "_AGAIN", 1e-3)
+    monkeypatch.setattr(rescue, "CLIENT", replace(CLIENT, rescue_retry=1e-3))
     watch = GuardWatch(FakeGuard(), supply)
     supply.dead = "before"
     assert not watch.vent(0.01)
@@ -281,7 +285,7 @@ def test_a_thread_that_wants_to_vent_tries_by_itself(
 def test_to_stop_ends_the_attempts(
     supply: FakeSupply, watching: Callable[..., GuardWatch], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rescue, "_AGAIN", 1000.0)
+    monkeypatch.setattr(rescue, "CLIENT", replace(CLIENT, rescue_retry=1000.0))
     supply.dead = "before"
     guard = FakeGuard()
     guard.alive = False

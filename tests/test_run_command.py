@@ -392,7 +392,7 @@ def shown(width: int = 100) -> str:
         best_stiffness=1.5,
         wrench=np.arange(6) * 1e-3,
         alarms=(Alarm("tracker-missing", "the tracker [bold]does not see the tip", 1.0),),
-        timing=Timing(100, 3, 2e-3, (EDGES, COUNTS)),
+        timing=Timing(100, 3, 2e-3, EDGES, COUNTS),
     )
     events = [Event(1.0, "armed", "armed"), Event(2.0, "leak", "channel 2 leaks", Severity.ERROR)]
     console = Console(file=io.StringIO(), width=width, markup=False)

@@ -15,8 +15,8 @@ import pytest
 from made_runs import BEGIN, FakeLoop, StillClock, event, snapshot, ticks
 from stiffopt.daemon import recording as recording_module
 from stiffopt.daemon.recording import MIN_FREE, Recording
+from stiffopt.daemon.run_log import read_run
 from stiffopt.daemon.telemetry import about_run
-from stiffopt.logs.run_log import read_run
 from stiffopt.model.robot_files import load_description
 
 foxglove = pytest.importorskip("foxglove")
@@ -29,10 +29,10 @@ class Logger:
     """A recording and what is logged into it."""
 
     def __init__(self, folder: Path, name: str = "rig", **options: Any) -> None:
-        from stiffopt.daemon.channels import Channels
+        from stiffopt.daemon.channels import TelemetryChannels
 
         context = foxglove.Context()
-        self.channels = Channels(context, round(WALL * 1e9), 0.03)
+        self.channels = TelemetryChannels(context, round(WALL * 1e9), 0.03)
         about = about_run(ROBOT, name, snapshot(BEGIN), BEGIN, 0)
         self.recording = Recording(
             folder, name, context, about, wall=lambda: WALL, **{"free": lambda _: 1e12, **options}

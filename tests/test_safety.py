@@ -16,13 +16,8 @@ from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.interface import PressureCommand, PressureLimits
 from stiffopt.rig.settings import Safety
-from stiffopt.safety.gate import (
-    DEFAULT_SLEW,
-    SafetyGate,
-    check_protection,
-    effective_slew,
-    gate_before,
-)
+from stiffopt.safety.gate import SafetyGate, check_protection, effective_slew, gate_before
+from stiffopt.safety.settings import COMMANDS
 
 AREAS = np.array([1e-5, 2e-5, 3e-5])
 
@@ -583,9 +578,9 @@ def test_the_gate_of_a_rig() -> None:
 
 def test_25_a_rig_without_rates_has_one() -> None:
     slew = effective_slew(rig(slew=np.array([1e5, math.inf, math.nan])))
-    np.testing.assert_array_equal(slew, [1e5, DEFAULT_SLEW, DEFAULT_SLEW])
+    np.testing.assert_array_equal(slew, [1e5, COMMANDS.default_slew, COMMANDS.default_slew])
     np.testing.assert_array_equal(effective_slew(rig()), SLEW)
-    assert DEFAULT_SLEW == 5e5
+    assert COMMANDS.default_slew == 5e5
 
 
 @pytest.mark.parametrize("protects", ["is_simulated", "has_watchdog", "has_dump_valve", ""])

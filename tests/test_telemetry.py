@@ -30,11 +30,11 @@ from made_runs import (
     tip_at,
 )
 from stiffopt.control.state import Alarm, Severity, State
+from stiffopt.daemon.run_export import log_of_run
+from stiffopt.daemon.run_log import read_run
 from stiffopt.daemon.telemetry import Telemetry
+from stiffopt.daemon.topics import topic_schemas
 from stiffopt.logs import read_log, write_log
-from stiffopt.logs.run_export import log_of_run
-from stiffopt.logs.run_log import read_run
-from stiffopt.logs.run_schemas import run_schemas
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.settings import ServiceSettings
 
@@ -88,8 +88,8 @@ def test_a_snapshot_is_recorded_as_it_was(tmp_path: Path) -> None:
     np.testing.assert_allclose(run.measured, [s.measured for s in given], atol=0.06)
     np.testing.assert_allclose(run.plan, [s.plan for s in given], atol=0.06)
     np.testing.assert_allclose(run.high, [s.high for s in given], atol=0.06)
-    np.testing.assert_allclose(run.tip, [s.tip_position for s in given], atol=6e-8)
-    np.testing.assert_allclose(run.target, [s.target_position for s in given], atol=6e-8)
+    np.testing.assert_allclose(run.tip_position, [s.tip_position for s in given], atol=6e-8)
+    np.testing.assert_allclose(run.target_position, [s.target_position for s in given], atol=6e-8)
     np.testing.assert_allclose(run.position_error, [s.position_error for s in given], atol=6e-8)
     np.testing.assert_allclose(run.stiffness, [s.stiffness for s in given], atol=6e-5)
     assert np.isnan(run.angle_error).all()
@@ -156,7 +156,7 @@ def test_messages_hold_to_their_schemas_and_foxglove_reads_these(tmp_path: Path)
             for item in value if schema["type"] == "array" else ():
                 check(schema["items"], item)
 
-    for topic, schema in run_schemas().items():
+    for topic, schema in topic_schemas().items():
         assert found[topic]
         for message in found[topic]:
             check(schema, json.loads(message.data))
@@ -360,7 +360,7 @@ def test_foxglove_sees_the_topics_with_their_schemas(tmp_path: Path) -> None:
         made.stop()
     assert data >= 20
     assert made.port is None
-    for topic, schema in run_schemas().items():
+    for topic, schema in topic_schemas().items():
         assert channels[topic]["encoding"] == "json"
         assert json.loads(channels[topic]["schema"]) == schema
     for topic, name in {

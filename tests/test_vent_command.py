@@ -27,9 +27,10 @@ from stiffopt.rig.config import load_rig_description
 from stiffopt.rig.interface import PressureCommand, PressureSupply
 from stiffopt.safety import vent as vent_module
 from stiffopt.safety.claim import Claim
-from stiffopt.safety.link import GuardLink, guarded_rig
+from stiffopt.safety.guard_client import GuardLink
+from stiffopt.safety.rigs import guarded_rig
 from stiffopt.safety.vent import vent_rig
-from stiffopt.safety.vent_line import Peer, Reply
+from stiffopt.safety.vent_line import Reply, SocketPeer
 
 RIGS = Path(__file__).parent.parent / "rig"
 BOUND = 45.0  # s, with the start of a Python on a machine that is busy
@@ -269,7 +270,7 @@ def test_who_is_no_guard_is_not_ended(
     """As if the process of this test had taken the address of a guard."""
     killed: list[int] = []
     monkeypatch.setattr(vent_module.os, "kill", lambda pid, _: killed.append(pid))
-    silent = Reply(Peer(os.getpid(), 0), answered=False, error="no answer")
+    silent = Reply(SocketPeer(os.getpid(), 0), answered=False, error="no answer")
     monkeypatch.setattr(vent_module, "ask_to_vent", lambda *_: [silent])
     assert vent_rig(lab[1]) == "vented directly: no program commands this supply"
     assert not killed
@@ -285,7 +286,7 @@ def test_a_guard_that_cannot_be_ended_is_told(
         raise PermissionError
 
     monkeypatch.setattr(vent_module.os, "kill", forbidden)
-    silent = Reply(Peer(7, 54321), answered=False, error="it hangs up")
+    silent = Reply(SocketPeer(7, 54321), answered=False, error="it hangs up")
     monkeypatch.setattr(vent_module, "ask_to_vent", lambda *_: [silent])
     assert vent_rig(lab[1]).startswith("vented directly")  # nobody has claimed it
     with held(lab[1]), pytest.raises(DeviceError, match=r"process 7 \(user 54321\): it hangs up"):
@@ -302,15 +303,15 @@ def test_a_guard_that_ended_while_it_was_asked_needs_not_be_ended(zombie: bool) 
         wait_for(lambda: not Path(f"/proc/{process.pid}/cmdline").read_bytes())
     else:
         process.wait()
-    assert vent_module._ended(Peer(process.pid, os.getuid()))
-    assert not vent_module._ended(Peer(0, 0))  # of whom the kernel does not tell
+    assert vent_module._ended(SocketPeer(process.pid, os.getuid()))
+    assert not vent_module._ended(SocketPeer(0, 0))  # of whom the kernel does not tell
     process.wait()
     process.stdout.close()
 
 
 def test_simulated_guards_that_fail_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    good = Reply(Peer(7, 54321), answered=True)
-    bad = Reply(Peer(8, 54321), answered=True, error="no answer")
+    good = Reply(SocketPeer(7, 54321), answered=True)
+    bad = Reply(SocketPeer(8, 54321), answered=True, error="no answer")
     monkeypatch.setattr(vent_module, "ask_to_vent", lambda *_: [good, bad])
     said = r"process 8 \(user 54321\) says that it could not vent.*no answer$"
     with pytest.raises(DeviceError, match=said):

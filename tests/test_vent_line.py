@@ -19,11 +19,11 @@ import pytest
 
 from stiffopt.safety import vent_line as module
 from stiffopt.safety.claim import address_of
-from stiffopt.safety.vent_line import Caller, Peer, Reply, VentLine, ask_to_vent, guards_of
+from stiffopt.safety.vent_line import Caller, Reply, SocketPeer, VentLine, ask_to_vent, guards_of
 
 STRANGER = 54321
 """A user who is nobody."""
-ME = Peer(os.getpid(), os.getuid())
+ME = SocketPeer(os.getpid(), os.getuid())
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ class Guard:
             ready, _, _ = select.select([*self._line.descriptors(), self._end], [], [], 0.01)
             if self._end in ready:
                 return
-            for caller in self._line.asked():
+            for caller in self._line.wanting_to_vent():
                 self.heard += 1
                 caller.answer(self._error)
 
@@ -118,7 +118,7 @@ def test_nobody_is_asked_where_nobody_listens(name: str) -> None:
 
 def test_it_is_told_who_listens(name: str, line: VentLine) -> None:
     assert guards_of(name) == [ME]
-    assert line.asked() == []  # to look is not to ask
+    assert line.wanting_to_vent() == []  # to look is not to ask
 
 
 def test_its_descriptors_wake_whoever_waits(
@@ -144,13 +144,13 @@ def test_of_several_endpoints_each_has_a_line(name: str) -> None:
 def test_without_endpoints_there_is_no_line() -> None:
     line = VentLine([])
     assert line.descriptors() == []
-    assert line.asked() == []
+    assert line.wanting_to_vent() == []
     line.close()
 
 
 def test_a_line_that_is_closed_hangs_up(line: VentLine, call: Callable[..., socket.socket]) -> None:
     silent = call()
-    assert line.asked() == []
+    assert line.wanting_to_vent() == []
     assert not hung_up(silent)
     line.close()
     assert hung_up(silent)
@@ -163,16 +163,16 @@ def test_a_line_that_is_closed_hangs_up(line: VentLine, call: Callable[..., sock
 
 def test_a_silent_caller_blocks_nobody(line: VentLine, call: Callable[..., socket.socket]) -> None:
     silent = call()
-    assert line.asked() == []
+    assert line.wanting_to_vent() == []
     entitled = call(b"vent")
-    (caller,) = line.asked()
-    assert caller.peer == Peer(os.getpid(), os.getuid())
+    (caller,) = line.wanting_to_vent()
+    assert caller.peer == SocketPeer(os.getpid(), os.getuid())
     caller.answer("")
     assert json.loads(entitled.recv(100)) == {"error": ""}
     assert entitled.recv(100) == b""
-    assert line.asked() == []  # nobody is heard twice
+    assert line.wanting_to_vent() == []  # nobody is heard twice
     silent.send(b"vent")  # who says it later is heard later
-    (caller,) = line.asked()
+    (caller,) = line.wanting_to_vent()
     caller.answer("late")
     assert json.loads(silent.recv(100)) == {"error": "late"}
 
@@ -182,7 +182,7 @@ def test_who_says_something_else_is_hung_up_on(
     word: bytes, line: VentLine, call: Callable[..., socket.socket]
 ) -> None:
     caller = call(word)
-    assert line.asked() == []
+    assert line.wanting_to_vent() == []
     assert hung_up(caller)
     assert line._callers == []
 
@@ -191,10 +191,10 @@ def test_who_hangs_up_first_is_forgotten(
     line: VentLine, call: Callable[..., socket.socket]
 ) -> None:
     call().close()
-    assert line.asked() == []
+    assert line.wanting_to_vent() == []
     assert line._callers == []
     call(b"vent").close()  # has asked all the same
-    (caller,) = line.asked()
+    (caller,) = line.wanting_to_vent()
     caller.answer("")
 
 
@@ -202,13 +202,13 @@ def test_of_too_many_silent_callers_the_oldest_go(
     line: VentLine, call: Callable[..., socket.socket]
 ) -> None:
     silent = [call() for _ in range(8)]
-    assert line.asked() == []
+    assert line.wanting_to_vent() == []
     assert not any(hung_up(caller) for caller in silent)
     silent += [call() for _ in range(3)]
-    assert line.asked() == []
+    assert line.wanting_to_vent() == []
     assert [hung_up(caller) for caller in silent] == [True] * 3 + [False] * 8
     silent[-1].send(b"vent")
-    (caller,) = line.asked()
+    (caller,) = line.wanting_to_vent()
     caller.answer("")
 
 
@@ -217,7 +217,7 @@ def test_who_asks_is_heard_however_many_are_silent(
 ) -> None:
     entitled = call(b"vent")
     silent = [call() for _ in range(40)]
-    (caller,) = line.asked()
+    (caller,) = line.wanting_to_vent()
     caller.answer("")
     assert json.loads(entitled.recv(100)) == {"error": ""}
     assert sum(hung_up(caller) for caller in silent) == 32
@@ -227,7 +227,7 @@ def test_many_who_ask_at_once_are_all_heard(
     line: VentLine, call: Callable[..., socket.socket]
 ) -> None:
     callers = [call(b"vent") for _ in range(60)]
-    heard = line.asked()
+    heard = line.wanting_to_vent()
     assert len(heard) == 60
     for caller in heard:
         caller.answer("")
@@ -257,12 +257,12 @@ def test_a_connection_that_breaks_has_asked_for_nothing() -> None:
         def recv(self, _: int) -> bytes:
             raise ConnectionResetError
 
-    assert Caller(Broken(), Peer(1, 0)).asks() is False  # type: ignore[arg-type]
+    assert Caller(Broken(), SocketPeer(1, 0)).asks() is False  # type: ignore[arg-type]
 
 
 def test_what_went_well_needs_no_word(line: VentLine, call: Callable[..., socket.socket]) -> None:
     asking = call(b"vent")
-    (caller,) = line.asked()
+    (caller,) = line.wanting_to_vent()
     caller.answer()
     assert json.loads(asking.recv(100)) == {"error": ""}
 
@@ -274,16 +274,16 @@ def test_root_and_the_same_user_are_heard_and_nobody_else(
     call: Callable[..., socket.socket],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(module, "_peer", lambda connection: Peer(9, uid))
+    monkeypatch.setattr(module, "_peer", lambda connection: SocketPeer(9, uid))
     caller = call(b"vent")
-    heard = line.asked()
+    heard = line.wanting_to_vent()
     if uid == STRANGER:
         assert heard == []
         assert hung_up(caller)
         assert line._callers == []
     else:
         (one,) = heard
-        assert one.peer == Peer(9, uid)
+        assert one.peer == SocketPeer(9, uid)
         one.answer("")
 
 
@@ -292,9 +292,9 @@ def test_who_is_neither_root_nor_the_user_of_the_guard_is_not_heard(
 ) -> None:
     """As it is where the guard does not run as root."""
     monkeypatch.setattr(os, "getuid", lambda: STRANGER)
-    monkeypatch.setattr(module, "_peer", lambda connection: Peer(9, STRANGER + 1))
+    monkeypatch.setattr(module, "_peer", lambda connection: SocketPeer(9, STRANGER + 1))
     caller = call(b"vent")
-    assert line.asked() == []
+    assert line.wanting_to_vent() == []
     assert hung_up(caller)
 
 
@@ -303,9 +303,9 @@ def test_root_is_heard_by_a_guard_that_does_not_run_as_root(
 ) -> None:
     monkeypatch.setattr(os, "getuid", lambda: STRANGER)
     for uid in (0, 1):
-        monkeypatch.setattr(module, "_peer", lambda connection, uid=uid: Peer(9, uid))
+        monkeypatch.setattr(module, "_peer", lambda connection, uid=uid: SocketPeer(9, uid))
         call(b"vent")
-        heard = line.asked()
+        heard = line.wanting_to_vent()
         assert len(heard) == (uid == 0)
         for caller in heard:
             caller.answer("")
@@ -314,11 +314,15 @@ def test_root_is_heard_by_a_guard_that_does_not_run_as_root(
 def test_strangers_do_not_use_up_the_turn_of_who_is_entitled(
     line: VentLine, call: Callable[..., socket.socket], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    peers = [Peer(1, STRANGER)] * 20 + [Peer(2, os.getuid())] + [Peer(1, STRANGER)] * 20
+    peers = (
+        [SocketPeer(1, STRANGER)] * 20
+        + [SocketPeer(2, os.getuid())]
+        + [SocketPeer(1, STRANGER)] * 20
+    )
     monkeypatch.setattr(module, "_peer", lambda connection: peers.pop(0))
     for _ in range(41):
         call(b"vent")
-    (caller,) = line.asked()
+    (caller,) = line.wanting_to_vent()
     assert caller.peer.pid == 2
     caller.answer("")
 
@@ -421,10 +425,10 @@ def test_another_user_s_word_that_it_is_vented_is_not_believed(
     name: str, monkeypatch: pytest.MonkeyPatch, uid: int, believed: bool
 ) -> None:
     monkeypatch.setattr(os, "getuid", lambda: STRANGER)
-    monkeypatch.setattr(module, "_peer", lambda connection: Peer(9, uid))
+    monkeypatch.setattr(module, "_peer", lambda connection: SocketPeer(9, uid))
     with Impostor(name, b'{"error": ""}'):
         replies = ask_to_vent(name)
-    assert replies == ([Reply(Peer(9, uid), answered=True)] if believed else [])
+    assert replies == ([Reply(SocketPeer(9, uid), answered=True)] if believed else [])
 
 
 def test_a_hung_guard_is_found_though_its_backlog_is_full(name: str, line: VentLine) -> None:
@@ -446,9 +450,9 @@ def test_who_became_root_may_be_believed(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_root_asks_the_guards_of_all_users(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 0)
-    monkeypatch.setattr(module, "_peer", lambda connection: Peer(9, STRANGER))
+    monkeypatch.setattr(module, "_peer", lambda connection: SocketPeer(9, STRANGER))
     with Impostor(name, b'{"error": ""}'):
-        assert ask_to_vent(name) == [Reply(Peer(9, STRANGER), answered=True)]
+        assert ask_to_vent(name) == [Reply(SocketPeer(9, STRANGER), answered=True)]
 
 
 def test_a_guard_that_does_not_answer_is_given_up(name: str, line: VentLine) -> None:
@@ -469,8 +473,8 @@ def test_a_guard_that_accepts_nobody_is_not_waited_for(
 
 def test_a_process_has_a_name_for_people() -> None:
     mine = pwd.getpwuid(os.getuid()).pw_name
-    assert Peer(7, os.getuid()).name == f"process 7 (user {mine})"
-    assert Peer(7, STRANGER).name == f"process 7 (user {STRANGER})"
+    assert SocketPeer(7, os.getuid()).name == f"process 7 (user {mine})"
+    assert SocketPeer(7, STRANGER).name == f"process 7 (user {STRANGER})"
 
 
 # what may go wrong -------------------------------------------------------------------------------
@@ -520,7 +524,7 @@ def test_where_the_kernel_has_no_table_there_are_no_guards(
 def test_strangers_that_accept_nobody_are_left_out(
     name: str, line: VentLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "_lines_of", lambda _: iter([(Peer(9, STRANGER), None)] * 40))
+    monkeypatch.setattr(module, "_lines_of", lambda _: iter([(SocketPeer(9, STRANGER), None)] * 40))
     monkeypatch.setattr(os, "getuid", lambda: STRANGER + 1)
     assert ask_to_vent(name) == []
     monkeypatch.setattr(os, "getuid", lambda: 0)

@@ -10,7 +10,7 @@ from scipy.linalg import eigh
 
 import stiffopt as so
 from independent import FLOP, Arm
-from stiffopt.control.vibration import Vibration
+from stiffopt.control.vibration import BendingMode
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import PlantSettings
@@ -80,7 +80,7 @@ class Beam:
 
 
 def test_uniform_beam_without_tip_mass_has_33_of_140_of_its_mass():
-    found = Vibration.of(drawn(0.09))
+    found = BendingMode.of(drawn(0.09))
     assert found.mass == pytest.approx(33 / 140 * section_mass() * 0.09, rel=0.015)
 
 
@@ -89,7 +89,7 @@ def test_uniform_beam_without_tip_mass_has_33_of_140_of_its_mass():
 def test_mass_makes_the_frequency_of_a_beam_of_finite_elements(lengths, tip_mass):
     """With the static stiffness 3 EI / L^3, up to the static shape's error (1.5 %)."""
     beam = Beam(sum(lengths), section_mass(), tip_mass)
-    found = Vibration.of(drawn(*lengths, tip_mass=tip_mass))
+    found = BendingMode.of(drawn(*lengths, tip_mass=tip_mass))
     stiffness = 1 / beam.pushed[-2]
     assert stiffness == pytest.approx(3 / sum(lengths) ** 3, rel=1e-6)
     omega = found.frequency(stiffness)
@@ -101,7 +101,7 @@ def test_mass_makes_the_frequency_of_a_beam_of_finite_elements(lengths, tip_mass
 def test_participation_is_what_the_true_mode_has_of_the_static_shape(tip_mass):
     """A pressure step excites the mode by phi M x / phi M phi of the finite-element beam."""
     beam = Beam(0.27, section_mass(), tip_mass)
-    found = Vibration.of(drawn(0.09, 0.09, 0.09, tip_mass=tip_mass))
+    found = BendingMode.of(drawn(0.09, 0.09, 0.09, tip_mass=tip_mass))
     for index in range(3):
         x = beam.bent(0.09 * index, 0.09 * (index + 1))
         share = beam.shape @ beam.M @ x / (beam.shape @ beam.M @ beam.shape) / x[-2]
@@ -109,13 +109,13 @@ def test_participation_is_what_the_true_mode_has_of_the_static_shape(tip_mass):
 
 
 def test_heavy_tip_takes_part_in_everything_fully():
-    found = Vibration.of(drawn(0.09, 0.09, tip_mass=10.0))
+    found = BendingMode.of(drawn(0.09, 0.09, tip_mass=10.0))
     assert found.mass == pytest.approx(10.0, rel=0.01)
     assert found.participation == pytest.approx(1.0, abs=0.01)
 
 
 def test_connector_is_stiff_and_weightless():
-    plain, joined = Vibration.of(drawn(0.09)), Vibration.of(drawn(0.09, connector=0.09))
+    plain, joined = BendingMode.of(drawn(0.09)), BendingMode.of(drawn(0.09, connector=0.09))
     # at the end of a lever as long as the segment, phi of the segment is 2/5 at its end
     s = np.linspace(0, 1, 4001)
     bent = (2 * s**2 / 2 - s**3 / 6) / (1.0 - 1 / 6 + (2 - 0.5))  # curvature 2 - s, then straight
@@ -131,11 +131,11 @@ def test_material_without_a_weight_counts_as_silicone():
         update={"material": segment.material.model_copy(update={"density": None})}
     )
     unknown = heavy.model_copy(update={"segments": (light,)})
-    assert Vibration.of(unknown).mass == pytest.approx(Vibration.of(heavy).mass, rel=1e-9)
+    assert BendingMode.of(unknown).mass == pytest.approx(BendingMode.of(heavy).mass, rel=1e-9)
 
 
 def test_no_stiffness_no_frequency():
-    found = Vibration.of(drawn(0.09))
+    found = BendingMode.of(drawn(0.09))
     assert found.frequency(-1.0) == 0.0
     assert found.frequency(4.0) == pytest.approx(2 * found.frequency(1.0))
 
@@ -146,7 +146,7 @@ def test_no_stiffness_no_frequency():
 def test_frequency_is_that_of_the_simulated_arm(name, share):
     """From the model's compliance, at rest and bent; the first two modes are nearly equal."""
     robot, model = load_description(name), so.load_robot(name)
-    plant, vibration = Plant(robot, PlantSettings(dynamics="full")), Vibration.of(robot)
+    plant, vibration = Plant(robot, PlantSettings(dynamics="full")), BendingMode.of(robot)
     rng = np.random.default_rng(5)
     for k in range(4):
         p = rng.uniform(0, 0.9e5, robot.n_pressures) if k else np.zeros(robot.n_pressures)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import textwrap
 import time
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ from stiffopt.workspace import (
     open_workspace_map,
     store,
 )
-from stiffopt.workspace.sampling import Grid, QuasiRandom
+from stiffopt.workspace.plan import TUNING, Grid, QuasiRandom
 from stiffopt.workspace.table import CellTable, Gathering, cell_indices, cell_keys, merged
 
 SAMPLES = 70_000  # three blocks
@@ -159,7 +160,7 @@ def test_merging_does_not_depend_on_groups_and_order(rows: Any, random: Any) -> 
         pieces.append(CellTable.of_samples(keys, values, np.arange(start, start + len(part))))
         start = end
     random.shuffle(pieces)
-    gathering = Gathering(CellTable.empty(1))
+    gathering = Gathering(CellTable.empty(1), TUNING.most_cells)
     for piece in pieces:
         gathering.add(piece)
     for table in (gathering.table(), merged(pieces)):
@@ -171,7 +172,7 @@ def test_merging_does_not_depend_on_groups_and_order(rows: Any, random: Any) -> 
 
 
 def test_too_many_cells_are_refused(monkeypatch: pytest.MonkeyPatch, robot: Manipulator) -> None:
-    monkeypatch.setattr("stiffopt.workspace.table.MOST_CELLS", 100)
+    monkeypatch.setattr("stiffopt.workspace.mapping.TUNING", replace(TUNING, most_cells=100))
     with pytest.raises(InputError, match=r"fills more than 100 cells.*larger cells"):
         map_workspace(robot, samples=2000, cell=0.002)
 
@@ -310,9 +311,9 @@ def test_a_run_survives_being_killed(
     path = tmp_path / "map.zarr"
     script = f"""
         import sys, time, stiffopt
+        from dataclasses import replace
         from stiffopt.workspace import map_workspace, mapping
-        mapping._BETWEEN_CHECKPOINTS = mapping._CHECKPOINT_SHARE = 1e-9
-        mapping._CHECKPOINT_SHARE = 1e9
+        mapping.TUNING = replace(mapping.TUNING, checkpoint=1e-9, checkpoint_share=1e9)
         def report(done, total):
             if done:
                 time.sleep(0.2)
@@ -340,7 +341,7 @@ def test_a_run_survives_being_killed(
 
 
 @pytest.mark.parametrize(
-    "step", ["store.write_arrays", "arrays._write_coordinates", "store._write_json"]
+    "step", ["store.write_arrays", "store._write_coordinates", "store._write_json"]
 )
 def test_a_run_survives_being_killed_at_the_end(
     robot: Manipulator, tmp_path: Path, step: str, monkeypatch: pytest.MonkeyPatch
@@ -461,8 +462,9 @@ def test_a_cluster_that_is_not_there(tmp_path: Path) -> None:
         """
         import sys, stiffopt
         from stiffopt.errors import InputError
+        from dataclasses import replace
         from stiffopt.workspace import map_workspace, workers
-        workers._PATIENCE = 1.0
+        workers.TUNING = replace(workers.TUNING, cluster_patience=1.0)
         robot = stiffopt.load_robot("stiff-flop-1")
         for address, kind in (("tcp://127.0.0.1:1", workers.ClusterError), ("a:b:c", InputError)):
             try:

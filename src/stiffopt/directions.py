@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator
@@ -11,7 +12,7 @@ from stiffopt.errors import InputError
 from stiffopt.schema import Vector, items_of
 from stiffopt.units import Number
 
-__all__ = ["Direction", "Frame", "Quaternion"]
+__all__ = ["Direction", "Frame", "Quaternion", "direction_name"]
 
 
 def _unit_vector(vector: tuple[float, ...]) -> tuple[float, ...]:
@@ -47,3 +48,11 @@ Quaternion = Annotated[
     AfterValidator(_unit_quaternion),
 ]
 """A unit quaternion (w, x, y, z) with w >= 0."""
+
+
+def direction_name(direction: Sequence[float]) -> str:
+    """Return the name of a unit vector (3,) for people: ``x``, ``-z``, ``(0.6, 0.8, 0)``."""
+    for axis, name in enumerate("xyz"):
+        if abs(abs(direction[axis]) - 1) < 1e-9:
+            return name if direction[axis] > 0 else f"-{name}"
+    return f"({', '.join(f'{round(part, 3) + 0.0:g}' for part in direction)})"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from importlib.util import find_spec
 
 Loc = tuple[str | int, ...]
 """The place of a value in nested data: keys, and indices of items counted from 0."""
@@ -94,6 +95,24 @@ class MissingExtraError(StiffoptError):
             f"this needs {self.package}, which is not installed; "
             f"run: pip install 'stiffopt[{self.extra}]'"
         )
+
+
+def require_package(package: str, extra: str, module: str | None = None) -> None:
+    """Raise `MissingExtraError` if an optional package is not installed; it is not imported.
+
+    Parameters
+    ----------
+    package, extra :
+        As for `MissingExtraError`.
+    module :
+        Name under which it is imported, if that differs from `package`.
+    """
+    try:
+        found = find_spec(module or package) is not None
+    except ValueError:  # a placeholder in sys.modules
+        found = False
+    if not found:
+        raise MissingExtraError(package, extra)
 
 
 class DeviceError(StiffoptError):

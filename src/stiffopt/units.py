@@ -39,6 +39,7 @@ __all__ = [
     "Number",
     "Pressure",
     "PressureRate",
+    "QuantityKind",
     "Ratio",
     "RotationalStiffness",
     "Speed",
@@ -49,6 +50,7 @@ __all__ = [
     "get_ready",
     "parse_quantity",
     "read_from_file",
+    "unit_suffix",
     "within",
 ]
 
@@ -71,8 +73,11 @@ _MOST, _DEEPEST = 10, 2  # factors of a unit, and parentheses in each other
 
 
 @dataclass(frozen=True)
-class _Kind:
-    """A kind of quantity: its SI unit, an example, and the unit to write it in."""
+class QuantityKind:
+    """A kind of quantity: its SI unit, an example, and the unit to write it in.
+
+    It is part of the types below, so that the unit of a field can be found from its type.
+    """
 
     unit: str
     what: str
@@ -80,23 +85,23 @@ class _Kind:
     written: str
 
 
-_LENGTH = _Kind("m", "length", "90 mm", "mm")
-_ANGLE = _Kind("rad", "angle", "30 deg", "deg")
-_PRESSURE = _Kind("Pa", "pressure", "1.5 bar", "kPa")
-_PRESSURE_RATE = _Kind("Pa/s", "rate of pressure", "5 bar/s", "kPa/s")
-_MASS = _Kind("kg", "mass", "20 g", "g")
-_DENSITY = _Kind("kg/m^3", "density", "1070 kg/m^3", "kg/m^3")
-_ACCELERATION = _Kind("m/s^2", "acceleration", "9.81 m/s^2", "m/s^2")
-_FORCE = _Kind("N", "force", "0.02 N", "N")
-_MOMENT = _Kind("N*m", "moment", "0.001 N*m", "N*m")
-_TRANSLATIONAL = _Kind("N/m", "translational stiffness", "1.3 N/m", "N/m")
-_ROTATIONAL = _Kind("N*m/rad", "rotational stiffness", "0.2 N*m/rad", "N*m/rad")
-_DURATION = _Kind("s", "duration", "20 ms", "s")
-_FREQUENCY = _Kind("Hz", "frequency", "50 Hz", "Hz")
-_SPEED = _Kind("m/s", "speed", "10 mm/s", "mm/s")
-_VOLTAGE = _Kind("V", "voltage", "10 V", "V")
-_FORCE_PER_VOLTAGE = _Kind("N/V", "force per voltage", "0.5 N/V", "N/V")
-_RATIO = _Kind("", "ratio", "1 %", "")
+_LENGTH = QuantityKind("m", "length", "90 mm", "mm")
+_ANGLE = QuantityKind("rad", "angle", "30 deg", "deg")
+_PRESSURE = QuantityKind("Pa", "pressure", "1.5 bar", "kPa")
+_PRESSURE_RATE = QuantityKind("Pa/s", "rate of pressure", "5 bar/s", "kPa/s")
+_MASS = QuantityKind("kg", "mass", "20 g", "g")
+_DENSITY = QuantityKind("kg/m^3", "density", "1070 kg/m^3", "kg/m^3")
+_ACCELERATION = QuantityKind("m/s^2", "acceleration", "9.81 m/s^2", "m/s^2")
+_FORCE = QuantityKind("N", "force", "0.02 N", "N")
+_MOMENT = QuantityKind("N*m", "moment", "0.001 N*m", "N*m")
+_TRANSLATIONAL = QuantityKind("N/m", "translational stiffness", "1.3 N/m", "N/m")
+_ROTATIONAL = QuantityKind("N*m/rad", "rotational stiffness", "0.2 N*m/rad", "N*m/rad")
+_DURATION = QuantityKind("s", "duration", "20 ms", "s")
+_FREQUENCY = QuantityKind("Hz", "frequency", "50 Hz", "Hz")
+_SPEED = QuantityKind("m/s", "speed", "10 mm/s", "mm/s")
+_VOLTAGE = QuantityKind("V", "voltage", "10 V", "V")
+_FORCE_PER_VOLTAGE = QuantityKind("N/V", "force per voltage", "0.5 N/V", "N/V")
+_RATIO = QuantityKind("", "ratio", "1 %", "")
 
 _KINDS = (
     *(_LENGTH, _ANGLE, _PRESSURE, _PRESSURE_RATE, _MASS, _DENSITY, _ACCELERATION, _FORCE),
@@ -203,6 +208,11 @@ def format_quantity(value: float, unit: str, written: str | None = None) -> str:
     return f"{number if float(number) == value else repr(float(value))} {unit}".rstrip()
 
 
+def unit_suffix(unit: str) -> str:
+    """Return how a name ends that tells a unit: ``_nm_per_rad`` for N*m/rad, nothing for none."""
+    return f"_{unit.replace('*', '').replace('/', '_per_').lower()}" if unit else ""
+
+
 def read_from_file(info: ValidationInfo) -> bool:
     """Say whether a pydantic validator is looking at a file (rather than at a call)."""
     return isinstance(info.context, Mapping) and bool(info.context.get("from_file"))
@@ -292,7 +302,7 @@ def _ratio(value: Any) -> float:
     return parse_quantity(value, "", "ratio") if isinstance(value, str) else finite_number(value)
 
 
-def _reader(kind: _Kind) -> BeforeValidator:
+def _reader(kind: QuantityKind) -> BeforeValidator:
     """Return the validator for a kind: text with its unit, or in code a number in SI."""
 
     def read(value: Any, info: ValidationInfo) -> float:
@@ -305,7 +315,7 @@ def _reader(kind: _Kind) -> BeforeValidator:
     return BeforeValidator(read)
 
 
-def _writer(kind: _Kind) -> PlainSerializer:
+def _writer(kind: QuantityKind) -> PlainSerializer:
     """Return the serializer with which ``model_dump(mode="json")`` writes quantities as text."""
 
     def write(value: float) -> str:
@@ -333,37 +343,45 @@ Number = Annotated[float, BeforeValidator(finite_number), _FINITE]
 """A finite number that has no unit."""
 Ratio = Annotated[float, BeforeValidator(_ratio), _FINITE]
 """A finite number that has no unit and may be written in per cent."""
-Length = Annotated[float, _reader(_LENGTH), _writer(_LENGTH), _FINITE]
+Length = Annotated[float, _LENGTH, _reader(_LENGTH), _writer(_LENGTH), _FINITE]
 """In m."""
-Angle = Annotated[float, _reader(_ANGLE), _writer(_ANGLE), _FINITE]
+Angle = Annotated[float, _ANGLE, _reader(_ANGLE), _writer(_ANGLE), _FINITE]
 """In rad."""
-Pressure = Annotated[float, _reader(_PRESSURE), _writer(_PRESSURE), _FINITE]
+Pressure = Annotated[float, _PRESSURE, _reader(_PRESSURE), _writer(_PRESSURE), _FINITE]
 """In Pa, gauge."""
-PressureRate = Annotated[float, _reader(_PRESSURE_RATE), _writer(_PRESSURE_RATE), _FINITE]
+PressureRate = Annotated[
+    float, _PRESSURE_RATE, _reader(_PRESSURE_RATE), _writer(_PRESSURE_RATE), _FINITE
+]
 """In Pa/s."""
-Mass = Annotated[float, _reader(_MASS), _writer(_MASS), _FINITE]
+Mass = Annotated[float, _MASS, _reader(_MASS), _writer(_MASS), _FINITE]
 """In kg."""
-Density = Annotated[float, _reader(_DENSITY), _writer(_DENSITY), _FINITE]
+Density = Annotated[float, _DENSITY, _reader(_DENSITY), _writer(_DENSITY), _FINITE]
 """In kg/m^3."""
-Acceleration = Annotated[float, _reader(_ACCELERATION), _writer(_ACCELERATION), _FINITE]
+Acceleration = Annotated[
+    float, _ACCELERATION, _reader(_ACCELERATION), _writer(_ACCELERATION), _FINITE
+]
 """In m/s^2."""
-Force = Annotated[float, _reader(_FORCE), _writer(_FORCE), _FINITE]
+Force = Annotated[float, _FORCE, _reader(_FORCE), _writer(_FORCE), _FINITE]
 """In N."""
-Moment = Annotated[float, _reader(_MOMENT), _writer(_MOMENT), _FINITE]
+Moment = Annotated[float, _MOMENT, _reader(_MOMENT), _writer(_MOMENT), _FINITE]
 """In N m."""
-TranslationalStiffness = Annotated[float, _reader(_TRANSLATIONAL), _writer(_TRANSLATIONAL), _FINITE]
+TranslationalStiffness = Annotated[
+    float, _TRANSLATIONAL, _reader(_TRANSLATIONAL), _writer(_TRANSLATIONAL), _FINITE
+]
 """In N/m."""
-RotationalStiffness = Annotated[float, _reader(_ROTATIONAL), _writer(_ROTATIONAL), _FINITE]
+RotationalStiffness = Annotated[
+    float, _ROTATIONAL, _reader(_ROTATIONAL), _writer(_ROTATIONAL), _FINITE
+]
 """In N m/rad."""
-Duration = Annotated[float, _reader(_DURATION), _writer(_DURATION), _FINITE]
+Duration = Annotated[float, _DURATION, _reader(_DURATION), _writer(_DURATION), _FINITE]
 """In s."""
-Frequency = Annotated[float, _reader(_FREQUENCY), _writer(_FREQUENCY), _FINITE]
+Frequency = Annotated[float, _FREQUENCY, _reader(_FREQUENCY), _writer(_FREQUENCY), _FINITE]
 """In Hz."""
-Speed = Annotated[float, _reader(_SPEED), _writer(_SPEED), _FINITE]
+Speed = Annotated[float, _SPEED, _reader(_SPEED), _writer(_SPEED), _FINITE]
 """In m/s."""
-Voltage = Annotated[float, _reader(_VOLTAGE), _writer(_VOLTAGE), _FINITE]
+Voltage = Annotated[float, _VOLTAGE, _reader(_VOLTAGE), _writer(_VOLTAGE), _FINITE]
 """In V."""
 ForcePerVoltage = Annotated[
-    float, _reader(_FORCE_PER_VOLTAGE), _writer(_FORCE_PER_VOLTAGE), _FINITE
+    float, _FORCE_PER_VOLTAGE, _reader(_FORCE_PER_VOLTAGE), _writer(_FORCE_PER_VOLTAGE), _FINITE
 ]
 """In N/V."""

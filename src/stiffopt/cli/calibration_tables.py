@@ -8,7 +8,7 @@ from math import degrees, floor, isfinite, log10
 import numpy as np
 
 from stiffopt.cli.tables import TextTable
-from stiffopt.experiments.stiffness import direction_name
+from stiffopt.directions import direction_name
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.comparison import Comparison, Errors, together
 from stiffopt.identify.estimates import Estimate

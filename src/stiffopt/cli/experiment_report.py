@@ -9,6 +9,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from stiffopt.cli.tables import MarkdownPage, TextTable, labelled, title
+from stiffopt.directions import direction_name
 from stiffopt.errors import printable
 from stiffopt.experiments import (
     CoverageResult,
@@ -17,7 +18,6 @@ from stiffopt.experiments import (
     StiffnessResult,
 )
 from stiffopt.experiments.slope import Estimate
-from stiffopt.experiments.stiffness import direction_name
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.plots.wording import BAR, MM, figures
 

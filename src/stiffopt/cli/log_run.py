@@ -20,9 +20,9 @@ def export(recording: str, out: str | None, *, quiet: bool) -> int:
     """Write a recording as log v1; return the exit code."""
 
     def work() -> None:
+        from stiffopt.daemon.run_export import log_of_run
+        from stiffopt.daemon.run_log import is_of_experiment, read_run
         from stiffopt.logs import Log, read_mcap_log, write_log
-        from stiffopt.logs.run_export import log_of_run
-        from stiffopt.logs.run_log import is_of_experiment, read_run
 
         path = _beside(recording, ".csv") if out is None else out
         check_new_file(path, (".csv",))
@@ -51,7 +51,7 @@ def plot(recording: str, out: str | None, *, quiet: bool) -> int:
     """Draw a recording; return the exit code."""
 
     def work() -> None:
-        from stiffopt.logs.run_log import read_run
+        from stiffopt.daemon.run_log import read_run
         from stiffopt.plots import save_figure
         from stiffopt.plots.run import plot_run
 

@@ -16,10 +16,10 @@ from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_lin
 from stiffopt.cli.exits import Interruptible, exit_code
 from stiffopt.cli.outputs import check_ending, check_picture, check_writable
 from stiffopt.cli.tables import number_table, title
+from stiffopt.directions import direction_name
 from stiffopt.documents import write_whole
 from stiffopt.errors import InputError
 from stiffopt.experiments.arm_map import ArmMap, TipMap, map_arm, map_tip
-from stiffopt.experiments.stiffness import direction_name
 from stiffopt.model.compliance import Boundary, Frame
 from stiffopt.model.manipulator import load_robot
 from stiffopt.plots.wording import BAR, MM, figures

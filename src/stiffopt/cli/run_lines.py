@@ -12,8 +12,10 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from stiffopt.control.state import Event, Severity, Snapshot, State
+from stiffopt.control.state_fields import entries
+from stiffopt.daemon.reports import plain
 from stiffopt.errors import printable
-from stiffopt.safety.lines import json_line
+from stiffopt.safety.messages import json_line
 
 __all__ = ["Display", "Facts", "Lines"]
 
@@ -76,7 +78,7 @@ class Lines:
 
     def __init__(self, *, as_json: bool, now: Callable[[], float] = time.monotonic) -> None:
         self._as_json, self._now = as_json, now
-        self._state: tuple[State, str] | None = None
+        self._told: dict[str, Any] = {}
 
     def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Write a line about this moment."""
@@ -98,12 +100,13 @@ class Lines:
         """Write what is new."""
         for event in events:
             self._line(event.time, str(event.severity), event.kind, event.text)
-        state = (now.state, now.reason)
-        if state != self._state:
-            self._state = state
+        shown = [entry for entry in entries(type(now)) if entry.shown.line]
+        told = {entry.json[0]: plain(getattr(now, entry.name), entry) for entry in shown}
+        if told != self._told:
+            self._told = told
             text = f"{now.state}: {now.reason}" if now.reason else str(now.state)
             level = "error" if now.state is State.FAULT else "info"
-            self._line(now.time, level, "state", text, state=str(now.state), reason=now.reason)
+            self._line(now.time, level, "state", text, **told)
 
     def end(self) -> None:
         """Nothing is left to be done."""

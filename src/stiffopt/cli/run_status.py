@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -16,6 +17,7 @@ from rich.text import Text
 from stiffopt.cli.console import console_on
 from stiffopt.cli.run_lines import Facts
 from stiffopt.control.state import Event, Severity, Snapshot, State
+from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.errors import printable
 
 __all__ = ["LiveStatus", "status"]
@@ -31,6 +33,7 @@ _LEVELS = {Severity.INFO: "dim", Severity.WARNING: "yellow", Severity.ERROR: "bo
 _BAR = 24  # characters of a pressure's bar
 _EVENTS = 6
 _UNKNOWN = "-"
+_FACTORS = {"": (1.0, 3), "mm": (1e3, 1), "deg": (180 / math.pi, 1)}  # and decimals of a vector
 
 
 class LiveStatus:
@@ -132,9 +135,8 @@ def status(
         Where everything is.
     """
     armed = now.state in (State.ACTIVE, State.HOLDING)
-    tip: list[tuple[str, RenderableType]]
-    tip = [("tip", f"{_triple(now.tip_position, 1e3)} mm"), *(_target(now) if armed else ())]
-    parts: list[RenderableType] = [_headline(now, name), _table(tip), _pressures(now, channels)]
+    parts: list[RenderableType] = [_headline(now, name), _table(_fields(now, armed))]
+    parts.append(_pressures(now, channels))
     stiffness = _stiffness(now) if armed else []
     parts.append(_table([*stiffness, *_loop(now, rate), *_alarms(now)]))
     parts += [_event(event) for event in events]
@@ -152,20 +154,31 @@ def _headline(now: Snapshot, name: str) -> Text:
     return text
 
 
-def _target(now: Snapshot) -> list[tuple[str, RenderableType]]:
-    rows: list[tuple[str, RenderableType]] = []
-    if now.target_position is not None:
-        free = _triple(now.target_position, 1e3, unknown="free")
-        rows.append(("target", f"{free} mm"))
-    if now.target_pointing is not None:
-        rows.append(("pointing", _triple(now.target_pointing, 1, "{:.3f}")))
-    errors = []
-    if math.isfinite(now.position_error):
-        errors.append(f"{now.position_error * 1e3:.2f} mm")
-    if math.isfinite(now.angle_error):
-        errors.append(f"{math.degrees(now.angle_error):.2f} deg")
-    rows.append(("error", ", ".join(errors) or _UNKNOWN))
-    return rows
+def _fields(now: Snapshot, armed: bool) -> list[tuple[str, RenderableType]]:
+    """Return the rows of the fields whose definitions name one; those of one name are joined."""
+    rows: dict[str, list[str]] = {}
+    for entry in entries(type(now)):
+        value = getattr(now, entry.name)
+        if entry.shown.row and value is not None and (armed or not entry.shown.armed_only):
+            texts = rows.setdefault(entry.shown.row, [])
+            if (text := _shown(value, entry)) != _UNKNOWN:
+                texts.append(text)
+    return [(row, ", ".join(texts) or _UNKNOWN) for row, texts in rows.items()]
+
+
+def _shown(value: Any, entry: Entry) -> str:
+    """Return a value in the unit of its row."""
+    unit = entry.shown.row_unit
+    factor, decimals = _FACTORS[unit]
+    if entry.kind is Kind.NUMBERS:
+        text = _triple(value, factor, f"{{:.{decimals}f}}", entry.shown.unknown)
+    elif entry.kind is Kind.NUMBER:
+        if not math.isfinite(value):
+            return entry.shown.unknown
+        text = f"{value * factor:.{decimals + 1}f}"
+    else:
+        text = printable(str(value))
+    return f"{text} {unit}".rstrip()
 
 
 def _pressures(now: Snapshot, channels: Sequence[str]) -> Table:

@@ -1,16 +1,20 @@
-"""Which pressures to command: a small quadratic program, solved in each tick.
+"""The quadratic program that turns the feedback law into pressures, solved in every tick.
 
-The tip shall be moved by v from where the reference puts it, with pressures p as near to the
-reference's as that leaves free::
+The tip is to move by v relative to the reference, with pressures p as near to the reference's r as
+that permits::
 
     minimise   |W (J (p - r) - v)|^2 + epsilon |p - r|^2
     such that  low <= p <= high,   |p - last| <= slew,   |G (p - last)| <= speed
 
-``p = last`` fulfils all of it as long as the last pressures are within their limits, which they
-are: there is always an answer, though OSQP gives up on one in a thousand of the hardest.
-Everything that goes in and comes out is checked for being finite and within the bounds, since what
-solvers say of themselves cannot be relied on: OSQP answers 2e9 to a contradiction and NaN for ever
-after one NaN, DAQP may give NaN with a flag of success.
+``p = last`` is feasible as long as the last pressures are within their limits, which they are. So
+there is always a solution, though OSQP gives up on one in a thousand of the hardest problems. All
+inputs and outputs are checked for being finite and within bounds, because solvers' flags are not
+reliable: OSQP answers 2e9 to a contradiction, and NaN for ever after one NaN; DAQP may return NaN
+with a flag of success.
+
+The slew also limits the reference (as a whole, so that its path stays straight) and the gate (each
+channel, by the time that has passed, whoever commands). Here it is a bound of the program, which so
+finds the best pressures that the gate will pass on unchanged; a test holds it to that.
 """
 
 from __future__ import annotations
@@ -24,17 +28,17 @@ import daqp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.control.demand import Demand
+from stiffopt.control.feedback import TrackingRows
 from stiffopt.control.formula import Formula
+from stiffopt.control.tuning import FeedbackTuning
 
 __all__ = ["SOLVERS", "Allocation", "QuadraticSolver"]
 
 Array = NDArray[np.float64]
 
 _BAR = 1e5
-_KEPT_NEAR = 0.3e-3  # m/bar; sqrt(epsilon): tip motions cheaper than this are left to the posture
-_SLACK = 1e-4  # bar
-_TRUSTED = 1e-3  # bar; a solver that breaks a bound by more has no answer
+_SLACK = 1e-4  # bar; a pressure that is nearer to a limit is at it
+_BOUND_ERROR = 1e-3  # bar; a solution that violates its bounds by more is none
 
 
 class QuadraticSolver(ABC):
@@ -45,11 +49,11 @@ class QuadraticSolver(ABC):
 
     @abstractmethod
     def solve(self, H: Array, f: Array, A: Array, lower: Array, upper: Array) -> Array | None:
-        """Return x (n,), or what the solver has instead; None if it has nothing."""
+        """Return x (n,), not checked; None without a solution."""
 
 
 class DaqpSolver(QuadraticSolver):
-    """DAQP, a dual active-set method."""
+    """DAQP: a dual active-set method."""
 
     def __init__(self, n: int, m: int) -> None:
         self._sense = np.zeros(n + m, dtype=np.int32)
@@ -61,7 +65,7 @@ class DaqpSolver(QuadraticSolver):
 
 
 class OsqpSolver(QuadraticSolver):
-    """OSQP, an operator-splitting method, with a workspace that persists."""
+    """OSQP: an operator-splitting method, with a workspace that persists."""
 
     def __init__(self, n: int, m: int) -> None:
         self._n, self._m = n, m
@@ -78,7 +82,7 @@ class OsqpSolver(QuadraticSolver):
         P = sparse.csc_matrix(np.triu(np.ones((n, n))))
         rows = np.vstack([np.eye(n), np.ones((m, n))])
         self._A = sparse.csc_matrix(rows)
-        # places of the entries of the rows below the unit matrix, by column
+        # where the entries of A are, by column, below those of the unit matrix
         self._values = self._A.data.copy()
         self._places = (np.arange(m) + 1 + np.arange(n)[:, None] * (m + 1)).ravel()
         P.data[:] = np.eye(n)[self._upper]
@@ -96,7 +100,7 @@ class OsqpSolver(QuadraticSolver):
         self._problem.update(q=f, l=lower, u=upper, Px=H[self._upper], Ax=self._values)
         x = self._problem.solve(raise_error=False).x
         if x is None or not np.isfinite(x).all():
-            self._make()  # it would stay so
+            self._make()  # the workspace keeps NaN otherwise
             return None
         result: Array = np.array(x)
         return result
@@ -110,110 +114,115 @@ class Allocation:
 
     Parameters
     ----------
-    demand :
+    law :
         J, v and G, in symbols.
     low, high :
-        What may be commanded (n,), in Pa.
+        Limits of the commands (n,), in Pa.
     step :
         Greatest change from tick to tick (n,), in Pa.
     tip_step :
-        By how much each coordinate of the tip may move from tick to tick, in m.
+        Greatest displacement of the tip along each axis from tick to tick, in m.
     solver :
         See `SOLVERS`.
+    tuning :
+        Its `posture_weight` is W and epsilon.
     """
 
     def __init__(
         self,
-        demand: Demand,
+        law: TrackingRows,
         low: Array,
         high: Array,
         step: Array,
         tip_step: float,
         solver: str = "daqp",
+        tuning: FeedbackTuning | None = None,
     ) -> None:
-        self._program = _program(demand, step / _BAR, tip_step)
-        self._answer = _answer(demand)
+        weight = (tuning or FeedbackTuning()).posture_weight
+        self._program = _program(law, step / _BAR, tip_step, weight)
+        self._solution = _solution(law)
         self._solver = SOLVERS[solver](len(low), 3)
-        self._nothing = np.zeros(len(low), dtype=bool)
+        self._none_held = np.zeros(len(low), dtype=bool)
         self.limit(low, high)
 
     def limit(self, low: Array, high: Array) -> None:
-        """Allow these pressures (n,) from now on, in Pa."""
+        """Permit these pressures (n,) from now on, in Pa."""
         self._low, self._high = low / _BAR, high / _BAR
 
     def solve(
-        self, demanded: Sequence[ArrayLike], reference: Array, last: Array
+        self, inputs: Sequence[ArrayLike], reference: Array, last: Array
     ) -> tuple[Array | None, NDArray[np.bool_], float]:
-        """Answer the program.
+        """Solve the program.
 
         Parameters
         ----------
-        demanded :
-            Inputs of the demand.
+        inputs :
+            Of the feedback law.
         reference, last :
             r and the last pressures (n,), in Pa.
 
         Returns
         -------
-        Pressures (n,) in Pa, None if there is no answer that can be used; which channels (n,) are
-        held by a limit; and what the task's rows miss, in m.
+        Pressures (n,) in Pa, None without a usable solution; the channels (n,) at a limit; and the
+        residual of the task's rows, in m.
         """
         H, f, G, lower, upper, finite, J, v = self._program(
-            *demanded, reference, last, self._low, self._high
+            *inputs, reference, last, self._low, self._high
         )
         if not math.isfinite(finite[0]):
-            return None, self._nothing, math.nan
+            return None, self._none_held, math.nan
         change = self._solver.solve(H, f, G, lower, upper)
         if change is None or change.shape != last.shape:
-            return None, self._nothing, math.nan
-        p, held, missing, beyond = self._answer(
+            return None, self._none_held, math.nan
+        p, held, residual, violation = self._solution(
             change, lower, upper, J, v, reference, last, self._low, self._high
         )
-        if not beyond[0] <= _TRUSTED**2:  # nor if it is NaN
-            return None, self._nothing, math.nan
-        return p, held > 0, float(missing[0])
+        if not violation[0] <= _BOUND_ERROR**2:  # nor if it is NaN
+            return None, self._none_held, math.nan
+        return p, held > 0, float(residual[0])
 
 
-def _program(demand: Demand, step: Array, tip_step: float) -> Formula:
+def _program(law: TrackingRows, step: Array, tip_step: float, weight: float) -> Formula:
     """The program in terms of the change of pressures; in bar, and scaled.
 
-    Gives H (n, n), f (n,), G (3, n), the bounds (n + 3,), a number that is finite only if all that
-    went in is (what is not so in H is in f), and J and v.
+    Outputs: H (n, n), f (n,), G (3, n), the bounds (n + 3,), a number that is finite only if all
+    inputs are (what is not finite in H makes f so), and J and v.
     """
-    J, v, n = demand.rows, demand.values, len(step)
+    J, v, n = law.rows, law.values, len(step)
     reference, last = ca.SX.sym("reference", n), ca.SX.sym("last", n)
-    least, most = ca.SX.sym("least", n), ca.SX.sym("most", n)
-    scaled, G = J * (_BAR / _KEPT_NEAR), demand.linear * _BAR
+    low, high = ca.SX.sym("low", n), ca.SX.sym("high", n)
+    scaled, G = J * (_BAR / weight), law.linear * _BAR
     before, reach = last / _BAR, ca.DM(step)
     H = scaled.T @ scaled + ca.SX.eye(n)
-    f = scaled.T @ (v / -_KEPT_NEAR) - H @ (reference / _BAR - before)
-    # a limit may have been tightened below the last pressures: then down as fast as may be
-    upper = ca.fmax(ca.fmin(most - before, reach), -reach)
-    lower = ca.fmin(ca.fmax(least - before, -reach), upper)
-    # by as much as it has to come down where a limit was tightened, the tip may move faster
+    f = scaled.T @ (v / -weight) - H @ (reference / _BAR - before)
+    # where a limit was tightened below the last pressures: down as fast as the slew allows
+    upper = ca.fmax(ca.fmin(high - before, reach), -reach)
+    lower = ca.fmin(ca.fmax(low - before, -reach), upper)
+    # the tip may be faster by what such a limit forces upon it
     forced = ca.fmax(ca.fmax(-upper, lower), 0)
-    moves = max(tip_step, 1e-9) + ca.fabs(G) @ forced
+    displacement = max(tip_step, 1e-9) + ca.fabs(G) @ forced
     finite = ca.sumsqr(f) + ca.sumsqr(G)
-    inputs = [*demand.inputs, reference, last, least, most]
-    outputs = [H, f, G, ca.vertcat(lower, -moves), ca.vertcat(upper, moves), finite, J, v]
-    return Formula(inputs, outputs, [*demand.matrices, H, G, J])
+    inputs = [*law.inputs, reference, last, low, high]
+    bounds = [ca.vertcat(lower, -displacement), ca.vertcat(upper, displacement)]
+    return Formula(inputs, [H, f, G, *bounds, finite, J, v], [*law.matrices, H, G, J])
 
 
-def _answer(demand: Demand) -> Formula:
-    """What a change of the pressures (n,), in bar, comes to.
+def _solution(law: TrackingRows) -> Formula:
+    """What a change of the pressures (n,), in bar, amounts to.
 
-    Gives pressures (n,) in Pa, 1 where a limit holds them (n,), what the task's rows miss, in m,
-    and the square of how far the change is beyond its bounds, in bar^2.
+    Outputs: pressures (n,) in Pa, 1 for channels at a limit (n,), the residual of the task's rows
+    in m, and the square of how far the change is beyond its bounds, in bar^2.
     """
-    t, n = demand.rows.shape
-    change, low, high = ca.SX.sym("change", n), ca.SX.sym("low", n + 3), ca.SX.sym("high", n + 3)
+    t, n = law.rows.shape
+    change = ca.SX.sym("change", n)
+    lower, upper = ca.SX.sym("lower", n + 3), ca.SX.sym("upper", n + 3)
     J, v = ca.SX.sym("J", t, n), ca.SX.sym("v", t)
     reference, last = ca.SX.sym("reference", n), ca.SX.sym("last", n)
-    least, most = ca.SX.sym("least", n), ca.SX.sym("most", n)
-    bounded = ca.fmin(ca.fmax(change, low[:n]), high[:n])
+    low, high = ca.SX.sym("low", n), ca.SX.sym("high", n)
+    bounded = ca.fmin(ca.fmax(change, lower[:n]), upper[:n])
     p = last / _BAR + bounded
-    held = ca.logic_or(p <= least + _SLACK, p >= most - _SLACK)
-    missing = (J @ (p * _BAR - reference) - v)[: demand.task_rows]
-    beyond = ca.sumsqr(change - bounded)
-    inputs = [change, low, high, J, v, reference, last, least, most]
-    return Formula(inputs, [p * _BAR, held, ca.norm_2(missing), beyond], [J])
+    held = ca.logic_or(p <= low + _SLACK, p >= high - _SLACK)
+    residual = (J @ (p * _BAR - reference) - v)[: law.task_rows]
+    violation = ca.sumsqr(change - bounded)
+    inputs = [change, lower, upper, J, v, reference, last, low, high]
+    return Formula(inputs, [p * _BAR, held, ca.norm_2(residual), violation], [J])

@@ -1,25 +1,153 @@
-"""What must hold before an arm is put under pressure. Each check returns what is wrong, by name."""
+"""Checks of requests before they reach the control thread, and of the rig before it is armed.
+
+A request is refused by them whoever makes it: a program in Python, a client of the daemon or the
+command line. When one is refused nothing has changed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
+from numpy.typing import NDArray
 
+from stiffopt.control.contents import understood
 from stiffopt.control.steering import Steering
-from stiffopt.control.tracker_watch import ENOUGH, Sight, TrackerWatch
-from stiffopt.errors import InputError
-from stiffopt.rig.interface import PressureReading, Rig
+from stiffopt.control.tracker_watch import Sight, TrackerWatch
+from stiffopt.control.trajectory import Trajectory, Waypoint
+from stiffopt.control.tuning import SupervisionTuning
+from stiffopt.errors import CommandError, InputError, StiffoptError
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.rig.interface import PressureLimits, PressureReading, Rig
+from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
-from stiffopt.safety.outlet import Outlet
 
-__all__ = ["check_rig", "check_vented_arm"]
+__all__ = [
+    "check_rig",
+    "check_target",
+    "check_task",
+    "check_trajectory",
+    "check_vented_arm",
+    "highest_pressures",
+    "limited_range",
+    "refusing",
+]
 
-_OFF = 0.1  # share of the arm's length by which the vented tip may be seen beside the model's
+Array = NDArray[np.float64]
+
+
+@contextmanager
+def refusing(what: str) -> Iterator[None]:
+    """Raise any error of the body as `InputError`, a refusal: nothing has changed.
+
+    Parameters
+    ----------
+    what :
+        What the body checks or prepares, for the message.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except StiffoptError as error:
+        raise CommandError(str(error)) from error
+    except Exception as error:
+        raise CommandError(
+            f"the {what} is refused and nothing has changed: unexpected "
+            f"{type(error).__name__} while it was prepared: {error}"
+        ) from error
+
+
+def check_task(task: Task, limits: PressureLimits) -> None:
+    """Refuse a task that is not valid or needs pressures beyond the limits.
+
+    Raises
+    ------
+    InputError
+        It names the key and, for a pressure, the channel.
+    """
+    with refusing("task"):
+        limited_range(understood(task, Task).pressure, limits)
+
+
+def check_target(target: Target) -> None:
+    """Refuse a target that is not valid.
+
+    Raises
+    ------
+    InputError
+        It names the key.
+    """
+    with refusing("target"):
+        understood(target, Target)
+
+
+def check_trajectory(trajectory: Trajectory) -> None:
+    """Refuse a trajectory that is not valid.
+
+    Raises
+    ------
+    InputError
+        It names the key.
+    """
+    with refusing("trajectory"):
+        if not isinstance(trajectory, Trajectory):
+            raise InputError(f"expected a Trajectory, not {type(trajectory).__name__}")
+        # one by one: all at once would hold Python's lock, and so the control thread, for too long
+        waypoints = tuple(understood(waypoint, Waypoint) for waypoint in trajectory.waypoints)
+        understood(trajectory.model_copy(update={"waypoints": waypoints[:1]}), Trajectory)
+        Trajectory(waypoints=waypoints)
+
+
+def highest_pressures(task: Task, limits: PressureLimits) -> Array:
+    """Return the highest pressures (n,) that a task permits on a rig, in Pa."""
+    return np.array(limited_range(task.pressure, limits).max, dtype=float)
+
+
+def limited_range(pressure: PressureRange, limits: PressureLimits) -> PressureRange:
+    """Return a task's limits of pressure for each channel, completed by those of a rig.
+
+    A limit beyond the rig's by no more than `PressureLimits.slack`, by rounding, becomes the rig's.
+
+    Raises
+    ------
+    InputError
+        A limit is beyond the rig's, or a channel is left no pressure; it names the channel.
+    """
+    lower = _bound("min", pressure.min, limits.low, limits)
+    upper = _bound("max", pressure.max, limits.high, limits)
+    for index in np.flatnonzero(lower > upper):
+        raise InputError(
+            f"pressure: channel {index + 1} is left no pressure: its min is "
+            f"{lower[index] * 1e-5:g} bar, its max {upper[index] * 1e-5:g} bar"
+        )
+    return PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
+
+
+def _bound(
+    key: str, given: float | tuple[float | None, ...] | None, default: Array, limits: PressureLimits
+) -> Array:
+    """Return one of a task's limits for each channel (n,), within those of the rig."""
+    values = np.array(given, dtype=float)  # None, no limit, becomes NaN
+    if values.shape not in ((), (limits.n,)):
+        raise InputError(
+            f"pressure.{key}: expected one value or a list of {limits.n}, not {values.size}"
+        )
+    values = np.where(np.isnan(values), default, values)
+    beyond = (values < limits.low - limits.slack) | (values > limits.high + limits.slack)
+    for index in np.flatnonzero(beyond):
+        raise InputError(
+            f"pressure.{key}: {values[index] * 1e-5:g} bar is beyond the limits of channel "
+            f"{index + 1}, {limits.low[index] * 1e-5:g} to {limits.high[index] * 1e-5:g} bar"
+        )
+    clipped: Array = np.clip(values, limits.low, limits.high)
+    return clipped
 
 
 def check_rig(rig: Rig, outlet: Outlet, steering: Steering) -> Iterator[str]:
-    """Yield what is wrong with how a rig is set up."""
+    """Yield the problems of a rig's configuration; each begins with the name of its check."""
     robot, limits = rig.robot, outlet.limits
     if rig.tracker is None:
         yield "tracker: this rig has none, and the loop cannot steer without; add one"
@@ -60,16 +188,17 @@ def check_vented_arm(
     pressures: PressureMonitor,
     reading: PressureReading,
     tracker: TrackerWatch,
+    tuning: SupervisionTuning,
 ) -> Iterator[str]:
-    """Yield what is wrong with what is measured of a vented arm."""
+    """Yield the problems of a vented arm's measurements; each begins with the name of its check."""
     trouble = pressures.implausible(now, reading)
     if trouble is not None:
         yield f"pressures: {trouble.text}"
     elif left := pressures.under_pressure(reading):
         yield f"pressures: {left}; wait until it has emptied, and check its gauge"
-    if tracker.samples < ENOUGH:
+    if tracker.samples < (enough := tracker.tuning.enough):
         yield (
-            f"tracker: it has seen the tip {tracker.samples} times, {ENOUGH} are needed; wait, or "
+            f"tracker: it has seen the tip {tracker.samples} times, {enough} are needed; wait, or "
             "bring the sensor into its field"
         )
         return
@@ -81,7 +210,7 @@ def check_vented_arm(
     if modelled is None:
         modelled = standing.tip_position - standing.disturbance
     off = float(np.linalg.norm(tracker.position - modelled))
-    if not off <= _OFF * rig.robot.length:  # NaN is too far as well
+    if not off <= tuning.vented_offset * rig.robot.length:  # NaN is too far as well
         seen, model = (", ".join(f"{1e3 * x:.1f}" for x in p) for p in (tracker.position, modelled))
         yield (
             f"calibration: the vented tip is seen at ({seen}) mm, {1e3 * off:.0f} mm from where "

@@ -1,9 +1,9 @@
-"""The controller: from what is asked and seen to the pressures of the next tick.
+"""The controller: from a task, pressure readings and tracker samples to the next pressures.
 
-It moves in the space of pressures, where every straight way between allowed pressures is allowed,
-along a smooth reference to the plan (`Reference`), and corrects at the tip: for the offset that the
-estimator finds and the plan does not count with yet, and, where the arm swings, by a feedback that
-damps the swing (`Gains`).  A small quadratic program (`Allocation`) brings both together within
+It moves in the space of pressures, where every straight line between permitted pressures is
+permitted, along a smooth reference to the plan (`Reference`). It corrects at the tip, for the
+offset that the estimator finds and the plan does not account for yet, and damps the vibration of
+the arm (`stiffopt.control.feedback`). A small quadratic program (`Allocation`) combines both within
 all limits.
 """
 
@@ -11,37 +11,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
-from stiffopt.control.asked import (
-    angle_to,
-    distance_to,
-    is_far,
-    parts_of,
-    stiffness_of,
-    within_limits,
-)
-from stiffopt.control.believed import memory_of, regulation_of, wrench_at
-from stiffopt.control.demand import demand, parts_asked
-from stiffopt.control.estimator import EstimatorSettings, TipEstimator
-from stiffopt.control.gains import Gains
-from stiffopt.control.nearby import NearbyTip
-from stiffopt.control.planner import InlinePlanner, Planner, ProcessPlanner
-from stiffopt.control.plans import Plan, Request
+from stiffopt.control.checks import limited_range, refusing
+from stiffopt.control.estimator import TipEstimator
+from stiffopt.control.feedback import GainSchedule, tracking_rows
+from stiffopt.control.linearised_tip import LinearisedTip
+from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.reference import Reference
-from stiffopt.control.regulators import RegulatorModel
-from stiffopt.control.requested import preparing
-from stiffopt.control.state import Severity
-from stiffopt.control.steering import Move, Notice, Seen, Standing
+from stiffopt.control.regulators import PressureEstimator
+from stiffopt.control.replanning import Pursuit, Replanner
+from stiffopt.control.state import Severity, SteeringStatus
+from stiffopt.control.steering import Move, Notice, Seen
+from stiffopt.control.tip_errors import TipErrors, target_arrays, wrench_at
 from stiffopt.control.trajectory import Course, Trajectory
-from stiffopt.control.vibration import Vibration
+from stiffopt.control.tuning import ControlTuning
+from stiffopt.control.vibration import BendingMode
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Task
+from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
@@ -50,38 +43,30 @@ __all__ = ["Controller"]
 
 Array = NDArray[np.float64]
 
-_PLAN_EVERY = 0.05  # s
-_UNHURRIED = 1.0  # s; with which the plan follows the offset
-_EFFORT = 1.0  # of feedback against error; see `Gains`
-_HASTE = 1.2  # rate of the reference of an arm that swings, over its frequency
-_SWINGS = 3.0  # rad of the arm's swing that this takes at least
-_HEED = 0.6  # rate with which a swinging arm's offset is corrected, over its frequency
-_BRISK = 100.0  # 1/s; rate of the reference of an arm that does not swing
-_BELIEVED = 0.5  # of the arm's length; an offset beyond is no model error any more
-_OFF = 3e3  # Pa; by which the command makes up for a regulator that is off
-_ALIKE = 3e3  # Pa; along the path only the model's derivatives are of interest
-_SHORT = 2e-4  # m; what a limit may take from the tip without being mentioned
+_MOST_STEPS = 50  # of the estimators in one tick, after a pause
 
 
 class Controller:
-    """Steers an arm; see `Steering`.
+    """Controls the tip of an arm; see `Steering` for its methods.
 
     Parameters
     ----------
     robot :
-        What the arm is believed to be.
+        The model of the arm.
     limits :
-        What may be commanded.
+        Of the commands.
     slew :
         Greatest rate of change (n,), in Pa/s.
     period :
         Of the loop, in s.
     control, safety :
         Settings of the rig.
-    swings :
-        Whether the arm vibrates as its robot file says, where the settings leave that open.
-    beside :
+    vibrates :
+        Whether the arm vibrates as its robot file implies, where the settings leave that open.
+    plan_in_process :
         Whether plans are made in a process of their own; otherwise at once, for simulated time.
+    tuning :
+        Of the parts.
     """
 
     def __init__(
@@ -93,135 +78,131 @@ class Controller:
         period: float,
         control: ControlSettings | None = None,
         safety: Safety | None = None,
-        swings: bool = True,
-        beside: bool = False,
+        vibrates: bool = True,
+        plan_in_process: bool = False,
+        tuning: ControlTuning | None = None,
     ) -> None:
         self.robot, self.limits = robot, limits
-        self._control, self._safety = control or ControlSettings(), safety or Safety()
-        self._period = period
-        n = robot.n_pressures
-        self._slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
-        kind = self._control.vibration
-        self._swings = swings if kind == "auto" else kind == "modelled"
-        self._farthest = _BELIEVED * robot.length
-        self._vibration = Vibration.of(robot.description) if self._swings else None
-        lag, dead_time = regulation_of(robot.description, self._control)
-        self._lag, self._dead_time = float(np.mean(lag)), dead_time
-        self._regulators = RegulatorModel(period, lag, dead_time, self._slew)
-        self._damping = self._control.damping
-        self._estimator = TipEstimator(
-            period,
-            n,
-            self._vibration,
-            EstimatorSettings(
-                noise=self._control.tracker_noise,
-                max_speed=self._safety.max_tip_speed,
-                damping=self._damping,
-            ),
+        control, safety = control or ControlSettings(), safety or Safety()
+        self._tuning = tuning = tuning or ControlTuning()
+        self._period, n = period, robot.n_pressures
+        slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
+        if control.vibration != "auto":
+            vibrates = control.vibration == "modelled"
+        mode = BendingMode.of(robot.description) if vibrates else None
+        self._vibrates = vibrates
+        self._pressures = PressureEstimator(
+            robot.description, control, period, slew, tuning.regulators
         )
-        self._gains = Gains(period, self._lag, self._damping, _EFFORT) if self._vibration else None
-        self._reference = Reference(period, self._slew, self._lag, self._damping, beside=6)
+        lag, dead_time = self._pressures.lag, self._pressures.dead_time
+        filter_tuning = replace(
+            tuning.estimator,
+            noise=control.tracker_noise,
+            max_speed=safety.max_tip_speed,
+            damping=control.damping,
+        )
+        self._estimator = TipEstimator(period, n, mode, filter_tuning)
+        self._reference = Reference(
+            period, slew, lag, control.damping, 6, tuning.reference.slew_share
+        )
+        self._gains: GainSchedule | None = None
+        if mode is not None:
+            self._gains = GainSchedule(period, lag, control.damping, tuning.feedback.effort)
         self._allocation = Allocation(
-            demand(n, self._vibration, self._damping, dead_time),
+            tracking_rows(n, mode, control.damping, dead_time, tuning.feedback),
             limits.low,
             limits.high,
-            self._slew * period,
-            self._safety.max_tip_speed * period,
-            self._control.solver,
+            slew * period,
+            safety.max_tip_speed * period,
+            control.solver,
+            tuning.feedback,
         )
-        self._planner: Planner = ProcessPlanner(robot) if beside else InlinePlanner(robot)
-        self._here: NearbyTip | None = None  # the model where the arm is, and along the path
-        self._there: NearbyTip | None = None
-        self._serial = 0
+        planner = ProcessPlanner(robot) if plan_in_process else InlinePlanner(robot)
+        self.replanner = Replanner(planner, tuning.replanning, period, dead_time)
+        self._errors = TipErrors()
+        self._model: LinearisedTip | None = None  # at the effective pressures
+        self._path_model: LinearisedTip | None = None  # on the reference's path
         self.begin(0.0)
-
-    # -- Steering -------------------------------------------------------------------------------
 
     def check(self) -> None:
         """Compile and try the model; see `Steering.check`."""
-        if self._here is not None:
+        if self._model is not None:
             return
-        here, there = NearbyTip(self.robot), NearbyTip(self.robot, _ALIKE)
-        if not here.is_fast and self.robot.is_loaded:
+        model = LinearisedTip(self.robot)
+        path_model = LinearisedTip(self.robot, self._tuning.reference.model_range)
+        if not model.is_fast and self.robot.is_loaded:
             raise InputError(
                 "the control loop needs a C compiler for an arm under gravity or a load; "
                 "install one (Debian: apt install gcc) or set STIFFOPT_COMPILER"
             )
-        self._here, self._there = here, there
+        self._model, self._path_model = model, path_model
         self.begin(self._now)
 
     def begin(self, now: float) -> None:
         """Start anew with a vented arm and no task."""
-        none = self._none()
-        self._serial += 1
-        self._task: Task | None = None
-        self._target: Target | None = None
-        self._asked = np.zeros(5)  # what of a pose
-        self._course: Course | None = None
-        self._plan: Plan | None = None
-        self._measure: Callable[..., float] | None = None
-        self._unit = "N/m"
-        self._asked_at = -math.inf
-        self._search = True
-        self._planned_offset, self._heeded = np.zeros(6), np.zeros(6)
         self._now = now
-        self._last_move = none.copy()
-        self._effective, self._chamber = none.copy(), none.copy()
-        self._memory = memory_of(self.robot.description)
-        self._regulators.begin(none)
+        self.replanner.begin()
+        self._pressures.begin()
         self._estimator.begin()
-        self._reference.begin(np.concatenate([none, np.zeros(6)]))
-        self._saturated = np.zeros(len(none), dtype=bool)
+        zero = self._pressures.command
+        self._reference.begin(np.concatenate([zero, np.zeros(6)]))
+        self._corrected_offset = np.zeros(6)
+        self._saturated = np.zeros(len(zero), dtype=bool)
         self._allocation.limit(self.limits.low, self.limits.high)
-        self._at_u: TipAt | None = None
-        if self._here is not None:
-            self._at_u = self._here.at(none)
-            self._estimator.advance(now, none, self._at_u)
-        self._fresh = True
+        self._tip: TipAt | None = None
+        if self._model is not None:
+            self._tip = self._model.at(zero)
+            self._estimator.advance(now, zero, self._tip)
+        self._at_rest = True  # the reference begins at the present pressures
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Steering.set_task`."""
-        with preparing("task"):
+        with refusing("task"):
             pursue = self._prepared_task(task)
         pursue()
 
-    def _prepared_task(self, task: Task) -> Callable[[], None]:
-        """Return what pursues a task from its call on; until then nothing changes."""
-        limited = within_limits(task, self.robot, self.limits)
-        lower, upper = limited.pressure_bounds(self.robot.description)
-        asked, measure = parts_asked(task.target), stiffness_of(task)
-        unit = task.measures[0].unit if task.measures else "N/m"
-
-        def pursue() -> None:
-            self._task, self._target, self._course = limited, task.target, None
-            self._asked, self._measure, self._unit = asked, measure, unit
-            self._allocation.limit(lower, upper)
-            self._anew()
-
-        return pursue
-
     def set_target(self, target: Target) -> None:
         """Go to another target; see `Steering.set_target`."""
-        with preparing("target"):
+        with refusing("target"):
             pursue = self._prepared_target(target)
         pursue()
-        self._course = None
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory; see `Steering.follow`."""
-        with preparing("trajectory"):
+        with refusing("trajectory"):
             estimate = self._estimator.estimate
             course = Course(trajectory, now, estimate.position, estimate.rotation)
-            pursue = self._prepared_target(course.at(now))
+            pursue = self._prepared_target(course.at(now), course)
         pursue()
-        self._course = course
+
+    def _prepared_task(self, task: Task, course: Course | None = None) -> Callable[[], None]:
+        """Return what begins to pursue a task when it is called; until then nothing changes."""
+        limited = _within_limits(task, self.robot, self.limits)
+        lower, upper = limited.pressure_bounds(self.robot.description)
+        begin = self.replanner.prepared(replace(Pursuit.of(task, limited), course=course))
+
+        def pursue() -> None:
+            self._allocation.limit(lower, upper)
+            begin()
+
+        return pursue
+
+    def _prepared_target(self, target: Target, course: Course | None = None) -> Callable[[], None]:
+        """Return what begins to go to a target, with goal and limits of the task, if any."""
+        pursuit = self.replanner.pursuit
+        if pursuit.task is None:
+            task = Task(robot=self.robot.description.name, target=target)
+            return self._prepared_task(task, course)
+        return self.replanner.prepared(pursuit.to(target, course))
 
     def resume(self, now: float) -> None:
-        """Steer again from where the pressures are."""
-        offset = self._estimator.beside
-        self._heeded = offset
-        self._reference.begin(np.concatenate([self._last_move + self._remembered, offset]))
-        self._fresh = False
+        """Control again from where the pressures are."""
+        offset, pressures = self._estimator.offset, self._pressures
+        self._corrected_offset = offset
+        self._reference.begin(
+            np.concatenate([pressures.command + pressures.history_offset, offset])
+        )
+        self._at_rest = False
 
     def observe(
         self,
@@ -230,219 +211,152 @@ class Controller:
         reading: PressureReading,
         samples: Sequence[PoseSample],
     ) -> Seen:
-        """Follow pressures and tip; see `Steering.observe`."""
-        steps = min(max(1, round((now - self._now) / self._period)), 50)
+        """Estimate pressures and tip; see `Steering.observe`."""
+        steps = min(max(1, round((now - self._now) / self._period)), _MOST_STEPS)
         self._now = now
-        for _ in range(steps):
-            self._chamber = self._regulators.advance(commanded, reading.pressures)
-        self._last_move = commanded.copy()
-        if self._memory is None:
-            self._effective = self._chamber
-        else:
-            self._effective = self._memory.advance(steps * self._period, self._chamber)
-        here, _ = self._models()
-        self._at_u = here.at(self._effective)
+        self._pressures.advance(steps, commanded, reading.pressures)
+        effective = self._pressures.effective
+        self._tip = tip = self._models()[0].at(effective)
         for step in range(steps):
             moment = now - (steps - 1 - step) * self._period
-            self._estimator.advance(moment, self._effective, self._at_u)
+            self._estimator.advance(moment, effective, tip)
         return self._estimator.take(samples)
 
     def move(self, now: float) -> Move:
-        """Decide; see `Steering.move`."""
-        self._ask(now)
-        aim = self._aim()
-        if aim is None:  # nothing to do, or not planned yet
-            self._fresh = True
-            return Move(self._last_move.copy(), True, np.zeros(len(self._last_move), dtype=bool))
-        if self._fresh:
+        """Compute the next command; see `Steering.move`."""
+        reference, estimator, pressures = self._reference, self._estimator, self._pressures
+        omega, command_offset = estimator.omega, pressures.command_offset
+        plan = self.replanner.update(now, estimator.offset, command_offset, omega, reference.delay)
+        last, n = pressures.command, len(pressures.command)
+        if plan is None:  # nothing to do, or no plan yet
+            self._at_rest = True
+            return Move(last.copy(), True, np.zeros(n, dtype=bool))
+        if self._at_rest:
             self.resume(now)
-        if self._implausible():
-            return Move(self._last_move.copy(), False, self._saturated.copy())
-        reference, omega, n = self._reference, self._estimator.omega, len(self._last_move)
-        reference.rate = min(_BRISK, _HASTE * omega) if self._swings else _BRISK
+        if self._model_is_wrong():
+            return Move(last.copy(), False, self._saturated.copy())
+        tuning = self._tuning.reference
+        reference.rate = tuning.rigid_rate
+        if self._vibrates:
+            reference.rate = min(reference.rate, tuning.vibrating_rate * omega)
         reference.omega = omega
-        reference.advance(aim)
-        at = self._models()[1].at(reference.path[:n])
-        self._heed(omega)
-        correction = reference.path[n:] - self._heeded
-        pressures, held, missing = self._allocation.solve(
-            (at.pose, at.jacobian, self._asked, correction, *self._swing()),
-            reference.command - self._beside,
-            self._last_move,
+        reference.advance(plan)
+        tip = self._models()[1].at(reference.path[:n])
+        self._update_corrected_offset(omega)
+        correction = reference.path[n:] - self._corrected_offset
+        prescribed = self.replanner.pursuit.prescribed
+        command, held, residual = self._allocation.solve(
+            (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs()),
+            reference.command - command_offset,
+            last,
         )
-        if pressures is None:
-            return Move(self._last_move.copy(), False, self._saturated.copy())
-        self._saturated = held if missing > _SHORT else np.zeros(n, dtype=bool)
-        return Move(pressures, True, self._saturated.copy())
+        if command is None:
+            return Move(last.copy(), False, self._saturated.copy())
+        reported = residual > self._tuning.feedback.unreported_error
+        self._saturated = held if reported else np.zeros(n, dtype=bool)
+        return Move(command, True, self._saturated.copy())
 
-    def standing(self, now: float) -> Standing:
-        """Say how things stand."""
-        n = self.robot.n_pressures
-        if self._at_u is None:
-            return Standing.unknown(n)
+    def standing(self, now: float) -> SteeringStatus:
+        """Return the controller's part of the state; see `Steering.standing`."""
+        n, tip, pursuit = self.robot.n_pressures, self._tip, self.replanner.pursuit
+        if tip is None:
+            return SteeringStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
-        target = self._course.at(now) if self._course is not None else self._target
-        position, pointing, quaternion = parts_of(target)
-        sample, plan = self._estimator.sample, self._plan
+        target = pursuit.target_at(now)
+        position, pointing, quaternion = target_arrays(target)
+        position_error, angle_error = self._errors.at(target, estimate.position, estimate.rotation)
+        sample, plan = self._estimator.sample, self.replanner.plan
         stiffness = math.nan
-        if self._measure is not None:
-            stiffness = float(self._measure(self._at_u.compliance, self._at_u.pose[:3, :3]))
-        return Standing(
-            plan=np.full(n, np.nan) if plan is None else plan.pressures - self._remembered,
+        if pursuit.stiffness is not None:
+            stiffness = pursuit.stiffness(tip.compliance, tip.pose[:3, :3])
+        turn = estimate.turn if self._estimator.turn_known else None
+        planned = np.full(n, np.nan)
+        if plan is not None:
+            planned = plan.pressures - self._pressures.history_offset
+        return SteeringStatus(
+            plan=planned,
             tip_position=estimate.position,
             tip_quaternion=estimate.quaternion,
             seen_position=np.full(3, np.nan) if sample is None else sample.position,
-            seen_time=-math.inf if sample is None else sample.time,
+            seen_age=math.inf if sample is None else now - sample.time,
             target_position=position,
             target_quaternion=quaternion,
             target_pointing=pointing,
-            position_error=distance_to(estimate.position, position),
-            angle_error=angle_to(estimate.rotation, pointing, quaternion),
+            position_error=position_error,
+            angle_error=angle_error,
             stiffness=stiffness,
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
-            wrench=wrench_at(
-                self._at_u, estimate.offset, estimate.turn if self._estimator.turn_known else None
-            ),
-            task=self._what(),
-            stiffness_unit=self._unit,
+            wrench=wrench_at(tip, estimate.offset, turn),
+            task=pursuit.kind,
+            stiffness_unit=pursuit.unit,
             model_position=estimate.static,
         )
 
     def notices(self) -> tuple[Notice, ...]:
-        """Say what is wrong."""
-        found = list(self._planner.notices())
-        plan = self._plan
-        if plan is not None and plan.serial == self._serial and not plan.reached:
-            text = f"the target cannot be reached: {plan.message}"
-            found.append(Notice("unreachable", text, standing=True))
-        if self._implausible():
-            away = 1e3 * float(np.linalg.norm(self._estimator.beside[:3]))
+        """Return what is wrong."""
+        notices = self.replanner.notices()
+        if self._model_is_wrong():
+            away = 1e3 * float(np.linalg.norm(self._estimator.offset[:3]))
             text = (
                 f"the tip is seen {away:.0f} mm from where the model has it; check the tracker's "
                 "registration and sensor, the tubes, and that the robot file is this arm's"
             )
-            found.append(Notice("implausible", text, Severity.ERROR, standing=True))
-        return tuple(found)
-
-    def _implausible(self) -> bool:
-        """Whether the arm is so far from its model that it is rather something else."""
-        offset = self._estimator.beside[:3]
-        return float(offset @ offset) > self._farthest**2
+            notices = (*notices, Notice("implausible", text, Severity.ERROR, standing=True))
+        return notices
 
     def close(self) -> None:
         """End the planner."""
-        self._planner.close()
+        self.replanner.close()
 
-    # -- what is asked --------------------------------------------------------------------------
+    def _model_is_wrong(self) -> bool:
+        """Whether the offset is too large to be an error of this arm's model."""
+        offset = self._estimator.offset[:3]
+        most = self._tuning.feedback.max_offset * self.robot.length
+        return float(offset @ offset) > most**2
 
-    def _prepared_target(self, target: Target) -> Callable[[], None]:
-        """Return what goes to a target from its call on; until then nothing changes."""
-        if self._task is None:
-            return self._prepared_task(Task(robot=self.robot.description.name, target=target))
-        asked = parts_asked(target)
-        anew = self._target is None or bool((asked != self._asked).any())
-        far = self._target is not None and is_far(self._target, target)
-
-        def pursue() -> None:
-            if anew:
-                self._anew()
-            self._search = self._search or far
-            self._target, self._asked = target, asked
-            self._asked_at = -math.inf
-
-        return pursue
-
-    def _anew(self) -> None:
-        self._serial += 1
-        self._search = True
-        self._asked_at = -math.inf
-
-    def _ask(self, now: float) -> None:
-        """Ask for a plan now and then, for where the target will be when the path is there."""
-        if self._task is None or self._target is None:
-            return
-        if now - self._asked_at < _PLAN_EVERY - 1e-6:
-            return
-        anew = self._search and self._course is None
-        self._asked_at, self._search = now, False
-        target = self._target
-        if self._course is not None:
-            target = self._course.at(
-                now + self._reference.delay + self._dead_time + 0.5 * self._period
-            )
-        offset = self._estimator.beside
-        # The offset depends on the posture too; the posture follows it slowly, the tip at once.
-        slowness = max(_UNHURRIED, _SWINGS / self._estimator.omega)
-        share = 1.0 if anew else -math.expm1(-_PLAN_EVERY / slowness)
-        self._planned_offset = self._planned_offset + share * (offset - self._planned_offset)
-        self._planner.ask(
-            Request(
-                self._serial, self._task, target, self._planned_offset.copy(), self._beside,
-                anew,
-            )
-        )  # fmt: skip
-
-    def _aim(self) -> Array | None:
-        """Effective pressures of the plan and the offset that it counts with (n + 6,)."""
-        plan = self._planner.latest()
-        if plan is not None and plan.serial == self._serial:
-            self._plan = plan
-        if self._plan is None:
-            return None
-        return np.concatenate([self._plan.pressures, self._plan.offset])
-
-    def _what(self) -> str:
-        if self._course is not None:
-            return "trajectory"
-        return "" if self._target is None else "target"
-
-    # -- the model ------------------------------------------------------------------------------
-
-    def _none(self) -> Array:
-        return np.zeros(self.robot.n_pressures)
-
-    @property
-    def _remembered(self) -> Array:
-        """By how much the pressures that act differ from those in the chambers (n,)."""
-        result: Array = self._effective - self._chamber
-        return result
-
-    @property
-    def _beside(self) -> Array:
-        """By how much the pressures that act will differ from those that are commanded (n,).
-
-        That is what the chambers get beside the command, and the arm beside the chambers.
-        """
-        off = np.minimum(np.maximum(self._regulators.offset, -_OFF), _OFF)
-        result: Array = self._remembered + off
-        return result
-
-    def _models(self) -> tuple[NearbyTip, NearbyTip]:
-        """The model where the arm is, and along the path."""
-        if self._here is None or self._there is None:
+    def _models(self) -> tuple[LinearisedTip, LinearisedTip]:
+        """The model at the effective pressures, and on the reference's path."""
+        if self._model is None or self._path_model is None:
             self.check()
             return self._models()
-        return self._here, self._there
+        return self._model, self._path_model
 
-    def _heed(self, omega: float) -> None:
-        """Let the offset that is corrected follow the one that is found.
+    def _update_corrected_offset(self, omega: float) -> None:
+        """Let the offset that feedback corrects follow the estimate.
 
-        For an arm that swings not at once: part of each swing is taken for an offset, and what the
-        model has no words for (higher modes) all of it.
+        In an arm that vibrates it is filtered: part of each vibration is mistaken for an offset,
+        and all of the higher modes, which the estimator does not model.
         """
-        found = self._estimator.beside
-        share = 1.0 if not math.isfinite(omega) else -math.expm1(-_HEED * omega * self._period)
-        self._heeded = self._heeded + share * (found - self._heeded)
+        share = 1.0
+        if math.isfinite(omega):
+            share = -math.expm1(-self._tuning.feedback.offset_rate * omega * self._period)
+        offset = self._corrected_offset
+        self._corrected_offset = offset + share * (self._estimator.offset - offset)
 
-    def _swing(self) -> tuple[ArrayLike, ...]:
-        """What `demand` wants to know of an arm that swings."""
+    def _vibration_inputs(self) -> tuple[ArrayLike, ...]:
+        """Inputs of `tracking_rows` for an arm that vibrates."""
         if self._gains is None:
             return ()
         estimator, motion = self._estimator, self._reference.motion
-        n = len(self._last_move)
+        n = len(self._pressures.command)
         return (
-            estimator.swing, estimator.across_matrix, estimator.omega,
-            self._gains.at(estimator.omega), self._regulators.ahead + self._remembered,
+            estimator.vibration, estimator.soft_plane, estimator.omega,
+            self._gains.at(estimator.omega), self._pressures.effective_ahead,
             self._reference.chamber, motion[0, :n], motion[1, :n],
         )  # fmt: skip
+
+
+def _within_limits(task: Task, robot: Manipulator, limits: PressureLimits) -> Task:
+    """Return a task with the rig's limits of pressure as well.
+
+    Raises
+    ------
+    InputError
+        It needs more than the rig permits (see `limited_range`), or leaves a channel no pressure.
+    """
+    on_rig = task.model_copy(update={"pressure": limited_range(task.pressure, limits)})
+    lower, upper = on_rig.pressure_bounds(robot.description)
+    pressure = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))
+    # a load shows in the tip's offset, by as much as there is of it
+    return task.model_copy(update={"pressure": pressure, "load": None})

@@ -1,19 +1,19 @@
-"""Where the tip is, from the pressures and a tracker that is late, noisy and now and then wrong.
+"""Kalman filter of the tip's pose, from pressures and a late, noisy, at times wrong tracker.
 
-In the base frame, the tip is where the model puts it for the pressures in the chambers, plus an
-offset d that changes slowly (model error, payload, creep), plus a swing xi in the soft plane::
+In the base frame, the tip is where the model has it at the effective pressures, plus an offset d
+that changes slowly (model error, payload, creep), plus a vibration xi in the soft plane::
 
     y = s(p) + d + xi,      xi' = w - s_v',      w' = -2 zeta omega w - omega^2 xi
 
-where s_v is the part of the static motion that the first bending mode has (see `Vibration`) and w
-the speed of that mode.  The tip's orientation has an offset of its own, and turns with the swing.
+s_v is the part of the static displacement that the first bending mode takes part in (`BendingMode`)
+and w the speed of that mode. The orientation has an offset of its own, and turns with the
+vibration.
 
-The swing is the sum of one that the pressures drive, from rest, and of a free one that samples
-teach.  A Kalman filter on xi, w and d takes samples at the time of their capture: the difference is
-taken from what the driven swing was then, with the free one brought back to that moment, and what
-it teaches is carried on to the present, which for a linear model is the same as to run everything
-again from there.  How far the model may be off depends on how far it has moved: the noise that
-drives d and xi grows with the way of s.  `tip_filter` has the formulas.
+The vibration is the sum of a driven one, which the pressures excite from rest, and a free one,
+which samples correct. A sample is compared with the state at its capture: with the driven vibration
+of that moment, and with the free one propagated back to it. The correction is propagated to the
+present, which for a linear system equals filtering again from the time of capture. The model's
+error grows with the tip's displacement, and so does the process noise of d and xi.
 """
 
 from __future__ import annotations
@@ -22,60 +22,31 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control import tip_filter
+from stiffopt import lie
+from stiffopt.control.formula import Formula
 from stiffopt.control.steering import Seen
-from stiffopt.control.vibration import Vibration
+from stiffopt.control.tuning import EstimatorTuning
+from stiffopt.control.vibration import BendingMode, transition
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample
 
-__all__ = ["EstimatorSettings", "TipEstimate", "TipEstimator"]
+__all__ = ["TipEstimate", "TipEstimator"]
 
 Array = NDArray[np.float64]
+Symbols = Any  # of CasADi
 
-_REMEMBERED = 0.4  # s; older samples are of no use
-_SOFT = 0.15  # of the softest direction's compliance; directions with less swing less
-_SLOWEST = 0.5  # rad/s; an arm about to buckle swings no slower, as far as the filter is concerned
-_FROZEN = 2e-3  # m; a tip that the model moves by more cannot be seen where it was
-_GIVEN_UP = 40  # rejected samples in a row after which all begins anew
-_UNTURNED = (1.0, 0.0, 0.0, 0.0)
-_LONGEST_LEAP = 0.05  # s; a tip that jumps and stays there is not believed after any time
+_MODE_EVERY = 8  # steps; frequency and soft plane change slowly
+_NO_ROTATION = (1.0, 0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class EstimatorSettings:
-    """How much is believed, and how quickly.
-
-    Attributes
-    ----------
-    noise : standard deviation of a tracked position in each axis, in m.
-    angular_noise : of a tracked orientation, in rad.
-    max_speed : no tip moves faster, in m/s.
-    model_error : by which share of its way the model may go wrong.
-    drift : growth of the offset's standard deviation while nothing moves, in m / sqrt(s).
-    angular_drift : the same of the orientation, in rad / sqrt(s).
-    agitation : of the swing's speed, from what is not modelled, in m/s / sqrt(s).
-    frequency_error : by which share the square of the swing's frequency may be wrong.
-    damping : share of critical damping of the swing.
-    """
-
-    noise: float = 5e-5
-    angular_noise: float = 2e-3
-    max_speed: float = 1.0
-    model_error: float = 0.2
-    drift: float = 3e-4
-    angular_drift: float = 3e-3
-    agitation: float = 2e-3
-    frequency_error: float = 0.2
-    damping: float = 0.04
-
-
-class _Moment(NamedTuple):
-    """What the pressures alone have done to the tip."""
+class _PastTip(NamedTuple):
+    """The tip that the pressures alone account for, at one moment."""
 
     time: float
     static: Array  # (3,)
@@ -85,34 +56,34 @@ class _Moment(NamedTuple):
 
 @dataclass(frozen=True)
 class TipEstimate:
-    """Where the tip is thought to be.
+    """Estimated tip, in the base frame.
 
     Attributes
     ----------
-    static : (3,), where the model puts it, in m.
-    offset : (3,) d, in m.
-    turn : (3,) rotation vector of the orientation's offset, base axes.
-    swing, speed : (3,) xi and w, in m and m/s.
-    rotation, quaternion : (3, 3) and (4,), w first, of the tip in the base.
+    static : position (3,) of the model, in m.
+    offset : d (3,), in m.
+    turn : offset of the orientation (3,), as a rotation vector in base axes.
+    vibration, speed : xi and w (3,), in m and m/s.
+    rotation, quaternion : orientation (3, 3) and (4,), w first.
     """
 
     static: Array
     offset: Array
     turn: Array
-    swing: Array
+    vibration: Array
     speed: Array
     rotation: Array
     quaternion: Array
 
     @property
     def position(self) -> Array:
-        """(3,), in m."""
-        result: Array = self.static + self.offset + self.swing
+        """Position (3,), in m."""
+        result: Array = self.static + self.offset + self.vibration
         return result
 
 
 class TipEstimator:
-    """Follows the tip.
+    """Estimates the tip's pose, its offset from the model and its vibration.
 
     Parameters
     ----------
@@ -120,31 +91,31 @@ class TipEstimator:
         Of the steps, in s.
     n :
         Number of channels.
-    vibration :
-        The arm's first bending mode, or None for an arm that does not swing.
-    settings :
-        What is believed.
+    mode :
+        The arm's first bending mode, or None for an arm that does not vibrate.
+    tuning :
+        Noise and outlier rejection.
 
     Attributes
     ----------
     omega : float
-        Angular frequency of the swing, in rad/s; infinite while it is not known.
-    across_matrix : ndarray
-        What of a vector (3, 3) is in the directions in which the tip is soft.
-    beside : ndarray
-        By what the tip is beside the model (6,): d, and the rotation vector of its turn.
+        Angular frequency of the vibration, in rad/s; infinite before it is known.
+    soft_plane : ndarray
+        Projection (3, 3) on the directions in which the tip is soft.
+    offset : ndarray
+        Tip pose relative to the model's (6,): d in m, and a rotation vector.
     sample : PoseSample or None
-        The last that was used.
+        The latest that was used.
     """
 
     def __init__(
-        self, period: float, n: int, vibration: Vibration | None, settings: EstimatorSettings
+        self, period: float, n: int, mode: BendingMode | None, tuning: EstimatorTuning
     ) -> None:
-        self._period, self._vibration, self._settings = period, vibration, settings
-        self._past: deque[_Moment] = deque(maxlen=max(4, round(_REMEMBERED / period)))
-        self._predict = tip_filter.prediction(vibration, n, settings.damping)
-        self._correct = tip_filter.correction(settings, vibration is not None)
-        self._orient = tip_filter.orientation()
+        self._period, self._mode, self._tuning = period, mode, tuning
+        self._past: deque[_PastTip] = deque(maxlen=max(4, round(tuning.memory / period)))
+        self._predict = _prediction(mode, n, tuning.damping)
+        self._correct = _correction(tuning, mode is not None)
+        self._orientation = _orientation()
         self.omega = math.inf
         self._times = np.array([1.0, period])  # omega, and since the step before
         self.begin()
@@ -153,119 +124,121 @@ class TipEstimator:
         """Start anew, with an arm at rest."""
         self._past.clear()
         self._free = np.zeros((2, 3))
-        self.beside = np.zeros(6)
-        self._offset, self._turn = self.beside[:3], self.beside[3:]
-        self.across_matrix = np.diag([1.0, 1.0, 0.0])
-        self._lean: Array = np.zeros((3, 3))  # turn of the tip per swing
+        self.offset = np.zeros(6)
+        self.soft_plane = np.diag([1.0, 1.0, 0.0])
+        self._lean: Array = np.zeros((3, 3))  # rotation of the tip per vibration
         self._pressures: Array | None = None
-        wide = (0.1, 0.05, 0.1) if self._vibration is not None else (0.0, 0.0, 0.1)
-        self._covariance = np.diag(np.square(wide))  # of xi, w, d in the soft plane
-        self._variances = np.array([wide[2] ** 2, 0.5**2])  # of d along the stiff axis, and of turn
-        self._ways = np.zeros(2)  # of the model's tip, and of what drives the swing
+        deviations = (0.1, 0.05, 0.1) if self._mode is not None else (0.0, 0.0, 0.1)
+        self._covariance = np.diag(np.square(deviations))  # of xi, w, d in the soft plane
+        # of d along the stiff axis, and of the orientation's offset
+        self._variances = np.array([deviations[2] ** 2, 0.5**2])
+        self._displacements = np.zeros(2)  # of the model's tip, and of what drives the vibration
         self._used_until = -math.inf
         self._ticks = 0
         self.sample: PoseSample | None = None
         self._first: PoseSample | None = None
-        self._same: tuple[Array, Array] | None = None  # a position, and the model's when it came
-        self._seen_at, self._refused = -math.inf, 0
+        self._unchanged: tuple[Array, Array] | None = None  # a sample, and the model's tip with it
+        self._last_sample, self._rejected = -math.inf, 0
 
     @property
     def estimate(self) -> TipEstimate:
-        """Where the tip is now."""
-        now, swing = self._past[-1], self.swing
-        rotation, quaternion = self._orient(self._turn, self._lean, swing[0], now.rotation)
+        """The tip now."""
+        now, vibration = self._past[-1], self.vibration
+        offset, turn = self.offset[:3], self.offset[3:]
+        rotation, quaternion = self._orientation(turn, self._lean, vibration[0], now.rotation)
         return TipEstimate(
-            now.static, self._offset, self._turn, swing[0], swing[1], rotation, quaternion
+            now.static, offset, turn, vibration[0], vibration[1], rotation, quaternion
         )
 
     @property
-    def swing(self) -> Array:
-        """Swing and its speed (2, 3), in m and m/s."""
+    def vibration(self) -> Array:
+        """Vibration and its speed (2, 3), in m and m/s."""
         result: Array = self._past[-1].driven + self._free
         return result
 
     @property
     def turn_known(self) -> bool:
-        """Whether the tracker tells orientations."""
+        """Whether the tracker measures orientations."""
         return self.sample is not None and self.sample.quaternion is not None
 
     def advance(self, now: float, pressures: Array, tip: TipAt) -> None:
-        """Take a step, at whose end the chambers have pressures (n,), and the model this tip."""
-        if self._vibration is not None:
-            self._look_at_mode(tip)
+        """Predict the state at the end of a step.
+
+        Parameters
+        ----------
+        now :
+            Time then, in s.
+        pressures, tip :
+            Effective pressures (n,) in Pa, and the model's tip at these.
+        """
+        if self._mode is not None:
+            self._update_mode(tip)
         rotation = tip.pose[:3, :3]
         if self._pressures is None:
-            self._past.append(_Moment(now, tip.pose[:3, 3].copy(), rotation, np.zeros((2, 3))))
+            self._past.append(_PastTip(now, tip.pose[:3, 3].copy(), rotation, np.zeros((2, 3))))
         else:
             last = self._past[-1]
-            self._times[1] = now - last.time  # which for a loop that is late is no period
-            static, driven, self._free, ways = self._predict(
-                tip.pose, tip.jacobian, last.static, last.driven, self._free, self.across_matrix,
+            self._times[1] = now - last.time  # longer than the period in a loop that is late
+            static, driven, self._free, displacements = self._predict(
+                tip.pose, tip.jacobian, last.static, last.driven, self._free, self.soft_plane,
                 pressures - self._pressures, self._times,
             )  # fmt: skip
-            self._ways += ways
-            self._past.append(_Moment(now, static, rotation, driven))
+            self._displacements += displacements
+            self._past.append(_PastTip(now, static, rotation, driven))
         self._pressures = pressures.copy()
 
     def take(self, samples: Sequence[PoseSample]) -> Seen:
-        """Learn from samples, each at the time of its capture.
+        """Correct the state by samples, each at the time of its capture.
 
-        Those that are older than the newest that was used, or than what is remembered, those of a
-        tip that was not seen, and those that repeat a pose to the last digit while the arm should
-        have moved, are left out.
+        Samples are left out that are older than the newest that was used or than the memory, that
+        did not see the tip, or that repeat a pose to the last digit although the arm has moved.
         """
         used = rejected = 0
         for sample in samples:
             if not sample.visible or not self._past:
                 continue
             if not self._used_until < sample.time <= self._past[-1].time + self._period:
-                continue  # old, from the future, or of no time at all
-            moment = self._moment(sample.time)
-            if moment is None:
+                continue  # old, from the future, or NaN
+            past = self._past_at(sample.time)
+            if past is None or self._is_frozen(sample, past):
                 continue
-            if self._repeats(sample, moment):
-                continue
-            if self._plausible(sample, moment):
-                self._learn(sample, moment)
+            if self._is_plausible(sample, past):
+                self._update(sample, past)
                 used += 1
             elif self.sample is not None:
                 rejected += 1
-                self._refused += 1
-                if self._refused >= _GIVEN_UP:  # whoever watches has long drawn the conclusion
+                self._rejected += 1
+                if self._rejected >= self._tuning.patience:  # supervision has acted long before
                     self.sample = self._first = None
-            self._seen_at = sample.time
+            self._last_sample = sample.time
         return Seen(used, rejected, self._used_until)
 
-    # -- of the swing ---------------------------------------------------------------------------
-
-    def _look_at_mode(self, tip: TipAt) -> None:
-        """Take frequency, soft plane and lean from the compliance, now and then: they are slow."""
+    def _update_mode(self, tip: TipAt) -> None:
+        """Compute frequency, soft plane and lean from the compliance, every few steps."""
         self._ticks += 1
-        if self._ticks % 8 != 1 or self._vibration is None:
+        if self._ticks % _MODE_EVERY != 1 or self._mode is None:
             return
         rotation = tip.pose[:3, :3]
         linear = rotation @ tip.compliance[:3, :3] @ rotation.T
-        softness, axes = np.linalg.eigh(linear)
-        # of a strongly bent arm, no direction is stiff altogether
-        share = np.minimum(1.0, softness / (_SOFT * softness[2]))
-        self.across_matrix = axes * share @ axes.T
-        omega = self._vibration.frequency(2 / float(softness[1] + softness[2]))
-        self.omega = max(_SLOWEST, omega)
+        compliances, axes = np.linalg.eigh(linear)
+        # in a strongly bent arm no direction is entirely stiff
+        share = np.minimum(1.0, compliances / (self._tuning.soft_share * compliances[2]))
+        self.soft_plane = axes * share @ axes.T
+        omega = self._mode.frequency(2 / float(compliances[1] + compliances[2]))
+        self.omega = max(self._tuning.least_frequency, omega)
         self._times[0] = self.omega
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
-        self._lean = turning @ axes[:, 1:] @ np.diag(1 / softness[1:]) @ axes[:, 1:].T
+        self._lean = turning @ axes[:, 1:] @ np.diag(1 / compliances[1:]) @ axes[:, 1:].T
 
     def _transition(self, duration: float) -> Array:
-        """What a duration in s does to the free swing (2, 2)."""
+        """Transition matrix (2, 2) of the free vibration over a duration in s."""
         if not math.isfinite(self.omega):
             return np.eye(2)
-        F: Array = np.array(tip_filter.transition(self.omega, self._settings.damping, duration))
+        F: Array = np.array(transition(self.omega, self._tuning.damping, duration))
         return F
 
-    # -- of the samples -------------------------------------------------------------------------
-
-    def _moment(self, time: float) -> _Moment | None:
-        """What was at a moment, between two steps; None if it is out of memory."""
+    def _past_at(self, time: float) -> _PastTip | None:
+        """Interpolate the past at a moment; None if it is older than the memory."""
         past = self._past
         if time < past[0].time:
             return None
@@ -277,50 +250,160 @@ class TipEstimator:
             return before
         after = past[index + 1]
         share = (time - before.time) / (after.time - before.time)
-        return _Moment(
+        return _PastTip(
             time,
             before.static + share * (after.static - before.static),
             before.rotation if share < 0.5 else after.rotation,
             before.driven + share * (after.driven - before.driven),
         )
 
-    def _plausible(self, sample: PoseSample, moment: _Moment) -> bool:
-        """Whether a tip can have got there since it was last seen, or is where it is expected."""
-        if self.sample is None:  # two must agree before the first is believed
+    def _is_plausible(self, sample: PoseSample, past: _PastTip) -> bool:
+        """Whether the tip can have come there since the last sample, or is expected there."""
+        if self.sample is None:  # the first is used once a second one agrees
             before, self._first = self._first, sample
             return before is not None and self._is_near(sample, before.position, before.time)
-        if self._is_near(sample, self.sample.position, self._seen_at):
+        if self._is_near(sample, self.sample.position, self._last_sample):
             return True
-        free = self._transition(moment.time - self._past[-1].time) @ self._free
-        expected = moment.static + moment.driven[0] + free[0] + self._offset
-        return self._is_near(sample, expected, self._seen_at)
+        free = self._transition(past.time - self._past[-1].time) @ self._free
+        expected = past.static + past.driven[0] + free[0] + self.offset[:3]
+        return self._is_near(sample, expected, self._last_sample)
 
     def _is_near(self, sample: PoseSample, position: Array, since: float) -> bool:
-        """Whether a tip that was at a position (3,) can be where the sample has it."""
-        elapsed = min(sample.time - since, _LONGEST_LEAP)
-        reach = self._settings.max_speed * elapsed + 10 * self._settings.noise
+        """Whether a tip that was at a position (3,) at a time can have come to the sample's."""
+        elapsed = min(sample.time - since, self._tuning.longest_gap)
+        reach = self._tuning.max_speed * elapsed + 10 * self._tuning.noise
         return math.dist(sample.position, position) <= reach
 
-    def _repeats(self, sample: PoseSample, moment: _Moment) -> bool:
-        """Whether a tracker says the same again and again while the arm should have moved."""
-        if self._same is None or (sample.position != self._same[0]).any():
-            self._same = sample.position, moment.static
+    def _is_frozen(self, sample: PoseSample, past: _PastTip) -> bool:
+        """Whether a tracker repeats a position although the model's tip has moved."""
+        if self._unchanged is None or (sample.position != self._unchanged[0]).any():
+            self._unchanged = sample.position, past.static
             return False
-        return math.dist(moment.static, self._same[1]) > _FROZEN
+        return math.dist(past.static, self._unchanged[1]) > self._tuning.frozen
 
-    def _learn(self, sample: PoseSample, moment: _Moment) -> None:
+    def _update(self, sample: PoseSample, past: _PastTip) -> None:
         first = not math.isfinite(self._used_until)
         elapsed = 0.0 if first else sample.time - self._used_until
-        age = self._past[-1].time - moment.time
-        told = sample.quaternion is not None
+        age = self._past[-1].time - past.time
+        has_orientation = sample.quaternion is not None
         self._free, offset, turn, self._covariance, self._variances = self._correct(
-            moment.static, moment.rotation, moment.driven, self._free, self._offset, self._turn,
-            self.across_matrix, self._lean, self._covariance, self._variances,
-            (age, elapsed, self.omega), self._ways, sample.position,
-            sample.quaternion if told else _UNTURNED, told,
+            past.static, past.rotation, past.driven, self._free, self.offset[:3], self.offset[3:],
+            self.soft_plane, self._lean, self._covariance, self._variances,
+            (age, elapsed, self.omega), self._displacements, sample.position,
+            sample.quaternion if has_orientation else _NO_ROTATION, has_orientation,
         )  # fmt: skip
-        self.beside = np.concatenate([offset, turn])
-        self._offset, self._turn = self.beside[:3], self.beside[3:]
-        self._ways = np.zeros(2)
+        self.offset = np.concatenate([offset, turn])
+        self._displacements = np.zeros(2)
         self._used_until = sample.time
-        self.sample, self._refused = sample, 0
+        self.sample, self._rejected = sample, 0
+
+
+def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:
+    """One step of the state.
+
+    Inputs: pose (4, 4) and Jacobian (6, n) of the model's tip, its position (3,) before, driven and
+    free vibration (2, 3), soft plane (3, 3), change of the pressures (n,), (omega, duration).
+    Outputs: position (3,), both vibrations, and the displacements (2,) of tip and mode.
+    """
+    pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
+    before, change = ca.SX.sym("before", 3), ca.SX.sym("change", n)
+    driven, free = ca.SX.sym("driven", 2, 3), ca.SX.sym("free", 2, 3)
+    soft_plane, times = ca.SX.sym("soft_plane", 3, 3), ca.SX.sym("times", 2)
+    position, excitation = pose[:3, 3], ca.SX.zeros(3)
+    driven_after, free_after = driven, free
+    if mode is not None:
+        # half of the excitation acts before the step, half after it
+        excitation = soft_plane @ (
+            pose[:3, :3] @ (jacobian[:3, :] @ (ca.DM(mode.participation) * change))
+        )
+        half = ca.vertcat(0.5 * excitation.T, ca.SX.zeros(1, 3))
+        F = transition(times[0], damping, times[1])
+        driven_after, free_after = F @ (driven - half) - half, F @ free
+    displacements = ca.vertcat(ca.norm_2(position - before), ca.norm_2(excitation))
+    inputs = [pose, jacobian, before, driven, free, soft_plane, change, times]
+    return Formula(inputs, [position, driven_after, free_after, displacements], [jacobian])
+
+
+def _correction(tuning: EstimatorTuning, vibrates: bool) -> Formula:
+    """The measurement update by one sample.
+
+    Inputs, at the capture: the model's position (3,) and rotation (3, 3), driven vibration (2, 3).
+    Now: free vibration (2, 3), offset and turn (3,), soft plane and lean (3, 3), covariance (3, 3)
+    of xi, w and d in the soft plane, variances (2,) of d along the stiff axis and of the turn.
+    Of the sample: (age, time since the one before, omega), displacements (2,) since then, position
+    (3,), quaternion (4,), and 1 if it has one. Outputs: free vibration, offset, turn, covariance
+    and variances.
+    """
+    t = tuning
+    static, rotation = ca.SX.sym("static", 3), ca.SX.sym("rotation", 3, 3)
+    driven, free = ca.SX.sym("driven", 2, 3), ca.SX.sym("free", 2, 3)
+    offset, turn = ca.SX.sym("offset", 3), ca.SX.sym("turn", 3)
+    soft_plane, lean = ca.SX.sym("soft_plane", 3, 3), ca.SX.sym("lean", 3, 3)
+    covariance, variances = ca.SX.sym("covariance", 3, 3), ca.SX.sym("variances", 2)
+    times, displacements = ca.SX.sym("times", 3), ca.SX.sym("displacements", 2)
+    position, quaternion = ca.SX.sym("position", 3), ca.SX.sym("quaternion", 4)
+    has_orientation = ca.SX.sym("has_orientation")
+    age, elapsed, omega = times[0], times[1], times[2]
+
+    # process noise, of the time since the last sample and the displacement since then
+    model_error = (t.model_error * displacements[0]) ** 2
+    drift = t.drift**2 * elapsed + model_error
+    length = ca.fmax(1e-3, ca.norm_2(static))
+    axial = variances[0] + drift
+    angular = variances[1] + t.angular_drift**2 * elapsed + model_error / length**2 * 4
+    vibration = driven
+    if vibrates:
+        vibration = driven + transition(omega, t.damping, -age) @ free
+        excited = t.model_error * displacements[1]
+        detuned = t.frequency_error * omega**2 * elapsed * ca.norm_2(vibration[0, :])
+        Q = [excited**2, t.agitation**2 * elapsed + (omega * excited) ** 2 + detuned**2, drift]
+        F = ca.diagcat(transition(omega, t.damping, elapsed), 1)
+        P = F @ covariance @ F.T + ca.diag(ca.vertcat(*Q))
+        P = 0.5 * (P + P.T)
+    else:
+        P = covariance + ca.diagcat(0, 0, drift)
+
+    # in the soft plane xi, w and d; along the stiff axis d alone
+    innovation = position - (static + vibration[0, :].T + offset)
+    H = ca.DM([1.0 if vibrates else 0.0, 0.0, 1.0])
+    PH = P @ H
+    noise = t.noise**2
+    gain = PH / (H.T @ PH + noise)
+    axial_gain = axial / (axial + noise)
+    soft = soft_plane @ innovation if vibrates else innovation
+    free_after = free
+    if vibrates:
+        free_after = free + transition(omega, t.damping, age) @ (gain[:2] @ soft.T)
+    offset_after = offset + gain[2] * soft + axial_gain * (innovation - soft)
+
+    expected = _rotation(turn + lean @ vibration[0, :].T) @ rotation
+    between = lie.rotation_from_quaternion(quaternion) @ expected.T
+    error = lie.rotation_vector_from_quaternion(lie.quaternion_from_rotation(between))
+    angular_gain = has_orientation * angular / (angular + t.angular_noise**2)
+    inputs = [
+        static, rotation, driven, free, offset, turn, soft_plane, lean, covariance, variances,
+        times, displacements, position, quaternion, has_orientation,
+    ]  # fmt: skip
+    variances_after = ca.vertcat((1 - axial_gain) * axial, (1 - angular_gain) * angular)
+    outputs = [
+        free_after, offset_after, turn + angular_gain * error, P - gain @ PH.T, variances_after,
+    ]  # fmt: skip
+    return Formula(inputs, outputs)
+
+
+def _orientation() -> Formula:
+    """Rotation (3, 3) and quaternion (4,) of the tip.
+
+    Inputs: offset of the orientation (3,), lean (3, 3), vibration (3,), the model's rotation (3,
+    3).
+    """
+    turn, lean = ca.SX.sym("turn", 3), ca.SX.sym("lean", 3, 3)
+    vibration, rotation = ca.SX.sym("vibration", 3), ca.SX.sym("rotation", 3, 3)
+    turned = _rotation(turn + lean @ vibration) @ rotation
+    outputs = [turned, lie.quaternion_from_rotation(turned)]
+    return Formula([turn, lean, vibration, rotation], outputs)
+
+
+def _rotation(vector: Symbols) -> Symbols:
+    """Rotation (3, 3) by a rotation vector (3,)."""
+    return lie.exp(ca.vertcat(ca.SX.zeros(3), vector))[:3, :3]

@@ -1,7 +1,7 @@
-"""Small formulas that are evaluated in each tick.
+"""Small formulas that are evaluated in every tick, compiled to CasADi's virtual machine.
 
-CasADi's machine takes a hundred of operations in the time of one NumPy call, which is what most of
-a tick would consist of otherwise.
+It runs a hundred operations in the time of one NumPy call; with NumPy alone a tick would take most
+of a period of 2 ms.
 """
 
 from __future__ import annotations
@@ -21,16 +21,17 @@ Array = NDArray[np.float64]
 
 
 class Formula:
-    """A function of arrays, from CasADi symbols to expressions; it belongs to one thread.
+    """A function of arrays, given by CasADi symbols and expressions; for one thread at a time.
 
-    Columns (k, 1) are given, and come, as (k,), and numbers come as (1,).
+    Columns (k, 1) are passed and returned as (k,), scalars are returned as (1,).
 
     Parameters
     ----------
     inputs, outputs :
         Symbols, and expressions of them.
     matrices :
-        Those of them that stay matrices with a single column: with a column for each channel, say.
+        Those of them that remain matrices even with a single column, such as a Jacobian with one
+        column per channel.
     """
 
     def __init__(
@@ -40,7 +41,7 @@ class Formula:
         self._buffer = Buffer(ca.Function("formula", list(inputs), dense), 1)
         self._evaluate = self._buffer.evaluate
         own = {id(matrix) for matrix in matrices}
-        self._targets = [
+        self._arguments = [
             target[:, None] if id(symbol) in own and target.ndim == 1 else target
             for symbol, target in zip(inputs, self._buffer.targets, strict=True)
         ]
@@ -50,8 +51,8 @@ class Formula:
         ]
 
     def __call__(self, *arguments: Any) -> list[Array]:
-        """Values of the outputs."""
-        for target, argument in zip(self._targets, arguments, strict=True):
+        """Return the outputs' values."""
+        for target, argument in zip(self._arguments, arguments, strict=True):
             target[...] = argument
         self._evaluate()
         return [result.copy() for result in self._results]

@@ -1,16 +1,19 @@
-"""Which state may follow which, and what may be asked for in each."""
+"""The state of a control loop: which transitions it has, and the events and alarms on its way."""
 
 from __future__ import annotations
 
-from stiffopt.control.state import State
+import threading
+from collections import deque
+
+from stiffopt.control.state import Alarm, Event, Severity, State
 from stiffopt.errors import CommandError
 
-__all__ = ["ARMED", "Lifecycle"]
+__all__ = ["ARMED", "Alarms", "EventBuffer", "Lifecycle"]
 
 ARMED = frozenset({State.ACTIVE, State.HOLDING})
 """States in which there may be pressure."""
 
-_FOLLOWING = {
+_TRANSITIONS = {
     State.UNCONFIGURED: {State.INACTIVE, State.FAULT},
     State.INACTIVE: {State.ACTIVE, State.FAULT},
     State.ACTIVE: {State.HOLDING, State.INACTIVE, State.FAULT},
@@ -18,7 +21,7 @@ _FOLLOWING = {
     State.FAULT: {State.INACTIVE},
 }
 
-_ALLOWED = {
+_REQUESTS = {
     "configure": {State.UNCONFIGURED, State.INACTIVE},
     "arm": {State.INACTIVE},
     "set a task": ARMED,
@@ -39,14 +42,14 @@ _ADVICE = {
 
 
 class Lifecycle:
-    """The state of a control loop, and why it is so.
+    """The state of a control loop.
 
     Attributes
     ----------
     state : State
         Now.
     reason : str
-        Why, where it is not as asked.
+        Why, where nobody requested it.
     """
 
     def __init__(self) -> None:
@@ -64,21 +67,99 @@ class Lifecycle:
         Raises
         ------
         CommandError
-            It cannot follow this one.
+            There is no such transition.
         """
-        if state not in _FOLLOWING[self.state]:
+        if state not in _TRANSITIONS[self.state]:
             raise CommandError(f"{state} cannot follow {self.state}")
         self.state, self.reason = state, reason
 
     def permit(self, request: str) -> None:
-        """Refuse a request that does not suit the state.
+        """Refuse a request that the state does not permit.
 
         Raises
         ------
         CommandError
             It says what to do instead.
         """
-        if self.state not in _ALLOWED[request]:
+        if self.state not in _REQUESTS[request]:
             advice = _ADVICE[self.state] if request != "reset" else "there is no fault"
             why = f" ({self.reason})" if self.state is State.FAULT else ""
             raise CommandError(f"cannot {request} while {self.state}{why}: {advice}")
+
+
+class EventBuffer:
+    """The latest events, in the order in which they happened; for all threads.
+
+    Parameters
+    ----------
+    size :
+        Number of events; the oldest are dropped.
+    """
+
+    def __init__(self, size: int = 10_000) -> None:
+        self._events: deque[Event] = deque(maxlen=size)
+        self._count = 0
+        self._lock = threading.Lock()
+
+    def add(self, time: float, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
+        """Append an event; see `Event`."""
+        with self._lock:
+            self._events.append(Event(time, kind, text, severity))
+            self._count += 1
+
+    def since(self, index: int) -> tuple[list[Event], int]:
+        """Return the events from an index on, as far as the buffer has them.
+
+        Parameters
+        ----------
+        index :
+            0 at first, then the `next_index` of the last call.
+
+        Returns
+        -------
+        events : list of Event
+        next_index : int
+        """
+        with self._lock:
+            new = min(max(self._count - index, 0), len(self._events))
+            events = list(self._events)[len(self._events) - new :] if new else []
+            return events, self._count
+
+
+class Alarms:
+    """The alarms that stand now, one of each kind; for all threads.
+
+    Setting and clearing one is an event.
+
+    Attributes
+    ----------
+    now : tuple of Alarm
+    """
+
+    def __init__(self, events: EventBuffer) -> None:
+        self._events = events
+        self._standing: dict[str, Alarm] = {}
+        self._lock = threading.Lock()
+        self.now: tuple[Alarm, ...] = ()
+
+    def set(self, time: float, kind: str, text: str, severity: Severity = Severity.WARNING) -> None:
+        """Set the alarm of a kind, or change its text."""
+        with self._lock:
+            before = self._standing.get(kind)
+            if before is not None and before.text == text:
+                return
+            since = time if before is None else before.since
+            self._standing[kind] = Alarm(kind, text, since)
+            self.now = tuple(self._standing.values())
+        if before is None:
+            self._events.add(time, kind, text, severity)
+
+    def clear(self, time: float, kind: str) -> None:
+        """Clear the alarm of a kind, if it stands."""
+        if kind not in self._standing:
+            return
+        with self._lock:
+            gone = self._standing.pop(kind, None)
+            self.now = tuple(self._standing.values())
+        if gone is not None:
+            self._events.add(time, f"{kind}-over", f"no longer: {gone.text}")

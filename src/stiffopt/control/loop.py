@@ -1,4 +1,4 @@
-"""The control loop: ticks at its deadlines, serves requests of any thread, and tells how it is."""
+"""The control loop: ticks at its deadlines, takes requests of any thread, publishes snapshots."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ import threading
 import time
 from collections.abc import Callable
 
-from stiffopt.control.journal import EventLog
-from stiffopt.control.machine import Machine
-from stiffopt.control.requested import check_target, check_task, check_trajectory
-from stiffopt.control.requests import Requests, asking
-from stiffopt.control.state import Snapshot, State
-from stiffopt.control.steering import Standing, Steering
-from stiffopt.control.timing import Punctuality
+import numpy as np
+
+from stiffopt.control.checks import check_target, check_task, check_trajectory
+from stiffopt.control.lifecycle import EventBuffer
+from stiffopt.control.request_queue import RequestQueue, current_requester
+from stiffopt.control.state import Snapshot, State, SteeringStatus
+from stiffopt.control.steering import Steering
+from stiffopt.control.supervisor import Supervisor
+from stiffopt.control.timing import TickTiming
 from stiffopt.control.trajectory import Trajectory
+from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.errors import CommandError, InputError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import Safety
-from stiffopt.safety.outlet import Outlet
+from stiffopt.safety.gate import Outlet
 
 __all__ = ["ControlLoop"]
 
-_LAST_TRIES = 0.5  # s after the ramp in which a supply that cannot be vented is tried again
 _STARTING = (
     "not while unconfigured: it is still starting, connects to the rig and checks it, which takes "
     "up to a minute or so; ask again when the state is inactive"
@@ -32,52 +34,64 @@ _STARTING = (
 
 
 class ControlLoop:
-    """Steers an arm, tick by tick, and lets nothing happen to it.
+    """Runs a controller on a rig, tick by tick, and keeps the arm safe.
 
-    It begins unconfigured; `configure` checks the rig and leaves it inactive, vented; `arm` lets
-    it steer. Whatever goes wrong either holds the pressures or is a fault, which vents and lasts
-    until `reset`. Requests may come from any thread: the control thread carries them out in its
-    next tick, or the caller at once while the loop does not run. They return when that is done, or
-    raise `InputError` with the reason; nothing has changed then. While it is configured for the
-    first time, which may take long, nothing waits: all is refused at once, but `vent` is done.
+    It begins unconfigured; `configure` checks the rig and leaves it inactive, which means vented;
+    `arm` activates the controller. Every failure either holds the pressures or is a fault, which
+    vents and lasts until `reset`.
+
+    Requests may come from any thread: the control thread carries them out in its next tick, or the
+    caller at once while the loop does not run. They return when that is done, or raise `InputError`
+    with the reason; nothing has changed then. During the first configuration, which may take long,
+    requests are refused at once, except for `vent`, which is carried out.
 
     Parameters
     ----------
     rig :
-        Robot, tracker and clock; of its supply the limits alone are looked at.
+        Robot, tracker and clock; of its supply the limits alone are used.
     steering :
-        Decides about pressures.
+        The controller.
     outlet :
         The only way to the supply.
     safety :
         What is a fault.
     period :
         Between ticks, in s.
+    tuning :
+        Of the supervision.
 
     Attributes
     ----------
-    events : EventLog
-        What happened.
+    events : EventBuffer
+        The latest events.
     """
 
     def __init__(
-        self, rig: Rig, steering: Steering, outlet: Outlet, *, safety: Safety, period: float
+        self,
+        rig: Rig,
+        steering: Steering,
+        outlet: Outlet,
+        *,
+        safety: Safety,
+        period: float,
+        tuning: SupervisionTuning | None = None,
     ) -> None:
         if not 0 < period < math.inf:
             raise InputError(f"the period must be above 0 s, not {period:g} s")
         self.rig = rig
         self.period = period
-        self._machine = Machine(rig, steering, outlet, safety, period)
-        self._requests = Requests()
+        tuning = tuning or SupervisionTuning()
+        self._supervisor = Supervisor(rig, steering, outlet, safety, period, tuning)
+        self._requests = RequestQueue()
         self._configuring = False
-        self._punctuality = Punctuality(period)
-        self._ramp_time = safety.ramp_time
-        self.events: EventLog = self._machine.events
-        self._nothing = Standing.unknown(outlet.limits.n)
-        self._snapshot = self._pictured(rig.clock.now())
+        self._timing = TickTiming(period)
+        self._stop_time = safety.ramp_time + tuning.stop_margin
+        self.events: EventBuffer = self._supervisor.events
+        self._unknown = SteeringStatus(plan=np.full(outlet.limits.n, np.nan))
+        self._snapshot = self._current_snapshot(rig.clock.now())
         self._listeners: list[Callable[[Snapshot], None]] = []
 
-    # Requests ------------------------------------------------------------------------------------
+    # -- requests -------------------------------------------------------------------------------
 
     def configure(self) -> None:
         """Connect supply and tracker, which vents, and check the rig; it is inactive then.
@@ -90,22 +104,22 @@ class ControlLoop:
         self._check_started()
         self._configuring = True
         try:
-            self._carry_out(self._machine.configure)
+            self._carry_out(self._supervisor.configure)
         finally:
             self._configuring = False
 
     def arm(self) -> None:
-        """Check the vented arm, then steer: it stays as it is until there is a task.
+        """Check the vented arm and activate the controller; pressures stay until there is a task.
 
-        The loop must have ticked for some time before, to learn how often the tracker sees the tip.
+        The loop must have ticked for some time before, to learn the rhythm of the tracker.
 
         Raises
         ------
         InputError
             A check failed; the text begins with its name. There may be several.
         """
-        asker = asking()  # checks may take long
-        self._ask(lambda now: self._machine.arm(now, lambda: asker.gone))
+        requester = current_requester()  # checks may take long
+        self._request(lambda now: self._supervisor.arm(now, lambda: requester.gone))
 
     def disarm(self) -> None:
         """Begin to let the pressures down; after `Safety.ramp_time` it is vented and inactive.
@@ -115,7 +129,7 @@ class ControlLoop:
         InputError
             It is in fault, and vented.
         """
-        self._ask(self._machine.disarm)
+        self._request(self._supervisor.disarm)
 
     def set_task(self, task: Task) -> None:
         """Pursue a task.
@@ -123,23 +137,23 @@ class ControlLoop:
         Raises
         ------
         InputError
-            It is not armed, or the task does not suit.
+            It is not armed, or the task is not valid on this rig.
         """
         self._check_started()
-        check_task(task, self._machine.outlet.limits)
-        self._carry_out(lambda now: self._machine.set_task(now, task))
+        check_task(task, self._supervisor.outlet.limits)
+        self._carry_out(lambda now: self._supervisor.set_task(now, task))
 
     def set_target(self, target: Target) -> None:
-        """Go to another target; what else the task asks for stays.
+        """Go to another target, with the stiffness goal and limits of the task.
 
         Raises
         ------
         InputError
-            It is not armed, or the target does not suit.
+            It is not armed, or the target is not valid.
         """
         self._check_started()
         check_target(target)
-        self._carry_out(lambda now: self._machine.set_target(now, target))
+        self._carry_out(lambda now: self._supervisor.set_target(now, target))
 
     def follow_trajectory(self, trajectory: Trajectory) -> None:
         """Follow a trajectory that begins now.
@@ -147,11 +161,11 @@ class ControlLoop:
         Raises
         ------
         InputError
-            It is not armed, or the trajectory does not suit.
+            It is not armed, or the trajectory is not valid.
         """
         self._check_started()
-        check_trajectory(trajectory)  # here, not in the control thread, which has to tick
-        self._carry_out(lambda now: self._machine.follow_trajectory(now, trajectory))
+        check_trajectory(trajectory)  # in this thread: the control thread has to tick
+        self._carry_out(lambda now: self._supervisor.follow_trajectory(now, trajectory))
 
     def hold(self, reason: str = "asked to") -> None:
         """Keep the pressures as they are until the next task, target or trajectory.
@@ -159,23 +173,23 @@ class ControlLoop:
         Raises
         ------
         InputError
-            It is not armed, so that there is nothing to hold.
+            It is not armed: there is nothing to hold.
         """
-        self._ask(lambda now: self._machine.hold(now, reason))
+        self._request(lambda now: self._supervisor.hold(now, reason))
 
     def vent(self, reason: str = "asked to") -> None:
-        """Let all pressure out at once; it is inactive then, or still in fault.
+        """Vent at once; it is inactive then, or still in fault.
 
         Raises
         ------
         InputError
-            The supply does not take it, or is not connected yet: that vents it. If it was
-            configured it is in fault then, and tries again in each tick.
+            The supply does not accept it, or is not connected yet; connecting vents it. If it was
+            configured it is in fault then, and venting is repeated in every tick.
         """
-        if self._starting:  # the supply itself can be told: nothing else commands it yet
-            self._machine.vent_beside()
+        if self._starting:  # directly: nothing else commands the supply yet
+            self._supervisor.vent_while_starting()
             return
-        self._ask(lambda now: self._machine.vent(now, reason))
+        self._request(lambda now: self._supervisor.vent(now, reason))
 
     def reset(self) -> None:
         """Leave the fault; it is inactive then.
@@ -185,60 +199,60 @@ class ControlLoop:
         InputError
             The reason for the fault is still there, or there is no fault.
         """
-        self._ask(self._machine.reset)
+        self._request(self._supervisor.reset)
 
     def add_alarm(self, kind: str, text: str) -> None:
-        """Let something that others found be wrong; it does not touch control."""
-        self._machine.alarms.set(self.rig.clock.now(), kind, text)
+        """Set an alarm that others have found; it does not affect control."""
+        self._supervisor.alarms.set(self.rig.clock.now(), kind, text)
 
     def clear_alarm(self, kind: str) -> None:
-        """Let it be well again."""
-        self._machine.alarms.clear(self.rig.clock.now(), kind)
+        """Clear such an alarm."""
+        self._supervisor.alarms.clear(self.rig.clock.now(), kind)
 
     def snapshot(self) -> Snapshot:
-        """Return how things stood at the end of the last tick."""
+        """Return the state at the end of the last tick."""
         return self._snapshot
 
     def listen(self, listener: Callable[[Snapshot], None]) -> None:
-        """Have a function told how things stand at the end of each tick, in the control thread.
+        """Call a function with the snapshot at the end of each tick, in the control thread.
 
-        It must not wait. What it raises is an alarm and does not touch control.
+        It must not wait. An error that it raises is an alarm and does not affect control.
         """
         self._listeners.append(listener)
 
     @property
     def _starting(self) -> bool:
-        return self._configuring and self._machine.lifecycle.state is State.UNCONFIGURED
+        return self._configuring and self._supervisor.lifecycle.state is State.UNCONFIGURED
 
     def _check_started(self) -> None:
-        """Refuse what would wait until all is connected, and come as a surprise then."""
+        """Refuse a request that would otherwise wait for the rig, and come as a surprise later."""
         if self._starting:
             raise CommandError(_STARTING)
 
-    def _ask(self, request: Callable[[float], None]) -> None:
+    def _request(self, request: Callable[[float], None]) -> None:
         self._check_started()
         self._carry_out(request)
 
     def _carry_out(self, request: Callable[[float], None]) -> None:
         def carry() -> None:
             try:
-                self._machine.carry_out(request)
+                self._supervisor.carry_out(request)
             finally:
-                self._snapshot = self._pictured(self.rig.clock.now())
+                self._snapshot = self._current_snapshot(self.rig.clock.now())
 
-        self._requests.make(carry)
+        self._requests.submit(carry)
 
-    # Time ----------------------------------------------------------------------------------------
+    # -- time -----------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        """Do what is to be done now, once."""
+        """Tick once, now."""
         self._tick(None)
 
     def run(self, stop: threading.Event) -> None:
         """Tick until `stop` is set, then let the pressures down and vent.
 
-        It returns within `Safety.ramp_time` and a second or so, whatever the devices do, as long as
-        time goes on. Ticks for which it is too late are left out.
+        It returns within `Safety.ramp_time` and about a second, whatever the devices do, as long as
+        the clock runs. Ticks that are overdue are skipped.
         """
         self._requests.begin()
         try:
@@ -253,45 +267,45 @@ class ControlLoop:
                 self._requests.end()
 
     def close(self) -> None:
-        """Vent, disconnect supply and tracker, and end what runs beside.
+        """Vent, disconnect supply and tracker, and end the controller.
 
         Raises
         ------
         DeviceError
-            The supply does not take the command to vent.
+            The supply does not accept the command to vent.
         """
-        machine = self._machine
+        supervisor = self._supervisor
         try:
-            machine.outlet.close()
+            supervisor.outlet.close()
         finally:
-            if machine.rig.tracker is not None:
-                machine.rig.tracker.close()
-            machine.steering.close()
+            if supervisor.rig.tracker is not None:
+                supervisor.rig.tracker.close()
+            supervisor.steering.close()
 
     def _ticked(self, due: float) -> float:
         """Tick when it is due; return when the next tick is."""
         clock = self.rig.clock
         try:
             clock.sleep_until(due)
-        except Exception as error:  # a simulated arm that cannot be followed any more
+        except Exception as error:  # a simulated arm that cannot be integrated any more
             text = f"unexpected {type(error).__name__}: {error}"
-            self._machine.fault(clock.now(), "internal", text)
+            self._supervisor.fault(clock.now(), "internal", text)
             time.sleep(self.period)
         self._tick(due)
-        return self._punctuality.next_due(due, clock.now())
+        return self._timing.next_due(due, clock.now())
 
     def _tick(self, due: float | None) -> None:
         began = time.perf_counter()
-        clock, machine, punctuality = self.rig.clock, self._machine, self._punctuality
+        clock, supervisor, timing = self.rig.clock, self._supervisor, self._timing
         with self._requests.turn:
             now = clock.now()
-            punctuality.begin(due, now)
-            machine.tick(now, self._requests.serve)
+            timing.begin(due, now)
+            supervisor.tick(now, self._requests.serve)
             ended = clock.now()
-            punctuality.end(now if due is None else due, ended, time.perf_counter() - began)
-            if punctuality.overruns_in_a_row:
-                machine.overran(ended, punctuality.overruns_in_a_row)
-            self._snapshot = self._pictured(now)
+            timing.end(now if due is None else due, ended, time.perf_counter() - began)
+            if timing.overruns_in_a_row:
+                supervisor.overran(ended, timing.overruns_in_a_row)
+            self._snapshot = self._current_snapshot(now)
         for listener in self._listeners:
             try:
                 listener(self._snapshot)
@@ -300,64 +314,46 @@ class ControlLoop:
 
     def _let_down(self, due: float) -> None:
         """Tick on until the pressures are let down, for a bounded time and number of ticks."""
-        machine = self._machine
-        if machine.lifecycle.armed:
-            machine.carry_out(lambda now: machine.disarm(now, "stopping"))
-        patience = self._ramp_time + _LAST_TRIES
-        end = self.rig.clock.now() + patience
-        for _ in range(math.ceil(patience / self.period)):
-            if machine.vented or self.rig.clock.now() > end:
+        supervisor = self._supervisor
+        if supervisor.lifecycle.armed:
+            supervisor.carry_out(lambda now: supervisor.disarm(now, "stopping"))
+        end = self.rig.clock.now() + self._stop_time
+        for _ in range(math.ceil(self._stop_time / self.period)):
+            if supervisor.vented or self.rig.clock.now() > end:
                 break
             due = self._ticked(due)
 
     def _vent_at_the_end(self) -> None:
         with self._requests.turn:
             now = self.rig.clock.now()
-            if self._machine.lifecycle.state is not State.UNCONFIGURED:
-                self._machine.shut(now)
-            self._snapshot = self._pictured(now)
+            if self._supervisor.lifecycle.state is not State.UNCONFIGURED:
+                self._supervisor.finish(now)
+            self._snapshot = self._current_snapshot(now)
 
-    # Snapshot ------------------------------------------------------------------------------------
-
-    def _pictured(self, now: float) -> Snapshot:
-        """Return how things stand; a steering that cannot tell keeps nobody from knowing."""
-        machine = self._machine
-        limits, reading = machine.outlet.limits, machine.reading
-        standing = self._nothing
-        if machine.lifecycle.state is not State.UNCONFIGURED:
+    def _current_snapshot(self, now: float) -> Snapshot:
+        """Return the state now; a controller that fails to give its own is a fault."""
+        supervisor = self._supervisor
+        limits, reading = supervisor.outlet.limits, supervisor.reading
+        standing = self._unknown
+        if supervisor.lifecycle.state is not State.UNCONFIGURED:
             try:
-                standing = machine.steering.standing(now)
+                standing = supervisor.steering.standing(now)
             except Exception as error:
                 text = f"unexpected {type(error).__name__}: {error}"
-                machine.fault(now, "internal", text)
+                supervisor.fault(now, "internal", text)
         return Snapshot(
             time=now,
-            state=machine.lifecycle.state,
-            reason=machine.lifecycle.reason,
-            commanded=machine.commanded,
+            state=supervisor.lifecycle.state,
+            reason=supervisor.lifecycle.reason,
+            commanded=supervisor.commanded,
             measured=reading.pressures,
             measured_time=reading.time,
             low=limits.low,
             high=limits.high,
-            saturated=machine.saturated,
-            samples=machine.samples,
-            rejected=machine.rejected,
-            seen_age=now - standing.seen_time,
-            alarms=machine.alarms.now,
-            timing=self._punctuality.timing(),
-            plan=standing.plan,
-            tip_position=standing.tip_position,
-            tip_quaternion=standing.tip_quaternion,
-            seen_position=standing.seen_position,
-            target_position=standing.target_position,
-            target_quaternion=standing.target_quaternion,
-            target_pointing=standing.target_pointing,
-            position_error=standing.position_error,
-            angle_error=standing.angle_error,
-            stiffness=standing.stiffness,
-            best_stiffness=standing.best_stiffness,
-            disturbance=standing.disturbance,
-            wrench=standing.wrench,
-            task=standing.task,
-            stiffness_unit=standing.stiffness_unit,
+            saturated=supervisor.saturated,
+            samples=supervisor.samples,
+            rejected=supervisor.rejected,
+            alarms=supervisor.alarms.now,
+            timing=self._timing.statistics(),
+            **vars(standing),
         )

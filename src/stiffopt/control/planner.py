@@ -1,7 +1,12 @@
-"""The re-planner beside the control loop.
+"""Planners: whoever makes plans, at once or in a process of its own.
 
-Plans are made one at a time by `Planning`: at once (`InlinePlanner`, for simulated time), or in a
-process beside the loop (`ProcessPlanner`), which is started again when it dies.
+The control loop hands over requests and takes the newest plan. On a simulated clock `InlinePlanner`
+plans at once. In real time `ProcessPlanner` plans in another process, so that neither its computing
+time nor Python's lock delays a tick; when the process dies it is started again.
+
+A tick waits for whatever goes to that process, so that no more is sent than is new: of a request
+the fields that differ from the request before (writing a task takes longer than all the rest), of a
+plan what is not in its request.
 """
 
 from __future__ import annotations
@@ -9,93 +14,99 @@ from __future__ import annotations
 import math
 import os
 import pickle
+import select
 import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
-from typing import Protocol
+from multiprocessing.connection import Connection
+from typing import Any, Protocol
 
-from stiffopt.control.planner_line import PlannerLine
-from stiffopt.control.planning import Planning
-from stiffopt.control.plans import Plan, Request
+import numpy as np
+
+from stiffopt.control.planning import Plan, Planning, PlanRequest
 from stiffopt.control.state import Severity
 from stiffopt.control.steering import Notice
 from stiffopt.errors import StiffoptError
 from stiffopt.model.manipulator import Manipulator
 
-__all__ = ["InlinePlanner", "Planner", "ProcessPlanner"]
+__all__ = ["InlinePlanner", "Planner", "PlannerEnd", "PlanningEnd", "ProcessPlanner", "main"]
 
-_RESTART_AFTER = 1.0  # s
-_PREPARES = 0.5  # s; a new task that takes longer is worth a word
+_RESTART_AFTER = 1.0  # s between two starts of the process
+_PREPARATION = 0.5  # s; a new task that takes longer is reported
+_NICE = 5  # of the process: the control loop comes first
+_ARRAYS = ("offset", "pressure_offset")  # of a request: compared and sent by value, every time
+_OBJECTS = ("serial", "task", "target", "search")  # immutable: compared by identity
 
 
 class Planner(Protocol):
-    """Plans for whoever asks, when it is done."""
+    """Makes the plans of a control loop."""
 
-    def ask(self, request: Request) -> None:
-        """Want a plan; one that was asked for before and is not begun is forgotten."""
+    def request(self, request: PlanRequest) -> None:
+        """Have a plan made; it replaces a request that waits."""
 
     def latest(self) -> Plan | None:
         """Return the newest plan."""
 
     def notices(self) -> tuple[Notice, ...]:
-        """What is wrong with the planner; see `Steering.notices`."""
+        """Return what is wrong with the planner; see `Steering.notices`."""
 
     def close(self) -> None:
-        """End."""
+        """End the planner."""
 
 
 class InlinePlanner:
-    """Plans at once, where it is asked: time stands still meanwhile, as in a simulation."""
+    """Plans within the request, while time stands still, as in a simulation."""
 
     def __init__(self, robot: Manipulator) -> None:
         self._planning = Planning(robot)
         self._plan: Plan | None = None
-        self._trouble: tuple[Notice, ...] = ()
+        self._notices: tuple[Notice, ...] = ()
 
-    def ask(self, request: Request) -> None:
+    def request(self, request: PlanRequest) -> None:
         """Plan."""
         try:
             self._plan = self._planning.plan(request)
-            self._trouble = ()
+            self._notices = ()
         except StiffoptError as error:
-            self._trouble = (Notice("planner", f"the planner failed: {error}", standing=True),)
+            self._notices = (Notice("planner", f"the planner failed: {error}", standing=True),)
 
     def latest(self) -> Plan | None:
         """Return the plan."""
         return self._plan
 
     def notices(self) -> tuple[Notice, ...]:
-        """Say whether the last request failed."""
-        return self._trouble
+        """Return whether the last request failed."""
+        return self._notices
 
     def close(self) -> None:
         """Nothing to end."""
 
 
 class ProcessPlanner:
-    """Plans in a process of its own, so that neither whoever asks nor Python's lock ever waits.
+    """Plans in a process of its own, so that the control loop never waits.
 
-    If planning fails in a way that no one thought of, or the process dies, the last plan stays, an
-    alarm says so, and another process is started.
+    When planning fails unexpectedly or the process dies, the last plan stays, an alarm reports it,
+    and another process is started.
 
     Parameters
     ----------
     robot :
         The arm.
     patience :
-        A plan that takes longer than this is worth an alarm, in s. The first one of a kind may be
+        Duration of a plan beyond which there is an alarm, in s. The first of a kind of task may be
         compiled, which takes seconds.
     """
 
     def __init__(self, robot: Manipulator, patience: float = 5.0) -> None:
         self._robot, self._patience = robot, patience
-        self._wanted: Request | None = None
-        self._serial = -1  # of what was asked last
+        self._waiting: PlanRequest | None = None
+        self._serial = -1  # of the last request that was sent
         self._plan: Plan | None = None
-        self._trouble, self._ended = "", False
+        self._failure, self._closed = "", False
         self._start()
 
     def _start(self) -> None:
@@ -106,23 +117,23 @@ class ProcessPlanner:
                     sys.executable,
                     "-P",
                     "-m",
-                    "stiffopt.control.planner_process",
+                    "stiffopt.control.planner",
                     str(theirs.fileno()),
                 ],
                 pass_fds=(theirs.fileno(),),
                 start_new_session=True,  # a terminal's Ctrl-C is not for it
             )
-        _let_it_yield(self._process.pid)
-        self._line = PlannerLine(ours.detach())
-        self._begun: float | None = math.inf  # busy with itself until it says that it is ready
+        _set_batch_policy(self._process.pid)
+        self._end = PlannerEnd(ours.detach())
+        self._busy_since: float | None = math.inf  # until the process is ready
         self._started_at = time.monotonic()
-        self._line.begin(self._robot)
+        self._end.begin(self._robot)
 
-    def ask(self, request: Request) -> None:
-        """Want a plan."""
-        if self._wanted is not None and self._wanted.serial == request.serial:
-            request = replace(request, anew=self._wanted.anew or request.anew)
-        self._wanted = request
+    def request(self, request: PlanRequest) -> None:
+        """Have a plan made as soon as the process is free."""
+        if self._waiting is not None and self._waiting.serial == request.serial:
+            request = replace(request, search=self._waiting.search or request.search)
+        self._waiting = request
         self._exchange()
 
     def latest(self) -> Plan | None:
@@ -131,12 +142,12 @@ class ProcessPlanner:
         return self._plan
 
     def notices(self) -> tuple[Notice, ...]:
-        """Say whether planning has failed, or takes too long."""
-        begun = self._begun
-        if self._trouble:
-            return (Notice("planner", self._trouble, standing=True),)
-        elapsed = 0.0 if begun is None else time.monotonic() - begun
-        if elapsed > _PREPARES and (self._plan is None or self._plan.serial != self._serial):
+        """Return whether planning has failed, or takes too long."""
+        busy_since = self._busy_since
+        if self._failure:
+            return (Notice("planner", self._failure, standing=True),)
+        elapsed = 0.0 if busy_since is None else time.monotonic() - busy_since
+        if elapsed > _PREPARATION and (self._plan is None or self._plan.serial != self._serial):
             text = (
                 "the optimiser prepares for a new task; the first of a kind is compiled, which "
                 "takes seconds, and until then the pressures stay"
@@ -148,8 +159,8 @@ class ProcessPlanner:
 
     def close(self) -> None:
         """End the process."""
-        self._ended = True
-        self._line.close()  # which ends it
+        self._closed = True
+        self._end.close()  # which ends the process
         try:
             self._process.wait(timeout=1.0)
         except subprocess.TimeoutExpired:
@@ -157,40 +168,169 @@ class ProcessPlanner:
             self._process.wait()
 
     def _exchange(self) -> None:
-        """Take what was planned, and hand over what is wanted if the process is free for it."""
-        if self._ended or (self._begun is None and self._wanted is None):
+        """Receive plans, and send the request that waits if the process is free."""
+        if self._closed or (self._busy_since is None and self._waiting is None):
             return
         try:
-            while self._line.has_answer():
-                answer = self._line.receive()
-                self._begun = None
+            while self._end.has_answer():
+                answer = self._end.receive()
+                self._busy_since = None
                 if isinstance(answer, Plan):
-                    self._plan, self._trouble = answer, ""
-                elif answer is not None:  # None: it is ready
-                    self._trouble = f"the planner failed and begins anew: {answer}"
-            if self._wanted is not None and self._begun is None:
-                self._line.ask(self._wanted)
-                self._serial = self._wanted.serial
-                self._wanted, self._begun = None, time.monotonic()
+                    self._plan, self._failure = answer, ""
+                elif answer is not None:  # None: the process is ready
+                    self._failure = f"the planner failed and begins anew: {answer}"
+            if self._waiting is not None and self._busy_since is None:
+                self._end.send(self._waiting)
+                self._serial = self._waiting.serial
+                self._waiting, self._busy_since = None, time.monotonic()
         except (OSError, EOFError, pickle.UnpicklingError):
             self._start_again()
 
     def _start_again(self) -> None:
-        self._trouble = "the planner died and is started again; the last plan stays"
+        self._failure = "the planner died and is started again; the last plan stays"
         if time.monotonic() - self._started_at < _RESTART_AFTER:
             return
-        self._line.close()
+        self._end.close()
         self._process.kill()
         self._process.wait()
         self._start()
 
 
-def _let_it_yield(process: int) -> None:
-    """Let a process not interrupt whoever wakes it, where the system can be told so.
+def _set_batch_policy(process: int) -> None:
+    """Schedule a process as SCHED_BATCH, where the system has that.
 
-    It is woken by each request, and would plan at once, for milliseconds, on the very processor on
-    which the control loop is in the middle of a tick. It also loses the loop's real-time priority,
-    which it has got if the loop itself started it.
+    A request wakes it. It would otherwise pre-empt the control loop in the middle of that tick and
+    plan for milliseconds on the same processor. It also gives up the loop's real-time priority,
+    which it inherits if the loop started it.
     """
     with suppress(AttributeError, OSError):
         os.sched_setscheduler(process, os.SCHED_BATCH, os.sched_param(0))
+
+
+class PlannerEnd:
+    """The control loop's end of the connection; a call raises `OSError` if the other is closed.
+
+    Parameters
+    ----------
+    handle :
+        File descriptor of the connection, which belongs to this end from now on.
+
+    Attributes
+    ----------
+    has_answer :
+        Returns whether there is something to receive, if only that the other end is closed.
+    """
+
+    def __init__(self, handle: int) -> None:
+        self._connection = Connection(handle)
+        self.has_answer = _readiness(self._connection)
+        self._sent: PlanRequest | None = None
+
+    def begin(self, robot: Manipulator) -> None:
+        """Send the arm to plan for; the first answer is None."""
+        self._connection.send(robot)
+
+    def send(self, request: PlanRequest) -> None:
+        """Send a request; the one before must have been answered."""
+        before = self._sent
+        news: dict[str, Any] = {
+            name: getattr(request, name)
+            for name in _OBJECTS
+            if before is None or getattr(request, name) is not getattr(before, name)
+        }
+        for name in _ARRAYS:  # as lists: pickling an array takes twenty times as long
+            news[name] = getattr(request, name).tolist()
+        self._connection.send_bytes(pickle.dumps(news, pickle.HIGHEST_PROTOCOL))
+        self._sent = request
+
+    def receive(self) -> Plan | str | None:
+        """Receive a plan, or why there is none; None when the process is ready.
+
+        Raises
+        ------
+        EOFError
+            The other end is closed.
+        """
+        answer: dict[str, Any] | str | None = self._connection.recv()
+        request = self._sent
+        if request is None or answer is None or isinstance(answer, str):
+            return None if answer is None else str(answer)
+        return Plan(
+            serial=request.serial,
+            pressures=np.array(answer.pop("pressures")),
+            offset=request.offset,
+            target=request.target,
+            **answer,
+        )
+
+    def close(self) -> None:
+        """Close the connection, which ends the process."""
+        self._connection.close()
+
+
+class PlanningEnd:
+    """The process's end of the connection; `EOFError` and `OSError`: the other end is closed.
+
+    Parameters
+    ----------
+    handle :
+        File descriptor of the connection.
+    """
+
+    def __init__(self, handle: int) -> None:
+        self._connection = Connection(handle)
+        self._fields: dict[str, Any] = {}
+
+    def robot(self) -> Manipulator:
+        """Receive the arm to plan for."""
+        robot: Manipulator = self._connection.recv()
+        return robot
+
+    def request(self) -> PlanRequest:
+        """Receive a request."""
+        self._fields.update(self._connection.recv())
+        arrays = {name: np.array(self._fields[name]) for name in _ARRAYS}
+        return PlanRequest(**{**self._fields, **arrays})
+
+    def answer(self, answer: Plan | str | None) -> None:
+        """Send the plan for the last request, or why there is none; None: the process is ready."""
+        if isinstance(answer, Plan):
+            self._connection.send(
+                {
+                    "pressures": answer.pressures.tolist(),
+                    "reached": answer.reached,
+                    "stiffness": answer.stiffness,
+                    "message": answer.message,
+                }
+            )
+        else:
+            self._connection.send(answer)
+
+
+def _readiness(connection: Connection) -> Callable[[], bool]:
+    """Return a function that returns whether a connection has something to receive."""
+    if not hasattr(select, "poll"):
+        return connection.poll  # makes a selector each time, which takes many times as long
+    poll = select.poll()
+    poll.register(connection.fileno(), select.POLLIN)  # errors are reported in any case
+    return lambda: bool(poll.poll(0))
+
+
+def main(end: PlanningEnd) -> None:
+    """Answer requests with plans, or with the reason why there is none, until the end is closed."""
+    robot = end.robot()
+    planning = Planning(robot)
+    end.answer(None)
+    while True:
+        request = end.request()
+        try:
+            end.answer(planning.plan(request))
+        except Exception as error:  # whatever it is, the next request may succeed
+            end.answer(f"{type(error).__name__}: {error}")
+            planning = Planning(robot)
+
+
+if __name__ == "__main__":
+    os.nice(_NICE)
+    with suppress(EOFError, OSError, KeyboardInterrupt):
+        main(PlanningEnd(int(sys.argv[1])))

@@ -1,59 +1,104 @@
-"""Making plans: which pressures are best for the target, as far off as the arm is found to be.
+"""Plans: the best pressures for a target, given by how much the tip is off the model.
 
-The arm's tip is found beside where the model has it, by an offset.  A target moved back by that
-offset, given to the optimiser, yields pressures that are the stiffest on the arm as it is, but for
-how stiffness itself is off.  The plan is the local optimum next to the last one; if the offset has
-changed much and the arm is at rest, all configurations are searched again, and the arm leaves its
-own only for one that is clearly better.
+The target, moved back by the tip's offset, is what the model has to reach. The optimiser then finds
+the pressures that are stiffest on the arm as it is, but for errors of the modelled stiffness. A
+plan is the local optimum next to the last plan. When the offset has changed much and the arm is at
+rest, all configurations are searched again, and the arm leaves its own only for one that is clearly
+better. For a target that is out of reach, the plan is the configuration nearest to it.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
+import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.closest import closest
-from stiffopt.control.plans import Plan, Request
+from stiffopt.control.tip_errors import TipErrors
+from stiffopt.control.tuning import FeedbackTuning, NearestTuning, PlanningTuning
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target, Tolerance
+from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipModel
 
-__all__ = ["Planning", "moved_back"]
+__all__ = ["NearestSearch", "Plan", "PlanRequest", "Planning", "model_target"]
 
 Array = NDArray[np.float64]
 
-_CLEARLY = 0.02  # by which share a configuration must be stiffer to be worth a move
-_MUCH = 2e-3  # m; change of the offset after which all is searched again
-_STILL = 5e-5  # m from plan to plan; more, and the arm is not at rest
-_NEAR = 2e4  # Pa; an answer that is farther from the last plan is another configuration
-_FAR_PER_METRE = 2e7  # Pa/m; the same for each metre that the target has moved
-_PATIENCE = 20  # plans
-_EXACT = Tolerance(position=1e-5, angle=1e-3)
+_BAR = 1e5
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """Everything that a plan is made for.
+
+    Attributes
+    ----------
+    serial : number of the task; a plan for an earlier one is discarded.
+    task : stiffness goal and limits.
+    target : takes the place of the task's own.
+    offset : tip pose relative to the model's (6,), in m and rad (rotation vector), base axes.
+    pressure_offset : effective pressures relative to commands (n,), in Pa.
+    search : whether all configurations are to be searched, as for a new target.
+    """
+
+    serial: int
+    task: Task
+    target: Target
+    offset: Array
+    pressure_offset: Array
+    search: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Pressures for a target.
+
+    Attributes
+    ----------
+    serial : of the request.
+    pressures : effective (n,), in Pa.
+    offset : of the tip (6,), for which the plan was made.
+    target : of the request.
+    reached : whether the model reaches it.
+    stiffness : along the task's first direction; NaN where it names none.
+    message : why it is not reached.
+    """
+
+    serial: int
+    pressures: Array
+    offset: Array
+    target: Target
+    reached: bool
+    stiffness: float
+    message: str
 
 
 class Planning:
-    """Makes plans, each from the one before.
+    """Makes plans, each from the last one.
 
     Parameters
     ----------
     robot :
         The arm.
+    tuning :
+        When a plan may change to another configuration.
     """
 
-    def __init__(self, robot: Manipulator) -> None:
-        self._robot = robot
-        self._tip = TipModel(robot)
+    def __init__(self, robot: Manipulator, tuning: PlanningTuning | None = None) -> None:
+        self._robot, self._tuning = robot, tuning or PlanningTuning()
+        self._search = NearestSearch(TipModel(robot), FeedbackTuning().lever)
         self._serial = -1
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
-        self._advantage, self._misses = _CLEARLY, 0
+        self._advantage, self._refused = self._tuning.advantage, 0
 
-    def plan(self, request: Request) -> Plan:
-        """Answer a request.
+    def plan(self, request: PlanRequest) -> Plan:
+        """Return the plan for a request.
 
         Raises
         ------
@@ -61,128 +106,197 @@ class Planning:
             The optimiser could not be run.
         """
         if request.serial != self._serial or self._last is None:
-            exact = request.target.model_copy(update={"tolerance": _EXACT})
+            exact = request.target.model_copy(update={"tolerance": _tolerance(self._tuning)})
             self._solver = PressureSolver(
                 self._robot, request.task.model_copy(update={"target": exact})
             )
             self._is_compiled = self._solver.is_compiled
             self._serial, self._last = request.serial, None
-        target = moved_back(request.target, request.offset)
-        self._limits = self._left(request.beside)
+        target = model_target(request.target, request.offset, self._tuning)
+        self._limits = self._effective_limits(request.pressure_offset)
         last = self._last
-        if last is None or request.anew:
-            self._searched_at, self._advantage, self._misses = request.offset, _CLEARLY, 0
-            solution = self._solved(target, None)
+        if last is None or request.search:
+            self._searched_at = request.offset
+            self._advantage, self._refused = self._tuning.advantage, 0
+            solution = self._solve(target, None)
         else:
             solution = self._next_to(last, target)
             solution = self._better(request, target, solution, last) if solution else None
         if solution is not None and solution.pressures is not None:
             pressures = np.array(solution.pressures, dtype=float)
-            stiffness = _value(solution.stiffness, math.nan)
+            stiffness = math.nan if solution.stiffness is None else float(solution.stiffness)
             self._last = Plan(
                 request.serial, pressures, request.offset, request.target, True, stiffness, ""
             )
         else:
-            self._last = self._closest(request, target)
+            self._last = self._nearest(request, target)
         return self._last
 
-    def _left(self, beside: Array) -> tuple[Array, Array]:
-        """Limits (n,) each, of pressures that act: those for which there are commands.
+    def _effective_limits(self, offset: Array) -> tuple[Array, Array]:
+        """Limits (n,) of effective pressures that some permitted command has, in Pa.
 
-        What is beside the commands never widens them; the model ends there.
+        The offset never widens the task's limits, beyond which the model does not hold.
         """
         lower, upper = self._solver.task.pressure_bounds(self._robot.description)
-        left = np.maximum(lower, lower + beside), np.minimum(upper, upper + beside)
-        return (lower, upper) if (left[0] > left[1]).any() else left
+        shifted = np.maximum(lower, lower + offset), np.minimum(upper, upper + offset)
+        return (lower, upper) if (shifted[0] > shifted[1]).any() else shifted
 
     def _next_to(self, last: Plan, target: Target) -> PressureSolution | None:
-        """The optimum next to the last plan; another one only if that is not to be had for long."""
-        solution = self._solved(target, last.pressures)
+        """The optimum next to the last plan; another one once it has stayed the answer for long."""
+        solution = self._solve(target, last.pressures)
         if solution is None or solution.pressures is None:
             return None
-        way = float(np.max(np.abs(solution.pressures - last.pressures)))
-        if way <= _NEAR + _FAR_PER_METRE * float(np.linalg.norm(_shift(last, target))):
-            self._misses = 0
+        t = self._tuning
+        distance = float(np.max(np.abs(solution.pressures - last.pressures)))
+        displacement = float(np.linalg.norm(self._displacement(last, target)))
+        if distance <= t.neighbourhood + t.neighbourhood_per_metre * displacement:
+            self._refused = 0
             return solution
-        self._misses += 1
-        if self._misses <= _PATIENCE:
+        self._refused += 1
+        if self._refused <= t.patience:
             return None
-        self._misses = 0
+        self._refused = 0
         return solution
 
     def _better(
-        self, request: Request, target: Target, solution: PressureSolution, last: Plan
+        self, request: PlanRequest, target: Target, solution: PressureSolution, last: Plan
     ) -> PressureSolution:
-        """The stiffest configuration, where things have changed and the arm is at rest.
+        """The stiffest configuration, if the offset has changed and the arm is at rest.
 
-        Each change of configuration makes the next one harder: on another one the offset is
-        another, and so may the choice be.
+        Each change of configuration makes the next one harder, since the offset, and with it the
+        choice, may be different in each configuration.
         """
         changed = float(np.linalg.norm((request.offset - self._searched_at)[:3]))
         drift = float(np.linalg.norm((request.offset - last.offset)[:3]))
-        if changed <= _MUCH or drift > _STILL:
+        if changed <= self._tuning.search_offset or drift > self._tuning.at_rest:
             return solution
         self._searched_at = request.offset
-        other = self._solved(target, None)
+        other = self._solve(target, None)
         if other is None or other.pressures is None:
             return solution
-        if _value(other.stiffness) <= (1 + self._advantage) * _value(solution.stiffness):
+        if (other.stiffness or 0.0) <= (1 + self._advantage) * (solution.stiffness or 0.0):
             return solution
         self._advantage *= 2
         return other
 
-    def _solved(self, target: Target, guess: Array | None) -> PressureSolution | None:
-        """Answer of the optimiser; None if it has none that holds, soon."""
+    def _solve(self, target: Target, guess: Array | None) -> PressureSolution | None:
+        """The optimiser's solution; None where it has none that holds, soon enough."""
         if self._is_compiled:
             return self._solver.solve_at_once(target, guess, self._limits)
         solution = self._solver.solve(target, guess)
         return solution if solution.found else None
 
-    def _closest(self, request: Request, target: Target) -> Plan:
-        """Plan for a target that is out of reach, or whose stiffness cannot be had there."""
+    def _nearest(self, request: PlanRequest, target: Target) -> Plan:
+        """Plan for a target that is out of reach, or cannot be had with the stiffness required."""
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
             start = np.clip(self._last.pressures, *self._limits)
-        pressures, away, turned = closest(self._tip, target, self._limits, start)
+        pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = request.task.target.tolerance
-        if away <= tolerance.position and turned <= tolerance.angle:
+        if distance <= tolerance.position and angle <= tolerance.angle:
             message = "the pose can be reached, but not with the stiffness that is asked for"
         else:
-            message = f"the nearest pose is {1e3 * away:.1f} mm away"
-            if turned > tolerance.angle:
-                message += f" and {math.degrees(turned):.1f} deg"
+            message = f"the nearest pose is {1e3 * distance:.1f} mm away"
+            if angle > tolerance.angle:
+                message += f" and {math.degrees(angle):.1f} deg"
         return Plan(
-            serial=request.serial,
-            pressures=pressures,
-            offset=request.offset,
-            target=request.target,
-            reached=False,
-            stiffness=math.nan,
-            message=message,
+            request.serial, pressures, request.offset, request.target, False, math.nan, message
         )
 
+    def _displacement(self, last: Plan, target: Target) -> Array:
+        """Displacement (3,) of the model's target from that of the last plan, in m."""
+        before = model_target(last.target, last.offset, self._tuning).position
+        if before is None or target.position is None:
+            return np.zeros(3)
+        pairs = zip(before, target.position, strict=True)
+        return np.array([0.0 if a is None or b is None else b - a for a, b in pairs])
 
-def moved_back(target: Target, offset: Array) -> Target:
-    """What the model has to reach, for an arm whose tip is off by an offset (6,) to reach a target.
+
+def model_target(target: Target, offset: Array, tuning: PlanningTuning | None = None) -> Target:
+    """Return the target that the model has to reach for the arm to reach a target.
 
     Parameters
     ----------
     target :
         Of the arm.
     offset :
-        In m and rad (rotation vector), base axes.
+        Tip pose of the arm relative to the model's (6,), in m and rad (rotation vector), base axes.
+    tuning :
+        Its tolerances.
     """
-    return target.moved_back(offset).model_copy(update={"tolerance": _EXACT})
+    update = {"tolerance": _tolerance(tuning or PlanningTuning())}
+    return target.moved_back(offset).model_copy(update=update)
 
 
-def _shift(last: Plan, target: Target) -> Array:
-    """By how much a target for the model differs from the one of the last plan, in m."""
-    before = moved_back(last.target, last.offset).position
-    if before is None or target.position is None:
-        return np.zeros(3)
-    pairs = zip(before, target.position, strict=True)
-    return np.array([0.0 if a is None or b is None else b - a for a, b in pairs])
+def _tolerance(tuning: PlanningTuning) -> Tolerance:
+    return Tolerance(position=tuning.position_tolerance, angle=tuning.angle_tolerance)
 
 
-def _value(stiffness: float | None, otherwise: float = 0.0) -> float:
-    return otherwise if stiffness is None else float(stiffness)
+class NearestSearch:
+    """Finds the pressures nearest to a target that is out of reach, soon enough for a loop.
+
+    Gauss-Newton on the squared pose error with the weight of angles that feedback uses, within the
+    limits of pressure.
+
+    Parameters
+    ----------
+    tip :
+        The model.
+    lever :
+        Weight of angles, in m/rad.
+    tuning :
+        Of the search.
+    """
+
+    def __init__(self, tip: TipModel, lever: float, tuning: NearestTuning | None = None) -> None:
+        self._tip, self._lever, self._tuning = tip, lever, tuning or NearestTuning()
+        self._errors = TipErrors()
+
+    def find(
+        self, target: Target, bounds: tuple[Array, Array], start: Array
+    ) -> tuple[Array, float, float]:
+        """Return the local optimum next to some pressures.
+
+        Parameters
+        ----------
+        target :
+            Of the model.
+        bounds :
+            Lower and upper limits (n,), in Pa.
+        start :
+            Pressures (n,), in Pa.
+
+        Returns
+        -------
+        Pressures (n,) in Pa, and the position and angle errors there, in m and rad.
+        """
+        tuning = self._tuning
+        low, high = bounds[0] / _BAR, bounds[1] / _BAR
+        x = np.clip(start / _BAR, low, high)
+        error, rows, distance, angle = self._error(target, x)
+        no_rows, max_step = np.zeros((0, len(x))), tuning.max_step / _BAR
+        for _ in range(tuning.iterations):
+            J = rows * _BAR
+            H = J.T @ J + tuning.regularisation**2 * np.eye(len(x))
+            lower, upper = np.maximum(low - x, -max_step), np.minimum(high - x, max_step)
+            step, *_ = daqp.solve(H * 1e6, J.T @ error * 1e6, no_rows, upper, lower)
+            if step is None or not np.isfinite(step).all():
+                break
+            share, value = 1.0, float(error @ error)
+            while share > 1e-3:
+                trial = np.clip(x + share * np.asarray(step), low, high)
+                found = self._error(target, trial)
+                if float(found[0] @ found[0]) < value:
+                    break
+                share *= 0.5
+            else:
+                break
+            x = trial
+            error, rows, distance, angle = found
+            if math.sqrt(value) - float(np.linalg.norm(error)) < tuning.progress:
+                break
+        result: Array = x * _BAR
+        return result, distance, angle
+
+    def _error(self, target: Target, x: Array) -> tuple[Array, Array, float, float]:
+        return self._errors.weighted(target, self._tip.at(x * _BAR), self._lever)

@@ -1,13 +1,14 @@
-"""From where the plan jumps to, to a reference that the arm can follow without swinging.
+"""The reference: a smooth path from the present pressures to those of the plan.
 
-The plan (pressures, and the offset of the tip that it counts with) goes through a limit of slew and
-four equal lags ``a / (s + a)``, which leave a path x(t) with three derivatives.  What has to be
-commanded for the arm to be on this path is ::
+Plans jump. Their pressures, and the offset of the tip that goes with them, pass a limit of slew and
+four equal lags ``a / (s + a)``, which leave a path x(t) with three derivatives. The command that
+makes the arm follow this path is ::
 
     x_command = (1 + tau s) (1 + 2 zeta / omega s + s^2 / omega^2) x,
 
-the inverse of regulators and first bending mode, one dead time early.  All channels have the same
-filter, so that they reach their goal together on a straight way, whatever the tip does between.
+the inverse of regulators and first bending mode, one dead time early. All channels have the same
+filter, so that they follow a straight line in the space of pressures, on which no limit can be
+violated, and reach the plan together.
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ __all__ = ["Reference"]
 Array = NDArray[np.float64]
 
 _LAGS = 4
-# of the levels: the last one, and its derivatives in units of the rate
+# of the lags' states: the last one, and its derivatives in units of the rate
 _DIFFERENCES = np.array(
     [[0, 0, 0, 0, 1], [0, 0, 0, 1, -1], [0, 0, 1, -2, 1], [0, 1, -3, 3, -1]], dtype=float
 )
 
 
 class Reference:
-    """A smooth way to the plan, for n pressures and m numbers that go with them.
+    """The path to the plan, of n pressures and m numbers that go with them.
 
     Parameters
     ----------
@@ -43,9 +44,11 @@ class Reference:
     lag :
         Of the regulators, in s.
     damping :
-        Share of critical damping of the vibration.
-    beside :
+        Damping ratio of the vibration.
+    extra :
         m.
+    slew_share :
+        Share of the slew that the reference may take; the rest is for feedback.
 
     Attributes
     ----------
@@ -56,53 +59,59 @@ class Reference:
     motion : ndarray
         The path now and its first three derivatives by time (4, n + m), in s.
     command, chamber : ndarray
-        Pressures (n,) to command, and those in the chambers when they take effect, in Pa.
+        Pressures (n,) to be commanded, and those in the chambers when the command acts, in Pa.
     """
 
     def __init__(
-        self, period: float, slew: Array, lag: float, damping: float = 0.0, beside: int = 0
+        self,
+        period: float,
+        slew: Array,
+        lag: float,
+        damping: float = 0.0,
+        extra: int = 0,
+        slew_share: float = 0.9,
     ) -> None:
         self._period, self._lag, self._damping = period, lag, damping
-        self._step = _step(slew * period, beside)
-        self._told: tuple[float, float] | None = None  # rate and omega of what follows
-        self._constants: tuple[Array, ...] = ()
+        self._step = _step(slew * period, extra, slew_share)
+        self._filter_of: tuple[float, float] | None = None  # rate and omega
+        self._filter: tuple[Array, ...] = ()
         self.rate, self.omega = 1.0, math.inf
-        self.begin(np.zeros(len(slew) + beside))
+        self.begin(np.zeros(len(slew) + extra))
 
     def begin(self, values: Array) -> None:
         """Start anew, at rest at pressures and what goes with them (n + m,)."""
-        self._levels = np.tile(values, (_LAGS + 1, 1))
-        self.motion = np.concatenate([self._levels[-1:], np.zeros((_LAGS - 1, len(values)))])
+        self._states = np.tile(values, (_LAGS + 1, 1))
+        self.motion = np.concatenate([self._states[-1:], np.zeros((_LAGS - 1, len(values)))])
 
     @property
     def delay(self) -> float:
-        """By how much the path is later than the plan, in s."""
+        """Delay of the path behind the plan, in s."""
         return _LAGS / self.rate
 
     @property
     def path(self) -> Array:
-        """Where the path is now (n + m,)."""
+        """The path now (n + m,)."""
         value: Array = self.motion[0]
         return value
 
     def advance(self, plan: Array) -> None:
         """Take a step towards a plan (n + m,)."""
-        if self._told != (self.rate, self.omega):
-            self._told, self._constants = (self.rate, self.omega), self._computed()
-        self._levels, self.motion, self.command, self.chamber = self._step(
-            self._levels, plan, *self._constants
+        if self._filter_of != (self.rate, self.omega):
+            self._filter_of, self._filter = (self.rate, self.omega), self._matrices()
+        self._states, self.motion, self.command, self.chamber = self._step(
+            self._states, plan, *self._filter
         )
 
-    def _computed(self) -> tuple[Array, ...]:
-        """What a step does to the levels (5, 5) while the first stays; see `_step`."""
+    def _matrices(self) -> tuple[Array, ...]:
+        """Transition matrix (5, 5) under a constant input, and weights; see `_step`."""
         a, x = self.rate, self.rate * self._period
-        # a step of the first of k lags in a row has gone through the last by 1 - sum of these
-        parts = [math.exp(-x) * x**k / math.factorial(k) for k in range(_LAGS)]
+        # the step response of k lags in series is 1 less the sum of the first k of these
+        terms = [math.exp(-x) * x**k / math.factorial(k) for k in range(_LAGS)]
         M = np.eye(_LAGS + 1)
         for i in range(1, _LAGS + 1):
-            M[i, 0] = 1 - sum(parts[:i])
+            M[i, 0] = 1 - sum(terms[:i])
             for k in range(i):
-                M[i, i - k] = parts[k]
+                M[i, i - k] = terms[k]
         c1, c2, tau = 2 * self._damping / self.omega, 1 / self.omega**2, self._lag
         return (
             M,
@@ -112,25 +121,26 @@ class Reference:
         )
 
 
-def _step(most: Array, beside: int) -> Formula:
-    """Levels (5, n + m) and motion after a step, and pressures (n,) to command and in the chambers.
+def _step(reach: Array, extra: int, slew_share: float) -> Formula:
+    """States (5, n + m), motion (4, n + m), command and chamber (n,) after a step.
 
-    From levels, the plan, what a step does (5, 5), differences (4, 5), and weights (4,) of the
-    motion in the command and in the chambers; n pressures may change by `most` in a step.
+    Inputs: states, whose first is the input of the lags; the plan (n + m,); transition matrix (5,
+    5); differences (4, 5); weights (4,) of the motion in command and chamber. The n pressures
+    change by at most `slew_share` of `reach` in a step.
     """
-    n = len(most)
-    levels, plan = ca.SX.sym("levels", _LAGS + 1, n + beside), ca.SX.sym("plan", n + beside)
+    n = len(reach)
+    states, plan = ca.SX.sym("states", _LAGS + 1, n + extra), ca.SX.sym("plan", n + extra)
     transition = ca.SX.sym("transition", _LAGS + 1, _LAGS + 1)
     differences = ca.SX.sym("differences", _LAGS, _LAGS + 1)
     command, chamber = ca.SX.sym("command", _LAGS), ca.SX.sym("chamber", _LAGS)
-    away = plan.T - levels[0, :]
-    # the share of the way that the slowest channel can go
-    needed = ca.mmax(ca.fabs(away[:n]).T / ca.DM(most))
-    share = ca.if_else(needed > 0.9, 0.9 / needed, 1)
-    begun = ca.vertcat(levels[0, :] + share * away, levels[1:, :])
+    way = plan.T - states[0, :]
+    # all channels go the share of their way that the slowest one can go in a step
+    needed = ca.mmax(ca.fabs(way[:n]).T / ca.DM(reach))
+    share = ca.if_else(needed > slew_share, slew_share / needed, 1)
+    begun = ca.vertcat(states[0, :] + share * way, states[1:, :])
     after = transition @ begun
     motion = differences @ after
     pressures = motion[:, :n].T
-    inputs = [levels, plan, transition, differences, command, chamber]
+    inputs = [states, plan, transition, differences, command, chamber]
     outputs = [after, motion, pressures @ command, pressures @ chamber]
-    return Formula(inputs, outputs, [levels, after, motion])
+    return Formula(inputs, outputs, [states, after, motion])

@@ -1,8 +1,18 @@
-"""Where the pressures are on their way to the commands, and where they will be.
+"""Pressures in the chambers, estimated from commands and readings, and those that act on the arm.
 
-Each regulator follows its set-point after a dead time, as a first-order lag ``tau x' = u + b - x``
-of limited slew.  Readings correct x and the offset b, so that a regulator that saturates, leaks or
-is off by a little is taken for where it is, not for where it should be.
+Each regulator follows its set-point after a dead time, as a first-order lag of limited slew::
+
+    tau x' = u + b - x
+
+Readings correct the pressure x and the offset b, so that a regulator that saturates, leaks or is
+slightly off is modelled where it is and not where it should be. An arm with hysteresis or creep
+then has the shape of another pressure, the effective one (`stiffopt.model.history`).
+
+The discrete lag ``x += (1 - exp(-h / tau)) (u - x)``, limited by the slew, stands in four places
+that must not share code: here with readings as feedback; in `stiffopt.safety.expected_pressure` as
+a bound that no reading may move; in the simulated plant, as what the others are tested against; and
+in `stiffopt.model.history`, exact for steps of any length, for calibration. A test holds them
+equal where they describe the same regulator.
 """
 
 from __future__ import annotations
@@ -14,17 +24,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.formula import Formula
+from stiffopt.control.tuning import RegulatorTuning
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.history import History, Memory
+from stiffopt.rig.settings import ControlSettings
 
-__all__ = ["RegulatorModel"]
+__all__ = ["PressureEstimator", "RegulatorModel"]
 
 Array = NDArray[np.float64]
 
-_TRUST = 30.0  # 1/s, at which a reading corrects the pressure
-_LEARN = 225.0  # 1/s^2, at which it corrects the offset
-
 
 class RegulatorModel:
-    """Pressures of n channels, followed in equal steps.
+    """Pressures behind the regulators of n channels, estimated in equal steps.
 
     Parameters
     ----------
@@ -34,23 +45,32 @@ class RegulatorModel:
         Of the regulators (n,), in s.
     slew :
         Greatest rate of change (n,), in Pa/s.
+    tuning :
+        Observer gains.
 
     Attributes
     ----------
     pressures : ndarray
-        (n,) now, in Pa.
+        Now (n,), in Pa.
     ahead : ndarray
-        (n,) a dead time from now, which no further command can change, in Pa.
+        A dead time from now (n,), in Pa; no further command can change them.
     offset : ndarray
-        (n,) by which the pressures end beside the commands, in Pa.
+        Offset b (n,), in Pa: settled pressures relative to commands.
     """
 
-    def __init__(self, period: float, lag: ArrayLike, dead_time: float, slew: Array) -> None:
+    def __init__(
+        self,
+        period: float,
+        lag: ArrayLike,
+        dead_time: float,
+        slew: Array,
+        tuning: RegulatorTuning | None = None,
+    ) -> None:
         n = len(slew)
         lags = np.broadcast_to(np.asarray(lag, dtype=float), n)
         share = 1 - np.exp(-period / np.maximum(lags, 1e-6))
         self._depth = round(dead_time / period) + 1
-        self._step = _step(share, slew * period, self._depth, period)
+        self._step = _step(share, slew * period, self._depth, period, tuning or RegulatorTuning())
         self.begin(np.zeros(n))
 
     def begin(self, pressures: Array) -> None:
@@ -60,11 +80,11 @@ class RegulatorModel:
         self._sent = np.tile(pressures, (self._depth, 1))  # the next to arrive comes first
 
     def advance(self, commanded: Array, reading: Array) -> Array:
-        """Take a step in which (n,) was commanded, at whose end (n,) is read; NaN: not measured.
+        """Take a step with commands (n,) and, at its end, readings (n,); NaN: not measured.
 
         Returns
         -------
-        Pressures (n,) now, in Pa.
+        Pressures (n,) at the end of the step, in Pa.
         """
         sent = self._sent
         sent[:-1] = sent[1:]
@@ -75,21 +95,137 @@ class RegulatorModel:
         return self.pressures
 
 
-def _step(share: Array, most: Array, depth: int, period: float) -> Formula:
-    """Pressures, offset and pressures ahead (n,) each, from those, commands (depth, n), reading."""
+class PressureEstimator:
+    """Commanded, chamber and effective pressures of an arm, step by step.
+
+    Parameters
+    ----------
+    robot :
+        Its history, if it has one: hysteresis, creep, and a lag that replaces the regulators'.
+    control :
+        Lag and dead time of the regulators.
+    period :
+        Of the steps, in s.
+    slew :
+        Greatest rate of change (n,), in Pa/s.
+    tuning :
+        Of the regulators' model.
+
+    Attributes
+    ----------
+    lag, dead_time : float
+        Mean lag of all channels, and dead time, in s.
+    command, chamber, effective : ndarray
+        Pressures (n,) that were commanded last, that are in the chambers, and that would give a
+        settled arm its present shape, in Pa.
+    """
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        control: ControlSettings,
+        period: float,
+        slew: Array,
+        tuning: RegulatorTuning,
+    ) -> None:
+        lag, self.dead_time = _regulation(robot, control)
+        self.lag = float(np.mean(lag))
+        self._robot, self._period = robot, period
+        self._max_compensation = tuning.max_compensation
+        self._regulators = RegulatorModel(period, lag, self.dead_time, slew, tuning)
+        self.begin()
+
+    def begin(self) -> None:
+        """Start anew with a vented arm."""
+        zero = np.zeros(self._robot.n_pressures)
+        self._memory = _memory(self._robot)
+        self._regulators.begin(zero)
+        self.command, self.chamber, self.effective = zero, zero, zero
+
+    def advance(self, steps: int, commanded: Array, reading: Array) -> None:
+        """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
+        for _ in range(steps):
+            self.chamber = self._regulators.advance(commanded, reading)
+        self.command = commanded.copy()
+        self.effective = self.chamber
+        if self._memory is not None:
+            self.effective = self._memory.advance(steps * self._period, self.chamber)
+
+    @property
+    def history_offset(self) -> Array:
+        """Effective pressures relative to those in the chambers (n,), in Pa."""
+        result: Array = self.effective - self.chamber
+        return result
+
+    @property
+    def command_offset(self) -> Array:
+        """Settled effective pressures relative to commands (n,), in Pa.
+
+        The offset of a regulator is part of it as far as commands may compensate it.
+        """
+        most = self._max_compensation
+        regulators = np.minimum(np.maximum(self._regulators.offset, -most), most)
+        result: Array = self.history_offset + regulators
+        return result
+
+    @property
+    def effective_ahead(self) -> Array:
+        """Effective pressures a dead time from now (n,), in Pa."""
+        result: Array = self._regulators.ahead + self.history_offset
+        return result
+
+
+def _step(
+    share: Array, reach: Array, depth: int, period: float, tuning: RegulatorTuning
+) -> Formula:
+    """Pressures, offset and pressures ahead (n,) each after a step.
+
+    Inputs are pressures and offset (n,), the commands under way (depth, n) and readings (n,).
+    """
     n = len(share)
     x, offset, reading = ca.SX.sym("x", n), ca.SX.sym("offset", n), ca.SX.sym("reading", n)
     sent = ca.SX.sym("sent", depth, n)
 
-    def moved(x: Any, offset: Any, command: Any) -> Any:
+    def lagged(x: Any, offset: Any, command: Any) -> Any:
         change = ca.DM(share) * (command.T + offset - x)
-        return x + ca.fmin(ca.fmax(change, -ca.DM(most)), ca.DM(most))
+        return x + ca.fmin(ca.fmax(change, -ca.DM(reach)), ca.DM(reach))
 
-    now = moved(x, offset, sent[0, :])
+    now = lagged(x, offset, sent[0, :])
     error = ca.if_else(ca.fabs(reading) < np.inf, reading - now, 0)  # NaN is not less
-    offset_after = offset + _LEARN * period**2 * error / ca.DM(share)
-    now = now + min(1.0, _TRUST * period) * error
+    offset_after = offset + tuning.offset_gain * period**2 * error / ca.DM(share)
+    now = now + min(1.0, tuning.pressure_gain * period) * error
     ahead = now
     for k in range(1, depth):
-        ahead = moved(ahead, offset_after, sent[k, :])
+        ahead = lagged(ahead, offset_after, sent[k, :])
     return Formula([x, offset, sent, reading], [now, offset_after, ahead], [sent])
+
+
+def _regulation(robot: RobotDescription, control: ControlSettings) -> tuple[Array, float]:
+    """Lags (n,) and dead time in s, of the robot file where it knows them, else of the rig.
+
+    The control loop needs the likeliest values; `safety.expected_pressure` takes the slowest.
+    """
+    lags, dead_time = [], control.regulator_dead_time
+    for segment in robot.segments:
+        history = segment.history
+        own = history is not None and history.lag > 0
+        lags += [history.lag if own and history else control.regulator_lag] * segment.n_channels
+        if own and history is not None:
+            dead_time = history.dead_time or dead_time
+    return np.array(lags), dead_time
+
+
+def _memory(robot: RobotDescription) -> Memory | None:
+    """Hysteresis and creep of a rested arm, without lags, which the regulators' model has."""
+    histories: list[History | None] = []
+    places: list[int] = []
+    for segment in robot.segments:
+        history = segment.history
+        if history is not None:
+            without_lag = {"lag": 0.0, "lag_falling": 0.0, "dead_time": 0.0}
+            history = history.model_copy(update=without_lag)
+        histories += [history] * segment.n_channels
+        places += list(range(segment.n_channels))
+    if not any(history is not None and history.parts for history in histories):
+        return None
+    return Memory(histories, places)

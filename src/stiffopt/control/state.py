@@ -1,18 +1,31 @@
-"""What the control loop says of itself: its state, what happened, and how things stand."""
+"""The state of the control loop: every field of it is defined here, and only here.
+
+A field's definition is its line in one of the dataclasses below: its type, and a `Shown` that says
+what it means, in which unit, and where it is shown. The HTTP and WebSocket interface, the client,
+recordings and live telemetry, metrics, the status on the terminal, the lines for programs and the
+table in docs/daemon-api.md are all made from these definitions. To add a field, add a line here.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import partial
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.state_fields import Shown
 from stiffopt.rig.interface import PoseSample
 
-__all__ = ["Alarm", "Event", "Severity", "Snapshot", "State", "Timing"]
+__all__ = [
+    *("Alarm", "Event", "SeenPose", "Severity", "Snapshot", "State", "SteeringStatus", "Timing"),
+]
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 
 class State(StrEnum):
@@ -40,112 +53,258 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened.
+    """Something that happened."""
 
-    Attributes
-    ----------
-    time : on the rig's clock, in s.
-    kind : a word for programs, such as ``tracker-missing``.
-    text : a sentence for people.
-    severity : how bad it is.
-    """
-
-    time: float
-    kind: str
-    text: str
-    severity: Severity = Severity.INFO
+    time: Annotated[float, Shown("when, on the rig's clock", "s")]
+    kind: Annotated[str, Shown("a word for programs, such as `tracker-missing`", topic="/event")]
+    text: Annotated[str, Shown("a sentence for people", topic="/event")]
+    severity: Annotated[Severity, Shown("how bad it is", topic="/event")] = Severity.INFO
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """Something that is wrong now, though control goes on.
+    """Something that is wrong now, though control goes on."""
 
-    Attributes
-    ----------
-    kind : a word for programs.
-    text : a sentence for people.
-    since : on the rig's clock, in s.
-    """
+    kind: Annotated[str, Shown("a word for programs")]
+    text: Annotated[str, Shown("a sentence for people")]
+    since: Annotated[float, Shown("since when, on the rig's clock", "s")]
 
-    kind: str
-    text: str
-    since: float
+
+@dataclass(frozen=True)
+class SeenPose:
+    """A sample of the tracker, used or not, as it is logged."""
+
+    time: Annotated[float, Shown("when it was captured, on the rig's clock", "s")]
+    received: Annotated[float, Shown("when it arrived, on the rig's clock", "s", topic="/tracker")]
+    frame: Annotated[int, Shown("the tracker's number of it", topic="/tracker")]
+    position: Annotated[
+        Array, Shown("of the tip, in the base frame", "m", size=3, topic="/tracker")
+    ]
+    quaternion: Annotated[
+        Array | None, Shown("of the tip, w first", size=4, json="quaternion_wxyz", topic="/tracker")
+    ]
+    doubted: Annotated[
+        bool, Shown("no arm could have moved there, or it came with such a one", topic="/tracker")
+    ]
 
 
 @dataclass(frozen=True)
 class Timing:
     """How punctual the loop is.
 
-    Attributes
-    ----------
-    ticks : so far.
-    overruns : ticks that ended after the next one was due.
-    tick_time : of the last tick, in s.
-    lateness : upper edges (k,) of a histogram of how late ticks begin, in s, and counts (k + 1,).
+    The histogram of how late ticks begin has k upper edges and k + 1 counts.
     """
 
-    ticks: int = 0
-    overruns: int = 0
-    tick_time: float = 0.0
-    lateness: tuple[tuple[float, ...], tuple[int, ...]] = ((), (0,))
+    ticks: Annotated[int, Shown("so far", topic="/timing", metric="ticks")] = 0
+    overruns: Annotated[
+        int,
+        Shown("ticks that ended after the next one was due", topic="/timing", metric="overruns"),
+    ] = 0
+    tick_time: Annotated[
+        float,
+        Shown(
+            "duration of the last tick",
+            "s",
+            topic="/timing",
+            decimals=7,
+            metric="tick_time_seconds",
+        ),
+    ] = 0.0
+    lateness_edges: Annotated[
+        tuple[float, ...],
+        Shown(
+            "upper edges (k,) of a histogram of how late ticks begin",
+            "s",
+            topic="/timing",
+            decimals=9,
+        ),
+    ] = ()
+    lateness_counts: Annotated[
+        tuple[int, ...], Shown("its counts (k + 1,); the last are later still", topic="/timing")
+    ] = (0,)
+
+    @property
+    def lateness(self) -> tuple[tuple[float, ...], tuple[int, ...]]:
+        """Edges and counts of the histogram."""
+        return self.lateness_edges, self.lateness_counts
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """How things stand at the end of a tick. SI units; poses in the base frame.
+_nan3, _nan4, _nan6 = (partial(np.full, count, np.nan) for count in (3, 4, 6))
 
-    Attributes
-    ----------
-    time : on the rig's clock, in s.
-    state, reason : and why, where it is not as asked.
-    commanded, measured, plan : pressures (n,), in Pa; NaN where unknown.
-    measured_time : when `measured` was read, in s; NaN where unknown.
-    low, high : what may be commanded (n,), in Pa.
-    saturated : channels (n,) that are at a limit which keeps them from doing what they should.
-    tip_position, tip_quaternion : as estimated now, (3,) and (4,) w first.
-    seen_position, seen_age : latest sample of the tracker that was used, and its age in s.
-    samples : all that the tracker has delivered since the last tick, in order of arrival, used or
-        not.
-    rejected : how many of them no arm could have moved to.
-    target_position, target_quaternion, target_pointing : what is asked for now; NaN for a free
-        axis, None where nothing is asked.
-    position_error, angle_error : of the estimate, in m and rad; NaN where nothing is asked.
-    stiffness, best_stiffness : along the task's direction at the pressures now, and that of the
-        plan; NaN where the task names none.
-    stiffness_unit : ``N/m``, or ``N*m/rad`` where the task is about rotation.
-    disturbance : offset of the tip from the model (3,), in m.
-    wrench : force and moment (6,) at the tip that would explain it, in the base frame.
-    alarms : what is wrong now.
-    task : what is being done, in a word or two.
-    timing : of the loop.
+
+@dataclass(frozen=True, kw_only=True)
+class SteeringStatus:
+    """What the steering knows of the state. SI units; poses in the base frame; NaN is unknown."""
+
+    plan: Annotated[
+        Array,
+        Shown(
+            "pressures that the optimiser found for the target",
+            "Pa",
+            topic="/pressure",
+            metric="pressure_pascals",
+            label="plan",
+        ),
+    ]
+    tip_position: Annotated[
+        Array,
+        Shown(
+            "estimate of the tip's position",
+            "m",
+            size=3,
+            topic="/tip",
+            key="position_m",
+            row="tip",
+            row_unit="mm",
+            armed_only=False,
+        ),
+    ] = field(default_factory=_nan3)
+    tip_quaternion: Annotated[
+        Array,
+        Shown(
+            "estimate of the tip's orientation, w first",
+            size=4,
+            json="tip_quaternion_wxyz",
+            topic="/tip",
+            key="quaternion_wxyz",
+        ),
+    ] = field(default_factory=_nan4)
+    seen_position: Annotated[
+        Array, Shown("the tip's position in the tracker's latest sample that was used", "m", size=3)
+    ] = field(default_factory=_nan3)
+    seen_age: Annotated[
+        float,
+        Shown("age of that sample", "s", topic="/tip", metric="tracker_age_seconds"),
+    ] = math.inf
+    target_position: Annotated[
+        Array | None,
+        Shown(
+            "target now; null for a free axis",
+            "m",
+            size=3,
+            topic="/tip",
+            row="target",
+            row_unit="mm",
+            unknown="free",
+        ),
+    ] = None
+    target_quaternion: Annotated[
+        Array | None,
+        Shown("target orientation, w first", size=4, json="target_quaternion_wxyz", topic="/tip"),
+    ] = None
+    target_pointing: Annotated[
+        Array | None,
+        Shown("direction in which the tip is to point", size=3, topic="/tip", row="pointing"),
+    ] = None
+    position_error: Annotated[
+        float,
+        Shown(
+            "distance of the estimate from the target",
+            "m",
+            topic="/tip",
+            metric="position_error_meters",
+            row="error",
+            row_unit="mm",
+        ),
+    ] = math.nan
+    angle_error: Annotated[
+        float,
+        Shown(
+            "angle between the estimate and the target",
+            "rad",
+            topic="/tip",
+            metric="angle_error_radians",
+            row="error",
+            row_unit="deg",
+        ),
+    ] = math.nan
+    stiffness: Annotated[
+        float,
+        Shown(
+            "stiffness along the task's direction, at the pressures now",
+            ("N/m", "N*m/rad"),
+            "stiffness_unit",
+            topic="/tip",
+            key="stiffness",
+            metric="stiffness",
+        ),
+    ] = math.nan
+    best_stiffness: Annotated[
+        float,
+        Shown(
+            "stiffness of the plan, in the same direction",
+            ("N/m", "N*m/rad"),
+            "stiffness_unit",
+            topic="/tip",
+            key="best_stiffness",
+            metric="best_stiffness",
+        ),
+    ] = math.nan
+    stiffness_unit: Annotated[str, Shown("N/m, or N*m/rad for a rotation", json=())] = "N/m"
+    disturbance: Annotated[
+        Array, Shown("offset of the tip from the model", "m", size=3, topic="/tip")
+    ] = field(default_factory=_nan3)
+    wrench: Annotated[
+        Array,
+        Shown(
+            "force and moment at the tip that would explain the offset",
+            "N",
+            size=6,
+            json=("wrench_force_n", "wrench_moment_nm"),
+            topic="/tip",
+            key="wrench",
+        ),
+    ] = field(default_factory=_nan6)
+    task: Annotated[str, Shown("what is being done, in a word or two", topic="/state")] = ""
+    model_position: Annotated[
+        Array | None, Shown("where the model alone has the tip", "m", size=3, json=())
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Snapshot(SteeringStatus):
+    """The state of the control loop at the end of a tick.
+
+    SI units; poses in the base frame; gauge pressures. NaN is what is not known, None what nobody
+    asks for. Beside the fields that are shown, `samples` are all that the tracker has delivered
+    since the last tick, in order of arrival, used or not.
     """
 
-    time: float
-    state: State
-    reason: str
-    commanded: Array
-    measured: Array
-    plan: Array
-    low: Array
-    high: Array
-    saturated: NDArray[np.bool_]
-    tip_position: Array
-    tip_quaternion: Array
-    seen_position: Array
-    seen_age: float
-    target_position: Array | None = None
-    target_quaternion: Array | None = None
-    target_pointing: Array | None = None
-    position_error: float = float("nan")
-    angle_error: float = float("nan")
-    stiffness: float = float("nan")
-    best_stiffness: float = float("nan")
-    disturbance: Array = field(default_factory=lambda: np.zeros(3))
-    wrench: Array = field(default_factory=lambda: np.zeros(6))
-    alarms: tuple[Alarm, ...] = ()
-    task: str = ""
-    timing: Timing = Timing()
-    measured_time: float = float("nan")
+    time: Annotated[float, Shown("on the rig's clock", "s")]
+    state: Annotated[State, Shown("where in its life the loop is", topic="/state", line=True)]
+    reason: Annotated[
+        str, Shown("why, where the state is not as requested", topic="/state", line=True)
+    ]
+    commanded: Annotated[
+        Array,
+        Shown("set-points", "Pa", topic="/pressure", metric="pressure_pascals", label="commanded"),
+    ]
+    measured: Annotated[
+        Array,
+        Shown("readings", "Pa", topic="/pressure", metric="pressure_pascals", label="measured"),
+    ]
+    measured_time: Annotated[
+        float, Shown("when the pressures were read, on the rig's clock", "s", topic="/pressure")
+    ] = math.nan
+    low: Annotated[Array, Shown("least that may be commanded", "Pa", topic="/limits")]
+    high: Annotated[
+        Array,
+        Shown(
+            "most that may be commanded",
+            "Pa",
+            topic="/limits",
+            metric="pressure_pascals",
+            label="limit",
+        ),
+    ]
+    saturated: Annotated[
+        Flags,
+        Shown("channels at a limit that keeps the tip from its target", topic="/pressure"),
+    ]
+    rejected: Annotated[
+        int,
+        Shown("samples of the last tick that no arm could have moved to", json="rejected_samples"),
+    ] = 0
+    alarms: Annotated[tuple[Alarm, ...], Shown("what is wrong now", topic="/state")] = ()
+    timing: Annotated[Timing, Shown("how punctual the loop is")] = Timing()
     samples: tuple[PoseSample, ...] = ()
-    rejected: int = 0
-    stiffness_unit: str = "N/m"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -10,13 +9,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.state import Severity
+from stiffopt.control.state import Severity, SteeringStatus
 from stiffopt.control.trajectory import Trajectory
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.rig.interface import PoseSample, PressureReading
 
-__all__ = ["Move", "Notice", "Seen", "Standing", "Steering"]
+__all__ = ["Move", "Notice", "Seen", "Steering"]
 
 Array = NDArray[np.float64]
 
@@ -74,54 +73,6 @@ class Notice:
     standing: bool = False
 
 
-@dataclass(frozen=True)
-class Standing:
-    """How control stands; names, shapes and units are those of `Snapshot`.
-
-    Beside them, ``model_position`` (3,) is where the model alone has the tip, if that is known.
-    """
-
-    plan: Array
-    tip_position: Array
-    tip_quaternion: Array
-    seen_position: Array
-    seen_time: float
-    target_position: Array | None
-    target_quaternion: Array | None
-    target_pointing: Array | None
-    position_error: float
-    angle_error: float
-    stiffness: float
-    best_stiffness: float
-    disturbance: Array
-    wrench: Array
-    task: str
-    stiffness_unit: str = "N/m"
-    model_position: Array | None = None
-
-    @classmethod
-    def unknown(cls, n: int) -> Standing:
-        """Return how control of n channels stands before anything is known."""
-        nowhere, nan = np.full(3, np.nan), float("nan")
-        return cls(
-            plan=np.full(n, np.nan),
-            tip_position=nowhere,
-            tip_quaternion=np.full(4, np.nan),
-            seen_position=nowhere,
-            seen_time=-math.inf,
-            target_position=None,
-            target_quaternion=None,
-            target_pointing=None,
-            position_error=nan,
-            angle_error=nan,
-            stiffness=nan,
-            best_stiffness=nan,
-            disturbance=nowhere,
-            wrench=np.full(6, np.nan),
-            task="",
-        )
-
-
 class Steering(Protocol):
     """Decides about pressures. Called from the control thread alone, one call at a time."""
 
@@ -155,8 +106,8 @@ class Steering(Protocol):
     def move(self, now: float) -> Move:
         """Return the next pressures, within all limits; in ticks in which it steers."""
 
-    def standing(self, now: float) -> Standing:
-        """Say how things stand."""
+    def standing(self, now: float) -> SteeringStatus:
+        """Return what it knows of the state."""
 
     def notices(self) -> tuple[Notice, ...]:
         """Return what stands, and once what has happened since the last call."""

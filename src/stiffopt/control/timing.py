@@ -1,4 +1,4 @@
-"""How punctual the loop is."""
+"""When ticks are due, and statistics of how late and how long they are."""
 
 from __future__ import annotations
 
@@ -6,34 +6,14 @@ from bisect import bisect_left
 
 from stiffopt.control.state import Timing
 
-__all__ = ["LatenessHistogram", "Punctuality"]
+__all__ = ["TickTiming"]
 
 _EDGES = tuple(float(f"{m}e{e}") for e in range(-6, 0) for m in (1, 2, 5))
-"""Upper edges from 1 us to 0.5 s, three a decade."""
+"""Upper edges of the histogram of lateness, from 1 us to 0.5 s, three per decade."""
 
 
-class LatenessHistogram:
-    """Counts delays in bins that grow with them.
-
-    Attributes
-    ----------
-    edges : tuple of float
-        Upper edges of all bins but the last (k,), in s.
-    counts : list of int
-        (k + 1,); the last bin takes all that is later.
-    """
-
-    def __init__(self) -> None:
-        self.edges = _EDGES
-        self.counts = [0] * (len(_EDGES) + 1)
-
-    def add(self, lateness: float) -> None:
-        """Count a delay, in s; what is early is not late."""
-        self.counts[bisect_left(self.edges, lateness)] += 1
-
-
-class Punctuality:
-    """Counts ticks, late ones and overruns.
+class TickTiming:
+    """Due times of ticks, and counts of ticks, overruns and lateness.
 
     Parameters
     ----------
@@ -45,12 +25,12 @@ class Punctuality:
     overruns_in_a_row : int
         The last ticks that ended after the next one was due.
     missed : int
-        Ticks that were left out because it was too late for them.
+        Ticks that were skipped because they were overdue.
     """
 
     def __init__(self, period: float) -> None:
         self._period = period
-        self._lateness = LatenessHistogram()
+        self._lateness = [0] * (len(_EDGES) + 1)  # the last bin has no upper edge
         self._ticks = self._overruns = 0
         self._tick_time = 0.0
         self.overruns_in_a_row = 0
@@ -59,10 +39,10 @@ class Punctuality:
     def begin(self, due: float | None, now: float) -> None:
         """Note when a tick begins, and when it was due, if it was."""
         if due is not None:
-            self._lateness.add(now - due)
+            self._lateness[bisect_left(_EDGES, now - due)] += 1
 
     def end(self, due: float, now: float, tick_time: float) -> None:
-        """Note that a tick ends, when it was due, and what it took, in s."""
+        """Note when a tick ends, when it was due, and how long it took, in s."""
         self._ticks += 1
         self._tick_time = tick_time
         if now > due + self._period * (1 + 1e-9):
@@ -72,7 +52,7 @@ class Punctuality:
             self.overruns_in_a_row = 0
 
     def next_due(self, due: float, now: float) -> float:
-        """Return when the next tick is due that is not over yet; count those that are."""
+        """Return when the next tick is due that is not overdue already; count those that are."""
         due += self._period
         if due < now:
             late = int((now - due) / self._period) + 1
@@ -80,7 +60,7 @@ class Punctuality:
             due += late * self._period
         return due
 
-    def timing(self) -> Timing:
-        """Return all that as part of a snapshot."""
-        counts = tuple(self._lateness.counts)
-        return Timing(self._ticks, self._overruns, self._tick_time, (self._lateness.edges, counts))
+    def statistics(self) -> Timing:
+        """Return the statistics so far."""
+        counts = tuple(self._lateness)
+        return Timing(self._ticks, self._overruns, self._tick_time, _EDGES, counts)

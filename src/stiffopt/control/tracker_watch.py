@@ -1,4 +1,4 @@
-"""Whether the tracker still sees the tip, and believably."""
+"""Whether the tracker sees the tip, and whether its samples are credible."""
 
 from __future__ import annotations
 
@@ -10,23 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.steering import Seen
+from stiffopt.control.tuning import TrackerTuning
 from stiffopt.rig.interface import PoseSample
 from stiffopt.rig.settings import Safety
 
-__all__ = ["BACK", "ENOUGH", "Sight", "TrackerWatch"]
+__all__ = ["Sight", "TrackerWatch"]
 
 Array = NDArray[np.float64]
 
-_KEPT = 24  # samples from which the usual interval and latency are learned
-ENOUGH = 8
-"""Samples without which neither is known."""
-BACK = 8
-"""Ticks with new samples, none of them missing for too long, after which the tip is seen again."""
-_JITTER = 0.25  # share of an interval by which a sample may be late
-
 
 class Sight(Enum):
-    """What the tracker does."""
+    """Whether the tracker sees the tip."""
 
     SEEN = "seen"
     MISSING = "missing"
@@ -34,55 +28,60 @@ class Sight(Enum):
 
 
 class TrackerWatch:
-    """Says for how long the tip has not been seen, and whether it jumps.
+    """Watches for how long the tip has not been seen, and whether it seems to jump.
 
-    Only a sample that was used and is newer than all before counts: nothing that is missing, not
-    visible, rejected, out of order, or of the same frame again. How old samples usually are, and
-    how far apart, is learned until the loop is armed; a sample is overdue by its age beyond that.
+    What counts are samples that were used and are newer than all before, not those that are
+    missing, not visible, rejected, out of order, or of the same frame again. The usual interval and
+    age of samples are learned until the loop is armed; a sample is overdue by its age beyond the
+    usual.
 
-    A tip that was missing is seen again only after `BACK` ticks with new samples, in which it was
-    not missing: one good sample now and then must not make the loop steer now and then. It is lost
-    when there was no good sample for the timeout, not even one now and then.
+    A tip that was missing is seen again after `TrackerTuning.back` ticks with new samples in which
+    none was overdue: single samples must not switch control on and off. It is lost when no sample
+    was used for the timeout.
 
-    Of a tracker so slow that the frames which may be missing last longer than the timeout, the tip
-    is missing at the timeout, and lost only after that. One whose frames are further apart than the
-    timeout never sees it.
+    With a tracker so slow that the frames which may be missing take longer than the timeout, the
+    tip is missing at the timeout, and lost shortly after. With an interval longer than the timeout
+    it is never seen.
 
     Parameters
     ----------
     safety :
-        How much may be missing.
+        How many frames may be missing, and the timeout.
     period :
-        Of the loop, in s: the accuracy with which it can tell.
+        Of the loop, in s, which is the resolution of these times.
+    tuning :
+        Learning and return of the tracker.
 
     Attributes
     ----------
     jumps : int
         Samples in a row that were rejected.
+    usual : tuple of float
+        Interval between samples, and their age on arrival, in s; a guess before they are learned.
     """
 
-    def __init__(self, safety: Safety, period: float) -> None:
+    def __init__(self, safety: Safety, period: float, tuning: TrackerTuning | None = None) -> None:
         self._safety, self._period = safety, period
+        self.tuning = tuning = tuning or TrackerTuning()
         self.jumps = 0
-        self._back = BACK  # ticks with new samples since the tip was missing
+        self._back = tuning.back  # ticks with new samples since the tip was missing
         self._frame: int | None = None
         self._reported = self._latest = -np.inf
         self.usual = safety.tracker_timeout / safety.tracker_frames, 0.0
-        """Time between samples and their age on arrival, in s; a guess before there are enough."""
         self._before = -np.inf
-        self._intervals: deque[float] = deque(maxlen=_KEPT)
-        self._ages: deque[float] = deque(maxlen=_KEPT)
-        self._positions: deque[Array] = deque(maxlen=_KEPT)
+        self._intervals: deque[float] = deque(maxlen=tuning.window)
+        self._ages: deque[float] = deque(maxlen=tuning.window)
+        self._positions: deque[Array] = deque(maxlen=tuning.window)
 
     def forget(self) -> None:
-        """Learn anew; until there are enough samples, what was usual still is."""
+        """Learn anew; until there are enough samples, interval and age stay as they were."""
         self._before = -np.inf
         self._intervals.clear()
         self._ages.clear()
         self._positions.clear()
 
     def new(self, samples: Sequence[PoseSample]) -> Sequence[PoseSample]:
-        """Return the samples without those that have the number of the frame before them."""
+        """Return the samples without repetitions of a frame."""
         if not samples:
             return samples
         fresh = []
@@ -93,7 +92,7 @@ class TrackerWatch:
         return fresh
 
     def learn(self, now: float, samples: Sequence[PoseSample]) -> None:
-        """Take in new samples of a vented arm."""
+        """Learn interval, age and position from samples of a vented arm."""
         for sample in samples:
             if not sample.visible or not self._before < sample.time <= now:
                 continue
@@ -102,29 +101,29 @@ class TrackerWatch:
             self._before = sample.time
             self._positions.append(sample.position)
             self._ages.append(now - sample.time)
-            if len(self._positions) >= ENOUGH:
+            if len(self._positions) >= self.tuning.enough:
                 self.usual = _median(self._intervals), _median(self._ages)
 
     @property
     def samples(self) -> int:
-        """Number of samples that were learned from."""
+        """Number of samples learned from."""
         return len(self._positions)
 
     @property
     def position(self) -> Array:
-        """Where the tip of the vented arm was seen (3,), in m."""
+        """Position of the tip of the vented arm (3,), in m."""
         return np.median(np.array(self._positions), axis=0)
 
     def update(self, now: float, seen: Seen) -> None:
-        """Take in what became of the samples of a tick."""
+        """Take in how many samples of a tick were used or rejected."""
         if self._latest == -np.inf:
-            self._latest = now  # it is given some time before it is missing
+            self._latest = now  # from here on it may be missing
         is_new = False
         if seen.used:
             self.jumps = 0
             if is_new := seen.latest > self._reported:
                 self._reported = seen.latest
-                self._latest = min(seen.latest, now)  # none is from the future
+                self._latest = min(seen.latest, now)  # not from the future
         elif seen.rejected:
             self.jumps += seen.rejected
         if self._by_age(now) is not Sight.SEEN:
@@ -133,30 +132,30 @@ class TrackerWatch:
             self._back += 1
 
     def overdue(self, now: float) -> float:
-        """Age of the newest sample that was used beyond the usual, in s."""
+        """Age of the newest sample used, beyond the usual age, in s."""
         return now - self._latest - self.usual[1]
 
     def sight(self, now: float) -> Sight:
-        """Say whether the tip is seen."""
+        """Return whether the tip is seen."""
         sight = self._by_age(now)
-        return Sight.MISSING if sight is Sight.SEEN and self._back < BACK else sight
+        return Sight.MISSING if sight is Sight.SEEN and self._back < self.tuning.back else sight
 
     def _by_age(self, now: float) -> Sight:
-        """Say the same of the newest sample alone."""
+        """Return the same by the age of the newest sample alone."""
         interval, _ = self.usual
         overdue = self.overdue(now)
-        slack = self._period + _JITTER * interval
+        slack = self._period + self.tuning.jitter * interval
         timeout = self._safety.tracker_timeout
         if overdue > timeout + slack:
             return Sight.LOST
-        # lost comes after missing by the slack at least, in which there is a tick
+        # missing precedes lost by the slack at least, and so by one tick
         if overdue > min(self._safety.tracker_frames * interval + slack, timeout):
             return Sight.MISSING
         return Sight.SEEN
 
     @property
     def jumping(self) -> bool:
-        """Whether it jumps too often to be believed."""
+        """Whether so many samples in a row were rejected that it is a fault."""
         return self.jumps >= self._safety.max_jumps
 
 

@@ -1,55 +1,58 @@
-"""The arm's first bending vibration, of which the statics know nothing.
+"""The arm's first bending mode, of which a model of its statics knows nothing.
 
-A hanging arm swings like a cantilever with a mass at its end.  In its first mode, of shape phi with
-phi(tip) = 1, the tip moves by eta, in the plane in which the tip is soft::
+A hanging arm vibrates like a cantilever with a mass at its end. In the first mode, of shape phi
+with phi(tip) = 1, the tip moves by eta in the plane in which it is soft::
 
     eta'' + 2 zeta omega eta' + omega^2 (eta - s) = 0,      omega^2 = k / m
 
-k is the lateral stiffness of the tip, m the modal mass ``int phi^2 dm``, and s what the mode has of
-the static shape: where pressure bends the arm to x(S), it is ``int phi x dm / m``.  Of a segment
-near the tip that is less than what the tip itself moves by; the rest of the static motion follows
-at once, as far as this mode is concerned.
+k is the lateral stiffness of the tip and m the modal mass ``int phi^2 dm``. s is the projection of
+the static shape x(S), to which pressures bend the arm, on the mode: ``int phi x dm / m``. For a
+segment near the tip it is less than the displacement of the tip itself; the rest of that
+displacement does not excite this mode and follows at once.
 
-The shape is that of the straight cantilever under a force at its tip.  A measure of how good that
-is: modal masses from frequencies and stiffnesses of the simulated arm, over many configurations,
-lie within 4 % of each other.
+phi is the shape of the straight cantilever under a force at its tip. To judge that approximation:
+modal masses from frequencies and stiffnesses of the simulated arm, over many configurations, lie
+within 4 % of each other.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["Vibration"]
+__all__ = ["BendingMode", "transition"]
 
 Array = NDArray[np.float64]
+Symbols = Any  # of CasADi
 
-_POINTS = 200  # along each segment
-_SILICONE = 1070.0  # kg/m^3, where the robot file knows no weight
+_PIECES = 200  # of each segment
+_SILICONE = 1070.0  # kg/m^3, where the robot file gives no density
 
 
 @dataclass(frozen=True)
-class Vibration:
+class BendingMode:
     """The first bending mode of an arm.
 
     Attributes
     ----------
     mass : float
-        Modal mass, in kg, for a shape that is 1 at the tip.
+        Modal mass, in kg, of a mode shape that is 1 at the tip.
     participation : ndarray
-        Of each channel (n,): how much of what it moves the tip by, the mode has.
+        Share (n,) of the tip's displacement by each channel that the mode takes part in.
     """
 
     mass: float
     participation: Array
 
     @classmethod
-    def of(cls, robot: RobotDescription) -> Vibration:
+    def of(cls, robot: RobotDescription) -> BendingMode:
         """Compute from the drawing of the straight arm."""
         station, weight, flexibility, owner = _beam(robot)
         length = station[-1]
@@ -68,17 +71,35 @@ class Vibration:
         return float(np.sqrt(max(stiffness, 0.0) / self.mass))
 
 
+def transition(omega: Symbols, damping: float, duration: Symbols) -> Symbols:
+    """Transition matrix (2, 2) of a free vibration and its speed.
+
+    Parameters
+    ----------
+    omega :
+        Angular frequency, in rad/s.
+    damping :
+        Damping ratio.
+    duration :
+        In s; may be negative.
+    """
+    damped = omega * (1 - damping**2) ** 0.5
+    decay = ca.exp(-damping * omega * duration)
+    c, s = decay * ca.cos(damped * duration), decay * ca.sin(damped * duration) / damped
+    return ca.blockcat([[c + damping * omega * s, s], [-(omega**2) * s, c - damping * omega * s]])
+
+
 def _beam(robot: RobotDescription) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Stations, masses, flexibilities in bending and segments (-1: a connector) of pieces (m,)."""
+    """Stations, masses, bending flexibilities and segments (-1: a connector) of pieces (m,)."""
     stations, masses, flexibilities, owners = [0.0], [0.0], [0.0], [-1]
     for index, segment in enumerate(robot.segments):
         geometry = SectionGeometry.of(segment)
-        step = segment.length / _POINTS
+        step = segment.length / _PIECES
         density = segment.material.density or _SILICONE
         modulus = segment.material.youngs_modulus
         if segment.compensation is not None:
             modulus *= segment.compensation.stiffness
-        for _ in range(_POINTS):
+        for _ in range(_PIECES):
             stations.append(stations[-1] + step)
             masses[-1] += 0.5 * density * geometry.area * step
             masses.append(0.5 * density * geometry.area * step)
@@ -93,7 +114,7 @@ def _beam(robot: RobotDescription) -> tuple[Array, Array, Array, NDArray[np.int6
 
 
 def _deflection(station: Array, curvature: Array) -> Array:
-    """Lateral displacement (m,) of a cantilever with these curvatures (m,), 1 at its end."""
+    """Lateral displacement (m,) of a cantilever with curvatures (m,), scaled to 1 at its end."""
     steps = np.diff(station, prepend=station[0])
     slope = np.cumsum(curvature * steps)
     x = np.cumsum((slope - curvature * steps / 2) * steps)

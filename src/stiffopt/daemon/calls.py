@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Protocol
 
-from stiffopt.control.requests import Asker, asked_by
+from stiffopt.control.request_queue import Requester, requested_by
 from stiffopt.control.state import Event, Snapshot
 from stiffopt.control.trajectory import Trajectory
 from stiffopt.daemon.refusals import RefusedError
@@ -31,8 +31,8 @@ class Commanded(Protocol):
     """What the service needs of a `ControlLoop`; see there.
 
     The commands return when they are done, or raise `CommandError` or `InputError` and change
-    nothing; one that its `Asker` has given up is not begun any more. `snapshot` and `events` return
-    at once.
+    nothing; one that its `Requester` has given up is not begun any more. `snapshot` and `events`
+    return at once.
     """
 
     @property
@@ -105,7 +105,7 @@ class LoopCalls:
         """
         if self._running >= _WAITING and not urgent:
             raise RefusedError(503, "busy", "the control loop has too much to do; try again")
-        asker = Asker()
+        asker = Requester()
         answer = start(function, *args, asker=None if lasting else asker)
         self._running += 1
         answer.add_done_callback(self._ended)
@@ -131,7 +131,7 @@ class LoopCalls:
 
 
 def start(
-    function: Callable[..., Any], *args: Any, asker: Asker | None = None
+    function: Callable[..., Any], *args: Any, asker: Requester | None = None
 ) -> asyncio.Future[Any]:
     """Call a function in a thread of its own, which does not keep the process from ending.
 
@@ -156,7 +156,7 @@ def start(
     def work() -> None:
         result, error = None, None
         try:
-            with asked_by(asker or Asker()):
+            with requested_by(asker or Requester()):
                 result = function(*args)
         except Exception as raised:
             error = raised

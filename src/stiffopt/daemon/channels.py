@@ -1,36 +1,35 @@
-"""What is logged: a snapshot of the loop as messages, the same live and in the recording.
+"""Writes the state of the loop to telemetry's topics, the same live and in the recording.
 
 Where Foxglove has a message of its own it is used, so that its panels show it without set-up:
-frames, the arm as a line, events as a log. Everything else is JSON with a schema.
+frames, the arm as a line, events as a log. Everything else is JSON, as `stiffopt.daemon.topics`
+has it.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.state import Event, Severity, Snapshot
-from stiffopt.logs.run_schemas import STATES, missing_left_out, plain, plain_list, run_schemas
+from stiffopt.control.state import Event, SeenPose, Severity, Snapshot
+from stiffopt.daemon.topics import STATES, encoded, state_topics, topic_schemas
 from stiffopt.rig.interface import PoseSample
 
-__all__ = ["Channels"]
+__all__ = ["TelemetryChannels"]
 
 Array = NDArray[np.float64]
 
 BASE, TIP, TARGET, SEEN = "base", "tip", "target", "tip_seen"
 """Names of the frames; all are children of the base."""
 
-_S, _PA, _M, _TURN = 6, 1, 7, 7  # decimals of s, Pa, m, and of what has no unit
-_ENCODER = json.JSONEncoder(allow_nan=False, check_circular=False, separators=(",", ":"))
+_SELDOM = ("/state", "/limits")
 _TARGET_SIZE = 0.004  # m
 _ARM_COLOUR, _TARGET_COLOUR = (0.31, 0.47, 0.65, 0.7), (0.84, 0.15, 0.16, 0.8)
 
 
-class Channels:
+class TelemetryChannels:
     """The topics of a daemon.
 
     Parameters
@@ -52,8 +51,9 @@ class Channels:
         self._seen: PoseSample | None = None
         self._json = {
             topic: Channel(topic, schema=schema, context=context)
-            for topic, schema in run_schemas().items()
+            for topic, schema in topic_schemas().items()
         }
+        self._each_tick = [topic for topic in state_topics() if topic not in _SELDOM]
         self._frames = FrameTransformsChannel("/tf", context=context)
         self._scene = SceneUpdateChannel("/scene", context=context)
         self._log = LogChannel("/log", context=context)
@@ -69,82 +69,33 @@ class Channels:
         return self._offset + round(time * 1e9)
 
     def log_tick(self, now: Snapshot) -> None:
-        """Log what every tick has: pressures and the tip."""
-        self._say(
-            "/pressure",
-            now.time,
-            measured_time_s=plain(now.measured_time, _S),
-            commanded_pa=_list(now.commanded, _PA),
-            measured_pa=_list(now.measured, _PA),
-            plan_pa=_list(now.plan, _PA),
-            saturated=now.saturated.tolist(),
-        )
-        self._say(
-            "/tip",
-            now.time,
-            position_m=_list(now.tip_position, _M),
-            quaternion_wxyz=_list(now.tip_quaternion, _TURN),
-            target_position_m=_list(now.target_position, _M),
-            target_quaternion_wxyz=_list(now.target_quaternion, _TURN),
-            target_pointing=_list(now.target_pointing, _TURN),
-            position_error_m=plain(now.position_error, _M),
-            angle_error_rad=plain(now.angle_error, _TURN),
-            stiffness=plain(now.stiffness, 4),
-            best_stiffness=plain(now.best_stiffness, 4),
-            disturbance_m=_list(now.disturbance, _M),
-            wrench=_list(now.wrench, 5),
-            seen_age_s=plain(now.seen_age, _S),
-        )
+        """Log what every tick has: pressures, the tip, and all else that does not change seldom."""
+        for topic in self._each_tick:
+            self._say(topic, now.time, now)
 
     def log_samples(self, now: Snapshot) -> None:
         """Log what the tracker has seen; times are those of capture."""
         for sample in now.samples:
             if sample.visible and not now.rejected:
                 self._seen = sample
-            self._say(
-                "/tracker",
+            seen = SeenPose(
                 sample.time,
-                at=now.time,
-                received_s=plain(sample.received, _S),
-                frame=sample.frame,
-                position_m=_list(sample.position, _M),
-                quaternion_wxyz=_list(sample.quaternion, _TURN),
+                sample.received,
+                sample.frame,
+                sample.position,
+                sample.quaternion,
                 doubted=now.rejected > 0,
             )
+            self._say("/tracker", sample.time, seen, at=now.time)
 
     def log_state(self, now: Snapshot) -> None:
         """Log what changes seldom: state, alarms and limits."""
-        self._say(
-            "/state",
-            now.time,
-            state=str(now.state),
-            state_number=STATES.index(now.state),
-            reason=now.reason,
-            task=now.task,
-            alarms=[
-                {"kind": a.kind, "text": a.text, "since_s": plain(a.since, _S)} for a in now.alarms
-            ],
-        )
-        self._say(
-            "/limits",
-            now.time,
-            low_pa=_list(now.low, _PA),
-            high_pa=_list(now.high, _PA),
-        )
+        self._say("/state", now.time, now, state_number=STATES.index(now.state))
+        self._say("/limits", now.time, now)
 
     def log_timing(self, now: Snapshot, dropped: int) -> None:
         """Log how punctual the loop is, and how many snapshots never got here."""
-        edges, counts = now.timing.lateness
-        self._say(
-            "/timing",
-            now.time,
-            ticks=now.timing.ticks,
-            overruns=now.timing.overruns,
-            tick_time_s=plain(now.timing.tick_time, 7),
-            lateness_edges_s=list(edges),
-            lateness_counts=list(counts),
-            dropped=dropped,
-        )
+        self._say("/timing", now.time, now.timing, dropped=dropped)
 
     def log_event(self, event: Event) -> None:
         """Log something that happened, for people and for programs."""
@@ -160,13 +111,7 @@ class Channels:
             timestamp=_timestamp(moment), level=level, message=event.text, name=event.kind
         )
         self._log.log(message, log_time=moment)
-        self._say(
-            "/event",
-            event.time,
-            kind=event.kind,
-            text=event.text,
-            severity=str(event.severity),
-        )
+        self._say("/event", event.time, event)
 
     def log_arm(self, now: Snapshot, poses: Array) -> None:
         """Log the arm's shape from poses (m, 4, 4) along it, and the target."""
@@ -197,15 +142,12 @@ class Channels:
         if known:
             self._frames.log(FrameTransforms(transforms=known), log_time=moment)
 
-    def _say(self, topic: str, time: float, *, at: float | None = None, **fields: Any) -> None:
-        """Log a message of a topic whose time is `time`; it comes in the tick at `at`."""
-        message = missing_left_out({"time_s": round(time, _S), **fields})
-        data = _ENCODER.encode(message).encode()
-        self._json[topic].log(data, log_time=self.nanoseconds(time if at is None else at))
-
-
-def _list(values: Array | None, digits: int) -> Any:
-    return None if values is None else plain_list(values.tolist(), digits)
+    def _say(
+        self, topic: str, time: float, record: Any, *, at: float | None = None, **more: Any
+    ) -> None:
+        """Log what a topic says of a record at a time; it comes in the tick at `at`."""
+        moment = self.nanoseconds(time if at is None else at)
+        self._json[topic].log(encoded(topic, time, record, **more), log_time=moment)
 
 
 def _timestamp(moment: int) -> Any:

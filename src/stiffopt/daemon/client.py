@@ -18,7 +18,7 @@ from stiffopt.control.state import Event, Snapshot, State
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.daemon.client_stream import ClientStream
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
-from stiffopt.daemon.reports import EventsReport, RobotReport, StateReport
+from stiffopt.daemon.reports import RobotReport, record_of
 from stiffopt.daemon.wire import Wire
 from stiffopt.errors import CommandError, InputError, ServiceError, StiffoptError
 from stiffopt.optimise.target import Target
@@ -116,13 +116,12 @@ class Client:
 
     def state(self) -> Snapshot:
         """Return how things stand."""
-        return StateReport.model_validate(self._wire.ask("GET", "state")).snapshot()
+        return record_of(Snapshot, self._wire.ask("GET", "state"))
 
     def events(self, since: int = 0) -> tuple[list[Event], int]:
         """Return what has happened since an index, and the index after that."""
         answer = self._wire.ask("GET", "events", query={"since": since})
-        report = EventsReport.model_validate(answer)
-        return [event.event() for event in report.events], report.next
+        return [record_of(Event, event) for event in answer["events"]], int(answer["next"])
 
     def robot(self) -> RobotReport:
         """Return what arm there is."""
@@ -270,7 +269,7 @@ class Client:
             tolerance = {"tolerance": rest.pop("tolerance")} if "tolerance" in rest else {}
             target = _target(position, pointing, orientation, **tolerance)
             task = Task(robot="robot", target=target, **rest)  # the one that there is
-        body = TaskMessage.of(task, robot).model_dump()
+        body = TaskMessage.of(task, robot=robot).model_dump()
         self._wire.ask("POST", "task", body=body)
 
     def set_target(

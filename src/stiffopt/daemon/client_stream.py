@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from stiffopt.control.state import Snapshot
 from stiffopt.daemon.messages import TargetMessage
-from stiffopt.daemon.reports import StateReport
+from stiffopt.daemon.reports import record_of
 from stiffopt.daemon.wire import Wire, error_of
 from stiffopt.errors import MissingExtraError, ServiceError, StiffoptError
 from stiffopt.optimise.target import Target
@@ -162,7 +162,7 @@ class ClientStream:
 
     def _take(self, message: dict[str, Any]) -> None:
         if message["type"] == "state":
-            self._state = StateReport.model_validate(message["state"]).snapshot()
+            self._state = record_of(Snapshot, message["state"])
         elif message["type"] == "answer" and message["accepted"]:
             self.accepted += 1
         elif "error" in message:

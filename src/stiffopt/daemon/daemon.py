@@ -30,8 +30,8 @@ from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.rig.config import RigDescription, load_rig_description
-from stiffopt.safety.link import guarded_rig
 from stiffopt.safety.realtime import real_time, tidy
+from stiffopt.safety.rigs import guarded_rig
 
 if TYPE_CHECKING:
     from stiffopt.daemon.serving import Server
@@ -131,8 +131,8 @@ class Daemon:
             period=period,
             control=description.control,
             safety=description.safety,
-            swings=_swings(description),
-            beside=True,
+            vibrates=_vibrates(description),
+            plan_in_process=True,
         )
         self.loop = ControlLoop(
             guarded, self._controller, self.link, safety=description.safety, period=period
@@ -480,7 +480,7 @@ class _Shape:
         return self._last
 
 
-def _swings(description: RigDescription) -> bool:
+def _vibrates(description: RigDescription) -> bool:
     """Return whether the arm has inertia: all have, but one that is simulated without."""
     simulated, plant = description.supply.driver == "simulated", description.plant
     return not (simulated and plant is not None and plant.dynamics == "quasi-static")

@@ -1,16 +1,31 @@
-"""What clients send, and how it becomes a task, a target or a trajectory, and back.
+"""What clients send, derived key by key from the schemas of the files.
 
-Plain numbers in SI; the unit of a quantity stands in its name. Unknown keys, text for numbers, NaN
-and infinities are refused.
+A message is the JSON form of a `Schema`: the same keys, plain numbers in SI, and the unit of a
+quantity at the end of its name. Its fields are made from those of the schema, so a key that is
+added to a schema is in its message too, and no conversion can lose one. Unknown keys, text for
+numbers, NaN and infinities are refused.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, TypeVar
+from collections.abc import Callable, Mapping
+from types import UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Literal,
+    Self,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
+import annotated_types as bounds
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Discriminator,
@@ -18,28 +33,33 @@ from pydantic import (
     Tag,
     TypeAdapter,
     ValidationError,
+    create_model,
 )
+from pydantic.fields import FieldInfo
 
-from stiffopt.control.contents import contents, differences, listed
+from stiffopt.control.contents import listed
 from stiffopt.control.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
 from stiffopt.daemon.refusals import sentence
 from stiffopt.documents import document_of
-from stiffopt.errors import InputError, Loc, shown
+from stiffopt.errors import InputError, Loc, dotted, shown
 from stiffopt.files import from_document
-from stiffopt.optimise.goal import MatchMatrix, StiffnessGoal, StiffnessMeasure
-from stiffopt.optimise.target import Target, Tolerance
-from stiffopt.optimise.task import Load, PressureRange, Task
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from stiffopt.schema import Schema
+from stiffopt.units import QuantityKind, unit_suffix
 
 __all__ = [
     "MAX_MESSAGE",
     "MAX_WAYPOINTS",
     "ControlRequest",
     "HoldRequest",
+    "SchemaMessage",
     "TargetMessage",
     "TaskMessage",
     "TaskRequest",
     "TaskText",
     "TrajectoryMessage",
+    "message_of",
     "task_of",
     "trajectory_of",
 ]
@@ -47,19 +67,14 @@ __all__ = [
 MAX_MESSAGE = 16_384
 """Characters of the longest message to a stream."""
 _MAX_TEXT = 65_536  # characters of a task file; to read more would keep the control loop waiting
-_MAX_MEASURES = 50
-_MAX_CHANNELS = 200
+_MAX_ITEMS = 50  # of a list of descriptions, such as stiffness measures
+_MAX_NUMBERS = 200  # of a list with one number per channel
+
+_UNITS_IN_NAMES = {"orientation": "orientation_wxyz", "matrix": "matrix_n_per_m"}
+"""Names of fields whose type does not tell the unit or the order of their numbers."""
 
 ModelT = TypeVar("ModelT")
-MessageT = TypeVar("MessageT", bound="_Message")
-
-Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Coordinate = Annotated[float, Field(ge=-1e3, le=1e3)]
-Position = Annotated[list[Coordinate | None], Field(min_length=3, max_length=3)]
-Quaternion = Annotated[list[float], Field(min_length=4, max_length=4)]
-Positive = Annotated[float, Field(gt=0)]
-PerChannel = float | Annotated[list[float | None], Field(max_length=_MAX_CHANNELS)]
-Frame = Literal["base", "tip"]
+ClassT = TypeVar("ClassT", bound=type)
 
 
 class _Message(BaseModel):
@@ -85,52 +100,192 @@ class HoldRequest(_Message):
     reason: Annotated[str, Field(min_length=1, max_length=200)] = "a client asked for it"
 
 
-class ToleranceMessage(_Message):
-    """How near is near enough."""
+def _valid(adapter: TypeAdapter[ModelT], given: Any, place: Loc) -> ModelT:
+    try:
+        return adapter.validate_python(given)
+    except ValidationError as error:
+        mistakes = [{**mistake, "loc": (*place, *mistake["loc"])} for mistake in error.errors()]
+        raise InputError(sentence(mistakes)) from None
 
-    position_m: Positive = 1e-4
-    angle_rad: Positive = math.radians(1)
+
+# Messages from schemas ---------------------------------------------------------------------------
 
 
-class TargetMessage(_Message):
+class SchemaMessage(_Message):
+    """The JSON form of a `Schema`; `message_of` makes one for each.
+
+    Attributes
+    ----------
+    schema_class : what it is the form of.
+    names : of its fields in JSON, by their names in the schema.
+    """
+
+    schema_class: ClassVar[type[Schema]]
+    names: ClassVar[Mapping[str, str]]
+
+    @classmethod
+    def of(cls, given: Schema, **more: Any) -> Self:
+        """Return the message for a description, in which `more` keys are replaced.
+
+        Raises
+        ------
+        InputError
+            The description is of a subclass whose further keys have no place in the message, or
+            has values that no message may have; the text names the keys.
+        """
+        lost: list[Loc] = []
+        said = {**_json_of(given, (), lost), **more}
+        if lost:
+            places = listed([dotted(place) for place in lost])
+            raise InputError(
+                f"{places}: the daemon's messages cannot say this, and it would be lost"
+            )
+        return _valid(TypeAdapter(cls), said, ())
+
+    def read(self, **more: Any) -> Any:
+        """Return the description, in which `more` keys are replaced.
+
+        Raises
+        ------
+        InputError
+            It makes no sense.
+        """
+        return self.schema_class(**{**_keys_of(self), **more})
+
+
+def _json_of(value: Any, place: Loc, lost: list[Loc]) -> Any:
+    """Return a description as JSON; places of what no message has a key for are added to `lost`."""
+    if isinstance(value, Schema):
+        message = next(_MADE[each] for each in type(value).__mro__ if each in _MADE)
+        found = {}
+        fields = type(value).model_fields
+        for name in (*fields, *(value.model_extra or ())):
+            field = getattr(value, name)
+            if field is None or (name in fields and _is_unsaid(fields[name])):
+                continue
+            if name in message.names:
+                found[message.names[name]] = _json_of(field, (*place, name), lost)
+            else:
+                lost.append((*place, name))
+        return found
+    if isinstance(value, list | tuple):
+        return [_json_of(item, (*place, index), lost) for index, item in enumerate(value)]
+    return value
+
+
+def _keys_of(value: Any) -> Any:
+    """Return what a message says, with the keys of its schema."""
+    if isinstance(value, SchemaMessage):
+        return {name: _keys_of(getattr(value, key)) for name, key in value.names.items()}
+    if isinstance(value, list):
+        return [_keys_of(item) for item in value]
+    return value
+
+
+_MADE: dict[type[Schema], type[SchemaMessage]] = {}
+
+
+def message_of(schema: type[Schema], base: type[SchemaMessage] = SchemaMessage) -> Any:
+    """Return the class of messages that say what a schema says.
+
+    Parameters
+    ----------
+    schema :
+        Its fields become those of the message, and so do those of the schemas in it.
+    base :
+        A message whose own fields take the place of those of the same name.
+    """
+    if schema not in _MADE or base is not SchemaMessage:
+        hints = get_type_hints(schema, include_extras=True)
+        said = {n: info for n, info in schema.model_fields.items() if not _is_unsaid(info)}
+        names = {name: _name(name, hints[name]) for name in said}
+        fields: dict[str, Any] = {
+            names[name]: (_type(hints[name]), _default(info))
+            for name, info in said.items()
+            if names[name] not in base.model_fields
+        }
+        own = base is not SchemaMessage
+        made = create_model(
+            base.__name__ if own else f"{schema.__name__}Message",
+            __base__=base,
+            __doc__=base.__doc__ if own else (schema.__doc__ or "").partition("\n\n")[0],
+            **fields,
+        )
+        made.schema_class, made.names = schema, names
+        _MADE[schema] = made
+    return _MADE[schema]
+
+
+def _says(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
+    """Decorate a message that says what a schema says: its fields are added."""
+    return lambda base: message_of(schema, base)
+
+
+def _is_unsaid(info: FieldInfo) -> bool:
+    """Whether a field is no part of what is described: where it was read, or a constant."""
+    is_constant = get_origin(info.annotation) is Literal and len(get_args(info.annotation)) == 1
+    return bool(info.exclude) or is_constant
+
+
+def _name(name: str, hint: Any) -> str:
+    return _UNITS_IN_NAMES.get(name) or name + unit_suffix(_unit(hint))
+
+
+def _unit(hint: Any) -> str:
+    """Return the unit that the type of a field tells; empty if it has none."""
+    args = get_args(hint)
+    own = [part.unit for part in args[1:] if isinstance(part, QuantityKind)]
+    return next(filter(None, [*own, *(_unit(part) for part in args)]), "")
+
+
+def _type(hint: Any) -> Any:
+    """Return the type in a message of what has a type in a schema: plain JSON, with its bounds."""
+    origin, args = get_origin(hint), get_args(hint)
+    if isinstance(hint, type) and issubclass(hint, Schema):
+        return message_of(hint)
+    if origin is Annotated:
+        return _bounded(_type(args[0]), args[1:])
+    if origin in (Union, UnionType):
+        return Union[tuple(map(_type, args))]  # noqa: UP007 - made of a tuple
+    if origin is tuple:
+        if args[-1] is not Ellipsis:
+            return Annotated[list[_type(args[0])], bounds.Len(len(args), len(args))]  # type: ignore[misc]
+        item = _type(args[0])
+        is_model = isinstance(item, type) and issubclass(item, SchemaMessage)
+        most = MAX_WAYPOINTS if args[0] is Waypoint else _MAX_ITEMS if is_model else _MAX_NUMBERS
+        return Annotated[list[item], bounds.Len(0, most)]  # type: ignore[valid-type]
+    return hint
+
+
+def _bounded(kind: Any, metadata: tuple[Any, ...]) -> Any:
+    """Return a type with those of a field's validators that hold for plain JSON as well."""
+    flat = [p for m in metadata for p in (m.metadata if isinstance(m, FieldInfo) else [m])]
+    if kind is float:
+        kept = [part for part in flat if isinstance(part, bounds.BaseMetadata | AfterValidator)]
+    else:
+        kept = [part for part in flat if isinstance(part, bounds.BaseMetadata)]
+    return Annotated[kind, *kept] if kept else kind
+
+
+def _default(info: FieldInfo) -> Any:
+    if info.is_required():
+        return ...
+    if isinstance(info.default, Schema):
+        return message_of(type(info.default)).of(info.default)
+    return list(info.default) if isinstance(info.default, tuple) else info.default
+
+
+@_says(Target)
+class TargetMessage(SchemaMessage):
     """A tip pose in the base frame: a position (null: this axis is free), a direction in which
     the tip points, or an orientation (w, x, y, z).
     """  # noqa: D205
 
     model_config = _example(position_m=[0.0, None, 0.2])
 
-    position_m: Position | None = None
-    pointing: Vector | None = None
-    orientation_wxyz: Quaternion | None = None
-    tolerance: ToleranceMessage = ToleranceMessage()
 
-    def target(self) -> Target:
-        """Return it in code; raise `InputError` if it makes no sense."""
-        return Target(
-            position=self.position_m,
-            pointing=self.pointing,
-            orientation=self.orientation_wxyz,
-            tolerance=Tolerance(position=self.tolerance.position_m, angle=self.tolerance.angle_rad),
-        )
-
-    @classmethod
-    def of(cls, target: Target) -> TargetMessage:
-        """Return the message that says this; raise `InputError` if it cannot say all of it."""
-        return _saying_all_of(target, lambda: _target_message(target), cls.target)
-
-
-class WaypointMessage(_Message):
-    """A target, and when to be there, counted from the beginning."""
-
-    time_s: Annotated[float, Field(ge=0)]
-    target: TargetMessage
-
-    def waypoint(self) -> Waypoint:
-        """Return it in code; raise `InputError` if it makes no sense."""
-        return Waypoint(time=self.time_s, target=self.target.target())
-
-
-class TrajectoryMessage(_Message):
+@_says(Trajectory)
+class TrajectoryMessage(SchemaMessage):
     """Waypoints in order of time, all of which ask for the same axes of the pose."""
 
     model_config = _example(
@@ -140,16 +295,22 @@ class TrajectoryMessage(_Message):
         ]
     )
 
-    waypoints: Annotated[list[WaypointMessage], Field(min_length=1, max_length=MAX_WAYPOINTS)]
 
-    @classmethod
-    def of(cls, trajectory: Trajectory) -> TrajectoryMessage:
-        """Return the message that says this; raise `InputError` if it cannot say all of it."""
-        return _saying_all_of(trajectory, lambda: _trajectory_message(trajectory), cls.trajectory)
+@_says(Task)
+class TaskMessage(SchemaMessage):
+    """What the arm shall do. A robot, if it is named, must be the daemon's."""
 
-    def trajectory(self) -> Trajectory:
-        """Return it in code; raise `InputError` if it makes no sense."""
-        return Trajectory(waypoints=[waypoint.waypoint() for waypoint in self.waypoints])
+    model_config = _example(
+        target={"position_m": [0.0, 0.0, 0.18]},
+        stiffness={"maximise": [{"direction": [1.0, 0.0, 0.0]}]},
+        load={"force_n": [0.0, 0.0, -0.02]},
+        pressure={"max_pa": 120000.0},
+    )
+
+    robot: Annotated[str, Field(min_length=1, max_length=200)] | None = None
+
+
+# Reading them ------------------------------------------------------------------------------------
 
 
 def trajectory_of(given: Any) -> Trajectory:
@@ -169,104 +330,8 @@ def trajectory_of(given: Any) -> Trajectory:
     _valid(_TRAJECTORY, {**given, "waypoints": waypoints[:1]}, ())
     read = []
     for index, waypoint in enumerate(waypoints):
-        read.append(_valid(_WAYPOINT, waypoint, ("waypoints", index)).waypoint())
+        read.append(_valid(_WAYPOINT, waypoint, ("waypoints", index)).read())
     return Trajectory(waypoints=read)
-
-
-class MeasureMessage(_Message):
-    """A stiffness along a direction or, of the kind rotation, about it."""
-
-    direction: Vector
-    frame: Frame = "base"
-    kind: Literal["translation", "rotation"] = "translation"
-    boundary: Literal["free", "guided", "clamped"] = "free"
-
-
-class AtLeastMessage(MeasureMessage):
-    """A stiffness that shall not be less than a value in N/m, for a rotation in N m/rad."""
-
-    value: Positive
-
-
-class MatchMessage(AtLeastMessage):
-    """A stiffness that shall be a value in N/m, for a rotation in N m/rad."""
-
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.01
-
-
-class MatrixMessage(_Message):
-    """A stiffness matrix that the tip shall have against translation."""
-
-    matrix_n_per_m: Annotated[list[Vector], Field(min_length=3, max_length=3)]
-    frame: Frame = "base"
-    boundary: Literal["guided", "clamped"] = "guided"
-    tolerance: Annotated[float, Field(gt=0, lt=1)] = 0.01
-
-
-class StiffnessMessage(_Message):
-    """What is asked of the stiffness: the smallest of `maximise` as great as can be, or a match."""
-
-    maximise: Annotated[list[MeasureMessage], Field(max_length=_MAX_MEASURES)] = []
-    at_least: Annotated[list[AtLeastMessage], Field(max_length=_MAX_MEASURES)] = []
-    match: MatchMessage | MatrixMessage | None = None
-
-
-class LoadMessage(_Message):
-    """A load at the tip; in the frame of the tip it follows the tip."""
-
-    force_n: Vector = [0.0, 0.0, 0.0]
-    moment_nm: Vector = [0.0, 0.0, 0.0]
-    frame: Frame = "base"
-
-
-class PressureMessage(_Message):
-    """Limits that tighten the robot's: one for all channels, or one per channel."""
-
-    min_pa: PerChannel | None = None
-    max_pa: PerChannel | None = None
-
-
-class TaskMessage(_Message):
-    """What the arm shall do. A robot, if it is named, must be the daemon's."""
-
-    model_config = _example(
-        target={"position_m": [0.0, 0.0, 0.18]},
-        stiffness={"maximise": [{"direction": [1.0, 0.0, 0.0]}]},
-        load={"force_n": [0.0, 0.0, -0.02]},
-        pressure={"max_pa": 120000.0},
-    )
-
-    target: TargetMessage
-    stiffness: StiffnessMessage | None = None
-    load: LoadMessage | None = None
-    pressure: PressureMessage = PressureMessage()
-    robot: Annotated[str, Field(min_length=1, max_length=200)] | None = None
-
-    @classmethod
-    def of(cls, task: Task, robot: str | None = None) -> TaskMessage:
-        """Return the message that says this of the robot of a name.
-
-        Raises
-        ------
-        InputError
-            It cannot say all of it; the text names what it cannot.
-        """
-        return _saying_all_of(
-            task, lambda: _task_message(task, robot), lambda message: message.task(task.robot)
-        )
-
-    def task(self, robot: str) -> Task:
-        """Return it in code, for the robot of a name; raise `InputError` if it makes no sense."""
-        load, limits = self.load, self.pressure
-        return Task(
-            robot=robot,
-            target=self.target.target(),
-            stiffness=None if self.stiffness is None else _stiffness(self.stiffness),
-            load=None
-            if load is None
-            else Load(force=load.force_n, moment=load.moment_nm, frame=load.frame),
-            pressure=PressureRange(min=limits.min_pa, max=limits.max_pa),
-        )
 
 
 class TaskText(_Message):
@@ -310,7 +375,8 @@ def task_of(given: Any, robot: str) -> Task:
     if isinstance(request, TaskText):
         return _task_of_text(request.text, robot)
     _same_robot(request.robot, robot)
-    return request.task(robot)
+    task: Task = request.read(robot=robot)
+    return task
 
 
 def _task_of_text(text: str, robot: str) -> Task:
@@ -331,120 +397,6 @@ def _same_robot(given: Any, robot: str) -> None:
         )
 
 
-def _valid(adapter: TypeAdapter[ModelT], given: Any, place: Loc) -> ModelT:
-    try:
-        return adapter.validate_python(given)
-    except ValidationError as error:
-        mistakes = [{**mistake, "loc": (*place, *mistake["loc"])} for mistake in error.errors()]
-        raise InputError(sentence(mistakes)) from None
-
-
-_WAYPOINT = TypeAdapter(WaypointMessage)
+_WAYPOINT: TypeAdapter[SchemaMessage] = TypeAdapter(message_of(Waypoint))
 _TRAJECTORY = TypeAdapter(TrajectoryMessage)
 _TASK: TypeAdapter[TaskText | TaskMessage] = TypeAdapter(TaskRequest)
-
-
-def _stiffness(message: StiffnessMessage) -> StiffnessGoal:
-    match = message.match
-    wanted: Any = None if match is None else match.model_dump()
-    if isinstance(match, MatrixMessage):
-        wanted = {"matrix": wanted.pop("matrix_n_per_m"), **wanted}
-    return StiffnessGoal(
-        maximise=[m.model_dump() for m in message.maximise],
-        at_least=[m.model_dump() for m in message.at_least],
-        match=wanted,
-    )
-
-
-def _saying_all_of(
-    given: BaseModel, said: Callable[[], MessageT], heard: Callable[[MessageT], BaseModel]
-) -> MessageT:
-    """Return a message, if whoever gets it hears all that was to be said.
-
-    Parameters
-    ----------
-    given :
-        What is to be said.
-    said :
-        Makes the message.
-    heard :
-        Makes of the message what its receiver makes of it.
-
-    Raises
-    ------
-    InputError
-        The message cannot say all of it, or says it differently; the text names the keys.
-    """
-    try:
-        message = said()
-    except ValidationError as error:
-        raise InputError(sentence(error.errors())) from None
-    if lost := differences(contents(given), contents(heard(message))):
-        raise InputError(
-            f"{listed(lost)}: the daemon's messages cannot say this, and it would be lost"
-        )
-    return message
-
-
-def _target_message(target: Target) -> TargetMessage:
-    return TargetMessage(
-        position_m=_listed(target.position),
-        pointing=_listed(target.pointing),
-        orientation_wxyz=_listed(target.orientation),
-        tolerance=ToleranceMessage(
-            position_m=target.tolerance.position, angle_rad=target.tolerance.angle
-        ),
-    )
-
-
-def _trajectory_message(trajectory: Trajectory) -> TrajectoryMessage:
-    return TrajectoryMessage(
-        waypoints=[
-            WaypointMessage(time_s=w.time, target=_target_message(w.target))
-            for w in trajectory.waypoints
-        ]
-    )
-
-
-def _task_message(task: Task, robot: str | None) -> TaskMessage:
-    load, limits = task.load, task.pressure
-    return TaskMessage(
-        target=_target_message(task.target),
-        stiffness=None if task.stiffness is None else _stiffness_message(task.stiffness),
-        load=None
-        if load is None
-        else LoadMessage(force_n=list(load.force), moment_nm=list(load.moment), frame=load.frame),
-        pressure=PressureMessage(min_pa=_per_channel(limits.min), max_pa=_per_channel(limits.max)),
-        robot=robot,
-    )
-
-
-def _stiffness_message(goal: StiffnessGoal) -> StiffnessMessage:
-    match: MatchMessage | MatrixMessage | None = None
-    if isinstance(goal.match, MatchMatrix):
-        match = MatrixMessage(
-            matrix_n_per_m=[list(row) for row in goal.match.matrix],
-            frame=goal.match.frame,
-            boundary=goal.match.boundary,
-            tolerance=goal.match.tolerance,
-        )
-    elif goal.match is not None:
-        match = MatchMessage(**_measure(goal.match, MatchMessage))
-    return StiffnessMessage(
-        maximise=[MeasureMessage(**_measure(m, MeasureMessage)) for m in goal.maximise],
-        at_least=[AtLeastMessage(**_measure(m, AtLeastMessage)) for m in goal.at_least],
-        match=match,
-    )
-
-
-def _measure(measure: StiffnessMeasure, message: type[_Message]) -> dict[str, Any]:
-    said = {name: getattr(measure, name) for name in message.model_fields}
-    return {**said, "direction": list(measure.direction)}
-
-
-def _listed(values: Any) -> Any:
-    return None if values is None else list(values)
-
-
-def _per_channel(values: float | tuple[float | None, ...] | None) -> Any:
-    return list(values) if isinstance(values, tuple) else values

@@ -6,34 +6,23 @@ import threading
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from math import isfinite
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from stiffopt.control.state import Event, Snapshot, State
+from stiffopt.control.state import Snapshot, State
+from stiffopt.control.state_fields import Kind, entries
 from stiffopt.errors import MissingExtraError
+
+if TYPE_CHECKING:
+    from stiffopt.control.loop import ControlLoop
+    from stiffopt.daemon.telemetry import Telemetry
 
 __all__ = ["CONTENT_TYPE", "Metrics"]
 
+_SHARED = {"pressure_pascals": "Gauge pressures of the channels."}
+"""Help of metrics that several fields share."""
+
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """Of what `Metrics.render` returns."""
-
-
-class _Events(Protocol):
-    def since(self, index: int) -> tuple[list[Event], int]: ...
-
-
-class _Loop(Protocol):
-    @property
-    def events(self) -> _Events: ...
-
-    def snapshot(self) -> Snapshot: ...
-
-
-class _Telemetry(Protocol):
-    @property
-    def dropped(self) -> int: ...
-
-    @property
-    def written(self) -> int: ...
 
 
 class Metrics:
@@ -54,7 +43,7 @@ class Metrics:
         prometheus-client is not installed.
     """
 
-    def __init__(self, name: str, loop: _Loop, telemetry: _Telemetry | None = None) -> None:
+    def __init__(self, name: str, loop: ControlLoop, telemetry: Telemetry | None = None) -> None:
         try:
             from prometheus_client import CollectorRegistry
         except ImportError:
@@ -77,7 +66,7 @@ class Metrics:
         now = self._loop.snapshot()
         yield from self._of_state(now)
         yield from self._of_timing(now)
-        yield from self._of_arm(now)
+        yield from self._of_fields(now)
         yield from self._of_events()
         if self._telemetry is not None:
             yield self._counter(
@@ -99,9 +88,7 @@ class Metrics:
         from prometheus_client.core import HistogramMetricFamily
 
         timing = now.timing
-        yield self._counter("ticks", "Ticks of the loop.", timing.ticks)
-        yield self._counter("overruns", "Ticks that ended too late.", timing.overruns)
-        yield self._gauge("tick_time_seconds", "Duration of the last tick.", timing.tick_time)
+        yield from self._of_fields(timing)
         edges, counts = timing.lateness
         total, buckets = 0, []
         for edge, count in zip((*edges, float("inf")), counts, strict=True):
@@ -113,29 +100,27 @@ class Metrics:
         late.add_metric([self._name], buckets, sum_value=None)
         yield late
 
-    def _of_arm(self, now: Snapshot) -> Iterator[Any]:
-        for name, text, value in (
-            ("position_error_meters", "Of the estimated tip.", now.position_error),
-            ("angle_error_radians", "Of the estimated tip.", now.angle_error),
-            ("stiffness", "Along the task's direction, N/m or N m/rad.", now.stiffness),
-            ("best_stiffness", "Of the plan, in the same direction.", now.best_stiffness),
-            ("tracker_age_seconds", "Age of the latest sample that was used.", now.seen_age),
-        ):
-            if isfinite(value):
-                yield self._gauge(name, text, value)
-        pressures = self._gauges(
-            "pressure_pascals", "Gauge pressures of the channels.", "channel", "kind"
-        )
-        for kind, values in (
-            ("commanded", now.commanded),
-            ("measured", now.measured),
-            ("plan", now.plan),
-            ("limit", now.high),
-        ):
-            for channel, value in enumerate(values.tolist(), start=1):
-                if isfinite(value):
-                    pressures.add_metric([self._name, str(channel), kind], value)
-        yield pressures
+    def _of_fields(self, record: Any) -> Iterator[Any]:
+        """Yield the metrics of a record whose definitions name one."""
+        shared: dict[str, Any] = {}
+        for entry in entries(type(record)):
+            name, about = entry.shown.metric, _sentence(entry.shown.about)
+            value = getattr(record, entry.name) if name else None
+            if value is None:
+                continue
+            if entry.kind is Kind.COUNT:
+                yield self._counter(name, about, value)
+            elif entry.kind is Kind.NUMBERS:
+                labels = ("channel", "kind") if entry.shown.label else ("channel",)
+                about = _SHARED.get(name, about)
+                family = shared.setdefault(name, self._gauges(name, about, *labels))
+                for channel, number in enumerate(value.tolist(), start=1):
+                    if isfinite(number):
+                        of = (str(channel), entry.shown.label)[: len(labels)]
+                        family.add_metric([self._name, *of], number)
+            elif isfinite(value):
+                yield self._gauge(name, about, value)
+        yield from shared.values()
 
     def _of_events(self) -> Iterable[Any]:
         from prometheus_client.core import CounterMetricFamily
@@ -165,6 +150,10 @@ class Metrics:
         family = CounterMetricFamily(f"stiffopt_{name}", text, labels=["rig"])
         family.add_metric([self._name], value)
         return family
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 class _Collector:

@@ -6,7 +6,11 @@ import asyncio
 import logging
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from math import isfinite
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from stiffopt import units
 from stiffopt.control.state import State
@@ -19,8 +23,8 @@ from stiffopt.daemon.reports import (
     GrantReport,
     LeaseReport,
     RobotReport,
-    StateReport,
     TaskReport,
+    state_json,
 )
 from stiffopt.daemon.wire import LEASE_HEADER
 from stiffopt.errors import CommandError, StiffoptError
@@ -67,13 +71,13 @@ class Operations:
         self._task: TaskMessage | None = None  # the last that was accepted, while it matters
         self._settling: asyncio.Task[None] | None = None
 
-    def state(self) -> StateReport:
-        """Return how things stand."""
+    def state(self) -> dict[str, Any]:
+        """Return the state of the loop and who has control, as `StateReport` describes it."""
         holder = self.lease.holder
         lease = None
         if holder is not None:
             lease = LeaseReport(client=holder.client, expires_in_s=holder.expires_in)
-        return StateReport.of(self.loop.snapshot(), lease)
+        return state_json(self.loop.snapshot(), lease)
 
     def robot_report(self) -> RobotReport:
         """Return what arm this is."""
@@ -89,16 +93,20 @@ class Operations:
 
     def task(self) -> TaskReport:
         """Return what is being done."""
-        now = self.state()
-        asked: TargetMessage | None = None
-        if now.target_position_m or now.target_quaternion_wxyz or now.target_pointing:
-            asked = TargetMessage(
-                position_m=now.target_position_m,
-                orientation_wxyz=_whole(now.target_quaternion_wxyz),
-                pointing=_whole(now.target_pointing),
-            )
+        now = self.loop.snapshot()
+        wanted = {
+            "position_m": now.target_position,
+            "orientation_wxyz": _whole(now.target_quaternion),
+            "pointing": _whole(now.target_pointing),
+        }
+        told = {
+            key: [x if isfinite(x) else None for x in value.tolist()]
+            for key, value in wanted.items()
+            if value is not None
+        }
+        target = TargetMessage.model_validate(told) if told else None
         given = None if now.state in _VENTED else self._task
-        return TaskReport(doing=now.task, target=asked, task=given)
+        return TaskReport(doing=now.task, target=target, task=given)
 
     # Control ----------------------------------------------------------------------------------
 
@@ -171,7 +179,7 @@ class Operations:
 
         def pursue() -> TaskMessage:
             task = task_of(given, self.robot.name)
-            message = TaskMessage.of(task, self.robot.name)  # what clients are told later
+            message = TaskMessage.of(task, robot=self.robot.name)  # what clients are told later
             self.loop.set_task(task)
             return message
 
@@ -238,7 +246,6 @@ def _shown(identity: str | None) -> str:
     return identity
 
 
-def _whole(values: list[float | None] | None) -> list[float] | None:
+def _whole(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
     """Return the values if all are known."""
-    known = [x for x in values or () if x is not None]
-    return known if known and len(known) == len(values or ()) else None
+    return values if values is not None and np.isfinite(values).all() else None

@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Any
 
 from stiffopt.daemon.private import make_private
-from stiffopt.logs.run_schemas import METADATA
+from stiffopt.daemon.topics import METADATA
 
 __all__ = ["MIN_FREE", "Recording", "free_bytes"]
 

@@ -1,51 +1,159 @@
-"""What the daemon answers, as JSON: SI units in the names, null for what is not known."""
+"""What the daemon answers, as JSON: SI units in the names, null for what is not known.
+
+The reports of the loop's state and of its events follow from the definitions in
+`stiffopt.control.state`; the other answers are models of their own.
+"""
 
 from __future__ import annotations
 
-import math
-from typing import Annotated
+from collections.abc import Mapping
+from math import isfinite, nan
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, BeforeValidator, Field
+from pydantic import BaseModel, BeforeValidator, Field, create_model
 
-from stiffopt.control.state import Alarm, Event, Severity, Snapshot, State, Timing
+from stiffopt.control.state import Event, Snapshot, State
+from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.messages import TargetMessage, TaskMessage
-from stiffopt.errors import printable
+from stiffopt.errors import ServiceError, printable
 
 __all__ = [
     "DoneReport",
     "ErrorReport",
-    "EventReport",
     "EventsReport",
     "GrantReport",
     "LeaseReport",
     "RobotReport",
     "StateReport",
     "TaskReport",
+    "json_of",
+    "plain",
+    "record_of",
+    "state_json",
 ]
 
-Array = NDArray[np.float64]
+RecordT = TypeVar("RecordT")
+
 Values = list[float | None]
 Text = Annotated[str, BeforeValidator(printable)]  # a file's name, say, need not be valid Unicode
 
 
-class AlarmReport(BaseModel):
-    """Something that is wrong now."""
-
-    kind: str
-    text: Text
-    since_s: float
+# From the definitions of the state ---------------------------------------------------------------
 
 
-class TimingReport(BaseModel):
-    """How punctual the control loop is: counts of how late ticks begin, between edges."""
+def json_of(record: Any) -> dict[str, Any]:
+    """Return a record of the state, such as a `Snapshot` or an `Event`, as JSON has it."""
+    found: dict[str, Any] = {}
+    for entry in entries(type(record)):
+        value = plain(getattr(record, entry.name), entry)
+        found.update(zip(entry.json, _shares(record, entry, value), strict=True))
+    return found
 
-    ticks: int
-    overruns: int
-    tick_time_s: float | None
-    lateness_edges_s: list[float]
-    lateness_counts: list[int]
+
+def state_json(now: Snapshot, lease: LeaseReport | None = None) -> dict[str, Any]:
+    """Return the state of the loop, and who has control, as `StateReport` describes it."""
+    return {**json_of(now), "lease": None if lease is None else lease.model_dump()}
+
+
+def record_of(record: type[RecordT], given: Mapping[str, Any]) -> RecordT:
+    """Return what `json_of` was given; what was not known is NaN. Further keys do no harm.
+
+    Raises
+    ------
+    ServiceError
+        Something is missing, or is none of the values that can be there.
+    """
+    try:
+        return _record_of(record, given)
+    except (KeyError, TypeError, ValueError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise ServiceError(f"the daemon's {record.__name__.lower()} is none: {reason}") from None
+
+
+def _shares(record: Any, entry: Entry, value: Any) -> list[Any]:
+    """Return what goes under each of a field's names in JSON."""
+    if len(entry.json) < 2:
+        return [value] * len(entry.json)
+    if entry.units:
+        held = getattr(record, entry.shown.unit_field)
+        return [value if unit == held else None for unit in entry.units]
+    size = len(value) // len(entry.json)
+    return [value[k * size : (k + 1) * size] for k in range(len(entry.json))]
+
+
+def plain(value: Any, entry: Entry) -> Any:
+    """Return a value as JSON has it."""
+    if value is None:
+        return None
+    match entry.kind:
+        case Kind.NUMBER:
+            return float(value) if isfinite(value) else None
+        case Kind.NUMBERS:
+            numbers = np.asarray(value, dtype=float).tolist()
+            return [x if isfinite(x) else None for x in numbers]
+        case Kind.COUNTS | Kind.FLAGS:
+            values: list[Any] = np.asarray(value).tolist()
+            return values
+        case Kind.TEXT:
+            return printable(str(value))
+        case Kind.RECORD:
+            return json_of(value)
+        case Kind.RECORDS:
+            return [json_of(item) for item in value]
+    return value
+
+
+def _record_of(record: type[RecordT], given: Mapping[str, Any]) -> RecordT:
+    fields: dict[str, Any] = {}
+    for entry in entries(record):
+        if not entry.json:
+            continue
+        values = [given[name] for name in entry.json]
+        if entry.units:
+            place = next((k for k, value in enumerate(values) if value is not None), 0)
+            fields[entry.name] = _value_of(values[place], entry)
+            if values[place] is not None:
+                fields[entry.shown.unit_field] = entry.units[place]
+        else:
+            value = values[0] if len(values) == 1 else [x for part in values for x in part]
+            fields[entry.name] = _value_of(value, entry)
+    return record(**fields)
+
+
+def _value_of(value: Any, entry: Entry) -> Any:
+    if value is None:
+        return nan if entry.kind is Kind.NUMBER else None
+    match entry.kind:
+        case Kind.NUMBERS | Kind.FLAGS if entry.in_array:
+            return np.array(value, dtype=entry.type)
+        case Kind.NUMBERS | Kind.COUNTS:
+            return tuple(map(entry.type, value))
+        case Kind.RECORD:
+            return _record_of(entry.type, value)
+        case Kind.RECORDS:
+            return tuple(_record_of(entry.type, item) for item in value)
+    return entry.type(value)
+
+
+def _report_model(name: str, record: type, **more: Any) -> type[BaseModel]:
+    """Return the model of what `json_of` gives of a record."""
+    fields: dict[str, Any] = {}
+    for entry in entries(record):
+        kind: Any = {
+            Kind.NUMBER: float | None,
+            Kind.NUMBERS: Values if entry.in_array else list[float],
+            Kind.COUNTS: list[int],
+            Kind.FLAGS: list[bool],
+        }.get(entry.kind, entry.type)
+        if entry.kind in (Kind.RECORD, Kind.RECORDS):
+            kind = _report_model(f"{entry.type.__name__}Report", entry.type)
+            kind = list[kind] if entry.kind is Kind.RECORDS else kind
+        if entry.optional:
+            kind = kind | None
+        for key in entry.json:
+            fields[key] = (kind, Field(description=entry.shown.about))
+    return create_model(name, __doc__=(record.__doc__ or "").partition("\n\n")[0], **fields, **more)
 
 
 class LeaseReport(BaseModel):
@@ -55,156 +163,18 @@ class LeaseReport(BaseModel):
     expires_in_s: float
 
 
-class StateReport(BaseModel):
-    """How things stand; `Snapshot` says what the values mean.
-
-    Times are on the rig's clock. Of the two stiffnesses the one that the task is about is given.
-    """
-
-    time_s: float
-    state: State
-    reason: Text
-    task: Text
-    commanded_pa: Values
-    measured_pa: Values
-    measured_time_s: float | None
-    plan_pa: Values
-    low_pa: Values
-    high_pa: Values
-    saturated: list[bool]
-    tip_position_m: Values
-    tip_quaternion_wxyz: Values
-    seen_position_m: Values
-    seen_age_s: float | None
-    rejected_samples: int
-    target_position_m: Values | None
-    target_quaternion_wxyz: Values | None
-    target_pointing: Values | None
-    position_error_m: float | None
-    angle_error_rad: float | None
-    stiffness_n_per_m: float | None
-    best_stiffness_n_per_m: float | None
-    stiffness_nm_per_rad: float | None
-    best_stiffness_nm_per_rad: float | None
-    disturbance_m: Values
-    wrench_force_n: Values
-    wrench_moment_nm: Values
-    alarms: list[AlarmReport]
-    timing: TimingReport
-    lease: LeaseReport | None
-
-    @classmethod
-    def of(cls, s: Snapshot, lease: LeaseReport | None) -> StateReport:
-        """Return the report of a snapshot, and of who has control."""
-        turns = s.stiffness_unit != "N/m"
-        stiffness, best = _number(s.stiffness), _number(s.best_stiffness)
-        edges, counts = s.timing.lateness
-        return cls(
-            time_s=s.time,
-            state=s.state,
-            reason=s.reason,
-            task=s.task,
-            commanded_pa=_values(s.commanded),
-            measured_pa=_values(s.measured),
-            measured_time_s=_number(s.measured_time),
-            plan_pa=_values(s.plan),
-            low_pa=_values(s.low),
-            high_pa=_values(s.high),
-            saturated=[bool(x) for x in s.saturated],
-            tip_position_m=_values(s.tip_position),
-            tip_quaternion_wxyz=_values(s.tip_quaternion),
-            seen_position_m=_values(s.seen_position),
-            seen_age_s=_number(s.seen_age),
-            rejected_samples=s.rejected,
-            target_position_m=_values_or_none(s.target_position),
-            target_quaternion_wxyz=_values_or_none(s.target_quaternion),
-            target_pointing=_values_or_none(s.target_pointing),
-            position_error_m=_number(s.position_error),
-            angle_error_rad=_number(s.angle_error),
-            stiffness_n_per_m=None if turns else stiffness,
-            best_stiffness_n_per_m=None if turns else best,
-            stiffness_nm_per_rad=stiffness if turns else None,
-            best_stiffness_nm_per_rad=best if turns else None,
-            disturbance_m=_values(s.disturbance),
-            wrench_force_n=_values(s.wrench[:3]),
-            wrench_moment_nm=_values(s.wrench[3:]),
-            alarms=[AlarmReport(kind=a.kind, text=a.text, since_s=a.since) for a in s.alarms],
-            timing=TimingReport(
-                ticks=s.timing.ticks,
-                overruns=s.timing.overruns,
-                tick_time_s=_number(s.timing.tick_time),
-                lateness_edges_s=[float(x) for x in edges if math.isfinite(x)],
-                lateness_counts=[int(x) for x in counts],
-            ),
-            lease=lease,
-        )
-
-    def snapshot(self) -> Snapshot:
-        """Return the snapshot that this is a report of; NaN for what is not known."""
-        turns = self.stiffness_nm_per_rad is not None or self.best_stiffness_nm_per_rad is not None
-        timing = self.timing
-        return Snapshot(
-            time=self.time_s,
-            state=self.state,
-            reason=self.reason,
-            task=self.task,
-            commanded=_array(self.commanded_pa),
-            measured=_array(self.measured_pa),
-            measured_time=_known(self.measured_time_s),
-            plan=_array(self.plan_pa),
-            low=_array(self.low_pa),
-            high=_array(self.high_pa),
-            saturated=np.array(self.saturated, dtype=bool),
-            tip_position=_array(self.tip_position_m),
-            tip_quaternion=_array(self.tip_quaternion_wxyz),
-            seen_position=_array(self.seen_position_m),
-            seen_age=_known(self.seen_age_s),
-            rejected=self.rejected_samples,
-            target_position=_array_or_none(self.target_position_m),
-            target_quaternion=_array_or_none(self.target_quaternion_wxyz),
-            target_pointing=_array_or_none(self.target_pointing),
-            position_error=_known(self.position_error_m),
-            angle_error=_known(self.angle_error_rad),
-            stiffness=_known(self.stiffness_nm_per_rad if turns else self.stiffness_n_per_m),
-            best_stiffness=_known(
-                self.best_stiffness_nm_per_rad if turns else self.best_stiffness_n_per_m
-            ),
-            stiffness_unit="N*m/rad" if turns else "N/m",
-            disturbance=_array(self.disturbance_m),
-            wrench=_array([*self.wrench_force_n, *self.wrench_moment_nm]),
-            alarms=tuple(Alarm(a.kind, a.text, a.since_s) for a in self.alarms),
-            timing=Timing(
-                timing.ticks,
-                timing.overruns,
-                _known(timing.tick_time_s),
-                (tuple(timing.lateness_edges_s), tuple(timing.lateness_counts)),
-            ),
-        )
-
-
-class EventReport(BaseModel):
-    """Something that happened."""
-
-    time_s: float
-    kind: str
-    text: Text
-    severity: Severity
-
-    @classmethod
-    def of(cls, event: Event) -> EventReport:
-        """Return the report of an event."""
-        return cls(time_s=event.time, kind=event.kind, text=event.text, severity=event.severity)
-
-    def event(self) -> Event:
-        """Return the event that this is a report of."""
-        return Event(self.time_s, self.kind, self.text, self.severity)
+StateReport = _report_model("StateReport", Snapshot, lease=(LeaseReport | None, ...))
+_EventReport: Any = _report_model("EventReport", Event)
 
 
 class EventsReport(BaseModel):
     """Events, and what to ask for as `since` to get those after them."""
 
-    events: list[EventReport]
+    events: list[_EventReport]
     next: int
+
+
+# Other answers -----------------------------------------------------------------------------------
 
 
 class RobotReport(BaseModel):
@@ -255,27 +225,3 @@ class ErrorReport(BaseModel):
     """Why a request was not done."""
 
     error: Mistake
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _values(array: ArrayLike) -> Values:
-    return [x if math.isfinite(x) else None for x in np.asarray(array, dtype=float).tolist()]
-
-
-def _values_or_none(array: Array | None) -> Values | None:
-    return None if array is None else _values(array)
-
-
-def _known(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
-def _array(values: Values) -> Array:
-    return np.array(values, dtype=float)
-
-
-def _array_or_none(values: Values | None) -> Array | None:
-    return None if values is None else _array(values)

@@ -26,12 +26,12 @@ from stiffopt.daemon.messages import (
 from stiffopt.daemon.reports import (
     DoneReport,
     ErrorReport,
-    EventReport,
     EventsReport,
     GrantReport,
     RobotReport,
     StateReport,
     TaskReport,
+    json_of,
 )
 from stiffopt.errors import MissingExtraError
 from stiffopt.model.description import RobotDescription
@@ -49,6 +49,7 @@ except ModuleNotFoundError as error:
 from stiffopt.daemon.access import Access, Token
 from stiffopt.daemon.calls import Commanded
 from stiffopt.daemon.crowd import MEMBER, Crowd, Member
+from stiffopt.daemon.metrics import CONTENT_TYPE
 from stiffopt.daemon.operations import Operations
 from stiffopt.daemon.page import POLICY, page_of
 from stiffopt.daemon.refusals import RefusedError, sentence
@@ -57,7 +58,6 @@ from stiffopt.daemon.wire import LEASE_HEADER
 
 __all__ = ["create_app"]
 
-_METRICS_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _WHY = {
     401: "The token is missing.",
     403: "The token is wrong, or the request comes from another site.",
@@ -183,16 +183,16 @@ def _reading(operations: Operations) -> APIRouter:
     """Return the calls that anyone may make."""
     router = APIRouter(tags=["read"], responses=_responses(403, 413))
 
-    @router.get("/state")
-    async def state() -> StateReport:
+    @router.get("/state", response_model=StateReport)
+    async def state() -> Response:
         """How things stand."""
-        return operations.state()
+        return JSONResponse(operations.state())
 
-    @router.get("/events", responses=_responses(422))
-    async def events(since: Annotated[int, Query(ge=0, le=2**53)] = 0) -> EventsReport:
+    @router.get("/events", response_model=EventsReport, responses=_responses(422))
+    async def events(since: Annotated[int, Query(ge=0, le=2**53)] = 0) -> Response:
         """What has happened since an earlier answer's `next`; from the beginning without it."""
         found, after = operations.loop.events.since(since)
-        return EventsReport(events=[EventReport.of(event) for event in found], next=after)
+        return JSONResponse({"events": [json_of(event) for event in found], "next": after})
 
     @router.get("/robot")
     async def robot() -> RobotReport:
@@ -267,7 +267,7 @@ def _moving(operations: Operations) -> APIRouter:
     @router.post("/target")
     async def set_target(request: TargetMessage, lease: LeaseHeader = None) -> DoneReport:
         """Go to another target, with the stiffness goal and the limits of the task."""
-        return await operations.command(lease, loop.set_target, request.target)
+        return await operations.command(lease, loop.set_target, request.read)
 
     @router.post("/trajectory")
     async def follow_trajectory(
@@ -311,7 +311,7 @@ def _add_pages(app: FastAPI, metrics: Callable[[], bytes] | None) -> None:
 
         @app.get("/metrics", include_in_schema=False)
         async def prometheus() -> Response:
-            return Response(metrics(), media_type=_METRICS_TYPE)
+            return Response(metrics(), media_type=CONTENT_TYPE)
 
 
 def _add_refusals(app: FastAPI) -> None:

@@ -123,8 +123,7 @@ class Stream:
         clock = asyncio.get_running_loop()
         due = clock.time()
         while True:
-            state = self._operations.state().model_dump_json()
-            await self._send_text(f'{{"type":"state","state":{state}}}')
+            await self._send({"type": "state", "state": self._operations.state()})
             due = max(due + period, clock.time())  # a slow reader gets fewer, not older ones
             await asyncio.sleep(due - clock.time())
 
@@ -179,7 +178,7 @@ class Stream:
             if streamed is None:
                 continue
             try:
-                await self._operations.command(self._lease, loop.set_target, streamed.target.target)
+                await self._operations.command(self._lease, loop.set_target, streamed.target.read)
             except RefusedError as refusal:
                 await self._answer(streamed.seq, refusal)
             else:

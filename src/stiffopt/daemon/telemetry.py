@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.state import Alarm, Event, Snapshot
-from stiffopt.daemon.channels import Channels
+from stiffopt.daemon.channels import TelemetryChannels
 from stiffopt.daemon.recording import Recording
+from stiffopt.daemon.topics import FORMAT
 from stiffopt.errors import MissingExtraError, StiffoptError
 from stiffopt.files import file_text
-from stiffopt.logs.run_schemas import FORMAT
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.device import Clock
 from stiffopt.rig.settings import ServiceSettings
@@ -118,7 +118,7 @@ class Telemetry:
         self._context = Context()
         begin = clock.now()
         self._offset = wall() - round(begin * 1e9)
-        self._channels = Channels(self._context, self._offset, 2 * _radius(robot))
+        self._channels = TelemetryChannels(self._context, self._offset, 2 * _radius(robot))
         first = loop.snapshot()
         facts = {**about_run(robot, name, first, begin, self._offset), **(about or {})}
         self._recording = (

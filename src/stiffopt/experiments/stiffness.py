@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from stiffopt.directions import Direction
+from stiffopt.directions import Direction, direction_name
 from stiffopt.errors import InputError
 from stiffopt.experiments.conductor import Array, Conductor, Row, at_rest, check_pressures
 from stiffopt.experiments.points import PointsFile, SeriesKey
@@ -28,7 +28,7 @@ from stiffopt.rig.interface import Rig
 from stiffopt.schema import Items
 from stiffopt.units import Duration, Force, Length, Pressure
 
-__all__ = ["StiffnessSettings", "direction_name", "run_stiffness"]
+__all__ = ["StiffnessSettings", "run_stiffness"]
 
 HARD_STOP = 5.0
 """Times the force that is meant not to be exceeded, at which a series ends."""
@@ -290,11 +290,3 @@ def _rounded(key: SeriesKey) -> tuple[int, float, tuple[float, ...]]:
     """Return what tells series apart, as a file keeps it."""
     direction = tuple(round(component, 6) + 0.0 for component in key.direction)
     return key.repetition, round(key.pressure, 1), direction
-
-
-def direction_name(direction: tuple[float, float, float]) -> str:
-    """Return a direction as people name it: x, -z, (0.6, 0.8, 0)."""
-    for axis, name in enumerate("xyz"):
-        if abs(abs(direction[axis]) - 1) < 1e-9:
-            return name if direction[axis] > 0 else f"-{name}"
-    return f"({', '.join(f'{component + 0.0:.3g}' for component in direction)})"

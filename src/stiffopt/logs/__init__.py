@@ -2,7 +2,8 @@
 
 from stiffopt.logs.layout import LogLayout
 from stiffopt.logs.log import Body, Log, LogRow
-from stiffopt.logs.mcap_log import McapLogWriter, read_mcap_log, require_mcap
+from stiffopt.logs.mcap_log import McapLogWriter, read_mcap_log
+from stiffopt.logs.mcap_reading import require_mcap
 from stiffopt.logs.reading import read_log
 from stiffopt.logs.stiffness import (
     StiffnessTable,

@@ -15,24 +15,24 @@ from __future__ import annotations
 
 import json
 import os
-import struct
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from importlib.util import find_spec
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from stiffopt.errors import FileError, InputError, MissingExtraError
+from stiffopt.errors import FileError, InputError
 from stiffopt.logs.layout import LogLayout
 from stiffopt.logs.log import Array, Log, LogRow
+from stiffopt.logs.mcap_reading import McapContents, read_mcap, require_mcap
 from stiffopt.logs.reading import log_of_values
 
-__all__ = ["McapLogWriter", "read_mcap_log", "require_mcap"]
+__all__ = ["LOG_METADATA", "McapLogWriter", "read_mcap_log"]
 
-_LOG = "stiffopt-log"
+LOG_METADATA = "stiffopt-log"
+"""Name of the metadata record of a log."""
 _NUMBER = {"type": "number"}  # or null; but Foxglove refuses a topic whose schema says so
 _LIST = {"type": "array", "items": _NUMBER}
 _SCHEMAS: dict[str, dict[str, Any]] = {
@@ -40,22 +40,6 @@ _SCHEMAS: dict[str, dict[str, Any]] = {
     "pose": {"position_m": _LIST, "quaternion_wxyz": _LIST},
     "force": {"force_n": _NUMBER, "stage_m": _NUMBER},
 }
-
-
-def require_mcap() -> None:
-    """Say how to get mcap if it is missing.
-
-    Raises
-    ------
-    MissingExtraError
-        It is not installed.
-    """
-    try:
-        missing = find_spec("mcap") is None
-    except ValueError:  # a placeholder in sys.modules
-        missing = True
-    if missing:
-        raise MissingExtraError("mcap", "log")
 
 
 class McapLogWriter:
@@ -98,7 +82,7 @@ class McapLogWriter:
             raise self._cannot(error) from None
         self._writer: Any = Writer(self._stream, use_chunking=False)
         self._writer.start(library="stiffopt")
-        self._writer.add_metadata(_LOG, {"start_ns": str(self._start), **_as_text(layout)})
+        self._writer.add_metadata(LOG_METADATA, {"start_ns": str(self._start), **_as_text(layout)})
         if about:
             self._writer.add_metadata("about", dict(about))
         self._channels = self._registered()
@@ -211,59 +195,26 @@ def read_mcap_log(path: str | os.PathLike[str]) -> Log:
     MissingExtraError
         mcap is not installed.
     """
-    require_mcap()
     name = os.fspath(path)
+    found = read_mcap(name)
+    if LOG_METADATA not in found.metadata:
+        raise FileError(name, "is no MCAP recording of stiffopt")
     try:
-        with open(name, "rb") as stream:
-            layout, rows = _whole_rows(stream)
-    except OSError as error:
-        raise FileError(name, f"cannot be read: {(error.strerror or '').lower()}") from None
+        layout = LogLayout.of_columns(name, found.metadata[LOG_METADATA]["columns"].split(","))
+        rows = list(_whole_rows(found, layout))
     except (ValueError, KeyError, TypeError) as error:
         raise FileError(name, f"is damaged: {error}") from None
-    if layout is None:
-        raise FileError(name, "is no MCAP recording of stiffopt")
     values = np.array(rows) if rows else np.empty((0, len(layout.columns)))
     return log_of_values(values, layout)
 
 
-def _whole_rows(stream: BinaryIO) -> tuple[LogLayout | None, list[Array]]:
-    from mcap.records import Channel, Message, Metadata
-
-    layout: LogLayout | None = None
-    topics: dict[int, str] = {}
+def _whole_rows(found: McapContents, layout: LogLayout) -> Iterator[Array]:
     parts: dict[str, Any] = {}
-    rows: list[Array] = []
-    for record in _records(stream):
-        if isinstance(record, Metadata) and record.name == _LOG:
-            layout = LogLayout.of_columns(stream.name, record.metadata["columns"].split(","))
-        elif isinstance(record, Channel):
-            topics[record.id] = record.topic
-        elif isinstance(record, Message) and layout is not None:
-            topic = topics[record.channel_id]
-            try:
-                parts[topic] = json.loads(record.data)
-            except ValueError:
-                if not stream.read(1):
-                    break  # the last message is not whole
-                raise
-            if topic == "/pressure":
-                rows.append(_row(parts).values(layout))
-                parts = {}
-    return layout, rows
-
-
-def _records(stream: BinaryIO) -> Iterator[Any]:
-    """Yield records up to the end, or to where a recording was cut short."""
-    from mcap.exceptions import McapError
-    from mcap.stream_reader import StreamReader
-
-    records = iter(StreamReader(stream).records)
-    while True:
-        try:
-            record = next(records)
-        except (StopIteration, McapError, EOFError, struct.error):
-            return
-        yield record
+    for topic, message in found.messages:
+        parts[topic] = message
+        if topic == "/pressure":  # the last of its row
+            yield _row(parts).values(layout)
+            parts = {}
 
 
 def _row(parts: Mapping[str, Any]) -> LogRow:
@@ -317,4 +268,4 @@ def _plain(values: Any) -> Any:
 
 
 def _as_text(layout: LogLayout) -> dict[str, str]:
-    return {"format": f"{_LOG}/1", "columns": ",".join(layout.columns)}
+    return {"format": f"{LOG_METADATA}/1", "columns": ",".join(layout.columns)}

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.directions import direction_name
 from stiffopt.experiments.arm_map import ArmMap, TipMap
-from stiffopt.experiments.stiffness import direction_name
 from stiffopt.plots.experiments import N_PER_CM
 from stiffopt.plots.figures import _literal, require_matplotlib
 from stiffopt.plots.scales import label_logarithmic, make_logarithmic, round_steps

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.experiments.stiffness import direction_name
+from stiffopt.directions import direction_name
 from stiffopt.identify.choice import Candidate
 from stiffopt.identify.comparison import Comparison
 from stiffopt.identify.stiffness_comparison import StiffnessComparison

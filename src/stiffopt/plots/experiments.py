@@ -4,9 +4,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stiffopt.directions import direction_name
 from stiffopt.experiments.coverage_result import CoverageResult
 from stiffopt.experiments.kinematics_result import KinematicsResult
-from stiffopt.experiments.stiffness import direction_name
 from stiffopt.experiments.stiffness_result import StiffnessResult
 from stiffopt.plots.figures import _literal, require_matplotlib
 from stiffopt.plots.scales import make_logarithmic

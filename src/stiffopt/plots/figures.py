@@ -3,14 +3,13 @@
 import os
 import tempfile
 from collections.abc import Sequence
-from importlib.util import find_spec
 from io import BytesIO
 from math import degrees
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING
 
-from stiffopt.errors import FileError, InputError, MissingExtraError, printable
+from stiffopt.errors import FileError, InputError, printable, require_package
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots.arm import draw_arm
@@ -32,12 +31,7 @@ def require_matplotlib() -> None:
     MissingExtraError
         If it is not installed.
     """
-    try:
-        missing = find_spec("matplotlib") is None
-    except ValueError:  # a placeholder in sys.modules
-        missing = True
-    if missing:
-        raise MissingExtraError("matplotlib", "plot")
+    require_package("matplotlib", "plot")
 
 
 def plot_solution(

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.daemon.run_log import RecordedRun, RunEvent
 from stiffopt.errors import printable
-from stiffopt.logs.run_log import Run, RunEvent
 from stiffopt.plots.experiments import AXES, CHANNELS, _head, _legend, _plain
 from stiffopt.plots.figures import _literal, require_matplotlib
 from stiffopt.plots.run_timeline import SHADES, draw_timeline, timeline_rows
@@ -36,7 +36,7 @@ _SMALLEST_RANGE = 2.0  # mm, of an axis of the tip
 _GREY = "#8a8f96"
 
 
-def plot_run(run: Run, *, title: str | None = None) -> Figure:
+def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
     """Draw a run.
 
     Parameters
@@ -93,7 +93,7 @@ def plot_run(run: Run, *, title: str | None = None) -> Figure:
     return figure
 
 
-def _draw_tip(axes: Any, run: Run, axis: int) -> None:
+def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
     seen = run.seen_position[:, axis] * MM
     if np.isfinite(seen).any():
         axes.plot(
@@ -101,10 +101,10 @@ def _draw_tip(axes: Any, run: Run, axis: int) -> None:
             markeredgewidth=0, label="tracker",
         )  # fmt: skip
     axes.plot(
-        *_thinned(run.time, run.tip[:, axis] * MM), color=AXES[axis], linewidth=1.3,
+        *_thinned(run.time, run.tip_position[:, axis] * MM), color=AXES[axis], linewidth=1.3,
         label="estimate",
     )  # fmt: skip
-    target = run.target[:, axis] * MM
+    target = run.target_position[:, axis] * MM
     if np.isfinite(target).any():
         axes.plot(
             *_thinned(run.time, target), color=TARGET, linewidth=1.3, linestyle=(0, (4, 2)),
@@ -119,7 +119,7 @@ def _draw_tip(axes: Any, run: Run, axis: int) -> None:
     _plain(axes)
 
 
-def _draw_error(axes: Any, run: Run) -> None:
+def _draw_error(axes: Any, run: RecordedRun) -> None:
     error = np.maximum(run.position_error, _FLOOR) * MM
     axes.plot(*_thinned(run.time, error), color="#333333", linewidth=1.2, label="position")
     axes.set_ylabel("error (mm)")
@@ -137,7 +137,7 @@ def _draw_error(axes: Any, run: Run) -> None:
     _plain(axes)
 
 
-def _draw_angle(axes: Any, run: Run) -> None:
+def _draw_angle(axes: Any, run: RecordedRun) -> None:
     axes.plot(
         *_thinned(run.time, np.degrees(run.angle_error)), color="#333333", linewidth=1.2,
         label="angle",
@@ -149,7 +149,7 @@ def _draw_angle(axes: Any, run: Run) -> None:
     _plain(axes)
 
 
-def _draw_pressures(axes: Any, run: Run, segment: int, channels: range) -> None:
+def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) -> None:
     from matplotlib.lines import Line2D
 
     for channel in channels:
@@ -179,7 +179,7 @@ def _draw_pressures(axes: Any, run: Run, segment: int, channels: range) -> None:
     _plain(axes)
 
 
-def _draw_stiffness(axes: Any, run: Run) -> None:
+def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
     if np.isfinite(run.best_stiffness).any():
         axes.plot(
             *_thinned(run.time, run.best_stiffness), color=TARGET, linewidth=1.3,
@@ -194,7 +194,7 @@ def _draw_stiffness(axes: Any, run: Run) -> None:
     _plain(axes)
 
 
-def _shade(panels: Any, run: Run) -> None:
+def _shade(panels: Any, run: RecordedRun) -> None:
     """Let the states in which it did not steer show behind everything."""
     for span in run.states:
         if span.kind in SHADES and span.kind != "active":
@@ -227,7 +227,7 @@ def _listed(events: tuple[RunEvent, ...]) -> list[RunEvent]:
     return [events[i] for i in sorted(order[:_MOST_EVENTS])]
 
 
-def _what(run: Run) -> str:
+def _what(run: RecordedRun) -> str:
     begin = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(int(run.about["start_ns"]) // 10**9))
     parts = [run.about.get("robot", ""), begin, f"{run.time[-1] - run.time[0]:.1f} s"]
     if "overruns" in run.timing:
@@ -237,7 +237,7 @@ def _what(run: Run) -> str:
     return "      ".join(parts)
 
 
-def _figures(run: Run) -> str:
+def _figures(run: RecordedRun) -> str:
     """Say how well it went while it steered."""
     steered = np.zeros(len(run), dtype=bool)
     for span in run.states:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from stiffopt.logs.run_log import Run, RunEvent, RunSpan
+from stiffopt.daemon.run_log import RecordedRun, RunEvent, RunSpan
 from stiffopt.plots.figures import _literal
 
 __all__ = ["SHADES", "draw_timeline", "timeline_rows"]
@@ -26,12 +26,12 @@ _LETTER = 0.0095  # of the width that a letter takes
 _APART = 0.012  # of the width between two numbers
 
 
-def timeline_rows(run: Run) -> int:
+def timeline_rows(run: RecordedRun) -> int:
     """Return how many rows the panel has."""
     return 1 + len(_alarm_kinds(run)) + bool(run.events)
 
 
-def draw_timeline(axes: Any, run: Run, listed: list[RunEvent]) -> None:
+def draw_timeline(axes: Any, run: RecordedRun, listed: list[RunEvent]) -> None:
     """Draw bands for states and alarms, and marks for events; those that are listed by number."""
     kinds = _alarm_kinds(run)
     labels = ["state", *kinds, *(["events"] if run.events else [])]
@@ -58,7 +58,9 @@ def _band(axes: Any, span: RunSpan, row: int, colour: str) -> None:
     axes.fill_between([span.begin, span.end], row - _HALF, row + _HALF, color=colour, linewidth=0.6)
 
 
-def _draw_events(axes: Any, run: Run, listed: list[RunEvent], row: int, width: float) -> None:
+def _draw_events(
+    axes: Any, run: RecordedRun, listed: list[RunEvent], row: int, width: float
+) -> None:
     numbers = {id(event): number for number, event in enumerate(listed, start=1)}
     last = -float("inf")
     for event in run.events:
@@ -77,7 +79,7 @@ def _short(name: str) -> str:
     return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 3]}..."
 
 
-def _alarm_kinds(run: Run) -> list[str]:
+def _alarm_kinds(run: RecordedRun) -> list[str]:
     """Return the kinds of alarms that have a row: those that stood longest."""
     stood: dict[str, float] = {}
     for span in run.alarms:

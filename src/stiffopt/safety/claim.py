@@ -1,9 +1,9 @@
 """Exclusive claims: no two programs command one supply.
 
-A claim is a name in Linux's abstract socket namespace, made of the supply's endpoint. The kernel
-gives such a name to one process at a time, whoever its user is, and takes it back however that
-process ends; there is no file that could be left behind, linked elsewhere or removed. Names are
-common to all programs of a machine, but not to containers with a network namespace of their own.
+A claim is a name in Linux's abstract socket namespace, made from the supply's endpoint. The kernel
+gives such a name to one process at a time, whatever its user, and frees it however that process
+ends; no file can be left behind, linked or removed. All programs of a machine share the names,
+except containers with a network namespace of their own.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from stiffopt.errors import DeviceError
 
 __all__ = ["Claim", "address_of"]
 
-_WAIT = 1.0  # s: a program that has just ended still vents for some tens of milliseconds
+_WAIT = 1.0  # s; a program that is just ending still vents for some tens of milliseconds
 _AGAIN = 0.02  # s between two attempts
 
 
 def address_of(purpose: str, endpoint: str) -> str:
-    """Return the abstract socket address that stands for an endpoint, for some purpose."""
+    """Return the abstract socket address of an endpoint for a purpose: ``claim`` or ``vent``."""
     return f"\0stiffopt/{purpose}/{hashlib.sha256(endpoint.encode()).hexdigest()[:40]}"
 
 
 class Claim:
-    """The right to command a supply, of one process at a time.
+    """The right to command a supply, which one process has at a time.
 
     Parameters
     ----------
     endpoints :
-        Returns what is claimed (`PressureSupply.endpoints`); called in `take`.
+        Returns the names to be claimed (`PressureSupply.endpoints`); called in `take`.
     holder :
-        Says who has an endpoint that is taken, as part of a sentence.
+        Returns who has claimed an endpoint, for the error message.
     wait :
-        Seconds for which a claim that is taken may still become free.
+        Time for which `take` waits for a claim that another process has, in s.
     """
 
     def __init__(
@@ -56,11 +56,11 @@ class Claim:
 
     @property
     def held(self) -> bool:
-        """Whether this object has taken it; a supply without endpoints is never held."""
+        """Whether this object holds the claim; a supply without endpoints is never held."""
         return bool(self._names)
 
     def take(self) -> None:
-        """Claim all endpoints; to take what is held already does nothing.
+        """Claim all endpoints; does nothing if they are held already.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class Claim:
                 raise
 
     def release(self) -> None:
-        """Give all endpoints back; to release what is not held does nothing."""
+        """Free all endpoints; does nothing if they are not held."""
         with self._lock:
             self._give_back()
 

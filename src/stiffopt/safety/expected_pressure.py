@@ -1,4 +1,4 @@
-"""Where the pressures can be, by what was commanded and how regulators follow."""
+"""Pressures that healthy regulators can have, given their commands and how slowly they follow."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ __all__ = ["ExpectedPressure", "Regulation"]
 
 Array = NDArray[np.float64]
 
-_TOLD = 1000  # commands that a dead time may hold back
+_TOLD = 1000  # commands kept, at most, while a dead time passes
 
 
 @dataclass(frozen=True)
 class Regulation:
-    """How slowly regulators follow at most.
+    """The slowest response of healthy regulators: a dead time and a first-order lag.
 
     Attributes
     ----------
-    lag, lag_falling : time constants of each channel (n,) while its pressure rises and falls, in s.
-    dead_time : until a command has any effect, in s.
+    lag, lag_falling : time constants (n,) of rising and falling pressures, in s.
+    dead_time : time until a command has any effect, in s.
     """
 
     lag: Array
@@ -34,11 +34,11 @@ class Regulation:
 
     @classmethod
     def slowest(cls, robot: RobotDescription, control: ControlSettings, n: int) -> Regulation:
-        """Return the larger, for each of n channels, of what the rig and the robot file say.
+        """Return the slower, for each of n channels, of the rig file's and the robot file's lags.
 
-        The lag of a calibrated robot file may be that of the arm behind its regulators, or of both.
-        A channel that is expected later than it comes is not wrong, one that is expected too early
-        would be. Where the robot has another number of channels the rig's numbers alone count.
+        The lag in a calibrated robot file may be that of the arm behind its regulators, or of both.
+        Assuming too slow a regulator delays the detection of a fault; assuming too fast a one would
+        find faults that are none. For a robot with another number of channels only the rig counts.
         """
         lag, dead_time = control.regulator_lag, control.regulator_dead_time
         if sum(segment.n_channels for segment in robot.segments) != n:
@@ -56,27 +56,25 @@ class Regulation:
 
 
 class ExpectedPressure:
-    """Between which pressures regulators are that work as they should.
+    """Bounds on the pressures of healthy regulators.
 
-    How slowly they follow at most is known: dead time, lag, limited rate. They may be faster, each
-    one otherwise, and faster up than down. So the lowest pressure rises as slowly as may be and
-    falls at once, and the highest rises at once and falls slowly. Every regulator that is no slower
-    is between the two, whatever it is told.
-
-    Readings do not correct them, unlike the estimator's model: they are what readings are held
-    against.
+    Only their slowest response is known: dead time, lag, limited rate. Each may be faster, also
+    faster in one direction. So the lower bound rises as slowly as possible and falls at once, and
+    the upper bound rises at once and falls as slowly as possible. Every regulator that is no slower
+    stays between the two, whatever its commands. Readings do not correct the bounds, since they are
+    compared with them.
 
     Parameters
     ----------
     regulation :
-        How slowly regulators follow.
+        Slowest response of the regulators.
     slew :
-        Rate of change (n,) that they can do at least, in Pa/s.
+        Rate of change (n,) that they reach at least, in Pa/s.
 
     Attributes
     ----------
     lowest, highest : ndarray
-        Between which they are now (n,), in Pa.
+        The bounds (n,) at present, in Pa.
     """
 
     def __init__(self, regulation: Regulation, slew: Array) -> None:
@@ -90,11 +88,11 @@ class ExpectedPressure:
         self._time = -np.inf
 
     def tell(self, time: float, commanded: Array) -> None:
-        """Take in that something else is commanded (n,) from a moment on."""
+        """Record set-points (n,), in Pa, that hold from a moment on."""
         self._told.append((time, commanded))
 
     def follow(self, time: float) -> float:
-        """Go on to a moment, and return by how much that is later than the last one, in s."""
+        """Advance the bounds to a moment; return the time since the last call, in s."""
         if np.isinf(self._time):
             self._time = time
         elapsed = time - self._time
@@ -103,7 +101,7 @@ class ExpectedPressure:
         told, acting = self._told, self._time - self._dead_time
         while len(told) > 1 and told[1][0] <= acting:
             told.popleft()
-        # any of these may have acted meanwhile
+        # any of these commands may have acted meanwhile
         commands = np.array([commanded for _, commanded in told])
         least, most = np.minimum.reduce(commands), np.maximum.reduce(commands)
         reach = self._slew * elapsed

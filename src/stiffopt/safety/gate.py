@@ -1,8 +1,15 @@
-"""The last gate before the supply: what may harm the arm does not pass, whoever commands it."""
+"""The safety gate: every command to a supply passes its checks and limits, whoever sends it.
+
+`Outlet` is the interface through which streams of commands reach a supply. It has two
+implementations: `SafetyGate`, in front of a supply of this process, and
+`stiffopt.safety.guard_client.GuardLink`, which sends commands to the guard process and its gate.
+"""
 
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,34 +26,100 @@ from stiffopt.rig.interface import (
 )
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.claim import Claim
-from stiffopt.safety.outlet import Applied
+from stiffopt.safety.settings import COMMANDS
 from stiffopt.safety.vent_line import guards_of
 
-__all__ = ["DEFAULT_SLEW", "SafetyGate", "check_protection", "effective_slew", "gate_before"]
+__all__ = [
+    "Applied",
+    "Outlet",
+    "SafetyGate",
+    "check_protection",
+    "effective_slew",
+    "gate_before",
+    "let_down",
+]
 
 Array = NDArray[np.float64]
 
-DEFAULT_SLEW = 5e5
-"""Rate in Pa/s of a channel for which neither robot nor rig file has a limit."""
-_PERIODS = 3  # a pause allows no greater step than this many periods do
+
+@dataclass(frozen=True)
+class Applied:
+    """Outcome of a command.
+
+    Attributes
+    ----------
+    pressures : ndarray
+        Set-points (n,) of the supply, in Pa.
+    reading : PressureReading
+        Newest measured pressures; their time tells how old they are.
+    limited : bool
+        Whether the set-points differ from the command, because of its rate or force.
+    refused : str
+        Why the command was refused; empty if it was carried out.
+    force_limited : bool
+        Whether it was shortened because of the total force.
+    """
+
+    pressures: Array
+    reading: PressureReading
+    limited: bool = False
+    refused: str = ""
+    force_limited: bool = False
+
+
+class Outlet(Protocol):
+    """Interface that takes a stream of commands to a supply, through the safety gate."""
+
+    limits: PressureLimits
+
+    def open(self) -> None:
+        """Connect to the supply, which vents it."""
+
+    def close(self) -> None:
+        """Vent and disconnect."""
+
+    def arm(self) -> None:
+        """Take commands from now on; set-points are 0 at first."""
+
+    def restrict(self, high: Array) -> None:
+        """Let no channel rise above a task's limits (n,), in Pa, until the next call or `arm`."""
+
+    def vent(self) -> None:
+        """Let all pressure out at once; no command is taken until `arm`."""
+
+    def apply(self, command: PressureCommand) -> Applied:
+        """Carry out a command as far as allowed; raise `DeviceError` if the supply fails."""
+
+    def read(self) -> PressureReading:
+        """Return the measured pressures; raise `DeviceError` if the supply does not answer."""
+
+
+def let_down(pressures: Array, share: float, limits: PressureLimits) -> Array:
+    """Return a share, clipped to 0 to 1, of pressures (n,), in Pa, while they are let down.
+
+    A channel that would fall below a low limit above 0 goes to 0.
+    """
+    down: Array = pressures * min(max(share, 0.0), 1.0)
+    low = limits.low
+    return np.where((low > 0) & (down < low), 0.0, down)
 
 
 class SafetyGate:
-    """Passes commands on to a supply: bounds, rates, total force and age are checked here.
+    """Passes commands on to a supply after checking range, rate of change, total force and age.
 
     A command that is malformed, not finite, out of range, expired or from the future is refused,
-    and the last set-points stay. One that asks for too fast a change, or for too great a force, is
-    carried out as far as it may be. Rates are limited from one write to the next: falling ones
-    too, only venting is at once. A raise that would take the total force above its limit is
-    shortened, in all channels by the same share; what falls always passes.
+    and the last set-points stay. A command that changes too fast, or needs too great a force, is
+    carried out as far as the limits allow. Rates are limited from one write to the next, of rising
+    and falling pressures alike; only venting is immediate. A rise that would take the total force
+    above its limit is shortened by the same share in all channels; falling always passes.
 
     A channel whose low limit is above 0 has no set-points between 0 and that limit: it stays at 0
-    for as long as a rise from 0 to there takes, then steps to the limit.
+    for as long as a rise from 0 to the limit takes, then steps to the limit.
 
     Parameters
     ----------
     supply :
-        What is commanded; nothing else may command it while the gate is in use.
+        The supply; nothing else may command it while the gate is in use.
     slew :
         Greatest rate of change, one value or one per channel (n,), in Pa/s.
     safety :
@@ -55,19 +128,20 @@ class SafetyGate:
         Chamber area of each channel (n,), in m^2, see `RobotDescription.channel_areas`; needed if
         `safety` limits the force.
     clock :
-        The rig's.
+        Clock of the rig.
     period :
-        Time between commands, in s. A longer pause than three of them counts as three.
+        Time between commands, in s. A pause longer than `CommandRules.pause_periods` of them
+        allows no greater step than these do.
 
     Attributes
     ----------
     limits : PressureLimits
-        What may be commanded: the supply's limits, tightened by those of `safety`.
+        Limits of the commands: the supply's, tightened by those of `safety`.
 
     Raises
     ------
     InputError
-        Something does not fit the number of channels, or is not a positive number.
+        An argument does not fit the number of channels, or is not a positive number.
     """
 
     def __init__(
@@ -88,7 +162,7 @@ class SafetyGate:
         self._slew = _positive("slew", slew, n)
         if not period > 0:
             raise InputError(f"the period must be above 0 s, not {period:g} s")
-        self._longest = _PERIODS * period
+        self._longest = COMMANDS.pause_periods * period
         self._timeout = safety.command_timeout
         self._max_force = safety.max_force
         if force_per_pressure is not None:
@@ -102,8 +176,8 @@ class SafetyGate:
         self._lock = threading.RLock()
         self._armed = False
         self._vent_failed = False
-        self._ramp: Array  # as far as the rates have let pressures come, in Pa
-        self._told: Array  # what was written: the same, but for gaps that a supply has
+        self._ramp: Array  # rate-limited pressures (n,), in Pa
+        self._told: Array  # set-points (n,): the same, but 0 below low limits above 0
         self._forget(clock.now())
 
     @property
@@ -133,7 +207,7 @@ class SafetyGate:
         Raises
         ------
         DeviceError
-            The supply did not take it, see `PressureSupply.close`; it stays claimed, for it is
+            Venting failed, see `PressureSupply.close`. The supply stays claimed, since closing is
             tried again when the interpreter exits.
         """
         with self._lock:
@@ -150,7 +224,7 @@ class SafetyGate:
             No rate of change is set, or nothing would vent the arm if this computer failed and
             the rig file does not accept that.
         DeviceError
-            The supply did not take it.
+            The supply failed.
         """
         with self._lock:
             self.check_arming()
@@ -170,7 +244,7 @@ class SafetyGate:
     def restrict(self, high: ArrayLike) -> None:
         """Let no channel rise above a task's limits (n,), in Pa, until the next call or `arm`.
 
-        What is above them already may stay, and fall.
+        A channel that is above its limit already may stay there, or fall.
 
         Raises
         ------
@@ -189,7 +263,7 @@ class SafetyGate:
         Raises
         ------
         DeviceError
-            The supply did not take it: try again. `expire` does so too.
+            The supply failed: try again, as `expire` does too.
         """
         with self._lock:
             self._armed = False
@@ -213,7 +287,7 @@ class SafetyGate:
         Raises
         ------
         DeviceError
-            The supply did not take it; the next call tries again.
+            The supply failed; the next call tries again.
         """
         with self._lock:
             kept = not self._armed or now - self._valid_at <= self._timeout
@@ -233,12 +307,12 @@ class SafetyGate:
         return self.supply.read()
 
     def apply(self, command: PressureCommand) -> Applied:
-        """Carry out a command as far as it may be, or refuse it and say why.
+        """Carry out a command as far as the limits allow, or refuse it.
 
         Raises
         ------
         DeviceError
-            The supply does not answer; whether it has the new set-points is not known.
+            The supply does not answer; it may or may not have the new set-points.
         """
         with self._lock:
             now = self.clock.now()
@@ -247,14 +321,16 @@ class SafetyGate:
                     f"no command came for {self._timeout:g} s, so the supply was vented; arm it"
                 )
             try:
-                asked = self._checked(command, now)
+                wanted = self._checked(command, now)
             except CommandError as error:
                 return self._refused(str(error))
             self._valid_at = now
-            near = self._within_rate(self._within_task(asked), now)
+            near = self._within_rate(self._within_task(wanted), now)
             ramp = self._within_force(near)
             before, self._written_at = self._ramp, now
-            self._ramp = np.minimum(ramp, before)  # should it fail: no more than this is there
+            self._ramp = np.minimum(
+                ramp, before
+            )  # the least that is certain, should the write fail
             told = self._writable(ramp)
             try:
                 reading = self.supply.exchange(told)
@@ -265,11 +341,11 @@ class SafetyGate:
                     self._forget(now)
                 return self._refused(str(error))
             self._ramp, self._told = ramp, told
-            limited = told.tolist() != asked.tolist()
+            limited = told.tolist() != wanted.tolist()
             return Applied(told, reading, limited, force_limited=ramp is not near)
 
     def _checked(self, command: PressureCommand, now: float) -> Array:
-        """Return the pressures (n,) of a command that may be carried out; refuse all others."""
+        """Return the pressures (n,) of a valid command; raise `CommandError` for others."""
         if not self._armed:
             raise CommandError("the supply is vented and takes no command; arm it first")
         age = now - command.time
@@ -279,22 +355,22 @@ class SafetyGate:
             raise CommandError(f"the command has expired; it is {age:.3g} s old")
         return self.limits.check(command.pressures)
 
-    def _within_task(self, asked: Array) -> Array:
-        """Return what is nearest to `asked` (n,) and rises no higher than the task allows."""
-        return np.minimum(asked, np.maximum(self._task_high, self._ramp))
+    def _within_task(self, wanted: Array) -> Array:
+        """Return the pressures (n,) nearest to a command that keep the task's limits."""
+        return np.minimum(wanted, np.maximum(self._task_high, self._ramp))
 
-    def _within_rate(self, asked: Array, now: float) -> Array:
-        """Return what is nearest to `asked` (n,) that can be reached by now."""
+    def _within_rate(self, wanted: Array, now: float) -> Array:
+        """Return the pressures (n,) nearest to a command that the slew limit allows by now."""
         elapsed = min(max(now - self._written_at, 0.0), self._longest)
         reach = self._slew * elapsed
-        nearest: Array = np.minimum(np.maximum(asked, self._ramp - reach), self._ramp + reach)
+        nearest: Array = np.minimum(np.maximum(wanted, self._ramp - reach), self._ramp + reach)
         if self._jumps_to_low:
             low = self.limits.low
             nearest = np.where((self._told == 0) & (low > 0), np.minimum(nearest, low), nearest)
         return nearest
 
     def _within_force(self, wanted: Array) -> Array:
-        """Shorten what rises in a step to `wanted` (n,) so that the force keeps its limit."""
+        """Shorten the rising part of a step to `wanted` (n,) so that the force keeps its limit."""
         if self._max_force is None:
             return wanted
         most = self._force(wanted)
@@ -313,7 +389,7 @@ class SafetyGate:
         return total_force(pressures, self._areas)
 
     def _writable(self, ramp: Array) -> Array:
-        """Return set-points (n,) that the supply has: none between 0 and a low limit above 0."""
+        """Return valid set-points (n,): none lies between 0 and a low limit above 0."""
         if not self._jumps_to_low:
             return ramp
         return np.where((ramp > 0) & (ramp < self.limits.low), 0.0, ramp)
@@ -322,15 +398,15 @@ class SafetyGate:
         return Applied(self._told, self.supply.read(), refused=reason)
 
     def _forget(self, now: float) -> None:
-        """Begin anew with a vented supply."""
+        """Start over with a vented supply."""
         self._ramp = self._told = np.zeros(self.limits.n)
         self._task_high = self.limits.high
         self._written_at = self._valid_at = now
 
 
 def effective_slew(rig: Rig) -> Array:
-    """Return the rates (n,) in Pa/s that no set-point exceeds: the rig's, or `DEFAULT_SLEW`."""
-    return np.where(np.isfinite(rig.slew), rig.slew, DEFAULT_SLEW)
+    """Return the slew limits (n,) in Pa/s; `CommandRules.default_slew` where the rig has none."""
+    return np.where(np.isfinite(rig.slew), rig.slew, COMMANDS.default_slew)
 
 
 def gate_before(rig: Rig, safety: Safety, period: float) -> SafetyGate:
@@ -339,7 +415,7 @@ def gate_before(rig: Rig, safety: Safety, period: float) -> SafetyGate:
     Parameters
     ----------
     rig :
-        Of `stiffopt.rig.assembly.make_rig`.
+        Rig without a gate, as `stiffopt.rig.assembly.make_rig` returns it.
     safety :
         Limits of pressure, force and age.
     period :
@@ -386,7 +462,7 @@ def _tightened(limits: PressureLimits, safety: Safety) -> PressureLimits:
 
 
 def _positive(name: str, value: ArrayLike, n: int) -> Array:
-    """Return positive numbers (n,), which need not be finite."""
+    """Return a value per channel (n,); raise `InputError` unless all are above 0."""
     given = _per_channel(name, value, n)
     if not (given > 0).all():
         raise InputError(f"{name}: expected values above 0")

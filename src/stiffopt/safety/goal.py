@@ -1,8 +1,9 @@
-"""Goals: what a program that commands now and then wants, and the outlet that keeps to it.
+"""Goals: commands of programs that command now and then, and the follower that keeps to them.
 
 A control loop commands in each of its ticks and must not fall silent. A script commands once and
 sleeps. Its command is a *goal*: `GoalFollower` approaches it through the safety gate, repeats it
-for as long as it is valid, and then lets the pressures down and vents.
+for as long as it is valid, and then lets the pressures down and vents. `GoalSupply` is the supply
+that programs see; its goals go to a follower in this process or, by a `GuardLink`, in the guard.
 """
 
 from __future__ import annotations
@@ -23,17 +24,13 @@ from stiffopt.rig.interface import (
     Supply,
 )
 from stiffopt.rig.settings import Safety
-from stiffopt.safety.gate import SafetyGate
-from stiffopt.safety.outlet import Applied, let_down
+from stiffopt.safety.gate import Applied, SafetyGate, let_down
+from stiffopt.safety.settings import COMMANDS
 
-__all__ = ["LONGEST", "GoalFollower", "GoalOutlet", "GoalSupply", "TickingClock"]
+__all__ = ["GoalFollower", "GoalOutlet", "GoalSupply", "TickingClock", "check_goal"]
 
 Array = NDArray[np.float64]
 
-LONGEST = 3600.0
-"""Seconds for which a goal may be valid: longer, nobody may be there any more."""
-_LATE = 1.5  # periods after a command until it is repeated: whoever commands in each is in time
-_REPEATS = 4  # of a goal, at least, within the time after which the gate finds a command too old
 _EXPIRED = (
     "no command came for as long as the last one was valid, so the pressures were let down and "
     "vented; arm the supply again, and give commands a longer valid_for"
@@ -41,7 +38,7 @@ _EXPIRED = (
 
 
 class GoalOutlet(Protocol):
-    """Takes goals to a supply, in this process or in that of a guard."""
+    """Interface that takes goals to a supply, in this process or through a guard."""
 
     limits: PressureLimits
 
@@ -51,17 +48,17 @@ class GoalOutlet(Protocol):
 
     @property
     def commanded(self) -> Array:
-        """The set-points (n,) that the supply has been told, in Pa."""
+        """Set-points (n,) of the supply, in Pa."""
 
     @property
     def has_dump_valve(self) -> bool:
-        """Whether to vent also opens a valve."""
+        """Whether venting also opens a valve."""
 
     def check_arming(self) -> None:
         """Raise `CommandError` if this supply may never be armed."""
 
     def open(self) -> None:
-        """Connect; the supply is vented then."""
+        """Connect to the supply, which vents it."""
 
     def close(self) -> None:
         """Vent and disconnect."""
@@ -70,29 +67,29 @@ class GoalOutlet(Protocol):
         """Take goals from now on."""
 
     def vent(self) -> None:
-        """Let all pressure out at once; no goal is taken until it is armed."""
+        """Let all pressure out at once; no goal is taken until the supply is armed."""
 
     def pursue(self, goal: PressureCommand) -> Applied:
-        """Take a goal, and make the first step towards it."""
+        """Take a goal and make the first step towards it."""
 
     def read(self) -> PressureReading:
         """Return the newest measured pressures."""
 
 
 def check_goal(goal: PressureCommand, now: float, limits: PressureLimits) -> Array:
-    """Return the pressures (n,) of a goal that may be pursued.
+    """Return the pressures (n,) of a valid goal, in Pa.
 
     Raises
     ------
     CommandError
-        They are not within the limits, or the goal has expired, or is valid for too long.
+        They are outside the limits, or the goal has expired or is valid for too long.
     """
     if isinstance(goal.valid_for, str):
         raise CommandError("expected a number of seconds for valid_for, not text")
-    if not 0 < goal.valid_for <= LONGEST:  # NaN is not either
+    if not 0 < goal.valid_for <= COMMANDS.longest_goal:  # NaN is not either
         raise CommandError(
-            f"a command must be valid for more than 0 s and at most {LONGEST:g} s, not "
-            f"{goal.valid_for:g} s"
+            "a command must be valid for more than 0 s and at most "
+            f"{COMMANDS.longest_goal:g} s, not {goal.valid_for:g} s"
         )
     if goal.expired(now):
         raise CommandError("the command has expired; nothing was written")
@@ -102,23 +99,23 @@ def check_goal(goal: PressureCommand, now: float, limits: PressureLimits) -> Arr
 class GoalFollower:
     """Brings a supply to a goal and keeps it there, tick by tick, while the goal is valid.
 
-    Whoever owns it calls `tick` when it is `due`. Any thread may call any method.
+    Its owner calls `tick` whenever it is `due`. Any thread may call any method.
 
     Parameters
     ----------
     gate :
-        The gate before the supply.
+        The gate in front of the supply.
     period :
-        Between ticks, in s.
+        Time between ticks, in s.
     ramp_time :
-        In which the pressures are let down once a goal has expired, in s.
+        Time in which the pressures are let down after a goal has expired, in s.
     clock :
-        The rig's.
+        Clock of the rig.
 
     Attributes
     ----------
     due : float
-        When the next tick is, on the rig's clock; inf while nothing is to be done.
+        Time of the next tick on the rig's clock, in s; inf while there is nothing to do.
     """
 
     def __init__(self, gate: SafetyGate, *, period: float, ramp_time: float, clock: Clock) -> None:
@@ -133,12 +130,12 @@ class GoalFollower:
         self._let_down_from: Array | None = None  # pressures when the goal expired
         self._told: Array = self._nothing
         self._why_vented = ""
-        self._failure = ""  # of a tick, which nobody waited for
+        self._failure = ""  # of a tick, told to the next command
 
     @classmethod
     def before(cls, gate: SafetyGate, safety: Safety, period: float, clock: Clock) -> GoalFollower:
-        """Return the follower for a rig, which repeats goals before the gate finds them too old."""
-        often = min(period, safety.command_timeout / _REPEATS)
+        """Return a follower that repeats goals well before the gate finds them too old."""
+        often = min(period, safety.command_timeout / COMMANDS.repeats)
         return cls(gate, period=often, ramp_time=safety.ramp_time, clock=clock)
 
     @property
@@ -148,12 +145,12 @@ class GoalFollower:
 
     @property
     def commanded(self) -> Array:
-        """The set-points (n,) that the supply has been told, in Pa; a copy."""
+        """Set-points (n,) of the supply, in Pa; a copy."""
         return self._told.copy()
 
     @property
     def has_dump_valve(self) -> bool:
-        """Whether to vent also opens a valve."""
+        """Whether venting also opens a valve."""
         return self._gate.supply.has_dump_valve
 
     def check_arming(self) -> None:
@@ -171,7 +168,7 @@ class GoalFollower:
             self._gate.close()
 
     def arm_for_goals(self) -> None:
-        """Take goals from now on; until the first one comes all set-points are 0.
+        """Take goals from now on; all set-points are 0 until the first one comes.
 
         Raises
         ------
@@ -198,12 +195,12 @@ class GoalFollower:
         return self._gate.read()
 
     def pursue(self, goal: PressureCommand) -> Applied:
-        """Take a goal in the place of the last one, and make the first step towards it.
+        """Replace the goal and make the first step towards the new one.
 
         Raises
         ------
         CommandError
-            It is refused, and the last goal stays. So it does where the answer says `refused`.
+            The goal is refused and the last one stays, as it does if `Applied.refused` says so.
         DeviceError
             The supply does not answer.
         """
@@ -225,8 +222,8 @@ class GoalFollower:
                 self.fail(error)
                 raise
             if self._gate.armed:
-                self.due = now + _LATE * self._period
-                if applied.refused:  # whoever is told so must not find the arm there later
+                self.due = now + COMMANDS.repeat_after * self._period
+                if applied.refused:  # a refused goal must not be reached later
                     self._goal, self._until, self._let_down_from = before
             return applied
 
@@ -258,7 +255,7 @@ class GoalFollower:
                 self._rest(_EXPIRED)
 
     def fail(self, error: DeviceError) -> None:
-        """Vent after a tick that failed, as far as that is possible; the next command tells why."""
+        """Try to vent after a tick that failed; the next command raises the reason."""
         with self._lock:
             self._rest("")
             self._failure = f"{error}; the supply was vented"
@@ -277,7 +274,7 @@ class GoalFollower:
         return applied
 
     def _rest(self, why: str) -> None:
-        """Have nothing to do: the supply is vented."""
+        """Drop the goal: the supply is vented."""
         self.due, self._until = math.inf, math.inf
         self._goal = self._told = self._nothing
         self._let_down_from = None
@@ -285,12 +282,12 @@ class GoalFollower:
 
 
 class GoalSupply(Supply):
-    """The supply of a rig as programs see it: a command is a goal, and limits always hold.
+    """The supply of a rig as programs see it: each command is a goal, and all limits hold.
 
-    Commands are approached within the limits of slew and force of robot and rig, and repeated until
-    they expire: a `PressureCommand` says when, plain pressures hold for 0.5 s. Then the pressures
-    are let down within `Safety.ramp_time` and vented. In real time a guard process sees to that,
-    which vents at once when this process ends; a simulated rig does it on its own clock.
+    A goal is approached within the slew and force limits of robot and rig, and repeated until it
+    expires: a `PressureCommand` says when, plain pressures are valid for 0.5 s. Then the pressures
+    are let down within `Safety.ramp_time` and vented. In real time the guard process does all this,
+    and vents at once when this process ends; a simulated rig does it on its own clock.
     """
 
     def __init__(self, outlet: GoalOutlet, clock: Clock) -> None:
@@ -300,17 +297,17 @@ class GoalSupply(Supply):
 
     @property
     def commanded(self) -> Array:
-        """The set-points (n,) that the supply has now, on their way to the goal, in Pa."""
+        """Present set-points (n,) on their way to the goal, in Pa."""
         return self._outlet.commanded
 
     @property
     def armed(self) -> bool:
-        """Whether commands of pressure are taken; not so after `open`, `vent` and expiry."""
+        """Whether goals are taken; not so after `open`, `vent` and expiry."""
         return self.is_open and self._outlet.armed
 
     @property
     def has_dump_valve(self) -> bool:
-        """Whether `vent` also opens a valve that needs no regulator's cooperation."""
+        """Whether `vent` also opens a valve that works without the regulators."""
         return self._outlet.has_dump_valve
 
     def check_arming(self) -> None:
@@ -325,13 +322,13 @@ class GoalSupply(Supply):
         CommandError
             No rate of change is set, or the supply is unprotected; see `SafetyGate.arm`.
         DeviceError
-            The device did not take it; the supply is not armed.
+            The device failed; the supply is not armed.
         """
         self._must_be_open()
         self._outlet.arm_for_goals()
 
     def command(self, pressures: ArrayLike | PressureCommand) -> None:
-        """Have the pressures go to (n,), in Pa, and stay there until the command expires.
+        """Let the pressures go to (n,), in Pa, and stay there until the command expires.
 
         Raises
         ------
@@ -370,7 +367,7 @@ class GoalSupply(Supply):
         Raises
         ------
         DeviceError
-            The device did not take it.
+            The device failed.
         """
         self._must_be_open()
         self._outlet.vent()
@@ -382,7 +379,7 @@ class GoalSupply(Supply):
             goal = pressures
         else:
             goal = PressureCommand(pressures, now)
-        check_goal(goal, now, self.limits)  # what is refused does not even leave this process
+        check_goal(goal, now, self.limits)  # an invalid goal does not leave this process
         applied = self._outlet.pursue(goal)
         if applied.refused:
             raise CommandError(applied.refused)
@@ -396,14 +393,14 @@ class GoalSupply(Supply):
 
 
 class TickingClock(Clock):
-    """The clock of a simulated rig, on which an outlet ticks while time passes.
+    """Clock of a simulated rig that ticks a goal follower while simulated time passes.
 
     Parameters
     ----------
     clock :
-        Lets time pass.
+        Clock that lets simulated time pass.
     follower :
-        Is ticked whenever it is due.
+        Ticked whenever it is due.
     """
 
     def __init__(self, clock: Clock, follower: GoalFollower) -> None:
@@ -414,7 +411,7 @@ class TickingClock(Clock):
         return self._clock.now()
 
     def sleep_until(self, moment: float) -> None:
-        """Let time pass until a moment."""
+        """Let simulated time pass until a moment, in s."""
         while self._follower.due < moment:
             self._clock.sleep_until(self._follower.due)
             self._tick()

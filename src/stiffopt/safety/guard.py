@@ -1,22 +1,21 @@
-"""The guard: a process of its own that owns the supply, and vents when nobody commands any more.
+"""The guard: a process of its own that owns the supply and vents when its client fails.
 
-Started by `stiffopt.safety.link.GuardLink`. It takes commands of two kinds, through the safety
-gate:
+`stiffopt.safety.guard_client.GuardLink` starts it. It takes two kinds of commands and passes them
+through the safety gate:
 
-- A control loop sends a *stream*. When no command has come for the guard's timeout, because the
-  loop was killed or stopped or hangs, the guard vents.
+- A control loop sends a *stream*. If no command comes for the guard's timeout, because the loop
+  was killed or stopped or hangs, the guard vents.
 - A program that commands now and then sends *goals*, which say for how long they are valid. The
-  guard approaches and repeats a goal, and lets the pressures down when it has expired
-  (`stiffopt.safety.goal`).
+  guard approaches and repeats a goal, and lets the pressures down when it has expired, see
+  `stiffopt.safety.goal`.
 
-In both cases it vents when the other process is gone (and none that was forked from it still holds
-the line), on every signal that would end the guard and can be handled, and when somebody calls on
-the vent line. After it has vented by itself it is *tripped*: it takes no command
-until it is armed by a client that has been told of the trip.
+In both cases it vents when the client's process has ended, on every signal that would end the guard
+and can be handled, and when ``stiffopt vent`` calls on the vent line. After it has vented by itself
+it is *tripped*: it takes no command until it is armed by a client that has been told of the trip.
 
-What the guard cannot do: while the supply's driver waits for its device, at most for the driver's
-own timeouts, nothing else happens here; and a guard that is killed itself vents nothing. Its client
-then vents in its place (`stiffopt.safety.rescue`), and the watchdog of the device does.
+Two limits: while the supply's driver waits for its device, at most for the driver's own timeouts,
+the guard does nothing else; and a guard that is killed vents nothing. Its client then vents in its
+place (`stiffopt.safety.rescue`), and so does the device's own watchdog.
 """
 
 from __future__ import annotations
@@ -37,67 +36,68 @@ import numpy as np
 
 from stiffopt.errors import CommandError, DeviceError, SlowWarning, StiffoptError
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading
-from stiffopt.safety.frames import Answer, Channel, CommandFrame, Message, Poses, Request, Word
+from stiffopt.safety.gate import Applied, Outlet
 from stiffopt.safety.goal import GoalFollower
-from stiffopt.safety.hosted import Hosted, Owned, owned
-from stiffopt.safety.lines import JSON, json_line
-from stiffopt.safety.outlet import Applied, Outlet
+from stiffopt.safety.hosted import HostedDevices, Owned, owned
+from stiffopt.safety.messages import (
+    JSON,
+    CommandFrame,
+    GuardAnswer,
+    GuardChannel,
+    GuardNotice,
+    GuardRequest,
+    Message,
+    TrackedPoses,
+    json_line,
+)
 from stiffopt.safety.realtime import real_time
+from stiffopt.safety.settings import GUARD
 from stiffopt.safety.vent_line import VentLine
 
-__all__ = ["FIRST_COMMAND", "Guard", "main"]
+__all__ = ["Guard", "main"]
 
-FIRST_COMMAND = 1.0
-"""Seconds from arming, in which nothing is under pressure yet, to the first command."""
-
-PRIORITY = 81  # of the guard's thread, where permitted: above that of the loop
-_IDLE = 0.05  # s between looks at what has to be done unasked
-_HOSTING = 0.002  # s between looks at a simulated world, so that there is little to catch up with
-_AGAIN = 0.05  # s from a failed attempt to vent to the next
-_ATTEMPTS = 20  # to vent before the process ends all the same
-_TIDY = 10.0  # s between collections of garbage while nothing is under pressure
 _ASKED = "asked to"
-_POSES = 200  # samples in a packet
-_LONGEST = 500  # characters of a text: what is told must fit into a packet
-_IGNORED = ("SIGINT", "SIGPIPE", "SIGTSTP", "SIGTTIN", "SIGTTOU")  # the client says when it is over
-_HARMLESS = ("SIGCHLD", "SIGCONT", "SIGURG", "SIGWINCH")  # which do nothing by themselves
+_POSES = 200  # tracker samples per packet
+_LONGEST = 500  # characters of a text: an answer must fit into one packet
+_IGNORED = ("SIGINT", "SIGPIPE", "SIGTSTP", "SIGTTIN", "SIGTTOU")  # the client decides on the end
+_HARMLESS = ("SIGCHLD", "SIGCONT", "SIGURG", "SIGWINCH")  # by default these do nothing
 _FATAL = ("SIGKILL", "SIGSTOP", "SIGSEGV", "SIGBUS", "SIGFPE", "SIGILL")
 
 
 class Guard:
-    """What the guard process decides.
+    """The decisions of the guard process: when to pass commands on, when to vent.
 
     Parameters
     ----------
     outlet :
         The gate in front of the supply; open.
     channel :
-        To the loop.
+        Connection to the client.
     timeout :
-        It vents when no command of a stream has come for this long, in s.
+        Silence of a stream after which the guard vents, in s.
     follower :
         Brings the supply to goals; None: only streams are taken.
     line :
-        Where those call who want to vent; None: there is none.
+        Vent line on which ``stiffopt vent`` calls; None: there is none.
     clock :
-        Time in s, `time.monotonic` of all processes.
+        Returns the time in s; `time.monotonic` is common to all processes.
     pause :
-        Lets some s pass.
+        Sleeps for some s.
     epoch :
-        Moment 0 of the rig's own clock on it, in s.
+        Time 0 of the rig's own clock on `clock`, in s.
     hosted :
-        The rest of a simulated rig.
+        Tracker, probe and truth of a simulated rig.
     as_json :
-        Whether what it has to say on stderr is JSON lines; else words for people.
+        Whether log lines on stderr are JSON instead of sentences.
     orphaned :
-        Says whether the client's process has ended. Its end of the channel may outlive it, in a
-        child that it has forked.
+        Returns whether the client's process has ended. A child that it has forked may keep its end
+        of the channel open.
     """
 
     def __init__(
         self,
         outlet: Outlet,
-        channel: Channel,
+        channel: GuardChannel,
         timeout: float,
         *,
         follower: GoalFollower | None = None,
@@ -105,7 +105,7 @@ class Guard:
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
         epoch: float = 0.0,
-        hosted: Hosted | None = None,
+        hosted: HostedDevices | None = None,
         as_json: bool = False,
         orphaned: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -131,20 +131,20 @@ class Guard:
         self._reading = PressureReading(np.nan, np.full(n, np.nan))
         self._armed = False
         self._goals = False  # whether it is armed for goals
-        self._due: float | None = None  # when it vents; None while no stream is taken
-        self._to_vent: float | None = None  # when to try again to vent; None: it is vented or armed
+        self._due: float | None = None  # when a silent stream is vented; None: no stream
+        self._to_vent: float | None = None  # next attempt to vent; None: vented, or armed
         self._trips = 0
         self._tripped = ""
         self._leaving = ""
         self._tidied = clock()
-        self._broken_told = 0.5  # packets; twice as many are worth another word
+        self._broken_told = 0.5  # broken packets reported; the next report is at twice as many
 
     def leave(self, reason: str) -> None:
-        """Vent and come to an end soon; for handlers of signals."""
+        """End soon, and vent on the way; for signal handlers."""
         self._leaving = reason
 
     def serve(self) -> int:
-        """Guard until the loop has gone or asks to end; return the exit code of the process."""
+        """Run until the client has ended or asks for the end; return the exit code."""
         try:
             while not self._leaving:
                 self.step()
@@ -156,68 +156,70 @@ class Guard:
         return code
 
     def step(self) -> None:
-        """Take in what has come, or wait a little for it, and do what has to be done unasked."""
-        self._take(self._channel.receive(self._patience()))
-        self._hear_callers()
+        """Handle the messages that have come, or wait a little for them; check all deadlines."""
+        self._handle(self._channel.receive(self._patience()))
+        self._answer_callers()
         if self._channel.broken >= 2 * self._broken_told:
-            self._tell_of_broken()
+            self._report_broken()
         if (self._channel.closed or self._orphaned()) and not self._leaving:
             self._leaving = "the process that commands has ended"
-        self._look_at_the_time()
+        self._check_deadline()
         self._follow()
         now = self._clock()
         if self._to_vent is not None and now >= self._to_vent:
             self._vent()
-        if not self._armed and now - self._tidied > _TIDY:
+        if not self._armed and now - self._tidied > GUARD.collect:
             gc.collect()
             self._tidied = now
         self._forward_poses()
 
     def _patience(self) -> float:
-        moments = [self._clock() + (_IDLE if self._hosted is None else _HOSTING)]
+        moments = [self._clock() + (GUARD.idle if self._hosted is None else GUARD.hosting)]
         moments += [moment for moment in (self._due, self._to_vent) if moment is not None]
         if self._follower is not None:
             moments.append(self._follower.due + self._epoch)
         return max(0.0, min(moments) - self._clock())
 
-    # what comes ----------------------------------------------------------------------------------
+    # messages ------------------------------------------------------------------------------------
 
-    def _take(self, messages: Sequence[Message]) -> None:
-        """Vent first, if that is asked for; of several commands only the newest counts."""
-        vents = [i for i, m in enumerate(messages) if isinstance(m, Request) and m.do == "vent"]
+    def _handle(self, messages: Sequence[Message]) -> None:
+        """Handle messages: requests to vent first; of several commands the newest alone."""
+        vents = [
+            i for i, m in enumerate(messages) if isinstance(m, GuardRequest) and m.do == "vent"
+        ]
         last_vent = vents[-1] if vents else 0
         newest: CommandFrame | None = None
-        later: list[Request] = []
+        later: list[GuardRequest] = []
         for index, message in enumerate(messages):
             if isinstance(message, CommandFrame):
-                self._feed(message)
+                self._extend_deadline(message)
                 self._overtaken(newest, "a newer command")
                 newest = message
-            elif isinstance(message, Request) and (message.do == "vent" or index >= last_vent):
+            elif isinstance(message, GuardRequest) and (message.do == "vent" or index >= last_vent):
                 if message.do in ("arm", "vent"):
                     self._overtaken(newest, f"a request to {message.do}")
                     newest = None
-                self._obey(message)
-            elif isinstance(message, Request) and message.do in ("arm", "restrict"):
+                self._carry_out_request(message)
+            elif isinstance(message, GuardRequest) and message.do in ("arm", "restrict"):
                 self._answer(message.sequence, error="a command to vent has overtaken this")
-            elif isinstance(message, Request):
+            elif isinstance(message, GuardRequest):
                 later.append(message)
-        for request in later:  # which came before a vent, and could wait
-            self._obey(request)
+        for request in later:  # that came before a request to vent, and could wait
+            self._carry_out_request(request)
         if newest is not None:
-            self._look_at_the_time()
+            self._check_deadline()
             self._pass_on(newest)
 
     def _overtaken(self, frame: CommandFrame | None, by: str) -> None:
-        """Tell who sent a goal that it is not pursued; a stream goes on anyway."""
+        """Answer a goal that is not pursued; a stream needs no such answer."""
         if frame is not None and frame.goal:
             self._answer(
                 frame.sequence,
                 Applied(self._commanded, self._reading, refused=f"{by} has overtaken this one"),
             )
 
-    def _feed(self, frame: CommandFrame) -> None:
-        """Note when the loop was alive: when it sent, for the frame may have waited here."""
+    def _extend_deadline(self, frame: CommandFrame) -> None:
+        """Extend the deadline of a stream from when the frame was sent: it may have waited here."""
         if self._due is None or frame.goal:
             return
         if not frame.sent <= self._due:  # NaN is no time either
@@ -225,7 +227,7 @@ class Guard:
         else:
             self._due = min(frame.sent, self._clock()) + self._timeout
 
-    def _look_at_the_time(self) -> None:
+    def _check_deadline(self) -> None:
         if self._due is not None and self._clock() > self._due:
             self._trip(self._silence)
 
@@ -239,7 +241,7 @@ class Guard:
         except CommandError as error:
             applied = Applied(self._commanded, self._reading, refused=str(error))
         except Exception as error:
-            text = _told(error)
+            text = _sentence(error)
             self._trip(f"the supply failed: {text}")
             self._answer(frame.sequence, error=text)
             return
@@ -256,29 +258,29 @@ class Guard:
         return self._outlet.apply(command)
 
     def _follow(self) -> None:
-        """Repeat a goal, or let the pressures down after it, when that is due."""
+        """Let the follower repeat a goal, or let the pressures down after it, when it is due."""
         follower = self._follower
         if follower is None or follower.due + self._epoch > self._clock():
             return
         try:
             follower.tick()
         except Exception as error:
-            self._trip(f"the supply failed: {_told(error)}")
+            self._trip(f"the supply failed: {_sentence(error)}")
             return
         self._commanded, self._armed = follower.commanded, follower.armed
 
-    def _hear_callers(self) -> None:
-        """Vent for those who call on the vent line."""
+    def _answer_callers(self) -> None:
+        """Vent for callers on the vent line."""
         if self._line is None:
             return
-        for caller in self._line.asked():
+        for caller in self._line.wanting_to_vent():
             if self._armed:
                 error = self._trip(f"{caller.peer.name} called 'stiffopt vent'")
             else:
                 error = self._vent()
             caller.answer(error)
 
-    def _obey(self, request: Request) -> None:
+    def _carry_out_request(self, request: GuardRequest) -> None:
         error, value = "", None
         try:
             match request.do:
@@ -296,19 +298,19 @@ class Guard:
                     self._leaving = _ASKED
                     error = self._vent()
                 case word:
-                    value = self._ask(word, request.about)
+                    value = self._ask_hosted(word, request.about)
         except Exception as problem:
-            error = _told(problem)
+            error = _sentence(problem)
         self._answer(request.sequence, error=error, value=value)
 
     def _arm(self, told: Any, *, goals: bool) -> None:
-        """Arm, unless there is a trip that the client has not been told of."""
+        """Arm, unless the client has not been told of the last trip; it knows `told` trips."""
         if self._tripped and told != self._trips:
             raise DeviceError(f"the guard had vented: {self._tripped}")
         if self._to_vent is not None:
             raise DeviceError("the supply could not be vented yet; it cannot be armed")
         try:
-            if self._armed:  # it may be under pressure, and arming begins without; nor with a goal
+            if self._armed:  # arming starts without pressure and without a goal
                 (self._follower or self._outlet).vent()
             if goals and self._follower is not None:
                 self._follower.arm_for_goals()
@@ -320,22 +322,22 @@ class Guard:
         self._commanded = np.zeros_like(self._commanded)
         self._tripped = ""
         self._armed, self._goals = True, goals
-        self._due = None if goals else self._clock() + FIRST_COMMAND
+        self._due = None if goals else self._clock() + GUARD.first_command
 
-    def _ask(self, word: str, about: dict[str, Any]) -> Any:
+    def _ask_hosted(self, word: str, about: dict[str, Any]) -> Any:
         if self._hosted is None:
             raise DeviceError(f"the guard does not know '{word}'; only a simulated rig might")
         return self._hosted.ask(word, about)
 
-    def _tell_of_broken(self) -> None:
-        """Say that messages were refused; nothing was done for them, and they feed nobody."""
+    def _report_broken(self) -> None:
+        """Report messages that could not be decoded; they extend no deadline."""
         self._broken_told = self._channel.broken
         self._say(f"messages refused so far that make no sense: {self._broken_told}")
 
-    # what is done --------------------------------------------------------------------------------
+    # actions -------------------------------------------------------------------------------------
 
     def _trip(self, reason: str) -> str:
-        """Vent, and stay vented until a client that knows of it arms; say if that fails, why."""
+        """Vent and take no command until a client that knows of it arms; return why it failed."""
         self._tripped = reason[:_LONGEST]
         self._trips += 1
         error = self._vent()
@@ -345,15 +347,15 @@ class Guard:
         return error
 
     def _vent(self) -> str:
-        """Vent; where it fails say why, and try again soon."""
+        """Vent; if that fails return why, and try again soon."""
         self._armed, self._due = False, None
         try:
             (self._follower or self._outlet).vent()
         except Exception as error:
             if self._to_vent is None:
-                self._say(f"COULD NOT VENT, and tries again: {_told(error)}", "error")
-            self._to_vent = self._clock() + _AGAIN
-            return _told(error)
+                self._say(f"COULD NOT VENT, and tries again: {_sentence(error)}", "error")
+            self._to_vent = self._clock() + GUARD.retry
+            return _sentence(error)
         if self._to_vent is not None:
             self._say("vented after all")
         self._to_vent = None
@@ -363,7 +365,7 @@ class Guard:
     def _answer(
         self, sequence: int, applied: Applied | None = None, *, error: str = "", value: Any = None
     ) -> None:
-        answer = Answer(
+        answer = GuardAnswer(
             sequence,
             self._commanded,
             self._reading.pressures,
@@ -378,23 +380,23 @@ class Guard:
             error=error[:_LONGEST],
             value=value,
         )
-        self._channel.send(answer)  # a loop that is stopped takes none: the newest then is lost
+        self._channel.send(answer)  # lost if the client is stopped and its socket full
 
     def _forward_poses(self) -> None:
         if self._hosted is None:
             return
-        samples = tuple(_later(sample, self._epoch) for sample in self._hosted.poses())
+        samples = tuple(_on_monotonic(sample, self._epoch) for sample in self._hosted.poses())
         for first in range(0, len(samples), _POSES):
-            self._channel.send(Poses(samples[first : first + _POSES]))
+            self._channel.send(TrackedPoses(samples[first : first + _POSES]))
 
     def _end(self) -> int:
-        """Vent, whatever it takes, and close; 0 if the supply took it."""
+        """Vent, with several attempts, and close; return 0 if the supply is vented."""
         surprised = self._armed and self._leaving != _ASKED
         failure = self._vent()
-        for _ in range(_ATTEMPTS):
+        for _ in range(GUARD.attempts):
             if not failure:
                 break
-            self._pause(_AGAIN)
+            self._pause(GUARD.retry)
             failure = self._vent()
         if surprised and not failure:
             self._say(f"vented: {self._leaving}")
@@ -403,7 +405,7 @@ class Guard:
         try:
             self._outlet.close()
         except Exception as error:
-            failure = failure or _told(error)
+            failure = failure or _sentence(error)
         if failure:
             text = f"THE SUPPLY COULD NOT BE VENTED: {failure}; cut its power or open its valve"
             self._say(text, "error")
@@ -411,16 +413,16 @@ class Guard:
 
     def _say(self, text: str, level: str = "warning") -> None:
         line = json_line(level, "guard", text) if self._as_json else f"stiffopt guard: {text}"
-        with suppress(OSError, ValueError):  # whoever listened is gone; to vent matters, not this
+        with suppress(OSError, ValueError):  # nobody reads stderr any more
             print(line, file=sys.stderr, flush=True)
 
 
-def _told(error: BaseException) -> str:
+def _sentence(error: BaseException) -> str:
     known = isinstance(error, StiffoptError)
     return str(error) if known else f"{type(error).__name__}: {error}"
 
 
-def _later(sample: PoseSample, epoch: float) -> PoseSample:
+def _on_monotonic(sample: PoseSample, epoch: float) -> PoseSample:
     times = (sample.time + epoch, sample.received + epoch)
     return PoseSample(*times, sample.frame, sample.position, sample.quaternion)
 
@@ -431,9 +433,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     arguments :
-        The number of the inherited end of the socket, and ``json`` if it shall speak so; by default
-        those of the command line. The rig comes pickled on standard input, from the process that
-        started this one.
+        File descriptor of the inherited socket, and optionally ``json`` for JSON lines on stderr;
+        by default those of the command line. The rig comes pickled on standard input, from the
+        process that started this one.
     """
     parent = os.getppid()
     _ignore(_IGNORED)
@@ -441,15 +443,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     descriptor, as_json = int(given[0]), JSON in given[1:]
     with ExitStack() as stack:
-        channel = stack.enter_context(closing(Channel(socket.socket(fileno=descriptor))))
+        channel = stack.enter_context(closing(GuardChannel(socket.socket(fileno=descriptor))))
         with suppress(OSError, AttributeError):  # systems without these look now and then
             ended = os.pidfd_open(parent)
             stack.callback(os.close, ended)
             channel.wake_for([ended])
         try:
-            owns = _opened(channel)
+            owns = _open_rig(channel)
         except StiffoptError as error:
-            channel.send(Word("failed", {"kind": type(error).__name__, "args": _plain(error)}))
+            channel.send(
+                GuardNotice("failed", {"kind": type(error).__name__, "args": _plain(error)})
+            )
             return 1
         guard = Guard(
             owns.gate,
@@ -463,8 +467,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             orphaned=lambda: os.getppid() != parent,
         )
         _on_signals(lambda number, _: guard.leave(_signal_name(number)))
-        with real_time(PRIORITY) as granted:
-            channel.send(Word("ready", {"real_time": granted.notice}))
+        with real_time(GUARD.priority) as granted:
+            channel.send(GuardNotice("ready", {"real_time": granted.notice}))
             return guard.serve()
 
 
@@ -481,9 +485,9 @@ def _signal_name(number: int) -> str:
 
 
 def _on_signals(handler: Callable[[int, Any], object]) -> None:
-    """Have a handler called on every signal that would end the process, as far as that can be.
+    """Install a handler for every signal that would end the process and can be handled.
 
-    A fault of the processor is not among them: after its handler the same instruction fails again.
+    Faults of the processor are left out: after the handler the same instruction would fail again.
     """
     left = {getattr(signal, name) for name in (*_IGNORED, *_HARMLESS, *_FATAL)}
     for number in signal.valid_signals() - left:
@@ -491,11 +495,11 @@ def _on_signals(handler: Callable[[int, Any], object]) -> None:
             signal.signal(number, handler)
 
 
-def _opened(channel: Channel) -> Owned:
-    """Make what the rig on standard input speaks of and connect; tell what takes its time."""
+def _open_rig(channel: GuardChannel) -> Owned:
+    """Make and connect the rig that comes on standard input; report what takes long."""
 
     def tell(message: Warning | str, *_: object, **__: object) -> None:
-        channel.send(Word("notice", {"text": str(message)}))
+        channel.send(GuardNotice("notice", {"text": str(message)}))
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", SlowWarning)

@@ -1,47 +1,64 @@
-"""What the guard process owns: the supply behind its gate, and for a simulated rig all the rest."""
+"""What the guard process owns, and how its client uses a simulated rig that lives there.
+
+The guard owns the supply, behind the gate. A simulated rig in real time is one world with its arm,
+so its tracker and probe live in the guard process too (`HostedDevices`); the client has
+`ForwardedTracker` and `ForwardedProbe` in their place.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from stiffopt.errors import DeviceError
+import numpy as np
+
+from stiffopt.errors import CommandError, DeviceError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription
-from stiffopt.rig.interface import ForceProbe, PoseSample, Rig
+from stiffopt.rig.interface import (
+    ForceProbe,
+    ForceSample,
+    PoseSample,
+    PoseTracker,
+    RawPose,
+    Rig,
+    SystemClock,
+)
 from stiffopt.safety.gate import SafetyGate, gate_before
 from stiffopt.safety.goal import GoalFollower
 from stiffopt.safety.vent_line import VentLine
 
-__all__ = ["Hosted", "Owned", "SimulatedRest", "owned", "simulated_endpoint"]
+if TYPE_CHECKING:
+    from stiffopt.safety.guard_client import GuardLink
 
+__all__ = [
+    "ForwardedProbe",
+    "ForwardedTracker",
+    "HostedDevices",
+    "Owned",
+    "owned",
+    "simulated_endpoint",
+]
 
-class Hosted(Protocol):
-    """The rest of a simulated rig, which lives where its supply does. Times are the rig's."""
-
-    def poses(self) -> Sequence[PoseSample]:
-        """Return what its tracker has delivered since the last call."""
-
-    def ask(self, word: str, about: dict[str, Any]) -> Any:
-        """Do something that only a simulation can; raise `StiffoptError` if this one cannot."""
+_LOOK = 0.005  # s between two looks at a stage that moves
 
 
 @dataclass(frozen=True)
 class Owned:
-    """What a guard needs.
+    """What a guard owns.
 
     Attributes
     ----------
-    gate : in front of the supply, not yet open.
+    gate : the gate in front of the supply, not yet open.
     follower : brings the supply to the goals of programs, through the gate.
-    timeout : of the guard, in s.
-    line : what the guard listens on for those who want to vent; not yet open.
-    epoch : moment 0 of the rig's clock on `time.monotonic`, in s.
-    hosted : the rest of a simulated rig.
+    timeout : silence of a stream after which the guard vents, in s.
+    line : makes the vent line on which the guard listens for `stiffopt vent`.
+    epoch : time 0 of the rig's clock on `time.monotonic`, in s.
+    hosted : tracker, probe and truth of a simulated rig; None on real devices.
     """
 
     gate: SafetyGate
@@ -49,11 +66,11 @@ class Owned:
     timeout: float
     line: Callable[[], VentLine]
     epoch: float = 0.0
-    hosted: Hosted | None = None
+    hosted: HostedDevices | None = None
 
 
 def owned(description: RigDescription, robot: RobotDescription) -> Owned:
-    """Make what the guard of a rig owns.
+    """Make what the guard of a rig owns; nothing is connected yet.
 
     Raises
     ------
@@ -69,23 +86,23 @@ def owned(description: RigDescription, robot: RobotDescription) -> Owned:
     if not simulated:
         supply = gate.supply
         return Owned(gate, follower, safety.guard_timeout, lambda: VentLine(supply.endpoints))
-    rest = SimulatedRest(rig)
+    rest = HostedDevices(rig)
     line = partial(VentLine, (simulated_endpoint(description),))
     return Owned(gate, follower, safety.guard_timeout, line, rest.world.epoch, rest)
 
 
 def simulated_endpoint(description: RigDescription) -> str:
-    """Return the name under which the guards of a simulated rig listen; several may have it."""
+    """Return the name under which guards of a simulated rig listen; several may share it."""
     return f"simulated {description.name}"
 
 
-class SimulatedRest:
-    """Tracker, probe and truth of a simulated rig in real time.
+class HostedDevices:
+    """Tracker, probe and truth of a simulated rig in real time, inside the guard process.
 
     Parameters
     ----------
     rig :
-        A simulated one.
+        A simulated rig.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -93,16 +110,16 @@ class SimulatedRest:
         self._tracker, self._probe = rig.tracker, rig.probe
 
     def poses(self) -> Sequence[PoseSample]:
-        """Let the world reach the present and return what its tracker has delivered."""
+        """Let simulated time reach the present and return the new samples of the tracker."""
         if self._tracker is None:
             return ()
         self._tracker.open()
-        with suppress(DeviceError):  # an arm that cannot be followed: its supply says so too
+        with suppress(DeviceError):  # a simulation that fails: the supply reports that too
             return self._tracker.read()
         return ()
 
     def ask(self, word: str, about: dict[str, Any]) -> Any:
-        """Answer to ``inject`` (`device`, `fault`, `channel`), ``truth``, ``pressures``, and probe.
+        """Carry out the request ``inject``, ``truth``, ``pressures`` or one of a `ForwardedProbe`.
 
         Raises
         ------
@@ -125,7 +142,7 @@ class SimulatedRest:
         raise DeviceError(f"a simulated rig knows nothing of '{word}'")
 
     def _use_probe(self, probe: ForceProbe, word: str, about: dict[str, Any]) -> Any:
-        """Do what a `ForwardedProbe` asks for; a move is begun, and `moving` tells when it ends."""
+        """Carry out a request of a `ForwardedProbe`; a move only begins here."""
         probe.open()
         match word:
             case "probe-align":
@@ -144,3 +161,68 @@ class SimulatedRest:
                 felt = probe.sample()
                 return [felt.force, felt.position]
         return None
+
+
+class ForwardedTracker(PoseTracker):
+    """The client's side of a hosted tracker; its poses are those of the tip in the base already."""
+
+    def __init__(self, link: GuardLink) -> None:
+        super().__init__(clock=SystemClock())
+        self._link = link
+
+    def _open(self) -> None:
+        self._link.take_poses()  # drop what was seen before
+
+    def _close(self) -> None:
+        pass
+
+    def _poll(self) -> None:
+        for sample in self._link.take_poses():
+            self._deliver(
+                RawPose(
+                    sample.time, sample.frame, sample.position, sample.quaternion, sample.received
+                )
+            )
+
+
+class ForwardedProbe(ForceProbe):
+    """The client's side of a hosted probe."""
+
+    def __init__(self, link: GuardLink) -> None:
+        super().__init__(SystemClock())
+        self._link = link
+
+    def _open(self) -> None:
+        pass
+
+    def _close(self) -> None:
+        pass
+
+    def align(self, direction: Iterable[float]) -> None:
+        """Put the plate just clear of the tip, facing along a unit vector (3,) in the base."""
+        self._ask("align", direction=[float(component) for component in direction])
+
+    def withdraw(self) -> None:
+        """Take the plate away."""
+        self._ask("withdraw")
+
+    def move_to(self, position: float, speed: float) -> None:
+        """Move the plate and return when it is there; see `ForceProbe.move_to`."""
+        if not (np.isfinite(position) and np.isfinite(speed) and speed > 0):
+            raise CommandError("expected a finite position and a speed above 0")
+        self._ask("move", position=float(position), speed=float(speed))
+        while self._ask("moving"):
+            self.clock.sleep(_LOOK)
+
+    def stop(self) -> None:
+        """Stop the plate."""
+        self._ask("stop")
+
+    def sample(self) -> ForceSample:
+        """Read force and position."""
+        force, position = self._ask("sample")
+        return ForceSample(self.clock.now(), force, position)
+
+    def _ask(self, word: str, **about: Any) -> Any:
+        self._must_be_open()
+        return self._link.ask_world(f"probe-{word}", **about)

@@ -1,4 +1,4 @@
-"""Whether what the supply reads can be, and is what it should be after what it was told."""
+"""The pressure monitor: finds faults of the supply by comparing readings with commands."""
 
 from __future__ import annotations
 
@@ -10,23 +10,21 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.rig.interface import PressureLimits, PressureReading
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.expected_pressure import ExpectedPressure, Regulation
-from stiffopt.safety.shortage import Shortage
-from stiffopt.safety.supply_line import SupplyLine
+from stiffopt.safety.settings import MONITOR
+from stiffopt.safety.shortage import Shortage, SupplyLine
 
 __all__ = ["PressureMonitor", "Trouble"]
 
 Array = NDArray[np.float64]
 
-_LOOKS = 3  # readings, at least, that it takes to find a regulator wrong, however long a pause
-
 
 @dataclass(frozen=True)
 class Trouble:
-    """Something that is a fault.
+    """A fault that the monitor has found.
 
     Attributes
     ----------
-    kind : a word for programs.
+    kind : ``pressure-reading``, ``regulator-stuck`` or ``leak``.
     text : a sentence for people.
     """
 
@@ -34,51 +32,45 @@ class Trouble:
     text: str
 
 
-_STILL = 5e3  # Pa; a command that changes by less than this is at rest
-_SETTLED = 0.5  # s after which a channel at rest has its pressure
-_LEAK = 0.1  # of a pressure that was reached; less than that much less is no leak
-_AT_ONCE = 3  # readings
-
-
 class PressureMonitor:
-    """Holds the readings of n channels against what was commanded.
+    """Compares the measured pressures of n channels with their commands.
 
-    A reading that is not finite in a channel that was measured before, or that no gauge of this
-    supply can show, is a fault at once, and so are readings that do not come any more. A reading
-    that is where no good regulator would be by now, see `ExpectedPressure`, by more than
-    `Safety.max_pressure_error`, for `Safety.pressure_error_time`, is a fault: a leak if it is
-    below, a regulator stuck if above.
+    It is a fault at once if readings do not come any more, if a reading is far outside the limits,
+    or if a channel that was measured before reads NaN. It is a fault if a reading is outside what a
+    healthy regulator can have by now, see `ExpectedPressure`, by more than the tolerance
+    `Safety.max_pressure_error`, for `Safety.pressure_error_time`: a leak if it is below, a stuck
+    regulator if it is above.
 
-    A leak and a regulator whose supply runs out of pressure both stay below the command. What
-    tells them apart is what the channel has reached since it was armed: a regulator that has no
-    more pressure still reaches that, and a leak takes it away. So below what was commanded, by
-    half of that error, a channel counts as saturated, which is an alarm; below what it is known to
-    reach, it leaks. Where its command is at rest, a tenth of the pressure is enough for that, if it
-    is more than half of that error. A channel that leaked from the beginning is saturated until its
-    command changes: what it gives then tells, see `Shortage`.
+    A leak and a regulator whose supply has too little pressure both read below the command. They
+    are told apart by what the channel has reached since it was armed: a regulator at the end of its
+    supply still reaches that, a leak does not. So a channel that stays below its command by half
+    the tolerance is saturated, which is an alarm; one that stays below what it has reached leaks.
+    While its command is at rest, a tenth of the pressure is enough for a leak, if that is more than
+    half the tolerance. A channel that leaked from the beginning is saturated until its command
+    changes, and is found by its response, see `Shortage`.
 
-    Several channels that fall together, of which none reads more, are at the end of a line that
-    sags, and saturated, see `SupplyLine`. One alone that falls below what it has reached may be
-    that too, but nobody can tell: it counts as leaking.
+    Several channels that fall together, while none reads more, are on a sagging line and saturated,
+    see `SupplyLine`. One alone that falls below what it has reached counts as leaking, though its
+    line might sag too.
 
-    While nothing has been commanded since arming, three readings above that error are enough for a
-    regulator that is stuck.
+    While nothing has been commanded since arming, three readings above the tolerance are enough for
+    a stuck regulator.
 
     Parameters
     ----------
     limits :
-        Of the commands.
+        Limits of the commands.
     safety :
-        What is too much.
+        The tolerance, how long it may be exceeded, and how old a reading may be.
     regulation :
-        How regulators follow.
+        Slowest response of healthy regulators.
     slew :
         Greatest rate of change of a pressure, one value or (n,), in Pa/s.
 
     Attributes
     ----------
-    saturated : ndarray
-        Channels (n,) that stay below what they should be; another array when it changes.
+    saturated : ndarray of bool
+        Channels (n,) that stay below what they should have; replaced when it changes.
     unsupervised : tuple of int
         Channels, counted from 0, that have never been measured.
     """
@@ -97,14 +89,16 @@ class PressureMonitor:
         self._reached: Array = np.zeros(n)  # the highest readings since it was armed
         self._shortage = Shortage(self._tolerance, safety.pressure_error_time)
         self._line = SupplyLine(self._half)
-        self._still: Array = np.full(n, np.inf)  # since when each command is near what it was
+        self._still: Array = np.full(n, np.inf)  # time since which each command is at rest
         self._near: Array = np.zeros(n)
-        self._idle, self._rising = True, 0  # nothing commanded yet; readings that rise all the same
-        self._most = np.stack((most, most, 0.5 * most))  # (3, n): leaks, stuck, saturated
-        self._least = np.stack((0.5 * most, most, 0.5 * most))  # that this can be
-        self._for: Array = np.zeros((3, n))  # s, for how long it was so, less how long it was not
-        self._doubtful = False  # whether any of that is not 0
-        self._beside: Array = np.zeros((3, n))
+        self._idle, self._rising = True, 0  # nothing commanded yet; readings above the tolerance
+        self._most = np.stack(
+            (most, most, 0.5 * most)
+        )  # tolerances (3, n) of: leak, stuck, saturated
+        self._least = np.stack((0.5 * most, most, 0.5 * most))  # least values of these
+        self._for: Array = np.zeros((3, n))  # s for which exceeded, less s for which not
+        self._doubtful = False  # whether any of these times is not 0
+        self._excess: Array = np.zeros((3, n))
         span = limits.high - np.minimum(limits.low, 0.0)
         self._lowest: Array = np.minimum(limits.low, 0.0) - span - most
         self._highest: Array = limits.high + span + most
@@ -112,17 +106,17 @@ class PressureMonitor:
         self.unsupervised = tuple(range(n))
 
     def tell(self, time: float, commanded: Array) -> None:
-        """Take in what the supply is told (n,), in Pa, and when."""
+        """Record the set-points (n,) of the supply, in Pa, and when they were written."""
         self._commanded = commanded
         self._expected.tell(time, commanded)
-        moved = (np.abs(commanded - self._near) > _STILL) | (time < self._still)
+        moved = (np.abs(commanded - self._near) > MONITOR.still) | (time < self._still)
         if moved.any():
             self._still = np.where(moved, time, self._still)
             self._near = np.where(moved, commanded, self._near)
         self._idle = self._idle and not commanded.any()
 
     def clear(self) -> None:
-        """Forget for how long anything was wrong."""
+        """Start over, as after arming."""
         self._for[:] = 0.0
         self._doubtful = False
         self._reached = np.zeros_like(self._reached)
@@ -132,30 +126,32 @@ class PressureMonitor:
         self.saturated = np.zeros_like(self.saturated)
 
     def update(self, now: float, reading: PressureReading) -> Trouble | None:
-        """Judge a reading; return what is wrong."""
+        """Judge a reading; return the fault, if there is one."""
         trouble = self.implausible(now, reading)
         if trouble is not None:
             return trouble
-        elapsed = min(self._expected.follow(reading.time), self._time / _LOOKS)
+        elapsed = min(self._expected.follow(reading.time), self._time / MONITOR.looks)
         due, p = self._expected.lowest, reading.pressures
         if self._idle and elapsed > 0:
             self._rising = self._rising + 1 if (p > self._tolerance).any() else 0
-            if self._rising >= _AT_ONCE:
+            if self._rising >= MONITOR.idle_readings:
                 return self._stuck(int(np.nanargmax(p - self._tolerance)), p)
-        beside = self._beside
+        excess = self._excess
         self._reached = np.fmax(self._reached, p)
-        np.subtract(np.minimum(due, self._reached), p, out=beside[0])
-        np.subtract(p, self._expected.highest, out=beside[1])
-        np.subtract(due, p, out=beside[2])
-        suspect = bool((beside > self._least).any())  # NaN, where nothing is measured, is not
+        np.subtract(np.minimum(due, self._reached), p, out=excess[0])
+        np.subtract(p, self._expected.highest, out=excess[1])
+        np.subtract(due, p, out=excess[2])
+        suspect = bool((excess > self._least).any())  # False where nothing is measured (NaN)
         if not (suspect or self._doubtful or self._line.known):
             return None
-        sagging = self._line.look(beside[2], p, self._reached)
-        np.minimum(beside[0], self._line.pressure - p, out=beside[0])
-        at_rest = reading.time - self._still > _SETTLED
-        share = np.maximum(self._half, np.minimum(self._tolerance, _LEAK * self._reached))
+        sagging = self._line.look(excess[2], p, self._reached)
+        np.minimum(excess[0], self._line.pressure - p, out=excess[0])
+        at_rest = reading.time - self._still > MONITOR.settled
+        share = np.maximum(
+            self._half, np.minimum(self._tolerance, MONITOR.leak_share * self._reached)
+        )
         self._most[0] = np.where(at_rest, share, self._tolerance)
-        wrong = beside > self._most
+        wrong = excess > self._most
         if wrong.any():
             self._for += np.where(wrong, elapsed, -elapsed)
         elif self._doubtful:
@@ -171,7 +167,7 @@ class PressureMonitor:
         return self._found(lasting, p)
 
     def _found(self, lasting: NDArray[np.bool_], p: Array) -> Trouble | None:
-        """Return the trouble where a reading (n,) was wrong for long enough."""
+        """Return the fault of a channel whose reading (n,) was wrong for long enough."""
         for channel in np.flatnonzero(lasting[1]):
             return self._stuck(int(channel), p)
         for channel in np.flatnonzero(lasting[0]):
@@ -192,7 +188,7 @@ class PressureMonitor:
         )
 
     def implausible(self, now: float, reading: PressureReading) -> Trouble | None:
-        """Return why a reading cannot be, if it cannot."""
+        """Return the fault of a reading that is impossible, by age, shape or value."""
         p = reading.pressures
         if not -self._oldest <= now - reading.time <= self._oldest:
             return Trouble(
@@ -223,14 +219,14 @@ class PressureMonitor:
         self.unsupervised = tuple(int(c) for c in np.flatnonzero(~self._measures))
 
     def under_pressure(self, reading: PressureReading) -> str:
-        """Say which channel is not at 0, of a supply that is vented; empty if none is."""
+        """Return which channel of a vented supply is not at 0, in words; empty if all are."""
         p = reading.pressures
         for channel in np.flatnonzero(np.abs(p) > self._tolerance):  # NaN is not
             return f"channel {channel + 1} reads {_bar(p[channel])}, though it is vented"
         return ""
 
     def believable(self, reading: PressureReading) -> PressureReading:
-        """Return a reading with NaN for what cannot be."""
+        """Return a reading with NaN for impossible values."""
         p = reading.pressures
         if p.shape != self._tolerance.shape:
             return PressureReading(reading.time, np.full_like(self._tolerance, np.nan))

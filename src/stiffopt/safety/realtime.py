@@ -1,4 +1,4 @@
-"""What makes a thread punctual, as far as the system permits it."""
+"""Real-time execution: priority, locked memory and exact timers, as far as the system permits."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _HOWEVER = {
 
 @dataclass(frozen=True)
 class RealTimeReport:
-    """What was permitted.
+    """Which real-time privileges a thread has got.
 
     Attributes
     ----------
-    granted : in a few words each.
-    denied : what was not, why, and how to allow it: a sentence each.
+    granted : privileges, in a few words each.
+    denied : privileges that it has not got, why, and how to allow them: a sentence each.
     """
 
     granted: tuple[str, ...]
@@ -43,7 +43,7 @@ class RealTimeReport:
 
     @property
     def notice(self) -> str:
-        """For people, on one line."""
+        """One line for people."""
         if not self.denied:
             return f"real-time: {', '.join(self.granted)}"
         return f"not real-time: {'; '.join(self.denied)}"
@@ -51,12 +51,11 @@ class RealTimeReport:
 
 @contextmanager
 def real_time(priority: int = 80) -> Iterator[RealTimeReport]:
-    """Make the calling thread punctual; all is as it was at the end.
+    """Context in which the calling thread is real-time; everything is restored at its end.
 
-    The thread gets the priority of `SCHED_FIFO` and exact timers. For the whole process, until the
-    last of several that are at it ends: memory that was used stays in memory, threads take turns
-    more often, and garbage is not collected by itself but in `tidy`. What is not permitted is left
-    out and told; this raises nothing.
+    The thread gets a `SCHED_FIFO` priority and exact timers. For the whole process, until the last
+    such context ends, memory is locked, threads switch more often, and garbage is collected only by
+    `tidy`. What is not permitted is left out and reported; nothing is raised.
 
     Parameters
     ----------
@@ -75,10 +74,9 @@ def real_time(priority: int = 80) -> Iterator[RealTimeReport]:
 
 
 def tidy(*, thoroughly: bool) -> None:
-    """Collect garbage, which nobody else does while a thread is real-time.
+    """Collect garbage, which does not happen by itself while a thread is real-time.
 
-    Takes tens of microseconds, or some milliseconds if `thoroughly`: to be called while nothing
-    moves then, and every few seconds else.
+    Takes tens of microseconds; if `thoroughly`, some milliseconds, so only while nothing moves.
     """
     gc.collect(2 if thoroughly else 1)
 
@@ -88,7 +86,7 @@ Step = Callable[[], tuple[str, Undo]]
 
 
 class _NotPermittedError(Exception):
-    """Why something is not possible."""
+    """The system does not permit a step; the message says why."""
 
 
 def _try(step: Step, name: str, granted: list[str], denied: list[str], undo: ExitStack) -> None:
@@ -103,7 +101,7 @@ def _try(step: Step, name: str, granted: list[str], denied: list[str], undo: Exi
 
 
 class _Process:
-    """What is set for the whole process, while at least one thread is real-time."""
+    """Settings of the whole process while at least one thread is real-time."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -150,7 +148,7 @@ def _first_in_first_out(priority: int) -> Step:
 
 
 def _exact_timers() -> tuple[str, Undo]:
-    """Let sleeping end on time, not up to 50 us later; needs no permission."""
+    """Let sleeps end on time instead of up to 50 us later; needs no permission."""
     libc = _libc()
     if libc is None:
         return "", lambda: None
@@ -160,7 +158,7 @@ def _exact_timers() -> tuple[str, Undo]:
 
 
 def _locked_memory() -> tuple[str, Undo]:
-    """Keep in memory what has been used; only where there is no limit that could be run into."""
+    """Lock used memory, if no limit of locked memory could be exceeded later."""
     libc = _libc()
     if libc is None:
         raise _NotPermittedError("memory cannot be locked (the C library has no mlockall)")

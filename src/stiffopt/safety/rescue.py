@@ -1,4 +1,4 @@
-"""What the client of a guard does when the guard is gone: it vents the supply itself, at once."""
+"""Venting without a guard: the client of a guard that is gone vents the supply itself, at once."""
 
 from __future__ import annotations
 
@@ -8,55 +8,32 @@ import select
 import threading
 import time
 from contextlib import ExitStack, suppress
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 from stiffopt.errors import DeviceError
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.claim import Claim
+from stiffopt.safety.settings import CLIENT
 
-__all__ = ["PING_PERIOD", "GuardWatch", "vent_directly"]
+if TYPE_CHECKING:
+    from stiffopt.safety.guard_client import GuardLink
 
-PING_PERIOD = 0.1
-"""Seconds between two looks at a guard."""
-_AGAIN = 0.1  # s between attempts to vent
+__all__ = ["GuardWatch", "vent_directly"]
+
 _log = logging.getLogger(__name__)
-_CLAIM = 0.2  # s for which a claim may still be that of a guard that is just ending
-
-
-class Watched(Protocol):
-    """What is watched: the client's end of a guard."""
-
-    @property
-    def pid(self) -> int | None:
-        """Number of the guard's process."""
-
-    @property
-    def alive(self) -> bool:
-        """Whether the guard's process is there."""
-
-    @property
-    def hung(self) -> bool:
-        """Whether it has not answered for so long that it never may."""
-
-    def ping(self) -> None:
-        """Ask for a sign of life; a guard that gives none is hung after some time."""
-
-    def kill(self) -> None:
-        """End it; the kernel takes its devices and its claim."""
 
 
 def vent_directly(supply: PressureSupply) -> bool:
-    """Vent a supply, and return whether nobody else commands it.
+    """Vent a supply; return False if another program has claimed it.
 
-    To vent is allowed also where another program has claimed the supply, who may raise the pressure
-    again.
+    Venting is allowed even then, but that program may raise the pressure again.
 
     Raises
     ------
     DeviceError
-        The supply does not take it.
+        The supply does not answer.
     """
-    claim = Claim(lambda: supply.endpoints, wait=_CLAIM)
+    claim = Claim(lambda: supply.endpoints, wait=CLIENT.claim)
     try:
         claim.take()
         alone = True
@@ -71,24 +48,25 @@ def vent_directly(supply: PressureSupply) -> bool:
 
 
 class GuardWatch:
-    """Watches a guard in a thread of its own, and vents in its place when it is gone or hangs.
+    """Watches a guard in a thread of its own and vents the supply when the guard is gone or hung.
 
     Parameters
     ----------
     guard :
-        What is watched.
+        The client's link to the guard.
     supply :
-        Another object for the guard's supply, not open; None: it is gone with the guard.
+        Another object for the guard's supply, not open; None: the supply is simulated and gone with
+        the guard.
 
     Attributes
     ----------
     rescued : threading.Event
         Set when the supply has been vented directly.
     error : str
-        Why it could not be so far; empty if it was, or need not be.
+        Why venting has failed so far; empty if it has not.
     """
 
-    def __init__(self, guard: Watched, supply: PressureSupply | None) -> None:
+    def __init__(self, guard: GuardLink, supply: PressureSupply | None) -> None:
         self.rescued = threading.Event()
         self.error = ""
         self._guard, self._supply = guard, supply
@@ -98,11 +76,11 @@ class GuardWatch:
         self._thread = threading.Thread(target=self._run, name="guard watch", daemon=True)
 
     def start(self) -> None:
-        """Begin to watch."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self, timeout: float = 1.0) -> None:
-        """Watch no more, for the guard is about to end as it should."""
+        """Stop watching: the guard is about to end regularly."""
         self._ended.set()
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout)
@@ -122,13 +100,13 @@ class GuardWatch:
         """
         end = time.monotonic() + timeout
         while not self._try() and time.monotonic() < end:
-            time.sleep(_AGAIN)
+            time.sleep(CLIENT.rescue_retry)
         return self.rescued.is_set()
 
     def _run(self) -> None:
         try:
             if self._supply is not None:
-                with suppress(Exception):  # nothing keeps this from watching
+                with suppress(Exception):  # whatever fails, go on to watch
                     self._supply.prepare()
             self._watch()
             if not self._ended.is_set():
@@ -137,34 +115,34 @@ class GuardWatch:
             self._over.set()
 
     def _watch(self) -> None:
-        """Return when the guard has ended, or nobody needs it any more."""
+        """Return when the guard has ended, or after `stop`."""
         poll = select.poll()
         with ExitStack() as stack:
-            with suppress(OSError, AttributeError):  # systems without these look more slowly
+            with suppress(OSError, AttributeError):  # without pidfd it is only polled
                 end = os.pidfd_open(self._guard.pid or 0)
                 stack.callback(os.close, end)
                 poll.register(end, select.POLLIN)
             while self._guard.alive and not self._ended.is_set():
-                poll.poll(PING_PERIOD * 1e3)
+                poll.poll(CLIENT.ping * 1e3)
                 if self._guard.alive and not self._ended.is_set():
                     self._guard.ping()
                     if self._guard.hung:
                         self._guard.kill()
 
     def _rescue(self) -> None:
-        """Vent, however long it takes until the supply answers."""
+        """Vent, and try again until the supply answers."""
         told = False
         while not self._try():
             if not told:
                 told = True
                 _log.error("the guard is gone and the supply is NOT VENTED yet: %s", self.error)
-            if self._ended.wait(_AGAIN):
+            if self._ended.wait(CLIENT.rescue_retry):
                 return
         if self._supply is not None:
             _log.warning("the guard is gone; the supply was vented directly")
 
     def _try(self) -> bool:
-        """Vent the supply unless that is done; return whether it is."""
+        """Vent the supply unless it is vented already; return whether it is."""
         with self._venting:
             if self.rescued.is_set():
                 return True

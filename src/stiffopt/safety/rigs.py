@@ -1,27 +1,37 @@
-"""Opening a rig so that whoever commands it does so through the gate."""
+"""Opening a rig so that every command to its supply passes the safety gate."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
 
+from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
 from stiffopt.rig.assembly import make_rig
-from stiffopt.rig.config import RigDescription, load_rig_description
-from stiffopt.rig.interface import Rig
+from stiffopt.rig.config import RigDescription, limits_of, load_rig_description, slew_of
+from stiffopt.rig.interface import (
+    Clock,
+    ForceProbe,
+    PoseTracker,
+    PressureSupply,
+    Rig,
+    SystemClock,
+)
+from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import effective_slew, gate_before
 from stiffopt.safety.goal import GoalFollower, GoalSupply, TickingClock
-from stiffopt.safety.link import guarded_rig
+from stiffopt.safety.guard_client import GuardLink
+from stiffopt.safety.hosted import ForwardedProbe, ForwardedTracker
 
-__all__ = ["open_rig", "rig_for_programs"]
+__all__ = ["gated_rig", "guarded_rig", "open_rig", "rig_for_programs"]
 
 
 def open_rig(path: str | os.PathLike[str], *, real_time: bool = False) -> Rig:
     """Return the rig that a rig file describes; nothing is connected before `Rig.open`.
 
     Its supply takes goals, see `stiffopt.safety.goal.GoalSupply`: the limits of robot, rig, supply
-    and channels hold whatever is commanded, and an arm that nobody commands any more is vented.
+    and channels hold for all commands, and an arm that nobody commands any more is vented.
 
     Parameters
     ----------
@@ -36,7 +46,7 @@ def open_rig(path: str | os.PathLike[str], *, real_time: bool = False) -> Rig:
     FileError
         A file is wrong.
     MissingExtraError
-        The simulator is asked for and numba is not installed.
+        The simulator is needed and numba is not installed.
     """
     description = load_rig_description(path)
     robot = load_description(description.robot, base=Path(path).parent)
@@ -51,12 +61,92 @@ def rig_for_programs(
         rig = guarded_rig(description, robot)[0]
         rig.slew = effective_slew(rig)
         return rig
-    rig, period = make_rig(description, robot), 1 / description.rate
-    gate = gate_before(rig, description.safety, period)
-    follower = GoalFollower.before(gate, description.safety, period, rig.clock)
+    return gated_rig(make_rig(description, robot), description.safety, 1 / description.rate)
+
+
+def gated_rig(rig: Rig, safety: Safety, period: float) -> Rig:
+    """Put gate and goal follower in front of the supply of a rig of bare devices, in place.
+
+    For rigs on a simulated clock, all in this process: the follower is ticked by the rig's clock.
+
+    Parameters
+    ----------
+    rig :
+        Rig of devices that have no gate in front of them.
+    safety :
+        Limits of pressure, force and age.
+    period :
+        Time between commands, in s.
+    """
+    gate = gate_before(rig, safety, period)
+    follower = GoalFollower.before(gate, safety, period, rig.clock)
     clock = TickingClock(rig.clock, follower)
     for device in (rig.tracker, rig.probe):
         if device is not None:
             device.clock = clock
     rig.clock, rig.supply, rig.slew = clock, GoalSupply(follower, clock), effective_slew(rig)
     return rig
+
+
+def guarded_rig(
+    rig: str | os.PathLike[str] | RigDescription,
+    robot: RobotDescription | None = None,
+    *,
+    json_lines: bool = False,
+) -> tuple[Rig, GuardLink]:
+    """Return a rig in real time whose supply a guard process owns, and the link to the guard.
+
+    Nothing is started before one of them is opened. Opening or closing the rig opens or closes the
+    link too.
+
+    Parameters
+    ----------
+    rig :
+        A rig file, or its content.
+    robot :
+        Robot of the rig; needed if its content is given.
+    json_lines :
+        Whether the guard writes JSON lines on stderr.
+
+    Raises
+    ------
+    FileError
+        A file is wrong.
+    InputError
+        The robot is missing.
+    MissingExtraError
+        A library is not installed.
+    """
+    if isinstance(rig, RigDescription):
+        if robot is None:
+            raise InputError("expected the robot of the rig too")
+        description = rig
+    else:
+        description = load_rig_description(rig)
+        robot = robot or load_description(description.robot, base=Path(rig).parent)
+    limits, slew = limits_of(description, robot), slew_of(description, robot)
+    clock: Clock = SystemClock()
+    tracker: PoseTracker | None
+    probe: ForceProbe | None
+    if description.supply.driver == "simulated":
+        link = GuardLink(description, robot, limits, json_lines=json_lines)
+        link.has_dump_valve = description.supply.dump_valve
+        tracker = None if description.tracker is None else ForwardedTracker(link)
+        probe = None if description.probe is None else ForwardedProbe(link)
+    else:
+        real = make_rig(description, robot)
+        spare = real.supply
+        assert isinstance(spare, PressureSupply)
+        link = GuardLink(description, robot, spare.limits, spare, json_lines=json_lines)
+        tracker, probe, clock = real.tracker, real.probe, real.clock
+    guarded = Rig(
+        robot,
+        GoalSupply(link, clock),
+        tracker,
+        probe,
+        clock=clock,
+        slew=slew,
+        max_force=description.safety.max_force,
+        settings=description,
+    )
+    return guarded, link

@@ -1,4 +1,4 @@
-"""Venting a rig from outside, whoever commands it."""
+"""Venting a rig from outside (``stiffopt vent``), whichever program commands it."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.hosted import simulated_endpoint
 from stiffopt.safety.rescue import vent_directly
-from stiffopt.safety.vent_line import Peer, ask_to_vent, trusted
+from stiffopt.safety.vent_line import SocketPeer, ask_to_vent, trusted
 
 __all__ = ["vent_rig"]
 
-_PATIENCE = 3.0  # s in which a guard must have vented, beyond its driver's own time
-_CALLS = 4  # of the driver, at most, that venting takes
-_GONE = 2.0  # s in which a process that was ended must be gone
+_PATIENCE = 3.0  # s in which a guard must have vented, beyond the time that its driver needs
+_CALLS = 4  # driver calls, at most, that venting takes
+_GONE = 2.0  # s in which a killed process must be gone
 
 
 def vent_rig(path: str | os.PathLike[str]) -> str:
-    """Vent the supply of a rig, by the guard that owns it, else directly; return how, in words.
+    """Vent the supply of a rig, by the guard that owns it or else directly; return how, in words.
 
-    A guard that does not answer is ended. Where no guard that can be believed says that it has
-    vented, the supply is vented directly, also beside a guard. None of this uses the network, and
-    no other user can keep it from happening.
+    A guard that does not answer is killed. If no trusted guard says that it has vented, the supply
+    is vented directly, even if another guard owns it. None of this uses the network, unless the
+    device itself does, and no other user can prevent it.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def vent_rig(path: str | os.PathLike[str]) -> str:
 
 
 def _vent_by_guards(endpoint: str, patience: float) -> tuple[str, list[str]]:
-    """Have the guards of a supply vent; return who has done so, and what else was said."""
+    """Call the guards of a supply to vent; return the success and the failures, in words."""
     done, failed = [], []
     for reply in ask_to_vent(endpoint, patience):
         guard = reply.guard
@@ -97,8 +97,8 @@ def _vent_simulated(description: RigDescription) -> str:
     return done or f"nothing to vent: nobody runs the simulated rig '{description.name}'"
 
 
-def _ended(guard: Peer) -> bool:
-    """End a guard that does not answer; return whether it is gone, by this or already."""
+def _ended(guard: SocketPeer) -> bool:
+    """Kill a guard that does not answer; return whether it is gone."""
     if guard.pid <= 0:
         return False
     if _is_guard(guard.pid):
@@ -111,7 +111,7 @@ def _ended(guard: Peer) -> bool:
 
 
 def _is_guard(pid: int) -> bool:
-    """Return whether a process runs, and is a guard."""
+    """Return whether a process runs and is a guard."""
     return b"stiffopt.safety.guard" in _command_line(pid)
 
 

@@ -1,10 +1,11 @@
-"""The vent line: a way to have a guard vent that needs no network, and that no stranger can block.
+"""The vent line: a local socket by which anybody entitled can have a guard vent.
 
-Each guard listens under an abstract socket address that begins with its supply's endpoint and ends
-with its process and something random, so that nobody can take it first; whoever wants to vent finds
-all such addresses in the kernel's table. The kernel also tells each side who the other is: a guard
-hears only root and its own user, and hangs up on all others at once; a caller believes only those
-of its own user and root. Whoever is heard says ``vent``, and is answered in JSON once that is done.
+It needs no network, and no other user can block it. Each guard listens at an abstract socket
+address that begins with its supply's endpoint and ends with its process id and a random part, so
+that nobody can take the address first; a caller finds all such addresses in the kernel's table. The
+kernel also tells each side who the other one is: a guard accepts only root and its own user, and
+closes all other connections at once; a caller trusts only guards of its own user and root. The
+caller sends ``vent`` and is answered in JSON once the supply is vented.
 """
 
 from __future__ import annotations
@@ -23,20 +24,20 @@ from pathlib import Path
 
 from stiffopt.safety.claim import address_of
 
-__all__ = ["Caller", "Peer", "Reply", "VentLine", "ask_to_vent", "guards_of", "trusted"]
+__all__ = ["Caller", "Reply", "SocketPeer", "VentLine", "ask_to_vent", "guards_of", "trusted"]
 
 _WORD = b"vent"
 _BACKLOG = 64
-_AT_ONCE = 64  # callers that are looked at in one step
-_WAITING = 8  # callers of this user that have not said their word yet
-_STRANGERS = 32  # guards of other users that root asks
-_LEAST = 0.05  # s for each guard
+_AT_ONCE = 64  # callers that are accepted in one step
+_WAITING = 8  # callers of this user that have connected and sent nothing yet
+_STRANGERS = 32  # guards of other users that root calls
+_LEAST = 0.05  # s that each guard has to answer, at least
 _CREDENTIALS = struct.Struct("3i")
 _ANSWER = 4096  # bytes
 
 
 @dataclass(frozen=True)
-class Peer:
+class SocketPeer:
     """A process at the other end of a local socket."""
 
     pid: int
@@ -44,7 +45,7 @@ class Peer:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Process and user, for messages."""
         try:
             user = pwd.getpwuid(self.uid).pw_name
         except KeyError:
@@ -52,21 +53,21 @@ class Peer:
         return f"process {self.pid} (user {user})"
 
 
-def _peer(connection: socket.socket) -> Peer:
+def _peer(connection: socket.socket) -> SocketPeer:
     packed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
     pid, uid, _ = _CREDENTIALS.unpack(packed)
-    return Peer(pid, uid)
+    return SocketPeer(pid, uid)
 
 
 class Caller:
-    """Somebody who is entitled to vent and has asked for it."""
+    """A connection of somebody who is entitled to vent."""
 
-    def __init__(self, connection: socket.socket, peer: Peer) -> None:
+    def __init__(self, connection: socket.socket, peer: SocketPeer) -> None:
         self._connection = connection
         self.peer = peer
 
     def asks(self) -> bool | None:
-        """Say whether the word has come; None: not yet."""
+        """Return whether the word ``vent`` has come; None: nothing has come yet."""
         try:
             return self._connection.recv(64).startswith(_WORD)
         except BlockingIOError:
@@ -75,23 +76,23 @@ class Caller:
             return False
 
     def answer(self, error: str = "") -> None:
-        """Tell what became of it, empty if the supply is vented, and hang up."""
+        """Send the outcome, an error or empty if the supply is vented, and hang up."""
         with suppress(OSError):
             self._connection.send(json.dumps({"error": error}).encode())
         self.hang_up()
 
     def hang_up(self) -> None:
-        """End the connection."""
+        """Close the connection."""
         self._connection.close()
 
 
 class VentLine:
-    """The guard's end. Nothing here waits for anybody.
+    """The guard's end of the vent line; it never blocks.
 
     Parameters
     ----------
     endpoints :
-        Of the supply that the guard owns.
+        Names of the supply that the guard owns, see `PressureSupply.endpoints`.
     """
 
     def __init__(self, endpoints: Sequence[str]) -> None:
@@ -99,11 +100,11 @@ class VentLine:
         self._callers: list[Caller] = []
 
     def descriptors(self) -> list[int]:
-        """Return the descriptors that become readable when somebody calls."""
+        """Return the file descriptors that become readable when somebody calls."""
         return [s.fileno() for s in self._listening]
 
-    def asked(self) -> list[Caller]:
-        """Return those who have asked to vent since the last call; each is to be answered."""
+    def wanting_to_vent(self) -> list[Caller]:
+        """Return the callers that want to vent, since the last call; each is to be answered."""
         for listening in self._listening:
             self._accept(listening)
         said = [(caller, caller.asks()) for caller in self._callers]
@@ -114,7 +115,7 @@ class VentLine:
         return [caller for caller, word in said if word]
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening and close all connections."""
         for listening in self._listening:
             listening.close()
         for caller in self._callers:
@@ -136,7 +137,7 @@ class VentLine:
 
 
 def _listening(endpoint: str) -> socket.socket:
-    """Return a listening socket at an address that nobody could foresee."""
+    """Return a listening socket at an address that nobody could guess."""
     listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         place = f"{os.getpid()}-{secrets.token_hex(8)}"
@@ -154,29 +155,29 @@ def _listening(endpoint: str) -> socket.socket:
 
 @dataclass(frozen=True)
 class Reply:
-    """What a guard said, or did not say.
+    """Reply of a guard that was called to vent, or the lack of one.
 
     Attributes
     ----------
-    guard : the process that listens.
-    answered : whether it said anything.
+    guard : the guard's process.
+    answered : whether it answered.
     error : why its supply may not be vented; empty if it says that it is.
     """
 
-    guard: Peer
+    guard: SocketPeer
     answered: bool
     error: str = ""
 
 
 def trusted(uid: int) -> bool:
-    """Return whether a user's word that a supply is vented may be believed.
+    """Return whether a guard of a user is trusted when it says that a supply is vented.
 
-    Those of root and of this user are, and for root that of the user who became it by ``sudo``.
+    Root and this user are trusted, and for root also the user who became root by ``sudo``.
     """
     return uid in (0, os.getuid()) or (os.getuid() == 0 and os.environ.get("SUDO_UID") == str(uid))
 
 
-def guards_of(endpoint: str) -> list[Peer]:
+def guards_of(endpoint: str) -> list[SocketPeer]:
     """Return the processes that listen for an endpoint, whoever their users are."""
     found = []
     for peer, line in _lines_of(endpoint):
@@ -187,16 +188,16 @@ def guards_of(endpoint: str) -> list[Peer]:
 
 
 def ask_to_vent(endpoint: str, patience: float = 5.0) -> list[Reply]:
-    """Have all guards of an endpoint vent that hear this user; see `trusted` for whom to believe.
+    """Call all guards of an endpoint that accept this user, and return their replies.
 
     Parameters
     ----------
     endpoint :
-        Of the supply.
+        Name of the supply.
     patience :
-        Seconds in which all must have answered.
+        Time in which all must have answered, in s.
     """
-    asked: list[tuple[Peer, socket.socket | None]] = []
+    asked: list[tuple[SocketPeer, socket.socket | None]] = []
     strangers = 0
     for peer, line in _lines_of(endpoint):
         if not trusted(peer.uid):
@@ -210,11 +211,13 @@ def ask_to_vent(endpoint: str, patience: float = 5.0) -> list[Reply]:
                 line.send(_WORD)
         asked.append((peer, line))
     end = time.monotonic() + patience
-    asked.sort(key=lambda one: not trusted(one[0].uid))  # strangers have what time is left
+    asked.sort(
+        key=lambda one: not trusted(one[0].uid)
+    )  # other users' guards have the time that is left
     return [_reply(peer, line, end) for peer, line in asked]
 
 
-def _reply(peer: Peer, line: socket.socket | None, end: float) -> Reply:
+def _reply(peer: SocketPeer, line: socket.socket | None, end: float) -> Reply:
     if line is None:
         return Reply(peer, answered=False, error="the guard accepts no calls")
     with line:
@@ -229,10 +232,10 @@ def _reply(peer: Peer, line: socket.socket | None, end: float) -> Reply:
         return Reply(peer, answered=False, error="the guard has hung up without an answer")
 
 
-def _lines_of(endpoint: str) -> Iterator[tuple[Peer, socket.socket | None]]:
-    """Yield who listens for an endpoint, with a connection where one is accepted at once.
+def _lines_of(endpoint: str) -> Iterator[tuple[SocketPeer, socket.socket | None]]:
+    """Yield the guards of an endpoint, each with a connection if it accepts one at once.
 
-    A guard that hangs may accept none: what its address says of its process is checked then.
+    A guard that hangs may accept none; its process is taken from its address then, and checked.
     """
     shown = address_of("vent", endpoint).replace("\0", "@") + "/"
     try:
@@ -256,12 +259,12 @@ def _lines_of(endpoint: str) -> Iterator[tuple[Peer, socket.socket | None]]:
             yield _peer(line), line
 
 
-def _process_of(place: str) -> Peer | None:
-    """Return the process that an address names; its user is the kernel's word."""
+def _process_of(place: str) -> SocketPeer | None:
+    """Return the process that an address names, with its user as the kernel has it."""
     number = place.partition("-")[0]
     if not number.isdecimal():
         return None
     try:
-        return Peer(int(number), os.stat(f"/proc/{number}").st_uid)
+        return SocketPeer(int(number), os.stat(f"/proc/{number}").st_uid)
     except OSError:
         return None

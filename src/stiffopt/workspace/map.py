@@ -1,4 +1,4 @@
-"""WorkspaceMap: where the tip can be and how stiff it can be made there."""
+"""The workspace map as a result: the cells that the tip reaches and the stiffness range in each."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,7 +8,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.workspace.plan import MapPlan, direction_name
+from stiffopt.directions import direction_name
+from stiffopt.workspace.plan import MapPlan
 from stiffopt.workspace.table import CellTable
 
 Vector = NDArray[np.float64]
@@ -16,7 +17,7 @@ Numbers = NDArray[np.int64]
 Quantity = Literal["count", "best", "worst", "best_sample", "worst_sample"]
 
 FILL = {"count": 0, "best": np.nan, "worst": np.nan, "best_sample": -1, "worst_sample": -1}
-"""What stands in cells that no sample reached."""
+"""Values of cells that no sample reached."""
 
 
 class Extreme(NamedTuple):
@@ -38,7 +39,7 @@ class Extreme(NamedTuple):
 
 @dataclass(frozen=True)
 class WorkspaceMap:
-    """Cells of space that the tip reaches, and the range of stiffness in each.
+    """The cells of space that the tip reaches, with the range of stiffness in each.
 
     Rows are the M cells that a sample reached, in the order of their indices; `grid` has them as
     a box.
@@ -68,7 +69,7 @@ class WorkspaceMap:
 
     @property
     def direction_names(self) -> tuple[str, ...]:
-        """What the directions are called."""
+        """Names of the directions."""
         return tuple(direction_name(measure.direction) for measure in self.plan.measures)
 
     @property
@@ -88,7 +89,7 @@ class WorkspaceMap:
 
     @property
     def ratio(self) -> Vector:
-        """Greatest by least stiffness (m, M): how much of it can be chosen at a place."""
+        """Ratio (m, M) of greatest to least stiffness: how much can be chosen at a place."""
         return np.asarray(self.best / self.worst)
 
     @property

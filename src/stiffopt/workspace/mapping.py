@@ -1,4 +1,4 @@
-"""`map_workspace`: sample the workspace of an arm; the run goes on where another one stopped."""
+"""`map_workspace` makes a workspace map, or resumes one; `open_workspace_map` reads it."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -16,16 +16,13 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer
 from stiffopt.workspace.map import WorkspaceMap
-from stiffopt.workspace.plan import Block, MapPlan
-from stiffopt.workspace.store import MapStore, Progress, is_vacant, require_zarr
+from stiffopt.workspace.plan import TUNING, Block, MapPlan
+from stiffopt.workspace.store import Checkpoint, MapStore, is_vacant, require_zarr
 from stiffopt.workspace.table import CellTable, Gathering
 from stiffopt.workspace.workers import Cluster, Threads, Workers, results
 
 Vector = NDArray[np.float64]
 Report = Callable[[int, int], None]
-
-_BETWEEN_CHECKPOINTS = 5.0  # s
-_CHECKPOINT_SHARE = 0.05  # of the time that checkpoints may take
 
 
 def map_workspace(
@@ -45,10 +42,10 @@ def map_workspace(
     overwrite: bool = False,
     progress: Report | None = None,
 ) -> WorkspaceMap:
-    """Sample an arm's pressures into reach and the range of stiffness of each cell of space.
+    """Map where an arm's tip can be, and the range of its stiffness there, by sampling pressures.
 
-    The same arguments give the same map to the last bit, whoever does the work and however often
-    it was interrupted.
+    The same arguments give the same map to the last bit, whatever computes it and however often it
+    was interrupted.
 
     Parameters
     ----------
@@ -108,7 +105,7 @@ def map_workspace(
             store.tidy()
             return _as_map(plan, store.read(), store.path, evaluated=0)
         begun = None if store is None else store.load()
-        run = _Run(plan, store, begun, progress or (lambda done, total: None))
+        run = _MapRun(plan, store, begun, progress or (lambda done, total: None))
         workers: Threads | Cluster = (
             stack.enter_context(Threads(plan, threads))
             if scheduler is None
@@ -118,7 +115,7 @@ def map_workspace(
 
 
 def open_workspace_map(path: str | os.PathLike[str]) -> WorkspaceMap:
-    """Complete map in a folder.
+    """Read a complete map from its folder.
 
     Raises
     ------
@@ -137,7 +134,7 @@ def open_workspace_map(path: str | os.PathLike[str]) -> WorkspaceMap:
 def _opened(
     path: str | os.PathLike[str], plan: MapPlan, overwrite: bool, stack: ExitStack
 ) -> MapStore:
-    """Store at a path, locked: one to go on with, or a new one."""
+    """Return the locked store at a path, an unfinished one or a new one."""
     require_zarr()
     parent = Path(path).resolve().parent
     if not parent.is_dir():
@@ -147,7 +144,7 @@ def _opened(
         if not overwrite:
             store.check(plan.record)
             stack.enter_context(store.locked())
-            return MapStore(path)  # as it is now that no one else is at work
+            return MapStore(path)  # read again now that nobody else works on it
         with store.locked():
             store = MapStore.create(path, plan.record, overwrite=True)
     else:
@@ -156,24 +153,24 @@ def _opened(
     return store
 
 
-class _Run:
-    """The sampling, from where it was left to its end."""
+class _MapRun:
+    """A run of the sampling, from the last checkpoint to the end."""
 
     def __init__(
-        self, plan: MapPlan, store: MapStore | None, begun: Progress | None, report: Report
+        self, plan: MapPlan, store: MapStore | None, begun: Checkpoint | None, report: Report
     ) -> None:
         if begun is None:
             none = CellTable.empty(len(plan.measures))
-            begun = Progress(0, 0, np.full(3, np.inf), np.full(3, -np.inf), none)
+            begun = Checkpoint(0, 0, np.full(3, np.inf), np.full(3, -np.inf), none)
         self._plan, self._store, self._report = plan, store, report
         self._state, self._begun = begun, begun.blocks
-        self._gathering = Gathering(begun.table)
+        self._gathering = Gathering(begun.table, TUNING.most_cells)
         self._saved = begun.blocks
-        self._whole = True  # an interrupt may come in the middle of a step
-        self._next_save = monotonic() + _BETWEEN_CHECKPOINTS
+        self._whole = True  # False while a step is half done, for interrupts
+        self._next_save = monotonic() + TUNING.checkpoint
 
     def finish(self, workers: Workers) -> WorkspaceMap:
-        """Evaluate what is missing and complete the map."""
+        """Evaluate the missing blocks and complete the map."""
         plan = self._plan
         self._tell()
         try:
@@ -209,7 +206,7 @@ class _Run:
         self._report(self._plan.samples_in(self._state.blocks), self._plan.total)
 
     def _save(self) -> None:
-        """Write a checkpoint if there is anything new, and nothing half done, to write."""
+        """Write a checkpoint if there is something new and no step is half done."""
         if self._store is None or self._state.blocks == self._saved or not self._whole:
             return
         begin = monotonic()
@@ -219,16 +216,16 @@ class _Run:
         self._store.save(self._state._replace(table=table))
         self._saved = self._state.blocks
         took = monotonic() - begin
-        self._next_save = monotonic() + max(_BETWEEN_CHECKPOINTS, took / _CHECKPOINT_SHARE)
+        self._next_save = monotonic() + max(TUNING.checkpoint, took / TUNING.checkpoint_share)
 
 
-def _as_map(plan: MapPlan, state: Progress, path: Path | None, evaluated: int) -> WorkspaceMap:
+def _as_map(plan: MapPlan, state: Checkpoint, path: Path | None, evaluated: int) -> WorkspaceMap:
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (state.low, state.high))
     return WorkspaceMap(plan, state.table, state.lost, low, high, path, evaluated)
 
 
 def _plan_of(store: MapStore) -> MapPlan:
-    """Plan that a map was made by."""
+    """Return the plan of a stored map."""
     said: dict[str, Any] = store.attributes
     try:
         load = np.array(said["tip_load"], dtype=float)

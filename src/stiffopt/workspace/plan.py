@@ -1,16 +1,24 @@
-"""What a map is of: the arm, the stiffnesses, the samples, the cells; and a block of it."""
+"""The plan of a workspace map: arm, stiffnesses, samples and cells, and how a block is evaluated.
+
+Sample i of a plan depends on i (and a seed) alone, so any block of samples can be computed anywhere
+and the pressures of a sample follow from its number. Sampling uses integer arithmetic up to the
+last step, which rounds the same on every machine.
+"""
 
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from decimal import Decimal, localcontext
+from functools import cache, cached_property
 from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.directions import direction_name
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.arguments import Measure, checked_measure
 from stiffopt.model.compiled import BatchFunction, interpreted, library
@@ -18,28 +26,178 @@ from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffne
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer, checked_number
 from stiffopt.model.shape import Shape
-from stiffopt.workspace.sampling import Grid, QuasiRandom, Sampling, checked_sampling
 from stiffopt.workspace.table import FARTHEST, CellTable, cell_indices, cell_keys
 
 Vector = NDArray[np.float64]
 
 AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 """Directions of a map unless others are named."""
-_FREE_SAMPLES = 1_000_000
-_LOADED_SAMPLES = 1_000  # an equilibrium takes thousands of times longer than a closed form
-_FREE_BLOCK = 1 << 15
-_COMPILED_FROM = 50_000  # samples; fewer take less time than a compiler
 _NAME = "workspace_map_1"  # to be counted up when what `MapPlan._outputs` gives is changed
-_LOADED_BLOCK = 16
+MOST_SAMPLES = 10**12
+"""Samples of a map, at most."""
+
+
+@dataclass(frozen=True)
+class MapTuning:
+    """Sizes and times of making a map; none changes the cells' values for a given plan.
+
+    Attributes
+    ----------
+    samples, loaded_samples : default number of samples of a free arm, and of one with gravity or
+        loads, whose equilibria take thousands of times longer than the closed form.
+    block, loaded_block : number of samples that are evaluated at a time, likewise.
+    compiled_from : number of samples from which machine code pays for its compilation.
+    most_cells : cells that one map may fill; each takes about 0.5 kB while it is made.
+    checkpoint : time between two checkpoints on disk, in s.
+    checkpoint_share : share of the time that checkpoints may take.
+    cluster_patience : time to wait for a scheduler, and for workers while there are none, in s.
+    retries : of a block that fails for a passing reason, such as a worker that is gone.
+    """
+
+    samples: int = 1_000_000
+    loaded_samples: int = 1_000
+    block: int = 1 << 15
+    loaded_block: int = 16
+    compiled_from: int = 50_000
+    most_cells: int = 1_500_000
+    checkpoint: float = 5.0
+    checkpoint_share: float = 0.05
+    cluster_patience: float = 30.0
+    retries: int = 3
+
+
+TUNING = MapTuning()
+
+
+@dataclass(frozen=True)
+class Sampling(ABC):
+    """Samples of the pressures, by number, between the limits of each channel.
+
+    Attributes
+    ----------
+    lower, upper : limits of each channel, in Pa.
+    """
+
+    lower: tuple[float, ...]
+    upper: tuple[float, ...]
+
+    @property
+    @abstractmethod
+    def total(self) -> int:
+        """Number of samples."""
+
+    @abstractmethod
+    def shares(self, start: int, stop: int) -> Vector:
+        """Samples start to stop - 1 as shares (k, n) of each channel's range, 0 to 1."""
+
+    @abstractmethod
+    def record(self) -> dict[str, Any]:
+        """The parameters of the sampling, as plain data."""
+
+    def pressures(self, start: int, stop: int) -> Vector:
+        """Pressures (k, n) of samples start to stop - 1, in Pa."""
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        return np.asarray(lower + (upper - lower) * self.shares(start, stop))
+
+
+@dataclass(frozen=True)
+class QuasiRandom(Sampling):
+    """Additive recurrence with the generalised golden ratio (M. Roberts, 2018), in 64 bits.
+
+    Sample i is ``frac(shift + (i + 1) ratio^-j)`` of the range of channel j, in fixed point; the
+    seed gives the shifts.
+
+    Attributes
+    ----------
+    count : number of samples.
+    seed : shifts the sequence.
+    """
+
+    count: int
+    seed: int = 0
+
+    @property
+    def total(self) -> int:
+        """Number of samples."""
+        return self.count
+
+    def shares(self, start: int, stop: int) -> Vector:
+        """Samples start to stop - 1 as shares (k, n) of each channel's range, 0 to below 1."""
+        n = len(self.lower)
+        steps = np.array(_golden_steps(n), dtype=np.uint64)
+        shifts = np.array([_shift(self.seed, channel) for channel in range(n)], dtype=np.uint64)
+        numbers = np.arange(start + 1, stop + 1, dtype=np.uint64)
+        fixed = numbers[:, np.newaxis] * steps + shifts  # modulo 2^64
+        return np.asarray((fixed >> np.uint64(11)).astype(np.float64) * 2.0**-53)
+
+    def record(self) -> dict[str, Any]:
+        """Kind, count and seed."""
+        return {"sampling": "quasi-random", "samples": self.count, "seed": self.seed}
+
+
+@dataclass(frozen=True)
+class Grid(Sampling):
+    """Equally spaced levels of each channel, limits included; the last channel runs fastest.
+
+    Attributes
+    ----------
+    levels : of each channel, at least 2.
+    """
+
+    levels: int
+
+    @property
+    def total(self) -> int:
+        """Number of samples: levels to the power of the number of channels."""
+        return int(self.levels ** len(self.lower))
+
+    def shares(self, start: int, stop: int) -> Vector:
+        """Samples start to stop - 1 as shares (k, n) of each channel's range, 0 to 1."""
+        left = np.arange(start, stop, dtype=np.int64)
+        digits = np.empty((len(left), len(self.lower)))
+        for channel in reversed(range(len(self.lower))):
+            left, digits[:, channel] = np.divmod(left, self.levels)
+        return digits / (self.levels - 1)
+
+    def record(self) -> dict[str, Any]:
+        """Kind, levels and the number of samples that they make."""
+        return {"sampling": "grid", "samples": self.total, "levels": self.levels}
+
+
+def _checked_sampling(sampling: Sampling) -> Sampling:
+    """Return a sampling; raise `InputError` if it has more than `MOST_SAMPLES`."""
+    if sampling.total > MOST_SAMPLES:
+        raise InputError(
+            f"{sampling.total:.3g} samples are too many; expected at most {MOST_SAMPLES:.0e}. "
+            "Take fewer levels, or quasi-random samples"
+        )
+    return sampling
+
+
+@cache
+def _golden_steps(n: int) -> tuple[int, ...]:
+    """Steps of the recurrence per channel in units of 2^-64; the ratio solves r^(n+1) = r + 1."""
+    with localcontext() as context:
+        context.prec = 60
+        ratio, change = Decimal(2), Decimal(1)
+        while abs(change) > Decimal("1e-50"):  # Newton from above: each step is nearer
+            change = (ratio ** (n + 1) - ratio - 1) / ((n + 1) * ratio**n - 1)
+            ratio -= change
+        return tuple(int(2**64 / ratio**power) for power in range(1, n + 1))
+
+
+def _shift(seed: int, channel: int) -> int:
+    digest = hashlib.sha256(f"stiffopt workspace {seed} {channel}".encode()).digest()
+    return int.from_bytes(digest[:8], "big")
 
 
 @dataclass(frozen=True)
 class Block:
-    """What the samples of one block came to.
+    """Result of a block of samples.
 
     Attributes
     ----------
-    table : the cells that they fell into.
+    table : the cells that the tip fell into.
     lost : number of samples at which the arm has no stable equilibrium.
     low, high : (3,) least and greatest coordinates of the tip, in m.
     """
@@ -52,14 +210,14 @@ class Block:
 
 @dataclass(frozen=True)
 class MapPlan:
-    """All that decides what a map comes to.
+    """Everything that determines the values of a map.
 
     Attributes
     ----------
     robot : the arm, with the load at its tip.
-    measures : the stiffnesses; their directions are of unit length.
-    sampling : the pressures.
-    cell : size of a cell, in m.
+    measures : the stiffness measures (m,), with unit directions.
+    sampling : the pressures that are sampled.
+    cell : edge length of a cell, in m.
     """
 
     robot: Manipulator
@@ -106,7 +264,7 @@ class MapPlan:
     @property
     def block_size(self) -> int:
         """Samples of a block, the last one excepted."""
-        return _LOADED_BLOCK if self.robot.is_loaded else _FREE_BLOCK
+        return TUNING.loaded_block if self.robot.is_loaded else TUNING.block
 
     @property
     def n_blocks(self) -> int:
@@ -114,11 +272,11 @@ class MapPlan:
         return -(-self.total // self.block_size)
 
     def samples_in(self, blocks: int) -> int:
-        """Number of samples in so many first blocks."""
+        """Number of samples in the first `blocks` blocks."""
         return min(blocks * self.block_size, self.total)
 
     def prepare(self) -> None:
-        """Compile what blocks need; then they may be evaluated by several threads at once."""
+        """Compile what blocks need; after that several threads may evaluate blocks at once."""
         if not self.robot.is_loaded:
             self._function  # noqa: B018
 
@@ -169,7 +327,7 @@ class MapPlan:
 
         def make() -> BatchFunction:
             description = self.robot.description.model_dump_json()
-            pays = self.total >= _COMPILED_FROM
+            pays = self.total >= TUNING.compiled_from
             code = library((_NAME, description, self.measures), functions, build_missing=pays)
             return interpreted(functions)[_NAME] if code is None else code.function(_NAME)
 
@@ -179,7 +337,7 @@ class MapPlan:
         """Position (3, 1) of the tip and its stiffnesses (m, 1)."""
         return [shape.position, ca.vertcat(*(_stiffness(shape, m) for m in self.measures))]
 
-    # -- what is written down ---------------------------------------------------------------
+    # -- record on disk ---------------------------------------------------------------------
 
     @property
     def unit(self) -> Literal["N/m", "N*m/rad"]:
@@ -212,19 +370,9 @@ class MapPlan:
 
     @cached_property
     def token(self) -> str:
-        """Name of this plan that no other has."""
+        """Hash that identifies this plan."""
         text = json.dumps(self.record, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
-
-
-def direction_name(direction: Sequence[float]) -> str:
-    """Return ``x`` for an axis of the frame, ``-x`` or ``(0.6, 0.8, 0)`` for others."""
-    for axis, name in zip(AXES, "xyz", strict=True):
-        if tuple(direction) == axis:
-            return name
-        if tuple(direction) == tuple(-part for part in axis):
-            return f"-{name}"
-    return f"({', '.join(f'{round(part, 3) + 0.0:g}' for part in direction)})"
 
 
 def _stiffness(shape: Shape, measure: Measure) -> Any:
@@ -261,15 +409,15 @@ def _sampling(robot: Manipulator, samples: int | None, levels: int | None, seed:
     if levels is not None:
         if samples is not None:
             raise InputError("give samples or levels, not both")
-        return checked_sampling(Grid(*limits, checked_integer("levels", levels, 2)))
+        return _checked_sampling(Grid(*limits, checked_integer("levels", levels, 2)))
     if samples is None:
-        samples = _LOADED_SAMPLES if robot.is_loaded else _FREE_SAMPLES
-    return checked_sampling(QuasiRandom(*limits, checked_integer("samples", samples, 1), seed))
+        samples = TUNING.loaded_samples if robot.is_loaded else TUNING.samples
+    return _checked_sampling(QuasiRandom(*limits, checked_integer("samples", samples, 1), seed))
 
 
 def _cell_size(robot: Manipulator, cell: float) -> float:
     size = checked_number("cell", cell)
-    # a segment that grows to eight times its length breaks: cells beyond that need no number
+    # no segment grows to eight times its length, so cells farther away need no index
     smallest = 8 * robot.length / FARTHEST
     if not smallest <= size <= robot.length:
         raise InputError(

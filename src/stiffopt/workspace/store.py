@@ -1,28 +1,27 @@
-"""A map on disk: a Zarr group (format 3) that any Zarr reader opens, and a run that can go on.
+"""A workspace map on disk: a Zarr group (format 3) that can be resumed until it is complete.
 
-A group is complete or not. As long as it is not, ``checkpoint.npz`` in it holds what was found in
-the first so many blocks; it is replaced as a whole, so that a process may be killed at any time.
-When all is done the arrays are written, the group's attributes say ``complete`` (again in one
-step), and the checkpoint goes. The process at work holds a lock on the folder.
+While a map is unfinished, ``checkpoint.npz`` in its folder holds the result of its first blocks; it
+is replaced as a whole, so that a process may be killed at any time. At the end the arrays are
+written, the attributes of the group are set to ``complete`` (again in one step) and the checkpoint
+is removed. The process at work holds a lock on the folder.
 """
 
 import json
 import os
+import shutil
 import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import FileError, MissingExtraError, shown
-from stiffopt.workspace.arrays import read_table, write_arrays
-from stiffopt.workspace.map import WorkspaceMap
-from stiffopt.workspace.table import CellTable
+from stiffopt.errors import FileError, require_package, shown
+from stiffopt.workspace.map import FILL, WorkspaceMap
+from stiffopt.workspace.table import CellTable, cell_keys
 
 Vector = NDArray[np.float64]
 
@@ -30,10 +29,19 @@ FORMAT = "stiffopt-map/1"
 _METADATA = "zarr.json"
 _CHECKPOINT = "checkpoint.npz"
 _PART = ".part"
+_CHUNK = 32  # cells along each axis
+
+_WHAT = {
+    "count": "number of samples in the cell",
+    "best": "greatest stiffness of a sample in the cell",
+    "worst": "least stiffness of a sample in the cell",
+    "best_sample": "lowest number of a sample with the greatest stiffness",
+    "worst_sample": "lowest number of a sample with the least stiffness",
+}
 
 
-class Progress(NamedTuple):
-    """What was found in the first blocks.
+class Checkpoint(NamedTuple):
+    """Result of the first blocks of a map.
 
     Attributes
     ----------
@@ -51,19 +59,8 @@ class Progress(NamedTuple):
 
 
 def require_zarr() -> None:
-    """Say how to get Zarr if it is missing.
-
-    Raises
-    ------
-    MissingExtraError
-        If it is not installed.
-    """
-    try:
-        missing = find_spec("zarr") is None
-    except ValueError:  # a placeholder in sys.modules
-        missing = True
-    if missing:
-        raise MissingExtraError("zarr", "map")
+    """Raise `MissingExtraError` if Zarr is not installed."""
+    require_package("zarr", "map")
 
 
 class MapStore:
@@ -73,8 +70,6 @@ class MapStore:
     ----------
     path :
         The folder; by custom its name ends in ``.zarr``.
-    attributes :
-        What the folder says of itself, or None to read it.
 
     Raises
     ------
@@ -90,7 +85,7 @@ class MapStore:
     def create(
         cls, path: str | os.PathLike[str], record: dict[str, Any], *, overwrite: bool
     ) -> "MapStore":
-        """New, empty map; it appears at its path as a whole, another map goes if it may."""
+        """Make a new, empty map in one step; with `overwrite` it replaces another one."""
         target = Path(path)
         attributes = {"format": FORMAT, "status": "unfinished", **record}
         try:
@@ -109,7 +104,7 @@ class MapStore:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all samples are in it."""
+        """Whether the map is complete."""
         return bool(self.attributes["status"] == "complete")
 
     @contextmanager
@@ -144,7 +139,7 @@ class MapStore:
             os.close(handle)
 
     def check(self, record: dict[str, Any]) -> None:
-        """Raise if this is a map of something else, naming what differs."""
+        """Raise `FileError` if this map has another plan; it names what differs."""
         differing = [key for key in record if self.attributes.get(key) != record[key]]
         if not differing:
             return
@@ -161,7 +156,7 @@ class MapStore:
 
     # -- while it is made -------------------------------------------------------------------
 
-    def save(self, progress: Progress) -> None:
+    def save(self, progress: Checkpoint) -> None:
         """Replace the checkpoint."""
         columns: dict[str, Any] = dict(progress.table.arrays)
         try:
@@ -177,14 +172,14 @@ class MapStore:
         except OSError as error:
             raise FileError(self.path, f"cannot be written: {_reason(error)}") from None
 
-    def load(self) -> Progress | None:
+    def load(self) -> Checkpoint | None:
         """Checkpoint, or None if there is none yet."""
         path = self.path / _CHECKPOINT
         try:
             with np.load(path, allow_pickle=False) as saved:
                 data = {name: saved[name] for name in saved.files}
             blocks, lost = int(data.pop("blocks")), int(data.pop("lost"))
-            return Progress(blocks, lost, data.pop("low"), data.pop("high"), CellTable(**data))
+            return Checkpoint(blocks, lost, data.pop("low"), data.pop("high"), CellTable(**data))
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
@@ -192,10 +187,10 @@ class MapStore:
                 path, "is damaged, so the map cannot be resumed; begin anew with --overwrite"
             ) from None
 
-    # -- when all is known ------------------------------------------------------------------
+    # -- when it is complete ----------------------------------------------------------------
 
     def finish(self, done: WorkspaceMap) -> None:
-        """Write the arrays and say that the map is complete."""
+        """Write the arrays and mark the map as complete."""
         require_zarr()
         attributes = {
             **self.attributes,
@@ -216,13 +211,13 @@ class MapStore:
             raise FileError(self.path, f"cannot be written: {_reason(error)}") from None
 
     def tidy(self) -> None:
-        """Remove what a complete map does not need."""
+        """Remove the files that a complete map does not need."""
         for name in (_CHECKPOINT, f"{_CHECKPOINT}{_PART}", f"{_METADATA}{_PART}"):
             with suppress(FileNotFoundError):
                 (self.path / name).unlink()
 
-    def read(self) -> Progress:
-        """All that a complete map says.
+    def read(self) -> Checkpoint:
+        """Read a complete map.
 
         Raises
         ------
@@ -240,10 +235,96 @@ class MapStore:
             raise FileError(
                 self.path, f"is damaged: {type(error).__name__}: {error}; begin anew (--overwrite)"
             ) from None
-        return Progress(0, lost, low, high, table)
+        return Checkpoint(0, lost, low, high, table)
 
 
-# Parts -------------------------------------------------------------------------------------------
+# arrays ------------------------------------------------------------------------------------------
+
+
+def write_arrays(path: Path, done: WorkspaceMap) -> None:
+    """Write all arrays chunk by chunk, so that the whole box need not fit into memory."""
+    import zarr
+
+    for entry in path.iterdir():  # of a run that was killed here
+        if entry.is_dir():
+            shutil.rmtree(entry)
+    group = zarr.open_group(str(path), mode="r+", zarr_format=3)
+    shape, m = done.shape, len(done.plan.measures)
+    cells = done.cells - done.first_cell
+    order, starts, chunks = _by_chunk(cells)
+    units = {"best": done.plan.unit, "worst": done.plan.unit}
+    for name, fill in FILL.items():
+        values = getattr(done.table, name)
+        lead = values.ndim - 1
+        array: Any = group.create_array(
+            name,
+            shape=(m,) * lead + shape,
+            chunks=(1,) * lead + tuple(max(1, min(_CHUNK, side)) for side in shape),
+            dtype=values.dtype,
+            fill_value=fill,
+            dimension_names=("direction",) * lead + ("x", "y", "z"),
+            attributes={"long_name": _WHAT[name], "units": units.get(name, "1")},
+        )
+        for begin, end, corner in zip(starts[:-1], starts[1:], chunks, strict=True):
+            rows = order[begin:end]
+            size = np.minimum(_CHUNK, np.array(shape) - corner)
+            box = np.full((m,) * lead + tuple(size), fill, dtype=values.dtype)
+            box[..., *(cells[rows] - corner).T] = values[..., rows]
+            array[..., *(slice(a, a + b) for a, b in zip(corner, size, strict=True))] = box
+    _write_coordinates(group, done)
+
+
+def _by_chunk(cells: NDArray[np.int64]) -> tuple[NDArray[np.intp], Any, NDArray[np.int64]]:
+    """Sort rows by chunk; return the order, the start of each chunk's rows, and its corner."""
+    if not len(cells):
+        return np.empty(0, np.intp), np.zeros(1, np.int64), np.empty((0, 3), np.int64)
+    corners = cells // _CHUNK * _CHUNK
+    key = cell_keys(corners)
+    order = np.argsort(key, kind="stable")
+    firsts = np.flatnonzero(np.diff(key[order], prepend=-1))
+    return order, np.append(firsts, len(order)), corners[order[firsts]]
+
+
+def _write_coordinates(group: Any, done: WorkspaceMap) -> None:
+    for axis, name in enumerate("xyz"):
+        centres = (done.first_cell[axis] + np.arange(done.shape[axis])) * done.plan.cell
+        group.create_array(
+            name,
+            data=centres,
+            dimension_names=(name,),
+            attributes={"long_name": f"{name} of the cell's centre, base frame", "units": "m"},
+        )
+    group.create_array(
+        "direction",
+        data=np.array(done.direction_names, dtype=np.dtypes.StringDType()),
+        dimension_names=("direction",),
+        attributes={"long_name": "direction of the stiffness"},
+    )
+
+
+def read_table(path: Path, first: NDArray[np.int64]) -> CellTable:
+    """Read the cells that were reached, slab by slab."""
+    import zarr
+
+    group = zarr.open_group(str(path), mode="r", zarr_format=3)
+    arrays: dict[str, Any] = {name: group[name] for name in FILL}
+    count, m = arrays["count"], arrays["best"].shape[0]
+    parts = [CellTable.empty(m)]
+    for start in range(0, count.shape[0], _CHUNK):
+        slab = {
+            name: np.asarray(array[..., start : start + _CHUNK, :, :])
+            for name, array in arrays.items()
+        }
+        where = np.nonzero(slab["count"])
+        inside: Any = (..., *where)
+        key = cell_keys(np.stack(where, axis=1) + first + np.array([start, 0, 0]))
+        parts.append(CellTable(key, **{name: box[inside] for name, box in slab.items()}))
+    names = list(parts[0].arrays)
+    # slabs follow each other along x, so keys ascend
+    return CellTable(*(np.concatenate([getattr(p, n) for p in parts], axis=-1) for n in names))
+
+
+# metadata ----------------------------------------------------------------------------------------
 
 
 def _read_attributes(path: Path) -> dict[str, Any]:

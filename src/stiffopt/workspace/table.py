@@ -1,8 +1,8 @@
-"""Cells of space and what was found in each; tables of them are merged in any order.
+"""Tables of cells of space with the range of stiffness in each; they merge in any order.
 
-Cell (i, j, k) of size c is centred at (i, j, k) c in the base frame.  Numbers of samples are added
-up; the best stiffness is the greatest, the worst the least, each with the lowest sample that
-attains it.  So the outcome does not depend on how samples are grouped.
+Cell (i, j, k) of size c is centred at (i, j, k) c in the base frame. Merging adds up the numbers of
+samples and keeps the greatest and least stiffness, each with the lowest sample number that attains
+it, so the outcome does not depend on how samples are grouped.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,7 @@ Numbers = NDArray[np.int64]
 _BITS = 20
 _HALF = 1 << (_BITS - 1)
 FARTHEST = _HALF - 1
-"""Largest number of a cell along an axis."""
-MOST_CELLS = 1_500_000
-"""Cells that one map may fill; they are held in memory, about 0.5 kB each while it is made."""
+"""Largest index of a cell along an axis."""
 
 _NO_SAMPLE = np.iinfo(np.int64).max
 
@@ -87,7 +85,7 @@ def cell_keys(indices: Numbers) -> Numbers:
 
 
 def merged(tables: Sequence[CellTable]) -> CellTable:
-    """One table of all that several say."""
+    """Merge tables into one."""
     if len(tables) == 1:
         return tables[0]
     names = [field.name for field in fields(CellTable)]
@@ -96,24 +94,33 @@ def merged(tables: Sequence[CellTable]) -> CellTable:
 
 
 class Gathering:
-    """A table that grows: what is added is merged when there is enough of it to be worth it."""
+    """A table that grows; added tables are merged once there are enough rows.
+
+    Parameters
+    ----------
+    table :
+        Table to begin with.
+    most_cells :
+        Cells that it may have.
+    """
 
     _ENOUGH = 1 << 18  # rows
 
-    def __init__(self, table: CellTable) -> None:
+    def __init__(self, table: CellTable, most_cells: int) -> None:
         self._table = table
+        self._most_cells = most_cells
         self._waiting: list[CellTable] = []
         self._rows = 0
 
     def add(self, table: CellTable) -> None:
-        """Add what another table says."""
+        """Add a table."""
         self._waiting.append(table)
         self._rows += len(table)
         if self._rows > max(len(self._table) // 2, self._ENOUGH):
             self.table()
 
     def table(self) -> CellTable:
-        """All that was added so far.
+        """Table of everything that was added so far.
 
         Raises
         ------
@@ -122,10 +129,10 @@ class Gathering:
         """
         self._table = merged([self._table, *self._waiting])
         self._waiting, self._rows = [], 0
-        if len(self._table) > MOST_CELLS:
+        if len(self._table) > self._most_cells:
             raise InputError(
-                f"the workspace fills more than {MOST_CELLS:,} cells, which is more than a map "
-                "may have; choose larger cells"
+                f"the workspace fills more than {self._most_cells:,} cells, which is more than a "
+                "map may have; choose larger cells"
             )
         return self._table
 
@@ -134,7 +141,7 @@ def _reduced(rows: CellTable) -> CellTable:
     """Rows with each key once, in ascending order."""
     if not len(rows.key):
         return rows
-    order = _order(rows.key)
+    order = np.argsort(rows.key, kind="stable")
     key = rows.key[order]
     first = np.concatenate([[True], key[1:] != key[:-1]])
     starts = np.flatnonzero(first)
@@ -145,15 +152,10 @@ def _reduced(rows: CellTable) -> CellTable:
     return CellTable(key[starts], count, -best, worst, best_sample, worst_sample)
 
 
-def _order(key: Numbers) -> NDArray[np.intp]:
-    """Order that sorts keys."""
-    return np.argsort(key, kind="stable")
-
-
 def _least(
     values: Vector, samples: Numbers, order: NDArray[np.intp], starts: Numbers, group: Numbers
 ) -> tuple[Vector, Numbers]:
-    """Least value (m, M) of each group and the lowest sample that has it."""
+    """Least value (m, M) of each group of rows, and the lowest sample that attains it."""
     values = values[:, order]
     least = np.minimum.reduceat(values, starts, axis=1)
     holders = np.where(values == least[:, group], samples[:, order], _NO_SAMPLE)

@@ -1,7 +1,7 @@
-"""Who evaluates the blocks of a plan: threads of this process, or a Dask cluster.
+"""Workers that evaluate the blocks of a plan: threads of this process, or a Dask cluster.
 
-Results come back in the order of the blocks, each exactly once, however often the work behind it
-had to be repeated; a bounded number of blocks is on its way at a time.
+Results come in the order of the blocks, each exactly once, however often its evaluation had to be
+repeated; a bounded number of blocks is in work at a time.
 """
 
 import os
@@ -13,17 +13,14 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from importlib.util import find_spec
 from time import monotonic
 from types import TracebackType
 from typing import Any, Protocol, Self
 
-from stiffopt.errors import InputError, MissingExtraError, StiffoptError
-from stiffopt.workspace.plan import Block, MapPlan
+from stiffopt.errors import InputError, StiffoptError, require_package
+from stiffopt.workspace.plan import TUNING, Block, MapPlan
 
 _POLL = 0.2  # s
-_PATIENCE = 30.0  # s to wait for a scheduler to answer, and for workers while there are none
-_RETRIES = 3  # of a block that fails for a passing reason, such as a worker that is gone
 
 
 class ClusterError(StiffoptError):
@@ -31,26 +28,26 @@ class ClusterError(StiffoptError):
 
 
 class Workers(Protocol):
-    """Evaluate blocks of a plan."""
+    """Interface of whatever evaluates blocks of a plan."""
 
     @property
     def width(self) -> int:
-        """Number of blocks to have on their way."""
+        """Number of blocks to have in work."""
 
     def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
-        """Have a block evaluated; `done` is called with it and its future, from any thread."""
+        """Start a block; `done` is called with its number and future, from any thread."""
 
     def result(self, future: Any) -> Block:
         """Result of a future that is done."""
 
     def check(self) -> None:
-        """Raise if nothing will ever come."""
+        """Raise if no result will ever come."""
 
 
 def results(
     workers: Workers, blocks: range, poll: Callable[[], None] = lambda: None
 ) -> Iterator[Block]:
-    """Results of blocks in their order; `poll` is called now and then while there is none."""
+    """Yield the results of blocks in order; `poll` is called now and then while waiting."""
     finished: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
     ready: dict[int, Block] = {}
     following = blocks.start
@@ -96,11 +93,11 @@ class Threads(AbstractContextManager["Threads"]):
 
     @property
     def width(self) -> int:
-        """Number of blocks to have on their way."""
+        """Number of blocks to have in work."""
         return 2 * self._count
 
     def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
-        """Have a block evaluated."""
+        """Start a block."""
         future = self._pool.submit(self._plan.evaluate, index)
         future.add_done_callback(lambda finished: done(index, finished))
 
@@ -137,10 +134,10 @@ class Cluster(AbstractContextManager["Cluster"]):
         try:
             self._payload = pickle.dumps(plan)
             self._token = plan.token
-            self._run = uuid.uuid4().hex  # no other run's results are taken for ours
+            self._run = uuid.uuid4().hex  # keeps results of other runs apart
             self._futures: set[Any] = set()
             self._seen = monotonic()
-            self._threads = self._count_threads(wait=_PATIENCE)
+            self._threads = self._count_threads(wait=TUNING.cluster_patience)
         except BaseException:
             self._client.close()
             raise
@@ -164,14 +161,14 @@ class Cluster(AbstractContextManager["Cluster"]):
 
     @property
     def width(self) -> int:
-        """Number of blocks to have on their way."""
+        """Number of blocks to have in work."""
         return 3 * self._threads + 2
 
     def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
-        """Have a block evaluated."""
+        """Start a block."""
         future = self._client.submit(
             _evaluate_on_worker, self._token, self._payload, index,
-            key=f"stiffopt-map-{self._run}-{index}", pure=False, retries=_RETRIES,
+            key=f"stiffopt-map-{self._run}-{index}", pure=False, retries=TUNING.retries,
         )  # fmt: skip
         self._futures.add(future)
         future.add_done_callback(lambda finished: done(index, finished))
@@ -186,7 +183,7 @@ class Cluster(AbstractContextManager["Cluster"]):
         """
         self._futures.discard(future)
         try:
-            token, block = future.result(timeout=_PATIENCE)
+            token, block = future.result(timeout=TUNING.cluster_patience)
         except StiffoptError:
             raise
         except (Exception, CancelledError) as error:
@@ -203,17 +200,17 @@ class Cluster(AbstractContextManager["Cluster"]):
         return result
 
     def check(self) -> None:
-        """Raise if nothing will ever come."""
-        if self._client.status != "running" and monotonic() - self._seen > _PATIENCE:
+        """Raise if no result will ever come."""
+        if self._client.status != "running" and monotonic() - self._seen > TUNING.cluster_patience:
             raise ClusterError(
                 "the connection to the scheduler is lost"
             )  # distributed reconnects for a while
-        if monotonic() - self._seen > _PATIENCE:
+        if monotonic() - self._seen > TUNING.cluster_patience:
             self._threads = self._count_threads(wait=0.0)
             self._seen = monotonic()
 
     def _count_threads(self, wait: float) -> int:
-        """Threads of all workers; there must be some, after a while at most."""
+        """Return the number of threads of all workers; wait for the first worker."""
         try:
             if wait:
                 self._client.wait_for_workers(1, timeout=wait)
@@ -228,17 +225,14 @@ class Cluster(AbstractContextManager["Cluster"]):
 
 
 def _client(address: str) -> Any:
-    try:
-        missing = find_spec("distributed") is None
-    except ValueError:  # a placeholder in sys.modules
-        missing = True
-    if missing:
-        raise MissingExtraError("distributed", "dask")
+    require_package("distributed", "dask")
     import distributed
 
     connect: Any = distributed.Client
     try:
-        return connect(address, timeout=_PATIENCE, set_as_default=False, name="stiffopt-map")
+        return connect(
+            address, timeout=TUNING.cluster_patience, set_as_default=False, name="stiffopt-map"
+        )
     except ValueError as error:
         raise InputError(
             f"'{address}' is not the address of a scheduler ({error}); "

@@ -1,4 +1,4 @@
-"""What a tick asks of the tip, against the same in plain NumPy and a swing in fine steps."""
+"""The feedback law at the tip, against the same in plain NumPy and a swing in fine steps."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import pytest
 from scipy.linalg import expm
 
 from stiffopt import Target, lie
-from stiffopt.control.closest import LEVER
-from stiffopt.control.demand import demand, parts_asked
+from stiffopt.control.feedback import prescribed_components, tracking_rows
 from stiffopt.control.formula import Formula
-from stiffopt.control.vibration import Vibration
+from stiffopt.control.tuning import FeedbackTuning
+from stiffopt.control.vibration import BendingMode
 
+LEVER = FeedbackTuning().lever
 N, DAMPING, DEAD_TIME = 6, 0.04, 0.013
-ARM = Vibration(0.04, np.array([0.9, 0.9, 0.9, 0.6, 0.7, 0.6]))
+ARM = BendingMode(0.04, np.array([0.9, 0.9, 0.9, 0.6, 0.7, 0.6]))
 TARGETS = {
     "position": Target(position=(0.01, 0.0, 0.2)),
     "height": Target(position=(None, None, 0.2)),
@@ -65,11 +66,11 @@ def task(pose, jacobian, correction, target, feedback):
 @pytest.mark.parametrize("name", list(TARGETS))
 @pytest.mark.parametrize("swings", [True, False])
 def test_rows_are_those_of_the_task(name, swings):
-    target, system = TARGETS[name], demand(N, ARM if swings else None, DAMPING, DEAD_TIME)
+    target, system = TARGETS[name], tracking_rows(N, ARM if swings else None, DAMPING, DEAD_TIME)
     pose, jacobian, correction, swing = drawn(3)
     if swings:  # without feedback
         swing = (*swing[:3], np.zeros(3), *swing[4:])
-    given = (pose, jacobian, parts_asked(target), correction, *(swing if swings else ()))
+    given = (pose, jacobian, prescribed_components(target), correction, *(swing if swings else ()))
     rows, values, linear = evaluated(system, *given)
     expected, wanted = task(pose, jacobian, correction, target, np.zeros(3))
     rows, values = rows[: system.task_rows], values[: system.task_rows]
@@ -82,10 +83,10 @@ def test_rows_are_those_of_the_task(name, swings):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_feedback_of_an_arm_that_swings(seed):
-    target, system = TARGETS["position"], demand(N, ARM, DAMPING, DEAD_TIME)
+    target, system = TARGETS["position"], tracking_rows(N, ARM, DAMPING, DEAD_TIME)
     pose, jacobian, correction, swing = drawn(seed)
     now, across, omega, gains, ahead, chamber, path, rate = swing
-    given = (pose, jacobian, parts_asked(target), correction, *swing)
+    given = (pose, jacobian, prescribed_components(target), correction, *swing)
     rows, values, linear = evaluated(system, *given)
     own = across @ linear @ np.diag(ARM.participation)  # of the mode
     home = ARM.participation.mean() * across @ correction[:3]

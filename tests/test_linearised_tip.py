@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stiffopt import load_robot
-from stiffopt.control.nearby import NearbyTip
+from stiffopt.control.linearised_tip import LinearisedTip
 from stiffopt.errors import StiffoptError
 
 
@@ -16,7 +16,7 @@ def robot():
 
 
 def test_a_walk_of_small_and_large_steps_is_the_models(robot):
-    nearby, rng = NearbyTip(robot), np.random.default_rng(2)
+    nearby, rng = LinearisedTip(robot), np.random.default_rng(2)
     p = 0.4 * robot.pressure_max
     evaluated = set()
     for k in range(200):
@@ -36,7 +36,7 @@ def test_the_jacobian_is_nearly_the_same_a_little_further_away(robot):
     for _ in range(30):
         p = rng.uniform(0.1, 0.9, robot.n_pressures) * robot.pressure_max
         step = rng.normal(size=len(p))
-        nearby = NearbyTip(robot, 3e3)
+        nearby = LinearisedTip(robot, 3e3)
         here, there = nearby.at(p), nearby.at(p + 2.9e3 * step / np.linalg.norm(step))
         assert there.jacobian is here.jacobian
         true = robot.tip_jacobian(p + 2.9e3 * step / np.linalg.norm(step))
@@ -44,7 +44,7 @@ def test_the_jacobian_is_nearly_the_same_a_little_further_away(robot):
 
 
 def test_what_was_returned_does_not_change(robot):
-    nearby, p = NearbyTip(robot), 0.4 * robot.pressure_max
+    nearby, p = LinearisedTip(robot), 0.4 * robot.pressure_max
     tips = [nearby.at(p + 50.0 * k) for k in range(4)]
     kept = [tip.pose.copy() for tip in tips]
     nearby.at(p + 1e4)
@@ -53,7 +53,7 @@ def test_what_was_returned_does_not_change(robot):
 
 
 def test_pressures_beyond_the_limits_count_as_those_at_them(robot):
-    nearby, p = NearbyTip(robot), robot.pressure_max.copy()
+    nearby, p = LinearisedTip(robot), robot.pressure_max.copy()
     assert nearby.at(p + 1e4).pose == pytest.approx(robot.tip_pose(p), abs=1e-9)
     below = robot.pressure_min - 50.0
     assert nearby.at(below).pose == pytest.approx(robot.tip_pose(robot.pressure_min), abs=1e-9)
@@ -61,7 +61,7 @@ def test_pressures_beyond_the_limits_count_as_those_at_them(robot):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_has_no_tip_and_does_no_harm(robot, bad):
-    nearby, p = NearbyTip(robot), 0.4 * robot.pressure_max
+    nearby, p = LinearisedTip(robot), 0.4 * robot.pressure_max
     before = nearby.at(p).pose
     spoilt = p.copy()
     spoilt[1] = bad

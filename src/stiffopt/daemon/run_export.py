@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from stiffopt.daemon.run_log import RecordedRun
 from stiffopt.logs.log import Array, Log
-from stiffopt.logs.run_log import Run
 
 __all__ = ["log_of_run"]
 
@@ -21,7 +21,7 @@ _NEAR = 0.1  # s between a frame and a reading that belongs to it
 _DIGITS = 6  # of a time in s, as log v1 writes it
 
 
-def log_of_run(run: Run) -> Log:
+def log_of_run(run: RecordedRun) -> Log:
     """Return the log of a run. Time 0 is when the recording began; N rows may be none.
 
     A frame that no arm could have moved to, or in which the tip was not seen, gives a row without
@@ -70,7 +70,7 @@ def _fillers(ticks: Array, captured: Array) -> Array:
     return np.array(chosen)
 
 
-def _held(run: Run, time: Array) -> Array:
+def _held(run: RecordedRun, time: Array) -> Array:
     """Return the commands (N, n) that held at times (N,); NaN where ticks are missing."""
     slack = 10.0**-_DIGITS  # times were rounded
     tick = np.maximum(np.searchsorted(run.time, time + slack, side="right") - 1, 0)
@@ -80,7 +80,7 @@ def _held(run: Run, time: Array) -> Array:
     return commanded
 
 
-def _between(run: Run, time: Array) -> Array:
+def _between(run: RecordedRun, time: Array) -> Array:
     """Return measured pressures (N, n) at times (N,), NaN where no reading is near."""
     read = np.where(np.isfinite(run.measured_time), run.measured_time, run.time)
     read, first = np.unique(read, return_index=True)

@@ -1,4 +1,4 @@
-"""The line to the planner's process: what arrives is what was sent, and nothing is sent twice."""
+"""The connection to the planner's process: all that is sent arrives, and only once."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ import pytest
 
 import stiffopt as so
 from stiffopt.control import planner as planner_module
-from stiffopt.control.planner import ProcessPlanner
-from stiffopt.control.planner_line import PlannerLine, PlanningLine
-from stiffopt.control.plans import Plan, Request
+from stiffopt.control.planner import PlannerEnd, PlanningEnd, ProcessPlanner
+from stiffopt.control.planning import Plan, PlanRequest
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -37,10 +36,10 @@ def task(x: float = 0.01) -> Task:
 class Ends:
     def __init__(self) -> None:
         one, other = socket.socketpair()
-        self.ours, self.theirs = PlannerLine(one.detach()), PlanningLine(other.detach())
+        self.ours, self.theirs = PlannerEnd(one.detach()), PlanningEnd(other.detach())
 
-    def passes(self, request: Request) -> Request:
-        self.ours.ask(request)
+    def passes(self, request: PlanRequest) -> PlanRequest:
+        self.ours.send(request)
         return self.theirs.request()
 
     def close(self) -> None:
@@ -55,26 +54,26 @@ def ends() -> Iterator[Ends]:
     ends.close()
 
 
-def assert_same(one: Request, other: Request) -> None:
-    assert (one.serial, one.task, one.target, one.anew) == (
-        other.serial, other.task, other.target, other.anew,
+def assert_same(one: PlanRequest, other: PlanRequest) -> None:
+    assert (one.serial, one.task, one.target, one.search) == (
+        other.serial, other.task, other.target, other.search,
     )  # fmt: skip
     assert one.offset.dtype == other.offset.dtype == np.float64
     assert one.offset.tobytes() == other.offset.tobytes()
-    assert one.beside.tobytes() == other.beside.tobytes()
+    assert one.pressure_offset.tobytes() == other.pressure_offset.tobytes()
 
 
 def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
     first, second = task(), task(0.02)
-    asked = Request(1, first, first.target, OFFSET, BESIDE)
+    asked = PlanRequest(1, first, first.target, OFFSET, BESIDE)
     elsewhere: dict[str, Any] = {"target": Target(pointing=(0.0, 0.0, 1.0))}
     for changes in (
         {},
         {},
-        {"anew": True},
+        {"search": True},
         {"offset": 2 * OFFSET},
-        {"beside": 2 * BESIDE},
-        {"anew": False},
+        {"pressure_offset": 2 * BESIDE},
+        {"search": False},
         elsewhere,
         {"serial": 2, "task": second},
         {"task": first},  # under the same number
@@ -87,7 +86,7 @@ def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
 
 def test_an_offset_that_was_changed_in_place_is_sent(ends: Ends) -> None:
     the_task, offset = task(), OFFSET.copy()
-    asked = Request(1, the_task, the_task.target, offset, BESIDE)
+    asked = PlanRequest(1, the_task, the_task.target, offset, BESIDE)
     ends.passes(asked)
     offset += 1.0
     assert ends.passes(asked).offset.tolist() == (OFFSET + 1.0).tolist()
@@ -95,19 +94,19 @@ def test_an_offset_that_was_changed_in_place_is_sent(ends: Ends) -> None:
 
 def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
     the_task = task()
-    first = Request(1, the_task, the_task.target, OFFSET, BESIDE)
+    first = PlanRequest(1, the_task, the_task.target, OFFSET, BESIDE)
     sent: list[bytes] = []
 
-    def news(line: PlannerLine, request: Request) -> set[str]:
+    def news(line: PlannerEnd, request: PlanRequest) -> set[str]:
         send = line._connection.send_bytes
         line._connection.send_bytes = lambda data: (sent.append(data), send(data))  # type: ignore[method-assign, assignment, func-returns-value]
-        line.ask(request)
+        line.send(request)
         del line._connection.send_bytes
         return set(pickle.loads(sent.pop()))
 
-    everything = {"serial", "task", "target", "offset", "beside", "anew"}
+    everything = {"serial", "task", "target", "offset", "pressure_offset", "search"}
     assert news(ends.ours, first) == everything
-    assert news(ends.ours, replace(first, offset=0 * OFFSET)) == {"offset", "beside"}
+    assert news(ends.ours, replace(first, offset=0 * OFFSET)) == {"offset", "pressure_offset"}
     other = Ends()
     assert news(other.ours, first) == everything
     other.close()
@@ -115,7 +114,7 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
 
 def test_plans_arrive_as_they_were(ends: Ends) -> None:
     the_task = task()
-    request = Request(4, the_task, the_task.target, OFFSET, BESIDE)
+    request = PlanRequest(4, the_task, the_task.target, OFFSET, BESIDE)
     for reached, stiffness, message in ((True, 123.4, ""), (False, math.nan, "it is far")):
         known = ends.passes(request)
         pressures = np.array([1e5 / 3, 0.0, -0.0])
@@ -148,7 +147,7 @@ def test_it_says_whether_there_is_an_answer(monkeypatch: pytest.MonkeyPatch, pol
     with pytest.raises((EOFError, ConnectionError)):
         ends.ours.receive()
     with pytest.raises(OSError, match=r"."):
-        ends.ours.ask(Request(1, task(), task().target, OFFSET, BESIDE))
+        ends.ours.send(PlanRequest(1, task(), task().target, OFFSET, BESIDE))
     ends.ours.close()
 
 
@@ -183,6 +182,6 @@ def test_a_system_that_cannot_be_told_to_yield_is_no_failure(
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse, raising=False)
-    planner_module._let_it_yield(os.getpid())
+    planner_module._set_batch_policy(os.getpid())
     monkeypatch.delattr(os, "sched_setscheduler")
-    planner_module._let_it_yield(os.getpid())
+    planner_module._set_batch_policy(os.getpid())

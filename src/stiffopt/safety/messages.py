@@ -1,7 +1,8 @@
-"""What the control loop and the guard process say to each other, and the socket they say it on.
+"""Messages between the guard process and its client, and the local socket that carries them.
 
-Every message is one packet of a local socket that keeps packets apart. The frequent ones are
-packed, the rest is JSON. All times are on `time.monotonic`, which is one clock for all processes.
+Each message is one packet of a ``SOCK_SEQPACKET`` socket. Commands, answers and poses, which are
+frequent, are packed binary; the rest is JSON. All times are on `time.monotonic`, which is one clock
+for all processes of a machine.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import socket
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -20,30 +22,44 @@ from numpy.typing import NDArray
 
 from stiffopt.rig.interface import PoseSample
 
-__all__ = ["Answer", "Channel", "CommandFrame", "Message", "Poses", "Request", "Word", "unpack"]
+__all__ = [
+    "JSON",
+    "CommandFrame",
+    "GuardAnswer",
+    "GuardChannel",
+    "GuardNotice",
+    "GuardRequest",
+    "Message",
+    "TrackedPoses",
+    "json_line",
+    "unpack",
+]
 
 Array = NDArray[np.float64]
 
-_LARGEST = 1 << 16  # bytes of a packet
+_LARGEST = 1 << 16  # bytes in a packet
 _COMMAND = struct.Struct("<cQddd")
 _ANSWER = struct.Struct("<cQQQ???dH")
-_AT_ONCE = 1000  # packets: whoever sends without end must not keep the other from all else
-_NUMBERS = 1 << 64
-_POSE = 10  # numbers: time, received, frame, position, quaternion
+_AT_ONCE = 1000  # packets per receive: a flood must not keep the receiver from its other work
+_SEQUENCE_END = 1 << 64
+_POSE = 10  # numbers per pose: time, received, frame, position (3), quaternion (4)
+JSON = "json"
+"""Command line argument with which a guard process writes JSON lines on stderr."""
 
 
 @dataclass(frozen=True)
 class CommandFrame:
-    """A command of pressures.
+    """A pressure command to the guard.
 
     Attributes
     ----------
-    sequence : counts whatever is sent to the guard.
-    sent : when, in s.
-    time, valid_for : of the command, in s.
+    sequence : number of the message; the client counts all that it sends.
+    sent : when it was sent, in s.
+    time, valid_for : when the command was given and for how long it is valid, in s.
     pressures : (n,), in Pa.
-    goal : whether the guard shall approach and repeat it while it is valid, see
-        `stiffopt.safety.goal`; otherwise it is one of a stream whose silence makes the guard vent.
+    goal : True: the guard approaches and repeats the pressures while they are valid, see
+        `stiffopt.safety.goal`. False: one command of a stream; the guard vents when the stream
+        stops.
     """
 
     sequence: int
@@ -54,29 +70,30 @@ class CommandFrame:
     goal: bool = False
 
     def pack(self) -> bytes:
-        """Return the packet."""
+        """Return the packet (bytes)."""
         kind = b"G" if self.goal else b"C"
         head = _COMMAND.pack(kind, self.sequence, self.sent, self.time, self.valid_for)
         return head + np.ascontiguousarray(self.pressures, dtype="<f8").tobytes()
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What became of what was sent to the guard, and how things stand there.
+class GuardAnswer:
+    """The guard's answer to a command or request, with the state of the supply.
 
     Attributes
     ----------
-    sequence : of the newest that this answers; older commands without an answer were overtaken.
-    commanded : what the supply has been told (n,), in Pa.
-    measured, time : pressures (n,), in Pa, and when they were read; NaN where unknown.
-    armed, limited : whether commands are taken, and whether this one was limited.
-    force_limited : whether it was limited for the total force.
+    sequence : number of the message that is answered; 0: the guard reports by itself. Older
+        commands that have no answer were overtaken by this one.
+    commanded : set-points (n,) of the supply, in Pa.
+    measured, time : measured pressures (n,), in Pa, and when they were read; NaN where unknown.
+    armed : whether the guard takes commands.
+    limited, force_limited : whether this command was limited at all, and for the total force.
     trips : how often the guard has tripped so far.
-    broken : packets so far that the guard could not understand.
-    tripped : why it is tripped now; empty where it is not.
-    refused : why the command was not passed on; empty where it was.
-    error : what the supply or the guard could not do; empty where it could.
-    value : what was asked for, for requests that ask for something else.
+    broken : number of packets so far that the guard could not decode.
+    tripped : why the guard is tripped now; empty if it is not.
+    refused : why the command was refused; empty if it was carried out.
+    error : why the request failed; empty if it did not.
+    value : result of a request that has one.
     """
 
     sequence: int
@@ -94,7 +111,7 @@ class Answer:
     value: Any = None
 
     def pack(self) -> bytes:
-        """Return the packet."""
+        """Return the packet (bytes)."""
         head = _ANSWER.pack(
             b"A",
             self.sequence,
@@ -112,14 +129,14 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Request:
-    """Something else that the guard shall do: ``arm``, ``vent``, ``read``, ``close`` and others.
+class GuardRequest:
+    """A request to the guard: ``arm``, ``vent``, ``read``, ``restrict``, ``ping``, ``close`` ...
 
     Attributes
     ----------
-    sequence : counts whatever is sent to the guard.
-    do : the word.
-    about : what it needs to know.
+    sequence : number of the message; the client counts all that it sends.
+    do : name of the request.
+    about : its arguments by name.
     """
 
     sequence: int
@@ -127,36 +144,36 @@ class Request:
     about: dict[str, Any] = field(default_factory=dict)
 
     def pack(self) -> bytes:
-        """Return the packet."""
+        """Return the packet (bytes)."""
         return b"R" + json.dumps([self.sequence, self.do, self.about]).encode()
 
 
 @dataclass(frozen=True)
-class Word:
-    """Something that the guard says unasked: ``ready``, ``failed`` or ``notice``.
+class GuardNotice:
+    """A report of a guard that starts: ``notice``, then ``ready`` or ``failed``.
 
     Attributes
     ----------
-    kind : which of them.
-    about : the rest.
+    kind : which of these.
+    about : its details by name.
     """
 
     kind: str
     about: dict[str, Any] = field(default_factory=dict)
 
     def pack(self) -> bytes:
-        """Return the packet."""
+        """Return the packet (bytes)."""
         return b"W" + json.dumps([self.kind, self.about]).encode()
 
 
 @dataclass(frozen=True)
-class Poses:
-    """Samples of a tracker that the guard process hosts."""
+class TrackedPoses:
+    """Samples of a simulated tracker that lives in the guard process."""
 
     samples: tuple[PoseSample, ...]
 
     def pack(self) -> bytes:
-        """Return the packet."""
+        """Return the packet (bytes)."""
         rows = np.full((len(self.samples), _POSE), np.nan)
         for row, sample in zip(rows, self.samples, strict=True):
             row[:3] = sample.time, sample.received, sample.frame
@@ -166,16 +183,16 @@ class Poses:
         return b"P" + rows.astype("<f8").tobytes()
 
 
-Message = CommandFrame | Answer | Request | Word | Poses
+Message = CommandFrame | GuardAnswer | GuardRequest | GuardNotice | TrackedPoses
 
 
 def unpack(packet: bytes) -> Message:
-    """Return the message in a packet.
+    """Decode a packet.
 
     Raises
     ------
     ValueError
-        It is not one.
+        The packet is no valid message.
     """
     try:
         match packet[:1]:
@@ -187,22 +204,22 @@ def unpack(packet: bytes) -> Message:
                 return _answer(packet)
             case b"R":
                 sequence, do, about = json.loads(packet[1:])
-                return Request(_number(sequence), _text(do), _named(about))
+                return GuardRequest(_sequence(sequence), _text(do), _arguments(about))
             case b"W":
                 kind, about = json.loads(packet[1:])
-                return Word(_text(kind), _named(about))
+                return GuardNotice(_text(kind), _arguments(about))
             case b"P":
                 rows = _numbers(packet[1:]).reshape(-1, _POSE)
-                return Poses(tuple(_pose(row) for row in rows))
+                return TrackedPoses(tuple(_pose(row) for row in rows))
     except (struct.error, TypeError, OverflowError, RecursionError) as error:
         raise ValueError(f"a broken packet: {error}") from None
     raise ValueError(f"a packet of unknown kind: {packet[:1]!r}")
 
 
-def _number(given: Any) -> int:
-    """Return what can be sent back as the number of a message."""
-    if type(given) is not int or not 0 <= given < _NUMBERS:
-        raise ValueError("the number of a message is a whole one of 64 bits")
+def _sequence(given: Any) -> int:
+    """Check a sequence number: it must fit into the answer."""
+    if type(given) is not int or not 0 <= given < _SEQUENCE_END:
+        raise ValueError("a sequence number is an unsigned integer of 64 bits")
     return given
 
 
@@ -212,23 +229,23 @@ def _text(given: Any) -> str:
     return given
 
 
-def _named(given: Any) -> dict[str, Any]:
+def _arguments(given: Any) -> dict[str, Any]:
     if not isinstance(given, dict):
-        raise ValueError("expected things with names")
+        raise ValueError("expected named arguments")
     return given
 
 
 def _numbers(packed: bytes) -> Array:
-    return np.frombuffer(packed, "<f8").astype(float)  # a copy: aligned, and one may write to it
+    return np.frombuffer(packed, "<f8").astype(float)  # a copy: aligned and writable
 
 
-def _answer(packet: bytes) -> Answer:
+def _answer(packet: bytes) -> GuardAnswer:
     _, sequence, trips, broken, armed, limited, forced, time, n = _ANSWER.unpack_from(packet)
     end = _ANSWER.size + 16 * n
     numbers = _numbers(packet[_ANSWER.size : end]).reshape(2, n)
     tail = json.loads(packet[end:]) if len(packet) > end else ("", "", "", None)
     known = (sequence, numbers[0], numbers[1], time, armed, limited, forced, trips, broken)
-    return Answer(*known, *tail)
+    return GuardAnswer(*known, *tail)
 
 
 def _pose(row: Array) -> PoseSample:
@@ -237,18 +254,18 @@ def _pose(row: Array) -> PoseSample:
     return PoseSample(float(time), float(received), int(frame), row[3:6], quaternion)
 
 
-class Channel:
-    """One end of a local socket that keeps packets apart. Nothing here waits for the other side.
+class GuardChannel:
+    """One end of the socket between guard and client; it never blocks on the other end.
 
     Parameters
     ----------
     end :
-        Of a pair of the kind `socket.SOCK_SEQPACKET`.
+        One end of a `socket.SOCK_SEQPACKET` pair.
 
     Attributes
     ----------
-    closed : whether the other end is gone, or this one was closed.
-    broken : packets that were no messages, and were left out.
+    closed : whether either end has been closed.
+    broken : number of packets that could not be decoded and were dropped.
     """
 
     def __init__(self, end: socket.socket) -> None:
@@ -262,12 +279,12 @@ class Channel:
         self.broken = 0
 
     def wake_for(self, descriptors: Sequence[int]) -> None:
-        """Let a wait end also when one of these can be read."""
+        """Let `receive` also return early when one of these file descriptors becomes readable."""
         for descriptor in descriptors:
             self._poll.register(descriptor, select.POLLIN)
 
     def send(self, message: Message) -> bool:
-        """Send a message; say whether it could be, which it cannot where nobody takes any."""
+        """Send a message; return False if the socket is full or closed."""
         try:
             self._end.send(message.pack())
         except BlockingIOError:
@@ -278,10 +295,7 @@ class Channel:
         return True
 
     def receive(self, wait: float = 0.0) -> list[Message]:
-        """Return all that has come; wait up to `wait` s for something. What is broken is left out.
-
-        A pause is measured in whole milliseconds, rounded up.
-        """
+        """Return all messages that have arrived; wait up to `wait` s (rounded up to ms) for one."""
         messages: list[Message] = []
         if not self.closed and wait > 0:
             self._poll.poll(math.ceil(wait * 1e3))
@@ -305,11 +319,29 @@ class Channel:
         return messages
 
     def _hung_up(self) -> bool:
-        """Say whether nothing more can come: an empty packet reads like the end."""
+        """Return whether the other end is closed; an empty packet alone does not mean that."""
         gone = select.POLLHUP | select.POLLRDHUP | select.POLLERR | select.POLLNVAL
         return any(events & gone for _, events in self._hang_up.poll(0))
 
     def close(self) -> None:
-        """Let the other end know that nothing more comes."""
+        """Close this end, which tells the other one."""
         self.closed = True
         self._end.close()
+
+
+def json_line(level: str, kind: str, text: str, when: datetime | None = None, **more: Any) -> str:
+    """Return a log line for programs: JSON with ``time`` (UTC), ``level``, ``kind``, ``text``.
+
+    Parameters
+    ----------
+    level, kind, text :
+        Severity (``info``, ``warning``, ``error``), a word for programs, a sentence for people.
+    when :
+        Time with its time zone; None: now.
+    more :
+        Further keys.
+    """
+    moment = (when or datetime.now(UTC)).astimezone(UTC)
+    stamp = moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    told = {"time": stamp, "level": level, "kind": kind, "text": text, **more}
+    return json.dumps(told, ensure_ascii=True)

@@ -1,0 +1,175 @@
+"""The linear feedback law at the tip, as rows of a linear system in the pressures.
+
+Relative to the reference, the tip is to move by the correction: the offset that the reference was
+planned with, less the offset estimated now. The vibration of an arm is damped as well. In each axis
+of the soft plane, relative to the reference, it obeys ::
+
+    tau sigma' = u - sigma                       the mode's static displacement, behind regulators
+    epsilon'' = -2 zeta omega epsilon' - omega^2 (epsilon - sigma)                        the tip
+
+and the linear-quadratic regulator ``v = -K (sigma, epsilon, epsilon')`` that minimises
+``int epsilon^2 + effort u^2`` brings it to rest.
+
+Channels of different segments excite the mode differently for the same motion of the tip. At the
+limits of pressure, rows for the tip alone could drive the mode the wrong way, so that it has rows
+of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_discrete_are
+
+from stiffopt.control.tuning import FeedbackTuning
+from stiffopt.control.vibration import BendingMode, transition
+from stiffopt.optimise.target import Target
+
+__all__ = ["GainSchedule", "TrackingRows", "lqr_gains", "prescribed_components", "tracking_rows"]
+
+Array = NDArray[np.float64]
+Symbols = Any  # of CasADi
+
+_FREQUENCIES = np.geomspace(2.0, 200.0, 60)  # rad/s, at which gains are tabulated
+
+
+@dataclass(frozen=True)
+class TrackingRows:
+    """Rows J and values v, in m, of a system J (p - r) = v in pressures p near the reference r.
+
+    They are symbolic, for `Allocation` to make one formula of them and its own terms.
+
+    Attributes
+    ----------
+    inputs : list
+        Symbols; see `tracking_rows`.
+    matrices : list
+        Those of them that have one column per channel.
+    rows, values : J (t, n), v (t,)
+    task_rows : int
+        Number of the first rows, which are the task's.
+    linear : Jacobian (3, n) of the tip's position, base axes, in m/Pa.
+    """
+
+    inputs: list[Symbols]
+    matrices: list[Symbols]
+    rows: Symbols
+    values: Symbols
+    linear: Symbols
+    task_rows: int
+
+
+def prescribed_components(target: Target) -> Array:
+    """1 for components (5,) that a target prescribes, else 0: x, y, z, pointing, orientation."""
+    position = target.position or (None, None, None)
+    components = [*position, target.pointing, target.orientation]
+    return np.array([float(component is not None) for component in components])
+
+
+def tracking_rows(
+    n: int,
+    mode: BendingMode | None,
+    damping: float = 0.0,
+    dead_time: float = 0.0,
+    tuning: FeedbackTuning | None = None,
+) -> TrackingRows:
+    """Return the feedback law of an arm with n channels.
+
+    Its inputs are pose (4, 4) and Jacobian (6, n) of the tip on the reference, as `TipModel` gives
+    them; the components that the target prescribes (5,), see `prescribed_components`; and the
+    correction of the tip (6,) in base axes, in m and as a rotation vector. Angles count as
+    displacements at the end of `FeedbackTuning.lever`.
+
+    For an arm that vibrates they are also: its vibration and the speed of that (2, 3); the soft
+    plane (3, 3); omega, in rad/s; gains K (3,), see `GainSchedule`; the effective pressures (n,) a
+    dead time from now; those that the reference has in the chambers then; those on its path; and
+    the rate of the latter (n,).
+
+    Parameters
+    ----------
+    n :
+        Number of channels.
+    mode :
+        The arm's first bending mode; None for an arm that does not vibrate.
+    damping, dead_time :
+        Damping ratio of the mode; dead time of the regulators, in s.
+    tuning :
+        Weights of the rows.
+    """
+    tuning = tuning or FeedbackTuning()
+    lever, mode_weight = tuning.lever, tuning.mode_weight
+    pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
+    prescribed, correction = ca.SX.sym("prescribed", 5), ca.SX.sym("correction", 6)
+    rotation, shift, turn = pose[:3, :3], correction[:3], correction[3:]
+    linear, angular = rotation @ jacobian[:3, :], rotation @ jacobian[3:, :]
+    inputs, mode_rows, mode_values = [pose, jacobian, prescribed, correction], [], []
+    if mode is not None:
+        vibration, soft_plane = ca.SX.sym("vibration", 2, 3), ca.SX.sym("soft_plane", 3, 3)
+        omega, gains = ca.SX.sym("omega"), ca.SX.sym("gains", 3)
+        ahead, chamber = ca.SX.sym("ahead", n), ca.SX.sym("chamber", n)
+        path, rate = ca.SX.sym("path", n), ca.SX.sym("rate", n)
+        inputs += [vibration, soft_plane, omega, gains, ahead, chamber, path, rate]
+        M = soft_plane @ (linear @ ca.diag(ca.DM(mode.participation)))  # Jacobian of the mode
+        later = transition(omega, damping, dead_time) @ vibration
+        goal = float(np.mean(mode.participation)) * (soft_plane @ shift)
+        sigma = M @ (ahead - chamber) - goal
+        epsilon = M @ (ahead - path) + later[0, :].T - goal
+        speed = later[1, :].T - M @ rate
+        feedback = -(gains[0] * sigma + gains[1] * epsilon + gains[2] * speed)
+        shift = shift + feedback
+        mode_rows, mode_values = [mode_weight * M], [mode_weight * (goal + feedback)]
+    axis = rotation[:, 2]
+    sideways = ca.SX.eye(3) - axis @ axis.T
+    position = ca.diag(prescribed[:3])
+    pointing, orientation = lever * prescribed[3], lever * prescribed[4]
+    task = [position @ linear, pointing * (sideways @ angular), orientation * angular]
+    values = [position @ shift, pointing * (sideways @ turn), orientation * turn]
+    rows = ca.vertcat(*task, *mode_rows)
+    return TrackingRows(inputs, [jacobian], rows, ca.vertcat(*values, *mode_values), linear, 9)
+
+
+class GainSchedule:
+    """Gains K (3,) of the linear-quadratic regulator over the frequency of the vibration.
+
+    Parameters
+    ----------
+    period :
+        Of the loop, in s.
+    lag :
+        Of the regulators, in s.
+    damping :
+        Damping ratio of the arm itself.
+    effort :
+        Weight of effort against error.
+    """
+
+    def __init__(self, period: float, lag: float, damping: float, effort: float) -> None:
+        self._table = np.array(
+            [lqr_gains(omega, damping, max(lag, 1e-3), period, effort) for omega in _FREQUENCIES]
+        )
+        self._last: tuple[float, Array] = (-1.0, np.zeros(3))
+
+    def at(self, omega: float) -> Array:
+        """Gains (3,) at an angular frequency in rad/s; the last one in s."""
+        if omega != self._last[0]:
+            columns = [np.interp(omega, _FREQUENCIES, column) for column in self._table.T]
+            self._last = omega, np.array(columns)
+        return self._last[1]
+
+
+def lqr_gains(omega: float, damping: float, lag: float, period: float, effort: float) -> Array:
+    """Gains (3,) of the linear-quadratic regulator at one frequency, sampled at the period."""
+    A = np.array(
+        [[-1 / lag, 0, 0], [0, 0, 1], [omega**2, -(omega**2), -2 * damping * omega]], dtype=float
+    )
+    B = np.array([[1 / lag], [0], [0]])
+    sampled = expm(period * np.block([[A, B], [np.zeros((1, 4))]]))
+    F, G = sampled[:3, :3], sampled[:3, 3:]
+    Q, R = np.diag([0.0, 1.0, 0.0]), np.array([[effort]])
+    S = solve_discrete_are(F, G, Q, R)
+    gains: Array = np.linalg.solve(R + G.T @ S @ G, G.T @ S @ F)[0]
+    return gains

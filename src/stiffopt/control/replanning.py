@@ -1,0 +1,204 @@
+"""The task being pursued, and when a plan is made anew: for which target, and for which offset."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.feedback import prescribed_components
+from stiffopt.control.planner import Planner
+from stiffopt.control.planning import Plan, PlanRequest
+from stiffopt.control.steering import Notice
+from stiffopt.control.tip_errors import stiffness_function, target_arrays
+from stiffopt.control.trajectory import Course
+from stiffopt.control.tuning import ReplanningTuning
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+
+__all__ = ["Pursuit", "Replanner"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Pursuit:
+    """What the controller pursues.
+
+    Attributes
+    ----------
+    task : its limits are those of the rig as well; None: nothing is pursued.
+    target : takes the place of the task's own.
+    course : the trajectory under way, which takes the place of the target; None: there is none.
+    prescribed : components of the pose (5,) that the target prescribes.
+    stiffness : along the task's first direction; None where it names none.
+    unit : of that stiffness.
+    """
+
+    task: Task | None = None
+    target: Target | None = None
+    course: Course | None = None
+    prescribed: Array = field(default_factory=lambda: np.zeros(5))
+    stiffness: Callable[[Array, Array], float] | None = None
+    unit: str = "N/m"
+
+    @classmethod
+    def of(cls, task: Task, limited: Task) -> Pursuit:
+        """Return the pursuit of a task, given with the limits of the rig as well."""
+        prescribed = prescribed_components(task.target)
+        unit = task.measures[0].unit if task.measures else "N/m"
+        return cls(limited, task.target, None, prescribed, stiffness_function(task), unit)
+
+    def to(self, target: Target, course: Course | None = None) -> Pursuit:
+        """Return the pursuit of another target, or course that begins there."""
+        prescribed = prescribed_components(target)
+        return replace(self, target=target, course=course, prescribed=prescribed)
+
+    def target_at(self, now: float) -> Target | None:
+        """Return the target at a moment, in s."""
+        return self.target if self.course is None else self.course.at(now)
+
+    @property
+    def kind(self) -> str:
+        """``trajectory``, ``target``, or empty."""
+        if self.course is not None:
+            return "trajectory"
+        return "" if self.target is None else "target"
+
+
+class Replanner:
+    """Has plans made for what is pursued, at intervals, and keeps the newest.
+
+    Parameters
+    ----------
+    planner :
+        Makes the plans.
+    tuning :
+        Interval, and how quickly plans follow the offset.
+    period :
+        Of the loop, in s.
+    dead_time :
+        Of the regulators, in s.
+
+    Attributes
+    ----------
+    pursuit : Pursuit
+        What plans are made for.
+    plan : Plan or None
+        The newest, which may be of the task before.
+    """
+
+    def __init__(
+        self, planner: Planner, tuning: ReplanningTuning, period: float, dead_time: float
+    ) -> None:
+        self._planner, self._tuning = planner, tuning
+        self._lead = dead_time + 0.5 * period
+        self._serial = 0
+        self._search, self._requested_at = True, -math.inf
+        self.begin()
+
+    def begin(self) -> None:
+        """Start anew, with nothing to pursue."""
+        self.pursuit = Pursuit()
+        self.plan: Plan | None = None
+        self._offset = np.zeros(6)
+        self._renew()
+
+    def prepared(self, pursuit: Pursuit) -> Callable[[], None]:
+        """Return what begins a pursuit when it is called; until then nothing changes."""
+        before = self.pursuit
+        new = pursuit.task is not before.task or before.target is None
+        new = new or bool((pursuit.prescribed != before.prescribed).any())
+        far = _is_far(before.target, pursuit.target, self._tuning)
+
+        def begin() -> None:
+            self.pursuit = pursuit
+            if new:
+                self._renew()
+            self._search = self._search or far
+            self._requested_at = -math.inf
+
+        return begin
+
+    def _renew(self) -> None:
+        self._serial += 1
+        self._search = True
+        self._requested_at = -math.inf
+
+    def update(
+        self, now: float, offset: Array, pressure_offset: Array, omega: float, delay: float
+    ) -> Array | None:
+        """Request a plan when it is time, and take the newest.
+
+        Parameters
+        ----------
+        now :
+            In s.
+        offset :
+            Of the tip from the model (6,), in m and rad.
+        pressure_offset :
+            Effective pressures relative to commands (n,), in Pa.
+        omega :
+            Angular frequency of the vibration, in rad/s.
+        delay :
+            Of the reference behind the plan, in s.
+
+        Returns ------- Effective pressures of the plan and the offset it was made for (n + 6,);
+        None without a plan.
+        """
+        task, target = self.pursuit.task, self.pursuit.target
+        interval = self._tuning.interval
+        if task is not None and target is not None and now - self._requested_at >= interval - 1e-6:
+            search = self._search and self.pursuit.course is None
+            self._requested_at, self._search = now, False
+            if self.pursuit.course is not None:  # where it is when the reference is there
+                target = self.pursuit.course.at(now + delay + self._lead)
+            # The offset depends on the posture: the posture follows it slowly, the tip at once.
+            time = max(self._tuning.offset_time, self._tuning.offset_periods / omega)
+            share = 1.0 if search else -math.expm1(-interval / time)
+            self._offset = self._offset + share * (offset - self._offset)
+            self._planner.request(
+                PlanRequest(
+                    self._serial, task, target, self._offset.copy(), pressure_offset, search
+                )
+            )
+        return self.latest()
+
+    def latest(self) -> Array | None:
+        """Return the newest plan's pressures and offset (n + 6,); see `update`."""
+        plan = self._planner.latest()
+        if plan is not None and plan.serial == self._serial:
+            self.plan = plan
+        if self.plan is None:
+            return None
+        return np.concatenate([self.plan.pressures, self.plan.offset])
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Return what is wrong with the planner and with its plan."""
+        notices, plan = self._planner.notices(), self.plan
+        if plan is not None and plan.serial == self._serial and not plan.reached:
+            text = f"the target cannot be reached: {plan.message}"
+            notices = (*notices, Notice("unreachable", text, standing=True))
+        return notices
+
+    def close(self) -> None:
+        """End the planner."""
+        self._planner.close()
+
+
+def _is_far(before: Target | None, target: Target | None, tuning: ReplanningTuning) -> bool:
+    """Whether another configuration may be better for a target than for the one before."""
+    (here, *directions), (there, *others) = target_arrays(before), target_arrays(target)
+    if here is not None and there is not None:
+        distance = float(np.linalg.norm(np.nan_to_num(there - here)))
+        if distance > tuning.far_position:
+            return True
+    cosine = math.cos(tuning.far_angle)
+    return any(
+        abs(float(a @ b)) < cosine
+        for a, b in zip(directions, others, strict=True)
+        if a is not None and b is not None
+    )

@@ -1,0 +1,173 @@
+"""The queue of requests that other threads make and the control thread carries out."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+
+from stiffopt.errors import CommandError
+
+__all__ = ["RequestQueue", "Requester", "current_requester", "requested_by"]
+
+Action = Callable[[], None]
+
+_CHECK_EVERY = 0.1  # s after which a waiting thread looks whether its request can still be served
+_GIVEN_UP = "nobody waits for this any more; it is not done"
+
+
+class Requester:
+    """Whoever waits for a request, and may give it up. Any thread may call any method."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._begun = self._gone = False
+
+    @property
+    def gone(self) -> bool:
+        """Whether the request was given up."""
+        return self._gone
+
+    def give_up(self) -> bool:
+        """Wait no more; return whether the request had not been begun, and so never will be."""
+        with self._lock:
+            self._gone = True
+            return not self._begun
+
+    def begin(self) -> None:
+        """Note that the request is being carried out.
+
+        Raises
+        ------
+        CommandError
+            It was given up.
+        """
+        with self._lock:
+            if self._gone:
+                raise CommandError(_GIVEN_UP)
+            self._begun = True
+
+
+_requester: ContextVar[Requester | None] = ContextVar("requester", default=None)
+
+
+@contextmanager
+def requested_by(requester: Requester) -> Iterator[None]:
+    """Make this thread's requests in the body those of a requester who may give them up."""
+    before = _requester.set(requester)
+    try:
+        yield
+    finally:
+        _requester.reset(before)
+
+
+def current_requester() -> Requester:
+    """Return the requester of this thread; without `requested_by`, one who never gives up."""
+    return _requester.get() or Requester()
+
+
+class _QueuedRequest:
+    """A request whose outcome a thread waits for."""
+
+    def __init__(self, action: Action) -> None:
+        self.action = action
+        self.done = threading.Event()
+        self.error: BaseException | None = None
+
+
+class RequestQueue:
+    """Has requests carried out by the thread that serves them, or at once where none does.
+
+    Attributes
+    ----------
+    turn : RLock
+        Held while something works on what requests change.
+    """
+
+    def __init__(self) -> None:
+        self.turn = threading.RLock()
+        self._queue: deque[_QueuedRequest] = deque()
+        self._server: threading.Thread | None = None
+
+    def begin(self) -> None:
+        """Serve from now on, in this thread.
+
+        Raises
+        ------
+        CommandError
+            Another one does already.
+        """
+        with self.turn:
+            if self._served():
+                raise CommandError("the loop runs already")
+            self._server = threading.current_thread()
+
+    def end(self) -> None:
+        """Serve no more; waiting requests are refused."""
+        with self.turn:
+            self._server = None
+            self.serve(refusing="the loop has ended")
+
+    def serve(self, refusing: str = "") -> None:
+        """Carry out the waiting requests, or refuse them for a reason."""
+        while True:
+            try:
+                queued = self._queue.popleft()
+            except IndexError:
+                return
+            try:
+                if refusing:
+                    raise CommandError(refusing)
+                queued.action()
+            except BaseException as error:  # raised in the thread that made the request
+                queued.error = error
+            queued.done.set()
+
+    def submit(self, action: Action) -> None:
+        """Have a request carried out, wait for it, and raise what it raises.
+
+        Raises
+        ------
+        CommandError
+            The loop has ended, or the request was given up before it was begun (see
+            `requested_by`).
+        """
+        requester = current_requester()
+
+        def carry_out() -> None:
+            requester.begin()
+            action()
+
+        if not self._served() or threading.current_thread() is self._server:
+            self._in_turn(carry_out, requester)
+            return
+        queued = _QueuedRequest(carry_out)
+        self._queue.append(queued)
+        while not queued.done.wait(_CHECK_EVERY):
+            if requester.gone:
+                self._withdraw(queued)
+            if not self._served() and queued in self._queue:
+                self.serve(refusing="the loop has ended")
+        if queued.error is not None:
+            raise queued.error
+
+    def _in_turn(self, action: Action, requester: Requester) -> None:
+        while not self.turn.acquire(timeout=_CHECK_EVERY):
+            if requester.gone:
+                raise CommandError(_GIVEN_UP)
+        try:
+            action()
+        finally:
+            self.turn.release()
+
+    def _withdraw(self, queued: _QueuedRequest) -> None:
+        """Take a request out of the queue, unless it is being carried out."""
+        with suppress(ValueError, IndexError):  # it is not in the queue, or the queue is changing
+            self._queue.remove(queued)
+            queued.error = CommandError(_GIVEN_UP)
+            queued.done.set()
+
+    def _served(self) -> bool:
+        return self._server is not None and self._server.is_alive()

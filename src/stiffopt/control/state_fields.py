@@ -1,0 +1,169 @@
+"""How the fields of the control loop's state are defined, and how the definitions are read.
+
+`stiffopt.control.state` has the definitions themselves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.units import unit_suffix
+
+__all__ = ["Entry", "Kind", "Shown", "entries"]
+
+_DECIMALS = {"s": 6, "Pa": 1, "m": 7, "rad": 7, "": 7, "N/m": 4, "N": 5}
+"""How finely quantities are logged: finer than any sensor."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a field of the state means, and how it is shown in each place.
+
+    Attributes
+    ----------
+    about : what it is.
+    unit : SI unit; the JSON name ends in it. Of several, the field `unit_field` says which holds,
+        and each has a JSON name of its own.
+    size : of an array; 0: one value per channel.
+    json : its name in the HTTP interface if that is not the field's name with the unit. Several
+        names share the elements of an array; no name: the interface does not have it.
+    topic : of telemetry, live and recorded; empty: it is not logged.
+    key : its name in the messages of the topic, by default the one in the interface.
+    decimals : that are logged; by default those of the unit.
+    metric : name for Prometheus after ``stiffopt_``; a counter for a whole number, else a gauge.
+    label : value of the metric's label ``kind``, which tells fields that share a metric apart.
+    row : in the status on the terminal: the row that it is shown in, in the unit `row_unit`.
+    armed_only : whether that row is left out while the arm is vented.
+    unknown : what the row says for NaN.
+    line : whether a change of it makes a line of ``stiffopt run --json``, which then has it.
+    """
+
+    about: str
+    unit: str | tuple[str, ...] = ""
+    unit_field: str = ""
+    size: int = 0
+    json: str | tuple[str, ...] | None = None
+    topic: str = ""
+    key: str = ""
+    decimals: int | None = None
+    metric: str = ""
+    label: str = ""
+    row: str = ""
+    row_unit: Literal["", "mm", "deg"] = ""
+    armed_only: bool = True
+    unknown: str = "-"
+    line: bool = False
+
+
+class Kind(Enum):
+    """The kinds of values that a field may have; in JSON, null stands for NaN."""
+
+    NUMBER = "number"
+    COUNT = "integer"
+    FLAG = "boolean"
+    TEXT = "string"
+    NUMBERS = "numbers"
+    COUNTS = "counts"
+    FLAGS = "flags"
+    RECORD = "record"
+    RECORDS = "records"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A field as its definition has it, with the defaults filled in.
+
+    Attributes
+    ----------
+    name : of the field.
+    kind : of its value.
+    type : of the value; of a record, or the items of `RECORDS`, the dataclass.
+    optional : whether the value may be None.
+    in_array : whether its values are in an array; else in a tuple.
+    shown : its definition.
+    units : of which one holds at a time, as `Shown.unit_field` says; empty if there is no choice.
+    json : names in the HTTP interface, in the order of `units` or of the array's parts.
+    key, decimals : in the messages of the topic.
+    """
+
+    name: str
+    kind: Kind
+    type: Any
+    optional: bool
+    in_array: bool
+    shown: Shown
+    units: tuple[str, ...]
+    json: tuple[str, ...]
+    key: str
+    decimals: int
+
+
+_READ: dict[type, tuple[Entry, ...]] = {}
+
+
+def entries(record: type) -> tuple[Entry, ...]:
+    """Return the fields of a dataclass that are shown; its own come before those of its bases."""
+    if record not in _READ:
+        _READ[record] = tuple(_entries(record))
+    return _READ[record]
+
+
+def _entries(record: type) -> Iterator[Entry]:
+    hints = get_type_hints(record, include_extras=True)
+    order = {
+        name: (depth, place)
+        for depth, base in reversed(list(enumerate(record.__mro__)))
+        for place, name in enumerate(vars(base).get("__annotations__", ()))
+    }
+    for each in sorted(dataclasses.fields(record), key=lambda each: order[each.name]):
+        hint = hints[each.name]
+        shown = next((part for part in get_args(hint)[1:] if isinstance(part, Shown)), None)
+        if shown is not None:
+            yield _entry(each.name, get_args(hint)[0], shown)
+
+
+def _entry(name: str, hint: Any, shown: Shown) -> Entry:
+    units = shown.unit if isinstance(shown.unit, tuple) else (shown.unit,)
+    json = tuple(name + unit_suffix(unit) for unit in units) if shown.json is None else shown.json
+    json = (json,) if isinstance(json, str) else json
+    optional = type(None) in get_args(hint)
+    if optional:
+        hint = next(part for part in get_args(hint) if part is not type(None))
+    kind, item = _kind(hint)
+    return Entry(
+        name=name,
+        kind=kind,
+        type=item,
+        optional=optional,
+        in_array=get_origin(hint) is np.ndarray,
+        shown=shown,
+        units=units if len(units) > 1 else (),
+        json=json,
+        key=shown.key or (json[0] if json else name),
+        decimals=_DECIMALS[units[0]] if shown.decimals is None else shown.decimals,
+    )
+
+
+def _kind(hint: Any) -> tuple[Kind, Any]:
+    """Return the kind of a type, and the type of what is in it."""
+    if get_origin(hint) in (Union, UnionType):
+        raise TypeError(f"a field of the state cannot be {hint}")
+    if get_origin(hint) is tuple:
+        item = get_args(hint)[0]
+        many = {float: Kind.NUMBERS, int: Kind.COUNTS, bool: Kind.FLAGS}
+        return many.get(item, Kind.RECORDS), item
+    if get_origin(hint) is np.ndarray:
+        return (Kind.FLAGS, np.bool_) if hint == NDArray[np.bool_] else (Kind.NUMBERS, np.float64)
+    if dataclasses.is_dataclass(hint):
+        return Kind.RECORD, hint
+    if issubclass(hint, str):
+        return Kind.TEXT, hint
+    return {float: Kind.NUMBER, int: Kind.COUNT, bool: Kind.FLAG}[hint], hint

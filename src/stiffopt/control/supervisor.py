@@ -1,0 +1,569 @@
+"""The state machine of the control loop: what happens in a tick, and what requests do to it.
+
+It has no threads and no time of its own: `ControlLoop` calls it, one call at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.checks import check_rig, check_vented_arm, highest_pressures, refusing
+from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
+from stiffopt.control.state import Severity, State
+from stiffopt.control.steering import Steering
+from stiffopt.control.tracker_watch import Sight, TrackerWatch
+from stiffopt.control.trajectory import Trajectory
+from stiffopt.control.tuning import SupervisionTuning
+from stiffopt.errors import CommandError, DeviceError, GuardTripped, InputError, StiffoptError
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig
+from stiffopt.rig.settings import ControlSettings, Safety
+from stiffopt.safety.expected_pressure import Regulation
+from stiffopt.safety.gate import Outlet, let_down
+from stiffopt.safety.monitors import PressureMonitor, Trouble
+
+__all__ = ["Supervisor"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Ramp:
+    """Pressures (n,) that are let down from a time on, within a duration in s, and why."""
+
+    begin: float
+    duration: float
+    pressures: Array
+    reason: str
+
+    def share(self, now: float) -> float:
+        """Return the share of the pressures that is left at a time, from 1 to 0.
+
+        A request may begin the ramp during a tick, later than that tick's `now`: then it is 1.
+        """
+        return min(max(1 - (now - self.begin) / self.duration, 0.0), 1.0)
+
+
+class Supervisor:
+    """Supervises a controller: state, faults, holds, letting down and venting.
+
+    Requests raise `InputError` with the reason when they are refused; nothing has changed then.
+    Whatever fails while something changes is a fault. `ControlLoop` has checked their arguments.
+    `now` is the time on the rig's clock, in s.
+
+    Attributes
+    ----------
+    lifecycle, events, alarms :
+        State and history.
+    commanded : ndarray
+        Set-points (n,) that the supply has, in Pa.
+    reading : PressureReading
+        The latest; NaN before the first, and where it is impossible.
+    samples : tuple of PoseSample
+        Delivered since the last tick; of these `rejected` were rejected.
+    saturated : ndarray
+        Channels (n,) at a limit that keeps them from what they should do.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        steering: Steering,
+        outlet: Outlet,
+        safety: Safety,
+        period: float,
+        tuning: SupervisionTuning,
+    ) -> None:
+        self.rig, self.steering, self.outlet = rig, steering, outlet
+        self._tuning = tuning
+        self._clock, self._safety = rig.clock, safety
+        self.lifecycle = Lifecycle()
+        self.events = EventBuffer()
+        self.alarms = Alarms(self.events)
+        control = ControlSettings() if rig.settings is None else rig.settings.control
+        n = outlet.limits.n
+        regulation = Regulation.slowest(rig.robot, control, n)
+        self._monitor = PressureMonitor(outlet.limits, safety, regulation, rig.slew)
+        self._tracker = TrackerWatch(safety, period)
+        self._no_channels: NDArray[np.bool_] = np.zeros(n, dtype=bool)
+        self._stuck_low = self._monitor.saturated
+        self._unsupervised: tuple[int, ...] = ()
+        self._zero: Array = np.zeros(n)
+        self.commanded: Array = self._zero
+        self._requested: Array = self._zero  # before the outlet limited it
+        self._held: Array | None = None
+        self.reading = PressureReading(float("nan"), np.full(n, np.nan))
+        self.samples: tuple[PoseSample, ...] = ()
+        self.rejected = 0
+        self.saturated = self._no_channels
+        self._exchanged: PressureReading | None = None  # with the last command
+        self._holds: dict[str, str] = {}  # reason of each kind
+        self._ramp: _Ramp | None = None
+        self._vented = True
+        self._trouble: Trouble | None = None
+        self._failures = 0  # of the controller, in a row
+        self._force_limited_at = -np.inf
+        self._standing_notices: frozenset[str] = frozenset()
+        self._ticked_at = self._clock.now()
+
+    @property
+    def vented(self) -> bool:
+        """Whether the supply has accepted the command to vent, and no pressure since."""
+        return self._vented
+
+    # -- a tick ---------------------------------------------------------------------------------
+
+    def tick(self, now: float, serve: Callable[[], None]) -> None:
+        """Measure, serve requests, command; an error is a fault, never an exception."""
+        if self.lifecycle.state is not State.UNCONFIGURED:
+            self._guarded(self._measure, now)
+        serve()
+        if self.lifecycle.state is not State.UNCONFIGURED:
+            self._guarded(self._actuate, now)
+            self._guarded(self._report_notices, now)
+        self._ticked_at = self._clock.now()
+
+    def overran(self, now: float, in_a_row: int) -> None:
+        """Note how many ticks in a row took too long."""
+        if self.lifecycle.armed and in_a_row >= self._safety.max_overruns:
+            self.fault(now, "overruns", f"{in_a_row} ticks in a row took too long")
+
+    def fault(self, now: float, kind: str, text: str) -> None:
+        """Vent, and stay vented until a reset."""
+        if self.lifecycle.state is not State.FAULT:
+            self.lifecycle.change(State.FAULT, text)
+            self._holds.clear()
+            self._ramp = None
+            self._vented = False
+            self.events.add(now, kind, text, Severity.ERROR)
+        if not self._vented:
+            self._try_to_vent(now)
+
+    def _guarded(self, action: Callable[[float], None], now: float) -> None:
+        try:
+            action(now)
+        except GuardTripped as error:
+            self.fault(now, "guard", str(error))
+        except DeviceError as error:
+            self.fault(now, "device", f"a device fails: {error}")
+        except Exception as error:
+            self.fault(now, "internal", f"unexpected {type(error).__name__}: {error}")
+
+    def _try_to_vent(self, now: float) -> None:
+        try:
+            self.outlet.vent()
+        except Exception as error:  # of any kind: the next tick tries again
+            self._vented = False
+            self.alarms.set(
+                now,
+                "not-vented",
+                f"the supply does not take the command to vent ({error}); it is repeated, and "
+                "the device's own watchdog vents if it has one",
+                Severity.ERROR,
+            )
+        else:
+            self._vented = True
+            self._note_commanded(now, self._zero)
+            self.alarms.clear(now, "not-vented")
+            self.alarms.clear(now, "force-limit")
+        self._exchanged = None
+        self._failures = 0
+        self.saturated = self._no_channels
+
+    def _note_commanded(self, now: float, pressures: Array) -> None:
+        self.commanded = pressures
+        self._monitor.tell(now, pressures)
+
+    def _measure(self, now: float) -> None:
+        """Read pressures and tracker, check them, and pass them to the controller."""
+        pause = now - self._ticked_at
+        if self.lifecycle.armed and not pause <= self._safety.command_timeout:
+            self.fault(now, "stalled", f"the loop stood still for {pause:.3g} s")
+        reading, self._exchanged = self._exchanged, None
+        if reading is None:
+            reading = self.outlet.read()
+        tracker = self.rig.tracker
+        arrived: Sequence[PoseSample] = () if tracker is None else tracker.read()
+        self.samples = samples = tuple(self._tracker.new(arrived)) if arrived else ()
+        self._trouble = trouble = self._monitor.update(now, reading)
+        if trouble is not None:
+            reading = self._monitor.believable(reading)
+            if self.lifecycle.state is State.FAULT:
+                self.alarms.set(now, trouble.kind, trouble.text, Severity.ERROR)
+            else:
+                self.fault(now, trouble.kind, trouble.text)
+        self.reading = reading
+        seen = self.steering.observe(now, self.commanded, reading, samples)
+        self.rejected = seen.rejected
+        if samples and not self.lifecycle.armed:
+            self._tracker.learn(now, samples)
+        self._tracker.update(now, seen)
+        self._update_alarms(now)
+
+    def _update_alarms(self, now: float) -> None:
+        """Set and clear the alarms of what is measured."""
+        monitor = self._monitor
+        if monitor.saturated is not self._stuck_low:
+            self._stuck_low = monitor.saturated
+            text = "stays below its command: no more pressure, or a leak"
+            self._set_channel_alarm(now, "saturated", np.flatnonzero(self._stuck_low), text)
+        if monitor.unsupervised is not self._unsupervised:
+            self._unsupervised = monitor.unsupervised
+            text = "has no gauge: leaks and stuck regulators are not seen there"
+            self._set_channel_alarm(now, "unsupervised", self._unsupervised, text)
+        if self._tracker.sight(now) is Sight.SEEN:
+            self.alarms.clear(now, "tracker-missing")
+        else:
+            self.alarms.set(now, "tracker-missing", "the tracker does not see the tip")
+
+    def _set_channel_alarm(self, now: float, kind: str, channels: Iterable[int], text: str) -> None:
+        if names := ", ".join(str(channel + 1) for channel in channels):
+            self.alarms.set(now, kind, f"channel {names} {text}")
+        else:
+            self.alarms.clear(now, kind)
+
+    def _actuate(self, now: float) -> None:
+        """Command the pressures that the state requires."""
+        if self.lifecycle.state is State.FAULT and not self._vented:
+            self._try_to_vent(now)
+        if self.lifecycle.armed:
+            self._check_tracker(now)
+        if self.lifecycle.state is State.ACTIVE:
+            self._control(now)
+        elif self.lifecycle.state is State.HOLDING:
+            self._hold_or_ramp(now)
+
+    def _check_tracker(self, now: float) -> None:
+        """Hold, let down or go on, by whether the tracker sees the tip."""
+        if self._tracker.jumping:
+            self.fault(
+                now,
+                "tracker-jumps",
+                f"the tip seems to have jumped {self._tracker.jumps} times in a row; the tracker "
+                "is disturbed, or its sensor has come off",
+            )
+            return
+        sight = self._tracker.sight(now)
+        if sight is Sight.SEEN:
+            if self._holds.pop("tracker", None) is not None:
+                self._resume(now)
+        elif sight is Sight.MISSING:
+            self._hold(now, "tracker", "the tracker does not see the tip")
+        else:
+            self._let_down(now, "tracker-lost", "the tracker has lost the tip")
+
+    def _control(self, now: float) -> None:
+        """Command what the controller decides."""
+        move = self.steering.move(now)
+        p, n = move.pressures, len(self._zero)
+        if not move.sound or p.shape != (n,) or not np.isfinite(p).all():
+            self._count_failure(now, "the solver has no answer")
+            self._command(now, self.commanded)
+        elif self._command(now, p, controlled=True):
+            self._failures = 0
+            self.alarms.clear(now, "solver")
+            self.saturated = self.saturated | move.saturated
+
+    def _count_failure(self, now: float, text: str) -> None:
+        """Count failures of the controller in a row; after some the pressures are held."""
+        self._failures += 1
+        if self._failures >= self._tuning.max_failures:
+            self.alarms.set(now, "solver", f"{text}, {self._failures} times in a row")
+            self._hold(now, "solver", text)
+
+    def _hold_or_ramp(self, now: float) -> None:
+        """Command the held pressures, or those that are left on the ramp."""
+        ramp = self._ramp
+        if ramp is None:
+            if self._held is None:  # once: a late reply must not change them
+                self._held = np.minimum(self._requested, self.commanded)
+            self._command(now, self._held)
+            return
+        share = ramp.share(now)
+        if not share > 1e-9:
+            self._stop(now, ramp.reason)
+            return
+        self._command(now, let_down(ramp.pressures, share, self.outlet.limits))
+
+    def _command(self, now: float, pressures: Array, *, controlled: bool = False) -> bool:
+        """Hand pressures (n,) to the outlet; return whether it accepted them."""
+        timeout = self._safety.command_timeout
+        self._requested = pressures
+        applied = self.outlet.apply(PressureCommand(pressures, now, timeout))
+        self._note_commanded(now, applied.pressures)
+        self._exchanged = applied.reading
+        self.saturated = self._monitor.saturated
+        if applied.refused:
+            text = f"a command was refused: {applied.refused}"
+            if controlled:
+                self._count_failure(now, text)
+            else:  # of pressures that were accepted before: their state is unknown
+                self.fault(now, "refused", text)
+            return False
+        if applied.limited:
+            self.saturated = self.saturated | (applied.pressures != pressures)
+        self._set_force_alarm(now, applied.force_limited)
+        return True
+
+    def _set_force_alarm(self, now: float, limited: bool) -> None:
+        """Keep an alarm while the limit of force shortens commands, and for a while after."""
+        if limited:
+            self._force_limited_at = now
+            text = "commands are shortened: more would be above safety.max_force, the total force"
+            self.alarms.set(now, "force-limit", text)
+        elif now - self._force_limited_at > self._tuning.force_alarm:
+            self.alarms.clear(now, "force-limit")
+
+    def _report_notices(self, now: float) -> None:
+        """Make alarms and events of the controller's notices."""
+        notices = self.steering.notices()
+        standing = frozenset(n.kind for n in notices if n.standing)
+        for notice in notices:
+            if notice.standing:
+                self.alarms.set(now, notice.kind, notice.text, notice.severity)
+            else:
+                self.events.add(now, notice.kind, notice.text, notice.severity)
+        for kind in self._standing_notices - standing:
+            self.alarms.clear(now, kind)
+        self._standing_notices = standing
+
+    # -- transitions --------------------------------------------------------------------------
+
+    def _hold(self, now: float, kind: str, reason: str) -> None:
+        if kind not in self._holds:
+            self.events.add(now, f"hold-{kind}", f"pressures are held: {reason}", Severity.WARNING)
+        self._holds[kind] = reason
+        if self.lifecycle.state is State.ACTIVE:
+            self._held = None
+            self.lifecycle.change(State.HOLDING, reason)
+
+    def _resume(self, now: float) -> None:
+        """Control again if no reason to hold is left."""
+        if self._ramp is not None or self.lifecycle.state is not State.HOLDING:
+            return
+        if self._holds:
+            self.lifecycle.reason = next(iter(self._holds.values()))
+            return
+        self.steering.resume(now)
+        self._failures = 0
+        self.lifecycle.change(State.ACTIVE)
+        self.events.add(now, "active", "steering again")
+
+    def _let_down(self, now: float, kind: str, reason: str) -> None:
+        """Begin to let the pressures down; a ramp under way goes on."""
+        if self._ramp is not None:
+            return
+        self._ramp = _Ramp(now, self._safety.ramp_time, self.commanded, reason)
+        if self.lifecycle.state is State.ACTIVE:
+            self.lifecycle.change(State.HOLDING, f"letting down: {reason}")
+        else:
+            self.lifecycle.reason = f"letting down: {reason}"
+        self.events.add(now, kind, f"pressures are let down: {reason}", Severity.WARNING)
+
+    def _stop(self, now: float, reason: str) -> None:
+        """Vent and become inactive."""
+        self._holds.clear()
+        self._ramp = None
+        self._try_to_vent(now)
+        if not self._vented:
+            self.fault(now, "device", "the supply does not take the command to vent")
+            return
+        if self.lifecycle.armed:
+            self.lifecycle.change(State.INACTIVE, reason)
+            self._tracker.forget()
+            self.alarms.clear(now, "solver")
+        self.events.add(now, "vented", f"vented: {reason}")
+
+    # -- requests -------------------------------------------------------------------------------
+
+    def carry_out(self, request: Callable[[float], None]) -> None:
+        """Carry out a request; errors are raised as `InputError`."""
+        now = self._clock.now()
+        try:
+            request(now)
+        except InputError:
+            raise
+        except StiffoptError as error:
+            raise CommandError(str(error)) from error
+        except Exception as error:
+            self.fault(now, "internal", f"unexpected {type(error).__name__}: {error}")
+            raise CommandError(self.lifecycle.reason) from error
+
+    def configure(self, now: float) -> None:
+        """Connect and check; see `ControlLoop.configure`."""
+        self.lifecycle.permit("configure")
+        with refusing("configuration"):
+            try:
+                if self.rig.tracker is not None:
+                    self.rig.tracker.open()
+                self.outlet.open()
+                problems = list(check_rig(self.rig, self.outlet, self.steering))
+                reading = self.outlet.read()  # after the checks, which may compile the model
+            except StiffoptError as error:
+                raise CommandError(f"devices: {error}") from error
+            trouble = self._monitor.implausible(self._clock.now(), reading)
+        if trouble is not None:
+            problems.append(f"pressures: {trouble.text}")
+        if problems:
+            raise CommandError("; ".join(problems))
+        if self.lifecycle.state is State.UNCONFIGURED:
+            self.steering.begin(self._clock.now())
+            self.lifecycle.change(State.INACTIVE)
+            self.events.add(now, "configured", "everything answers; vented")
+
+    def arm(self, now: float, unwanted: Callable[[], bool] = lambda: False) -> None:
+        """Check the arm and arm it; see `ControlLoop.arm`.
+
+        Parameters
+        ----------
+        now :
+            In s.
+        unwanted :
+            Returns whether the request was given up meanwhile.
+        """
+        self.lifecycle.permit("arm")
+        with refusing("arming"):
+            reading = self.outlet.read()
+            problems = [
+                *check_rig(self.rig, self.outlet, self.steering),
+                *check_vented_arm(
+                    now,
+                    self.rig,
+                    self.steering,
+                    self._monitor,
+                    reading,
+                    self._tracker,
+                    self._tuning,
+                ),
+            ]
+        if problems:
+            raise CommandError("; ".join(problems))
+        if unwanted():
+            raise CommandError("the checks took longer than anybody waited; arm again")
+        now = self._clock.now()  # checks take time
+        self._vented = False
+        try:
+            self.outlet.arm()
+            self.steering.begin(now)
+        except BaseException as error:
+            self._try_to_vent(now)
+            if not self._vented:
+                self.fault(now, "device", f"the supply could not be armed: {error}")
+            raise
+        self._note_commanded(now, self._zero)
+        self._monitor.clear()
+        self._exchanged, self._failures, self._ticked_at = None, 0, now
+        self._holds.clear()
+        self.lifecycle.change(State.ACTIVE)
+        self.events.add(now, "armed", "armed: pressures may change from now on")
+
+    def disarm(self, now: float, reason: str = "disarmed") -> None:
+        """Begin to let down; see `ControlLoop.disarm`."""
+        self.lifecycle.permit("disarm")
+        if self.lifecycle.armed:
+            self._let_down(now, "disarming", reason)
+
+    def set_task(self, now: float, task: Task) -> None:
+        """Pursue a task; see `ControlLoop.set_task`."""
+        self._permit_motion("set a task")
+        highest = highest_pressures(task, self.outlet.limits)
+        self.steering.set_task(task)
+        try:
+            self.outlet.restrict(highest)
+        except DeviceError as error:  # the controller has the task, and the gate has not
+            self.fault(now, "device", f"a device fails: {error}")
+            raise
+        self._go_on(now, "task", "there is a new task")
+
+    def set_target(self, now: float, target: Target) -> None:
+        """Go to a target; see `ControlLoop.set_target`."""
+        self._permit_motion("set a target")
+        self.steering.set_target(target)
+        self._go_on(now, "target", "")  # targets may come in a stream: no event for each
+
+    def follow_trajectory(self, now: float, trajectory: Trajectory) -> None:
+        """Follow a trajectory; see `ControlLoop.follow_trajectory`."""
+        self._permit_motion("follow a trajectory")
+        self.steering.follow(trajectory, now)
+        self._go_on(now, "trajectory", "there is a new trajectory")
+
+    def _permit_motion(self, request: str) -> None:
+        self.lifecycle.permit(request)
+        if self._ramp is not None:
+            raise CommandError(f"cannot {request} while {self.lifecycle.reason}; arm again then")
+
+    def _go_on(self, now: float, event: str, text: str) -> None:
+        if text:
+            self.events.add(now, event, text)
+        for kind in ("asked", "solver"):
+            self._holds.pop(kind, None)
+        try:
+            self._resume(now)
+        except Exception as error:  # the request is pursued already: too late to refuse it
+            self.fault(now, "internal", f"unexpected {type(error).__name__}: {error}")
+            raise CommandError(self.lifecycle.reason) from error
+
+    def hold(self, now: float, reason: str) -> None:
+        """Keep the pressures; see `ControlLoop.hold`."""
+        self._permit_motion("hold")
+        if not isinstance(reason, str):
+            raise CommandError(f"expected text as the reason, not {type(reason).__name__}")
+        self._hold(now, "asked", reason)
+        self.lifecycle.reason = reason
+
+    def vent(self, now: float, reason: str) -> None:
+        """Vent at once; see `ControlLoop.vent`."""
+        if self.lifecycle.state is State.UNCONFIGURED:
+            self.outlet.vent()
+        else:
+            self._stop(now, reason)
+            if not self._vented:
+                raise CommandError(self.lifecycle.reason)
+
+    def vent_while_starting(self) -> None:
+        """Vent while another thread configures, which this does not disturb."""
+        try:
+            self.outlet.vent()
+        except StiffoptError as error:
+            raise CommandError(
+                f"it is still starting, and the supply cannot be told to vent now ({error}); it is "
+                "vented when it is connected"
+            ) from error
+
+    def finish(self, now: float) -> None:
+        """Vent for good, with several attempts."""
+        for _ in range(self._tuning.vent_attempts):
+            if self.lifecycle.armed or not self._vented:
+                self._stop(now, "stopped")
+
+    def reset(self, now: float) -> None:
+        """Leave a fault whose reason is gone; see `ControlLoop.reset`."""
+        self.lifecycle.permit("reset")
+        left = ""
+        try:
+            self.outlet.vent()
+            self._vented = True
+            self._note_commanded(now, self._zero)
+            self.alarms.clear(now, "not-vented")
+            self._measure(now)
+        except Exception as error:  # which would be a fault in a tick
+            left = str(error)
+        if not left:
+            trouble = self._trouble
+            left = self._monitor.under_pressure(self.reading) if trouble is None else trouble.text
+        if not left and self._tracker.jumping:
+            left = "the tip still seems to jump"
+        if left:
+            raise CommandError(f"the reason for the fault is still there: {left}")
+        self._monitor.clear()
+        for kind in ("pressure-reading", "leak", "regulator-stuck", "solver"):
+            self.alarms.clear(now, kind)
+        self._tracker.forget()
+        self.steering.begin(now)
+        self.lifecycle.change(State.INACTIVE)
+        self.events.add(now, "reset", "reset after a fault; vented")

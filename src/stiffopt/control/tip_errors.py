@@ -1,0 +1,171 @@
+"""Errors of the tip to its target, and its stiffness, evaluated in every tick.
+
+The formulas are those of the optimiser: the residuals of `stiffopt.optimise.terms` and
+`directional_stiffness` of `stiffopt.model.compliance`, compiled once per kind of target.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.control.formula import Formula
+from stiffopt.model.compliance import directional_stiffness
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from stiffopt.optimise.terms import PoseTerm, pose_terms
+from stiffopt.optimise.tip import TipAt
+
+__all__ = ["TipErrors", "stiffness_function", "target_arrays", "wrench_at"]
+
+Array = NDArray[np.float64]
+
+
+class TipErrors:
+    """Position and angle errors of a tip to targets, and their derivatives by the pressures."""
+
+    def __init__(self) -> None:
+        self._norms: dict[Hashable, Formula] = {}
+        self._weighted: dict[Hashable, Formula] = {}
+
+    def at(self, target: Target | None, position: Array, rotation: Array) -> tuple[float, float]:
+        """Return the errors of a tip at a position (3,) with axes (3, 3).
+
+        Returns
+        -------
+        Position error in m and angle error in rad; NaN where the target prescribes nothing.
+        """
+        if target is None:
+            return math.nan, math.nan
+        terms = pose_terms(target)
+        key = tuple(term.structure for term in terms)
+        if key not in self._norms:
+            self._norms[key] = _norms(terms)
+        errors = self._norms[key](position, rotation, *(term.parameters for term in terms))
+        found = {term.name: float(error[0]) for term, error in zip(terms, errors, strict=True)}
+        return found.get("position", math.nan), found.get("angle", math.nan)
+
+    def weighted(
+        self, target: Target, tip: TipAt, lever: float
+    ) -> tuple[Array, Array, float, float]:
+        """Return the error of a tip as one vector of lengths, for least squares.
+
+        Parameters
+        ----------
+        target :
+            Prescribes one component at least.
+        tip :
+            The model's tip.
+        lever :
+            Weight of angles, in m/rad.
+
+        Returns
+        -------
+        error : (t,)
+            In m.
+        jacobian : (t, n)
+            Its derivative by the pressures, in m/Pa.
+        position_error, angle_error : float
+            In m and rad; 0 where the target prescribes nothing.
+        """
+        terms, n = pose_terms(target), tip.jacobian.shape[1]
+        key = (n, lever, *(term.structure for term in terms))
+        if key not in self._weighted:
+            self._weighted[key] = _weighted(terms, n, lever)
+        error, jacobian, *norms = self._weighted[key](
+            tip.pose, tip.jacobian, *(term.parameters for term in terms)
+        )
+        found = {term.name: float(norm[0]) for term, norm in zip(terms, norms, strict=True)}
+        return error, jacobian, found.get("position", 0.0), found.get("angle", 0.0)
+
+
+def _norms(terms: tuple[PoseTerm, ...]) -> Formula:
+    """Lengths of residuals; inputs: position (3,), rotation (3, 3), parameters of each term."""
+    position, rotation = ca.SX.sym("position", 3), ca.SX.sym("rotation", 3, 3)
+    parameters = [ca.SX.sym("parameters", len(term.parameters)) for term in terms]
+    residuals = _residuals(terms, position, rotation, parameters)
+    return Formula([position, rotation, *parameters], [ca.norm_2(r) for r in residuals])
+
+
+def _weighted(terms: tuple[PoseTerm, ...], n: int, lever: float) -> Formula:
+    """Error (t,), its Jacobian (t, n) and lengths of residuals.
+
+    Inputs: pose (4, 4) and Jacobian (6, n) of the tip, parameters of each term. The residuals are
+    differentiated by a twist xi of the tip, ``pose exp(xi)``, at xi = 0.
+    """
+    pose, jacobian = ca.SX.sym("pose", 4, 4), ca.SX.sym("jacobian", 6, n)
+    parameters = [ca.SX.sym("parameters", len(term.parameters)) for term in terms]
+    twist, rotation = ca.SX.sym("twist", 6), pose[:3, :3]
+    position = pose[:3, 3] + rotation @ twist[:3]
+    turned = rotation @ (ca.SX.eye(3) + lie.hat(twist[3:]))
+    residuals = _residuals(terms, position, turned, parameters)
+    weights = [lever if term.name == "angle" else 1.0 for term in terms]
+    error = ca.vertcat(*(w * r for w, r in zip(weights, residuals, strict=True)))
+    outputs = [error, ca.jacobian(error, twist) @ jacobian, *map(ca.norm_2, residuals)]
+    at_tip = [ca.substitute(output, twist, ca.SX.zeros(6)) for output in outputs]
+    return Formula([pose, jacobian, *parameters], at_tip, [jacobian, at_tip[1]])
+
+
+def _residuals(
+    terms: tuple[PoseTerm, ...], position: ca.SX, rotation: ca.SX, parameters: list[ca.SX]
+) -> list[ca.SX]:
+    return [
+        term.residual(position, rotation, values)
+        for term, values in zip(terms, parameters, strict=True)
+    ]
+
+
+def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
+    """Stiffness along a task's first direction, of a compliance (6, 6) and rotation (3, 3)."""
+    if not task.measures:
+        return None
+    measure = task.measures[0]
+    C, R = ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3)
+    value = directional_stiffness(
+        C, R, ca.DM(measure.direction),
+        frame=measure.frame, kind=measure.kind, boundary=measure.boundary,
+    )  # fmt: skip
+    formula = Formula([C, R], [value])
+
+    def stiffness(compliance: Array, rotation: Array) -> float:
+        return float(formula(compliance, rotation)[0][0])
+
+    return stiffness
+
+
+def wrench_at(tip: TipAt, offset: Array, turn: Array | None) -> Array:
+    """Return the wrench (6,), base axes, that would displace a tip by its offset.
+
+    Parameters
+    ----------
+    tip :
+        The model's tip, with its compliance.
+    offset :
+        Of the position (3,), in m.
+    turn :
+        Of the orientation, as a rotation vector (3,); None if it is unknown: then a force alone.
+    """
+    rotation = tip.pose[:3, :3]
+    if turn is not None:
+        motion = np.concatenate([rotation.T @ offset, rotation.T @ turn])
+        wrench = np.linalg.solve(tip.compliance, motion)
+    else:
+        force = np.linalg.solve(tip.compliance[:3, :3], rotation.T @ offset)
+        wrench = np.concatenate([force, np.zeros(3)])
+    return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
+
+
+def target_arrays(target: Target | None) -> tuple[Array | None, Array | None, Array | None]:
+    """Position (3,), NaN for free axes, pointing (3,) and quaternion (4,) of a target."""
+    if target is None:
+        return None, None, None
+    position = None
+    if target.position is not None:
+        position = np.array([np.nan if axis is None else axis for axis in target.position])
+    pointing = None if target.pointing is None else np.array(target.pointing)
+    return position, pointing, None if target.orientation is None else np.array(target.orientation)

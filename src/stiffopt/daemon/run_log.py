@@ -1,0 +1,266 @@
+"""A run of the daemon, read back from its recording: whatever is whole, also after a kill."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.state import SeenPose, Snapshot
+from stiffopt.control.state_fields import Entry, Kind, entries
+from stiffopt.daemon.topics import FORMAT, METADATA, STATES
+from stiffopt.errors import FileError
+from stiffopt.logs.mcap_log import LOG_METADATA
+from stiffopt.logs.mcap_reading import McapContents, read_mcap
+
+__all__ = ["RecordedRun", "RunEvent", "RunSpan", "is_of_experiment", "read_run"]
+
+Array = NDArray[np.float64]
+
+_FOREIGN = "is no recording of stiffopt; expected one (.mcap) of 'stiffopt run'"
+_HELD = ("/limits",)  # topics that are logged when they change, and hold until then
+
+
+@dataclass(frozen=True)
+class RunEvent:
+    """Something that happened; see `stiffopt.control.state.Event`. The time is that of the run."""
+
+    time: float
+    kind: str
+    text: str
+    severity: str
+
+
+@dataclass(frozen=True)
+class RunSpan:
+    """A time in which something was so: a state with its reason, an alarm with its text."""
+
+    begin: float
+    end: float
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedRun:
+    """A run, in SI units; what is missing is NaN. Time 0 is when the recording began.
+
+    Fields of `stiffopt.control.state.Snapshot` that are logged as numbers are attributes, with one
+    row per tick: ``run.commanded`` is (N, n), ``run.position_error`` is (N,).
+
+    Attributes
+    ----------
+    about : what the recording says of itself: ``rig``, ``robot``, ``robot_file`` (its text),
+        ``stiffopt`` (version), ``start_ns`` (date of time 0, since 1970).
+    channels : number of channels of each segment.
+    time : of the ticks (N,), in s.
+    fields : the state in each tick, by the names of `Snapshot`.
+    captured : when the tracker captured its frames (M,), in s, increasing.
+    seen_position, seen_quaternion : where it saw the tip (M, 3) and (M, 4), w first.
+    doubted : frames (M,) that no arm could have moved to, or that came with such a one.
+    states, alarms : in order of time.
+    events : in order of time.
+    timing : the last ``/timing`` message; empty if there is none.
+    complete : whether the recording was ended properly, and nothing in it is damaged.
+    """
+
+    about: Mapping[str, str]
+    channels: tuple[int, ...]
+    time: Array
+    fields: Mapping[str, Array]
+    captured: Array
+    seen_position: Array
+    seen_quaternion: Array
+    doubted: NDArray[np.bool_]
+    states: tuple[RunSpan, ...] = ()
+    alarms: tuple[RunSpan, ...] = ()
+    events: tuple[RunEvent, ...] = ()
+    timing: Mapping[str, Any] = field(default_factory=dict)
+    complete: bool = True
+
+    def __getattr__(self, name: str) -> Array:
+        try:
+            return self.__dict__["fields"][name]  # type: ignore[no-any-return]
+        except KeyError:
+            raise AttributeError(f"a run has no '{name}'") from None
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return sum(self.channels)
+
+
+def read_run(path: str | os.PathLike[str]) -> RecordedRun:
+    """Read a recording of the daemon, also one that was cut short by a kill.
+
+    Raises
+    ------
+    FileError
+        It cannot be read, is no recording of a run, or nothing whole is left of it.
+    MissingExtraError
+        mcap is not installed.
+    """
+    name = os.fspath(path)
+    found = read_mcap(path)
+    about = found.metadata.get(METADATA, {})
+    if not about:
+        if LOG_METADATA in found.metadata:
+            raise FileError(
+                name, "is a recording of an experiment; expected one of a run of 'stiffopt run'"
+            )
+        raise FileError(name, _FOREIGN)
+    if about.get("format") != FORMAT:
+        raise FileError(
+            name, f"has the format '{about.get('format')}'; this stiffopt reads '{FORMAT}'"
+        )
+    if not found.of_topic("/pressure"):
+        raise FileError(name, "has no whole message of a run; it was cut short too early")
+    try:
+        return _run(about, found)
+    except (KeyError, ValueError, TypeError) as error:
+        raise FileError(name, f"is damaged: {error}") from None
+
+
+def is_of_experiment(path: str | os.PathLike[str]) -> bool:
+    """Whether a recording is one of an experiment, for `stiffopt.logs.read_mcap_log`.
+
+    Raises
+    ------
+    FileError
+        It cannot be read, or is no recording of stiffopt.
+    MissingExtraError
+        mcap is not installed.
+    """
+    metadata = read_mcap(path, metadata_only=True).metadata
+    if METADATA not in metadata and LOG_METADATA not in metadata:
+        raise FileError(path, _FOREIGN)
+    return LOG_METADATA in metadata
+
+
+def _run(about: Mapping[str, str], found: McapContents) -> RecordedRun:
+    begin = float(about["start_s"])
+    channels = tuple(int(count) for count in about["channels"].split(","))
+    n = sum(channels)
+    time = _scalars(found.of_topic("/pressure"), "time_s") - begin
+    frames = sorted(found.of_topic("/tracker"), key=lambda frame: float(frame["time_s"]))
+    seen = {entry.name: _column(frames, entry, n) for entry in entries(SeenPose)}
+    states, timing = found.of_topic("/state"), found.of_topic("/timing")
+    return RecordedRun(
+        about=about,
+        channels=channels,
+        time=time,
+        fields=_fields(found, time, begin, n),
+        captured=seen["time"] - begin,
+        seen_position=seen["position"],
+        seen_quaternion=seen["quaternion"],
+        doubted=seen["doubted"] == 1,
+        states=_states(states, begin, float(time[-1])),
+        alarms=_alarms(states, begin, float(time[-1])),
+        events=tuple(
+            RunEvent(float(e["time_s"]) - begin, e["kind"], e["text"], e["severity"])
+            for e in found.of_topic("/event")
+        ),
+        timing=timing[-1] if timing else {},
+        complete=found.complete,
+    )
+
+
+def _fields(found: McapContents, time: Array, begin: float, n: int) -> dict[str, Array]:
+    """Return the fields of the state that are numbers, in the ticks at some times (N,)."""
+    fields: dict[str, Array] = {}
+    for entry in entries(Snapshot):
+        topic = entry.shown.topic
+        if not topic or entry.kind not in (Kind.NUMBER, Kind.COUNT, Kind.NUMBERS, Kind.FLAGS):
+            continue
+        messages = found.of_topic(topic)
+        moments = _scalars(messages, "time_s") - begin
+        rows = (_held if topic in _HELD else _rows_of)(time, moments)
+        values = _picked(_column(messages, entry, n), rows)
+        if entry.kind is Kind.FLAGS:
+            values = values == 1
+        elif entry.name.endswith("_time"):
+            values = values - begin
+        fields[entry.name] = values
+    return fields
+
+
+def _column(messages: Sequence[Mapping[str, Any]], entry: Entry, n: int) -> Array:
+    """Return a field of messages, (N,) or (N, m); NaN where it is missing."""
+    if entry.kind in (Kind.NUMBERS, Kind.FLAGS):
+        return _vectors(messages, entry.key, entry.shown.size or n)
+    return _scalars(messages, entry.key)
+
+
+def _scalars(messages: Sequence[Mapping[str, Any]], key: str) -> Array:
+    return np.array([_number(message.get(key)) for message in messages], dtype=float)
+
+
+def _vectors(messages: Sequence[Mapping[str, Any]], key: str, count: int) -> Array:
+    unknown = [None] * count
+    rows = [message.get(key) or unknown for message in messages]
+    for row in rows:
+        if len(row) != count:
+            raise ValueError(f"{key} has {len(row)} numbers, not {count}")
+    return np.array(rows, dtype=float).reshape(len(rows), count)
+
+
+def _number(value: Any) -> float:
+    return np.nan if value is None else float(value)
+
+
+def _rows_of(time: Array, other: Array) -> NDArray[np.int_]:
+    """Return for each tick the index of the message of the same tick, or -1."""
+    if not len(other):
+        return np.full(len(time), -1)
+    at = np.minimum(np.searchsorted(other, time), len(other) - 1)
+    return np.where(other[at] == time, at, -1)
+
+
+def _held(time: Array, changes: Array) -> NDArray[np.int_]:
+    """Return for each tick the index of the last message until then, or -1."""
+    return np.searchsorted(changes, time, side="right") - 1
+
+
+def _picked(values: Array, rows: NDArray[np.int_]) -> Array:
+    """Return rows of values; NaN where the index is -1."""
+    if not len(values):
+        return np.full((len(rows), *values.shape[1:]), np.nan)
+    picked = values[rows]
+    picked[rows < 0] = np.nan
+    return picked
+
+
+def _states(messages: Sequence[Mapping[str, Any]], begin: float, end: float) -> tuple[RunSpan, ...]:
+    spans: list[RunSpan] = []
+    for index, message in enumerate(messages):
+        state, reason = str(message["state"]), str(message.get("reason", ""))
+        if state not in STATES:
+            raise ValueError(f"there is no state '{state}'")
+        start = float(message["time_s"]) - begin
+        until = float(messages[index + 1]["time_s"]) - begin if index + 1 < len(messages) else end
+        if spans and (spans[-1].kind, spans[-1].text) == (state, reason):
+            start = spans.pop().begin
+        spans.append(RunSpan(start, until, state, reason))
+    return tuple(spans)
+
+
+def _alarms(messages: Sequence[Mapping[str, Any]], begin: float, end: float) -> tuple[RunSpan, ...]:
+    spans: list[RunSpan] = []
+    open_since: dict[str, tuple[float, str]] = {}
+    for message in messages:
+        now = float(message["time_s"]) - begin
+        standing = {alarm["kind"]: alarm for alarm in message["alarms"]}
+        for kind in [kind for kind in open_since if kind not in standing]:
+            since, text = open_since.pop(kind)
+            spans.append(RunSpan(since, now, kind, text))
+        for kind, alarm in standing.items():
+            open_since.setdefault(kind, (_number(alarm.get("since_s", now)) - begin, alarm["text"]))
+    spans += [RunSpan(since, end, kind, text) for kind, (since, text) in open_since.items()]
+    return tuple(sorted(spans, key=lambda span: span.begin))
