@@ -191,10 +191,7 @@ def _stiffnesses(solved: SolvedTask) -> list[Record] | None:
             "value": _quantity(value, measure.unit),
             "interval": None if ends is None else [_quantity(end, measure.unit) for end in ends],
             "plain": _quantity(blind, measure.unit),
-            "direction": list(measure.direction),
-            "frame": measure.frame,
-            "kind": measure.kind,
-            "boundary": measure.boundary,
+            **measure.said(),
         }
         for measure, value, blind, ends in zip(
             solution.task.measures, solution.stiffnesses, plain, intervals, strict=False

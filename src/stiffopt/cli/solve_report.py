@@ -21,7 +21,6 @@ from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import (
     BAR,
     MM,
-    direction_text,
     figures,
     gain_text,
     least_maximised,
@@ -195,14 +194,8 @@ def _stiffness(
     return Text.assemble(
         (f"{figures(value)} {unit_text(measure.unit)}", "bold"),
         f"  ({remark})" if remark else "",
-        f"\n{_meaning(measure)}",
+        f"\n{measure.words()}",
     )
-
-
-def _meaning(measure: StiffnessMeasure) -> str:
-    """Direction, frame, kind and boundary in words."""
-    direction = direction_text(measure)
-    return f"against {measure.kind} {direction}, {measure.frame} axes, {measure.boundary}"
 
 
 def _condition(measure: StiffnessMeasure) -> str:

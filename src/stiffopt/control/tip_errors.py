@@ -17,6 +17,7 @@ from stiffopt import lie
 from stiffopt.control.formula import Formula
 from stiffopt.model.compliance import directional_stiffness
 from stiffopt.model.shape import PointOfArm
+from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.term import Term
@@ -136,6 +137,8 @@ def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
     if not task.measures:
         return None
     measure = task.measures[0]
+    if not isinstance(measure, StiffnessMeasure):
+        return None
     C, R = ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3)
     value = directional_stiffness(
         C, R, ca.DM(measure.direction),

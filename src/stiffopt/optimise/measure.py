@@ -60,6 +60,11 @@ class Measure(Schema):
         """What a match minimises, as a function of the formula's value, and its derivative."""
         raise NotImplementedError
 
+    @property
+    def unit(self) -> str:
+        """Of its value."""
+        return "N/m"
+
     # -- what is said of it -----------------------------------------------------------------
 
     @property
@@ -74,6 +79,11 @@ class Measure(Schema):
     def shortfall(self, value: float) -> str:
         """Of one that is not: what was required, and what can be had."""
         return ""
+
+    def said(self) -> dict[str, Any]:
+        """Its keys and values but for what is required of it."""
+        said = self.model_dump(exclude={"value", "tolerance"})
+        return {key: list(v) if isinstance(v, tuple) else v for key, v in said.items()}
 
     def words(self) -> str:
         """What it measures: ``against translation along (1, 0, 0), base axes, free``."""

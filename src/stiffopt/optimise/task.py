@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,8 +103,8 @@ class Task(Schema):
         goal = self.stiffness
         if goal is None:
             return ()
-        first = (m for m in goal.first if isinstance(m, StiffnessMeasure))
-        return (*first, *goal.at_least)
+        named = (*goal.first, *goal.at_least)
+        return tuple(cast(StiffnessMeasure, m) for m in named if m.is_stiffness)
 
     def resolve_robot(self) -> RobotDescription:
         """Return the robot; a relative path starts at the task file's folder.
