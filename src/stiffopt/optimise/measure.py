@@ -31,6 +31,8 @@ class Measure(Schema):
         By which a task file tells it from others in the same place.
     role : {"maximise", "at_least", "match"}
         The place; a measure that can be in several of them has a class for each.
+    unit : str
+        Of the stiffness, ``"N/m"`` or ``"N*m/rad"``: a property or a field of each kind.
     """
 
     key: ClassVar[str]
@@ -59,11 +61,6 @@ class Measure(Schema):
     def mismatch(self, value: Any, parameters: Any) -> tuple[Any, Any]:
         """What a match minimises, as a function of the formula's value, and its derivative."""
         raise NotImplementedError
-
-    @property
-    def unit(self) -> str:
-        """Of its value."""
-        return "N/m"
 
     # -- what is said of it -----------------------------------------------------------------
 
