@@ -37,7 +37,7 @@ from settings import Settings
 
 if TYPE_CHECKING:
     from stiffopt import CalibrationResult, Log, Manipulator, RobotDescription
-    from stiffopt.plant.rig import SimulatedRig
+    from stiffopt.plant.devices import SimulatedRig
     from stiffopt.registration import Registration
     from stiffopt.rig.config import RigDescription
 

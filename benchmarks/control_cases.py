@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from stiffopt.model.description import RobotDescription
     from stiffopt.optimise.target import Target
     from stiffopt.optimise.task import Task
-    from stiffopt.plant.rig import SimulatedRig
+    from stiffopt.plant.devices import SimulatedRig
     from stiffopt.plant.settings import PlantSettings
     from stiffopt.registration import Registration
     from stiffopt.rig.config import RigDescription
@@ -213,13 +213,13 @@ class Arm:
 
     def stiffness(self, pressures: Array, direction: tuple[float, ...]) -> float:
         """Of the tip along a unit vector, in N/m, from small pushes and pulls."""
-        from stiffopt.plant.settings import Load
+        from stiffopt.plant.settings import PlantLoad
 
         d = np.array(direction)
         push = PUSH * self._truth.stiffness(pressures, direction)
         ends = []
         for sign in (1.0, -1.0):
-            self._plant.settle(pressures, Load(force=tuple((sign * push * d).tolist())))
+            self._plant.settle(pressures, PlantLoad(force=tuple((sign * push * d).tolist())))
             ends.append(self._plant.tip_pose()[:3, 3] @ d)
         self._plant.set_load(None)
         return 2 * push / float(ends[0] - ends[1])

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stiffopt.control.steering import Steering
     from stiffopt.control.trajectory import Trajectory
     from stiffopt.optimise.task import Task
-    from stiffopt.plant.rig import SimulatedRig
+    from stiffopt.plant.devices import SimulatedRig
 
 Array = NDArray[np.float64]
 

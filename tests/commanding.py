@@ -267,21 +267,19 @@ def simulated(limits: Limits) -> Iterator[Bench]:
 
 @contextmanager
 def third_party(limits: Limits) -> Iterator[Bench]:
-    from third_party import BoxSettings
+    import third_party
+    from stiffopt.rig.registry import load
 
     clock = HandClock()
-    highest = min(x for x in (limits.channel, limits.register, 9e5) if x)
-    settings = BoxSettings(channels=[{"port": i, "max": highest} for i in range(N)])
-    supply = settings.device(_robot_limits(), clock)
-    bench = Bench(supply, clock, limits, 1e-6, _safety(limits))
-    log = supply._write  # type: ignore[attr-defined]
-
-    def write(pressures: Array) -> None:
-        log(pressures)
-        bench.wire.extend((clock.now(), c, float(pressures[c])) for c in range(N))
-
-    supply._write = write  # type: ignore[method-assign]
-    yield bench
+    channel = _channel(limits, full_scale=limits.register or 9e5)
+    settings = third_party.careless(watchdog=None, timeout=5.0, channels=[channel] * N)
+    behind = RecordingBench(clock)
+    peer = load(settings.peer)(settings, behind)
+    try:
+        supply = peer.start().device(_robot_limits(), clock)
+        yield Bench(supply, clock, limits, 1.0, _safety(limits), behind.wire)
+    finally:
+        peer.close()
 
 
 DRIVERS: dict[str, Callable[[Limits], AbstractContextManager[Bench]]] = {

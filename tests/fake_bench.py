@@ -9,13 +9,13 @@ from threading import Lock
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stiffopt.lab.bench import Array, Bench, TrackerFrame
+from stiffopt.lab.bench import Array, TrackerFrame
 
 FRAME_RATE = 40.0  # Hz
 
 
-class FakeBench(Bench):
-    """Regulators that obey at once, a sensor that rests, a stage that moves at its speed.
+class FakeBench:
+    """In place of a `Bench`: regulators that obey at once, a resting sensor, a moving stage.
 
     Attributes
     ----------

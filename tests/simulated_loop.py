@@ -12,7 +12,7 @@ from stiffopt.control.state import Snapshot, State
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
-from stiffopt.plant.rig import SimulatedRig
+from stiffopt.plant.devices import SimulatedRig
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription
 from stiffopt.safety.gate import SafetyGate

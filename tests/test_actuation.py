@@ -597,13 +597,13 @@ def described(arm: Arm, law: str = "rest-length", **compensation: float) -> Robo
 
 def stiffness_of(plant: Any, p: Vector) -> Vector:
     """Stiffness (3,) of a simulated tip in the base axes, free, by forces of 0.2 mN."""
-    from stiffopt.plant.settings import Load
+    from stiffopt.plant.settings import PlantLoad
 
     found = []
     for axis in np.eye(3):
         moved = []
         for force in (2e-4, -2e-4):
-            plant.settle(p, Load(force=force * axis))
+            plant.settle(p, PlantLoad(force=force * axis))
             moved.append(axis @ plant.tip_pose()[:3, 3])
         found.append(4e-4 / (moved[0] - moved[1]))
     return np.array(found)

@@ -26,8 +26,7 @@ import pytest
 
 from fake_bench import FakeBench
 from stiffopt.errors import DeviceError, InputError, MissingExtraError
-from stiffopt.lab.aurora_peer import AuroraPeer
-from stiffopt.lab.ndi_wire import crc16
+from stiffopt.lab.aurora_peer import AuroraPeer, crc16
 from stiffopt.rig.drivers import aurora, ndi_reader
 from stiffopt.rig.drivers.aurora import AuroraSettings, AuroraTracker
 from stiffopt.rig.interface import PoseSample, SystemClock
@@ -487,7 +486,7 @@ def test_a_port_without_permission(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(ndi_reader.os, "open", refuse)
     with pytest.raises(ndi_reader.LostError, match=r"no permission to use /dev/ttyUSB0.*dialout"):
-        ndi_reader.Line("/dev/ttyUSB0")
+        ndi_reader.SerialPort("/dev/ttyUSB0")
 
 
 def test_a_port_that_another_program_uses() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 pytest.importorskip("numba")
-import stiffopt.plant.rig  # noqa: F401 - its code is kept where it always is
+import stiffopt.plant.devices  # noqa: F401 - its code is kept where it always is
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 

@@ -20,7 +20,7 @@ from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.settings import Load
+from stiffopt.plant.settings import PlantLoad
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, limits_of, slew_of
 from stiffopt.rig.interface import PressureReading
@@ -230,7 +230,7 @@ def test_load_at_the_tip_is_found():
     bench.settled()
     before = bench.controller.standing(bench.rig.clock.now()).wrench
     force = np.array([0.02, -0.015, 0.0])
-    bench.rig.world.plant.set_load(Load(force=tuple(force)))
+    bench.rig.world.plant.set_load(PlantLoad(force=tuple(force)))
     bench.run(2.0, steer=False)
     after = bench.controller.standing(bench.rig.clock.now()).wrench
     assert np.linalg.norm((after - before - [*force, 0, 0, 0])[:2]) < 0.25 * np.linalg.norm(force)
@@ -240,7 +240,7 @@ def test_load_at_the_tip_is_found():
 def test_load_that_is_let_go_all_at_once():
     bench = Bench(HANGING, "full")
     position = bench.settled(duration=3.0)
-    bench.rig.world.plant.set_load(Load(force=(0.03, 0.0, 0.0)))
+    bench.rig.world.plant.set_load(PlantLoad(force=(0.03, 0.0, 0.0)))
     bench.run(2.0)
     bench.rig.world.plant.set_load(None)
     errors = bench.run(4.0, position)

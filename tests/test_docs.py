@@ -6,7 +6,9 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 from pydantic import BaseModel
@@ -35,19 +37,13 @@ from stiffopt.optimise.task import Load, PressureRange, Task
 from stiffopt.plant import settings as simulated
 from stiffopt.registration import Placement, Registration
 from stiffopt.rig.config import (
-    LabSettings,
     LogSettings,
     RigDescription,
     Safety,
     limits_of,
     load_rig_description,
 )
-from stiffopt.rig.drivers import modbus_registers, nidaq, nidaq_valve
-from stiffopt.rig.drivers.aurora import AuroraSettings
-from stiffopt.rig.drivers.modbus import ModbusSettings, SerialLine, Tcp
-from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
-from stiffopt.rig.drivers.probe import ForceSettings, ProbeSettings
-from stiffopt.rig.drivers.zaber import StageSettings
+from stiffopt.rig.registry import KINDS, driver_class, driver_names
 from stiffopt.rig.settings import ControlSettings, ServiceSettings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -55,23 +51,39 @@ PAGES = [
     *(ROOT / name for name in ("README.md", "CHANGELOG.md", "rig/README.md")),
     *sorted((ROOT / "docs").glob("*.md")),
 ]
+
+
+def schemas_of(annotation: Any, package: str) -> Iterator[type[BaseModel]]:
+    """Yield the schemas of a package that an annotation speaks of, nested ones too."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        if annotation.__module__.startswith(package):
+            yield annotation
+        for field in annotation.model_fields.values():
+            yield from schemas_of(field.annotation, package)
+    for inner in get_args(annotation):
+        yield from schemas_of(inner, package)
+
+
+def driver_schemas() -> dict[type[BaseModel], None]:
+    """Return the settings of all drivers that come with stiffopt, and all that they are made of."""
+    return {
+        schema: None
+        for kind in KINDS
+        for name in driver_names(kind)
+        for schema in schemas_of(driver_class(kind, name), "stiffopt.")
+    }
+
+
 SCHEMAS: list[type[BaseModel]] = [
     *(RobotDescription, Segment, Chambers, Material, Compensation, PressureLimits),
     *(Corrections, History, Play, Creep, Recordings, TrackedBody, Tolerances),
     *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
-    *(RigDescription, Safety, LogSettings, LabSettings, Registration, Placement),
+    *(RigDescription, Safety, LogSettings, Registration, Placement),
     *(ControlSettings, ServiceSettings, Trajectory, Waypoint),
-    *(simulated.PlantSettings, simulated.Silicone, simulated.Creep, simulated.Hysteresis),
-    *(simulated.Mismatch, simulated.Spread, simulated.Load, simulated.Discretisation),
-    *(simulated.SimulatedSupplySettings, simulated.SimulatedTrackerSettings),
-    simulated.SimulatedProbeSettings,
-    *(ModbusSettings, Tcp, SerialLine, modbus_registers.Channel, modbus_registers.Scale),
-    *(modbus_registers.SetPoint, modbus_registers.Reading, modbus_registers.RegisterValue),
-    *(modbus_registers.Watchdog, modbus_registers.DumpValve),
-    *(nidaq.NidaqSettings, nidaq.RegulatorChannel, nidaq.Output, nidaq.Input),
-    nidaq_valve.DumpValve,
-    *(AuroraSettings, OpenIGTLinkSettings, ProbeSettings, StageSettings, ForceSettings),
+    *schemas_of(simulated.PlantSettings, "stiffopt.plant"),
+    simulated.LabSettings,
+    *driver_schemas(),
 ]
 SECTIONS = {  # of files.md, by how the module of a schema begins; the first that fits
     "stiffopt.rig.drivers.modbus": "Driver modbus",
@@ -80,6 +92,7 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.rig.drivers.openigtlink": "Drivers aurora and openigtlink",
     "stiffopt.rig.drivers": "Driver probe",
     "stiffopt.rig": "Rig file",
+    "stiffopt.plant": "Rig file",
     "stiffopt.registration": "Rig file",
     "stiffopt.model": "Robot file",
     "stiffopt.optimise": "Task file",

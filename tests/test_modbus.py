@@ -24,9 +24,8 @@ from modbus_device import HandmadeDevice
 from stiffopt.errors import DeviceError, FileError, InputError, MissingExtraError
 from stiffopt.files import read_file
 from stiffopt.lab.modbus_peer import ModbusPeer
-from stiffopt.rig.drivers.modbus import ModbusSettings, ModbusSupply
-from stiffopt.rig.drivers.modbus_line import ModbusLine, Tcp
-from stiffopt.rig.drivers.modbus_registers import Point, Scale
+from stiffopt.rig.drivers.modbus import ModbusLine, ModbusSettings, ModbusSupply, ModbusTcp
+from stiffopt.rig.drivers.modbus_registers import PressureRegister, PressureScale
 from stiffopt.rig.interface import Clock, PressureLimits
 from stiffopt.schema import Schema
 
@@ -85,10 +84,10 @@ def until(condition: Callable[[], bool], seconds: float = 5.0) -> bool:
 
 TYPES = ("int16", "uint16", "int32", "uint32", "float32")
 SCALES = (
-    Scale(counts=(0, 32767), pressure=(0.0, 1e6)),
-    Scale(counts=(6553, 32767), pressure=(0.0, 1e6)),
-    Scale(counts=(0, 4095), pressure=(2e5, -1e4)),
-    Scale(counts=(0, 1), pressure=(0.0, 100.0)),
+    PressureScale(counts=(0, 32767), pressure=(0.0, 1e6)),
+    PressureScale(counts=(6553, 32767), pressure=(0.0, 1e6)),
+    PressureScale(counts=(0, 4095), pressure=(2e5, -1e4)),
+    PressureScale(counts=(0, 1), pressure=(0.0, 100.0)),
 )
 
 
@@ -99,9 +98,9 @@ SCALES = (
     st.floats(0, 1.5e5),
 )
 def test_counts_never_say_more_than_the_limit(
-    kind: Any, order: Any, scale: Scale, pressure: float
+    kind: Any, order: Any, scale: PressureScale, pressure: float
 ) -> None:
-    point = Point(7, "holding", kind, order, scale)
+    point = PressureRegister(7, "holding", kind, order, scale)
     per_count = abs(np.diff(scale.pressure)[0] / np.diff(scale.counts)[0])
     for highest, slack in ((pressure, 1.0), (1e9, 0.5)):
         registers = point.encode(pressure, highest=highest)
@@ -117,9 +116,11 @@ def test_counts_never_say_more_than_the_limit(
     st.sampled_from(SCALES),
     st.lists(st.floats(-1.5e5, 1.5e5), min_size=3, max_size=3),
 )
-def test_counts_stay_within_both_limits(kind: Any, scale: Scale, pressures: list[float]) -> None:
+def test_counts_stay_within_both_limits(
+    kind: Any, scale: PressureScale, pressures: list[float]
+) -> None:
     low, pressure, high = sorted(pressures)
-    point = Point(7, "holding", kind, "big", scale)
+    point = PressureRegister(7, "holding", kind, "big", scale)
     per_count = abs(np.diff(scale.pressure)[0] / np.diff(scale.counts)[0])
     reach = point.pressure_range()
     try:
@@ -134,25 +135,25 @@ def test_counts_stay_within_both_limits(kind: Any, scale: Scale, pressures: list
 
 
 def test_words_are_in_order() -> None:
-    scale = Scale(counts=(0, 1), pressure=(0.0, 1.0))
+    scale = PressureScale(counts=(0, 1), pressure=(0.0, 1.0))
     for kind, value, words in (
         ("int32", 0x12345, (0x0001, 0x2345)),
         ("uint32", 0x12345, (0x0001, 0x2345)),
         ("int16", -1.0, (0xFFFF,)),
         ("float32", 1.5, (0x3FC0, 0x0000)),
     ):
-        assert Point(0, "holding", kind, "big", scale).encode(value) == words
-        little = Point(0, "holding", kind, "little", scale)
+        assert PressureRegister(0, "holding", kind, "big", scale).encode(value) == words
+        little = PressureRegister(0, "holding", kind, "little", scale)
         assert little.encode(value) == words[::-1]
         assert little.decode(words[::-1]) == value
 
 
 def test_counts_stay_in_the_register() -> None:
-    scale = Scale(counts=(0, 1), pressure=(0.0, 1.0))
-    assert Point(0, "holding", "int16", "big", scale).encode(1e9) == (0x7FFF,)
-    assert Point(0, "holding", "uint16", "big", scale).encode(-5.0) == (0,)
+    scale = PressureScale(counts=(0, 1), pressure=(0.0, 1.0))
+    assert PressureRegister(0, "holding", "int16", "big", scale).encode(1e9) == (0x7FFF,)
+    assert PressureRegister(0, "holding", "uint16", "big", scale).encode(-5.0) == (0,)
     with pytest.raises(InputError):
-        Point(0, "holding", "int16", "big", scale).encode(float("nan"))
+        PressureRegister(0, "holding", "int16", "big", scale).encode(float("nan"))
 
 
 # driver: what is on the wire ---------------------------------------------------------------------
@@ -486,7 +487,7 @@ def test_what_was_checked_before_close_is_not_written_after_it(
 
 
 def test_a_closed_line_stays_closed(device: HandmadeDevice) -> None:
-    line = ModbusLine(Tcp(host="127.0.0.1", port=device.port), 1, 2.0)
+    line = ModbusLine(ModbusTcp(host="127.0.0.1", port=device.port), 1, 2.0)
     line.connect()
     line.close()
     line.close()
@@ -511,7 +512,7 @@ def test_a_line_is_closed_after_the_request_under_way(
         return bytes.fromhex("04 02 0007")
 
     device.answers[4] = late
-    line = ModbusLine(Tcp(host="127.0.0.1", port=device.port), 1, 2.0)
+    line = ModbusLine(ModbusTcp(host="127.0.0.1", port=device.port), 1, 2.0)
     got: list[Any] = []
     reader = threading.Thread(target=lambda: got.append(line.read("it", "input", 0, 1)))
     closer = threading.Thread(target=lambda: end(line))

@@ -19,14 +19,13 @@ from pydantic import ValidationError
 
 from fake_bench import FakeBench
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
-from stiffopt.lab.daq_server import DaqHardware, DaqServer
-from stiffopt.lab.nidaq_peer import NidaqPeer
-from stiffopt.rig.drivers.daqmx import Daqmx
-from stiffopt.rig.drivers.daqmx_tasks import (
+from stiffopt.lab.nidaq_peer import DaqHardware, DaqServer, NidaqPeer
+from stiffopt.rig.drivers.daqmx import (
     AnalogueInput,
     AnalogueOutput,
+    Daqmx,
     InputChannel,
-    Watchdog,
+    WatchdogTask,
 )
 from stiffopt.rig.drivers.nidaq import NidaqSettings, NidaqSupply
 from stiffopt.rig.interface import PressureLimits
@@ -314,7 +313,7 @@ def test_the_watchdog_acts_when_the_connection_is_lost(started: Any, bench: Fake
 def test_a_watchdog_that_has_expired_before_is_cleared(started: Any, bench: FakeBench) -> None:
     supply = started(dump_valve=VALVE, watchdog=5.0)
     lost = Daqmx(supply._settings.grpc, 1.0, "nidaq")  # a program that died on the job
-    watchdog = Watchdog(lost, VALVE["line"], 0.02, high=False)
+    watchdog = WatchdogTask(lost, VALVE["line"], 0.02, high=False)
     watchdog.start()
     assert wait_for(lambda: bench.valve_open)
     watchdog.close()
@@ -629,12 +628,12 @@ def test_the_template_is_a_rig_that_can_be_rehearsed() -> None:
     from stiffopt.lab.probe_peer import ProbePeer
     from stiffopt.model.robot_files import load_description
     from stiffopt.rig.config import limits_of, load_rig_description
-    from stiffopt.rig.drivers.probe import ProbeSettings
+    from stiffopt.rig.drivers.probe import ZaberProbeSettings
 
     path = Path(__file__).parents[1] / "rig" / "nidaq-aurora.yaml"
     description = load_rig_description(path)
     assert isinstance(description.supply, NidaqSettings)
-    assert isinstance(description.probe, ProbeSettings)
+    assert isinstance(description.probe, ZaberProbeSettings)
     bench = FakeBench(3)
     peers = (NidaqPeer(description.supply, bench), ProbePeer(description.probe, bench))
     limits = limits_of(description, load_description(description.robot))

@@ -15,7 +15,7 @@ from pyelastica_peer import relax
 from references import beam
 from stiffopt.model.description import RobotDescription
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.settings import Load, PlantSettings, Silicone
+from stiffopt.plant.settings import PlantLoad, PlantSettings, Silicone
 
 LINEAR = Silicone(law="linear", creep=(), hysteresis=())
 NONE = (0.0, 0.0, 0.0)
@@ -50,7 +50,7 @@ def test_static_tip(name):
     arm = Arm((FLOP,) * case.segments).under(case.gravity, case.tip_mass)
     settings = PlantSettings(dynamics="quasi-static", silicone=LINEAR)
     plant = Plant(RobotDescription(**arm.mapping()), settings)
-    plant.settle(np.zeros(arm.n), Load(force=case.force, moment=case.moment))
+    plant.settle(np.zeros(arm.n), PlantLoad(force=case.force, moment=case.moment))
     peer = relax(
         beam(FLOP),
         arm.length,

@@ -28,13 +28,13 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import (
-    Creep,
     Discretisation,
-    Hysteresis,
-    Load,
     Mismatch,
+    PlantLoad,
     PlantSettings,
     Silicone,
+    SiliconeCreep,
+    SiliconeHysteresis,
 )
 from stiffopt.registration import Placement
 
@@ -52,7 +52,7 @@ def make(arm: Arm, silicone: Silicone = LINEAR, **settings: Any) -> Plant:
     return Plant(RobotDescription(**arm.mapping()), PlantSettings(silicone=silicone, **settings))
 
 
-def settled(arm: Arm, p: Any = None, load: Load | None = None, **settings: Any) -> Any:
+def settled(arm: Arm, p: Any = None, load: PlantLoad | None = None, **settings: Any) -> Any:
     plant = make(arm, **settings)
     plant.settle(np.zeros(arm.n) if p is None else p, load)
     return plant.tip_pose()
@@ -70,7 +70,7 @@ def material(**changes: Any) -> Silicone:
 def test_elastica(share, tubes):
     arm = Arm((STIFF,) * tubes)
     force = share * beam(STIFF).bending / arm.length**2
-    T = settled(arm, load=Load(force=(force, 0, 0)))
+    T = settled(arm, load=PlantLoad(force=(force, 0, 0)))
     x, z, angle = elastica_tip(share)
     assert T[:3, 3] == pytest.approx([x * arm.length, 0, z * arm.length], abs=1e-4)
     assert np.arctan2(T[0, 2], T[2, 2]) == pytest.approx(angle, abs=5e-3)
@@ -80,7 +80,7 @@ def test_elastica(share, tubes):
 def test_elastica_that_shears_and_stretches(share, tubes):
     arm = Arm((FLOP,) * tubes)
     force = share * beam(FLOP).bending / arm.length**2
-    T = settled(arm, load=Load(force=(0, force, 0)))
+    T = settled(arm, load=PlantLoad(force=(0, force, 0)))
     expected = loaded_tip(arm, np.zeros(arm.n), [Reference((0, force, 0))], steps=8)
     assert T[:3, 3] == pytest.approx(expected[:3, 3], abs=1e-4)
 
@@ -89,7 +89,7 @@ def test_a_stubby_elastica_on_a_finer_mesh():
     """One segment under 6 N across: it shears by a third of what it bends."""
     force = 13 * beam(FLOP).bending / ONE.length**2
     mesh = Discretisation(bending_degree=5, shear_degree=3, sub_intervals=8)
-    T = settled(ONE, load=Load(force=(0, force, 0)), discretisation=mesh)
+    T = settled(ONE, load=PlantLoad(force=(0, force, 0)), discretisation=mesh)
     x, z, _ = planar_tip(ONE, np.zeros(3), (force, 0))
     assert T[:3, 3] == pytest.approx([0, x, z], abs=1e-4)
 
@@ -98,7 +98,7 @@ def test_a_stubby_elastica_on_a_finer_mesh():
 @pytest.mark.parametrize("arm", [ONE, TWO], ids=["one segment", "two"])
 def test_pure_moment_bends_to_a_full_circle(arm, frame):
     moment = 2 * np.pi * beam(FLOP).bending / arm.length
-    T = settled(arm, load=Load(moment=(0, moment, 0), frame=frame))
+    T = settled(arm, load=PlantLoad(moment=(0, moment, 0), frame=frame))
     assert pytest.approx(np.eye(4), abs=1e-6) == T
 
 
@@ -127,7 +127,7 @@ def test_small_load_compliance(name):
         ends = []
         for sign in (1, -1):
             f, m = sign * wrench[:3], sign * wrench[3:]
-            plant.settle(p, Load(force=tuple(f), moment=tuple(m), frame="tip"))
+            plant.settle(p, PlantLoad(force=tuple(f), moment=tuple(m), frame="tip"))
             ends.append(plant.tip_pose())
         change = np.linalg.inv(T) @ (ends[0] - ends[1]) / (2 * wrench.max())
         columns.append([*change[:3, 3], change[2, 1], change[0, 2], change[1, 0]])
@@ -150,7 +150,7 @@ def test_load_against_the_rod_shot_from_its_tip(name):
     (load,) = LOADED[name]
     p = np.zeros(6) if name == "beyond buckling" else BAR * np.array([0.5, 0.2, 0, 0.3, 0.8, 0.0])
     frame = "tip" if load.follower else "base"
-    acting = Load(force=load.force, moment=load.moment, frame=frame, at=load.at)
+    acting = PlantLoad(force=load.force, moment=load.moment, frame=frame, at=load.at)
     expected = loaded_tip(TWO, p, [load], steps=8)
     assert settled(TWO, p, acting) == pytest.approx(expected, abs=1e-3)  # rotations
     assert settled(TWO, p, acting)[:3, 3] == pytest.approx(expected[:3, 3], abs=1e-4)
@@ -180,7 +180,7 @@ def test_sections_off_the_axis_and_connectors():
     """Three different segments, centroids beside the axis, against the rod from its base."""
     arm = ARMS["3 segments, mixed"].under((2.0, 1.0, 9.0), 0.01)
     load = Reference((0.05, -0.08, 0.02), (1e-3, 0, 5e-4))
-    T = settled(arm, load=Load(force=load.force, moment=load.moment))
+    T = settled(arm, load=PlantLoad(force=load.force, moment=load.moment))
     expected = rod_tip(arm, np.zeros(arm.n), [load], steps=6)
     assert T[:3, 3] == pytest.approx(expected[:3, 3], abs=1e-4)
     assert T[:3, :3] == pytest.approx(expected[:3, :3], abs=1e-3)
@@ -222,7 +222,7 @@ def test_random_arms_under_random_loads():
             rng.normal(0, 0.04, 3), rng.normal(0, 2e-3, 3), follower=bool(rng.integers(2))
         )
         frame = "tip" if load.follower else "base"
-        acting = Load(force=tuple(load.force), moment=tuple(load.moment), frame=frame)
+        acting = PlantLoad(force=tuple(load.force), moment=tuple(load.moment), frame=frame)
         expected = loaded_tip(arm, p, [load], steps=8)[:3, 3]
         assert settled(arm, p, acting)[:3, 3] == pytest.approx(expected, abs=1e-4)
 
@@ -243,7 +243,7 @@ def test_hyperelastic_stretch(law, stress):
     arm, area = Arm((PLAIN,)), silicone(PLAIN).area
     stretch = stretch_under(law, PLAIN.youngs_modulus, 0.2, stress)
     rubber = material(law=law, stiffening=0.2)
-    T = settled(arm, load=Load(force=(0, 0, stress * area)), silicone=rubber)
+    T = settled(arm, load=PlantLoad(force=(0, 0, stress * area)), silicone=rubber)
     assert T[2, 3] == pytest.approx(arm.length * stretch, rel=1e-6)
     if stress > 0:  # the same by pressure
         bores = 6 * np.pi * PLAIN.chamber_radius**2
@@ -260,7 +260,7 @@ def test_hyperelastic_bending(law):
     arm, moment = Arm((PLAIN,)), 0.06
     strain, curvature = fibre_bending(PLAIN, law, 0.3, (0.0, moment))
     rubber = material(law=law, stiffening=0.3)
-    T = settled(arm, load=Load(moment=(0, moment, 0)), silicone=rubber)
+    T = settled(arm, load=PlantLoad(moment=(0, moment, 0)), silicone=rubber)
     angle, radius = curvature * arm.length, (1 + strain) / curvature
     expected = [radius * (1 - np.cos(angle)), 0, radius * np.sin(angle)]
     assert angle > 1.4
@@ -307,9 +307,9 @@ def released(
 ) -> tuple[Any, Any]:
     """Times and the tip's motion along an axis after a pull is let go, every so many s."""
     zero = np.zeros(plant.robot.n_pressures)
-    plant.settle(zero, Load())
+    plant.settle(zero, PlantLoad())
     rest = plant.tip_pose()[axis, 3]
-    plant.settle(zero, Load(force=force))
+    plant.settle(zero, PlantLoad(force=force))
     plant.set_load(None)
     x = [plant.tip_pose()[axis, 3]]
     for _ in range(round(duration / sample)):
@@ -369,7 +369,7 @@ def test_nothing_damps_but_the_material(size, step):
     """Swings of 4 s without damping, large ones and small: no energy is lost, at any step."""
     plant = make(TWO, dynamics="full", discretisation=Discretisation(step=step))
     at_rest = balance(plant)
-    plant.settle(np.zeros(6), Load(force=(0.1 * size, 0.05 * size, 0)))
+    plant.settle(np.zeros(6), PlantLoad(force=(0.1 * size, 0.05 * size, 0)))
     plant.set_load(None)
     energies = []
     for _ in range(40):
@@ -395,7 +395,7 @@ BALANCED = Arm((CONSTANT, CONSTANT)).under(DOWN, 0.02)
 
 @pytest.mark.parametrize("law", ["linear", "yeoh"])
 def test_energy_balance_improves_with_the_square_of_the_step(law):
-    rubber = material(law=law, damping=0.1, creep=(Creep(share=0.1, time=0.5),))
+    rubber = material(law=law, damping=0.1, creep=(SiliconeCreep(share=0.1, time=0.5),))
     errors = [disbalance(rubber, step, BALANCED) for step in (4e-3, 2e-3, 1e-3)]
     for (coarse, _), (fine, lost) in itertools.pairwise(errors):
         assert fine < coarse / 3
@@ -456,7 +456,7 @@ def test_the_built_in_hanging_arm_rings_as_measured():
 
 # -- history --------------------------------------------------------------------------------
 
-SLIP = (Hysteresis(share=0.1, strain=0.01), Hysteresis(share=0.2, strain=0.03))
+SLIP = (SiliconeHysteresis(share=0.1, strain=0.01), SiliconeHysteresis(share=0.2, strain=0.03))
 
 
 def cycle(plant: Plant, top: Any, duration: float, cycles: int, samples: int = 40) -> Any:
@@ -512,7 +512,7 @@ def test_stretching_loops_are_jenkins():
 @pytest.mark.parametrize("bar", [[1.0, 1.0, 1.0], [1.0, 0.0, 0.0]], ids=["stretch", "bend"])
 def test_creep_is_maxwells(bar):
     shares, times = (0.2, 0.1), (2.0, 20.0)
-    branches = tuple(Creep(share=s, time=t) for s, t in zip(shares, times, strict=True))
+    branches = tuple(SiliconeCreep(share=s, time=t) for s, t in zip(shares, times, strict=True))
     arm = Arm((CONSTANT,))
     plant = make(arm, material(creep=branches), discretisation=Discretisation(step=0.01))
     p = BAR * np.array(bar)
@@ -567,7 +567,7 @@ def test_refining_the_rod_converges():
     errors = []
     for bending, shear, pieces in MESHES:
         mesh = Discretisation(bending_degree=bending, shear_degree=shear, sub_intervals=pieces)
-        T = settled(ONE, load=Load(force=(force, 0, 0)), discretisation=mesh)
+        T = settled(ONE, load=PlantLoad(force=(force, 0, 0)), discretisation=mesh)
         errors.append(np.hypot(T[0, 3] - x, T[2, 3] - z))
     assert all(fine < coarse / 10 for coarse, fine in itertools.pairwise(errors))
     assert errors[1] < 1e-4

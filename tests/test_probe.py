@@ -17,23 +17,27 @@ from pydantic import ValidationError
 
 from fake_bench import FakeBench
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
-from stiffopt.lab.probe_peer import ProbePeer
-from stiffopt.lab.zaber_peer import ZaberPeer
-from stiffopt.rig.drivers.probe import ProbeSettings, ZaberProbe, ask_at_the_terminal
-from stiffopt.rig.drivers.zaber import Stage, StageSettings
+from stiffopt.lab.probe_peer import ProbePeer, ZaberPeer
+from stiffopt.rig.drivers.probe import (
+    ZaberProbe,
+    ZaberProbeSettings,
+    ZaberStage,
+    ZaberStageSettings,
+    ask_at_the_terminal,
+)
 from stiffopt.rig.interface import SystemClock
 
 ENDING = ("daq", "zaber", "Thread-")  # names of threads that must end with their peer
 MICROSTEP = 0.047625e-6  # m; of the X-LSM100A, from its data sheet
 
 
-def settings(stage: dict[str, Any] | None = None, **changes: Any) -> ProbeSettings:
+def settings(stage: dict[str, Any] | None = None, **changes: Any) -> ZaberProbeSettings:
     data: dict[str, Any] = {
         "driver": "probe",
         "stage": {"max_speed": "50 mm/s", **(stage or {})},
         "force": {"channel": "Dev1/ai3", "sensitivity": "0.5 N/V", "tare_samples": 5},
     }
-    return ProbeSettings(**{**data, **changes})
+    return ZaberProbeSettings(**{**data, **changes})
 
 
 @pytest.fixture
@@ -47,7 +51,7 @@ def bench() -> FakeBench:
 class Rig:
     """A probe, its peers, and what it asked a person to do."""
 
-    def __init__(self, made: ProbeSettings, bench: FakeBench, *, homed: bool = True) -> None:
+    def __init__(self, made: ZaberProbeSettings, bench: FakeBench, *, homed: bool = True) -> None:
         self.said: list[str] = []
         self.peer = ProbePeer(made, bench, homed=homed)
         self.settings = self.peer.start()
@@ -65,7 +69,7 @@ class Rig:
 def started(bench: FakeBench) -> Iterator[Callable[..., Rig]]:
     rigs: list[Rig] = []
 
-    def make(made: ProbeSettings | None = None, *, homed: bool = True) -> Rig:
+    def make(made: ZaberProbeSettings | None = None, *, homed: bool = True) -> Rig:
         rigs.append(Rig(made or settings(), bench, homed=homed))
         return rigs[-1]
 
@@ -435,11 +439,11 @@ def test_no_stage(started: Any) -> None:
     lost = rig.settings.model_copy(update={"stage": stage}).device()
     with pytest.raises(DeviceError, match=r"connecting to the stage at 127.0.0.1:1 failed.*refus"):
         lost.open()
-    stage = StageSettings(serial="/dev/stiffopt-nothing")
+    stage = ZaberStageSettings(serial="/dev/stiffopt-nothing")
     lost = rig.settings.model_copy(update={"stage": stage}).device()
     with pytest.raises(DeviceError, match=r"the stage at /dev/stiffopt-nothing failed"):
         lost.open()
-    lost = rig.settings.model_copy(update={"stage": StageSettings()}).device()
+    lost = rig.settings.model_copy(update={"stage": ZaberStageSettings()}).device()
     with pytest.raises(DeviceError, match="the stage has no address"):
         lost.open()
     assert not rig.peer._sensor._sessions  # nothing was left open
@@ -469,7 +473,7 @@ def test_a_port_that_takes_no_connection() -> None:
 
         def connect() -> None:
             try:
-                Stage(StageSettings(host="127.0.0.1", port=port), 0.3, SystemClock())
+                ZaberStage(ZaberStageSettings(host="127.0.0.1", port=port), 0.3, SystemClock())
             except DeviceError as error:
                 failed.append(error)
 
@@ -489,7 +493,7 @@ def test_a_name_that_no_host_has() -> None:
         with pytest.raises(
             DeviceError, match=rf"connecting to the stage at {host}:55550 failed: \w"
         ):
-            Stage(StageSettings(host=host), 0.5, SystemClock())
+            ZaberStage(ZaberStageSettings(host=host), 0.5, SystemClock())
 
 
 def test_a_stage_that_takes_one_connection_at_a_time(started: Any) -> None:
@@ -594,8 +598,8 @@ def test_a_program_that_forgets_to_close_ends(bench: FakeBench) -> None:
     made = peer.start()
     script = (
         "import sys\n"
-        "from stiffopt.rig.drivers.probe import ProbeSettings\n"
-        "probe = ProbeSettings.model_validate_json(sys.argv[1]).device(prompt=print)\n"
+        "from stiffopt.rig.drivers.probe import ZaberProbeSettings\n"
+        "probe = ZaberProbeSettings.model_validate_json(sys.argv[1]).device(prompt=print)\n"
         "probe.open(); probe.align([1, 0, 0]); probe.move_to(0.001, 0.05)\n"
         "raise SystemExit(7)\n"
     )

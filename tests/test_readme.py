@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-import stiffopt.plant.rig  # noqa: F401 - its code is kept where it usually is
+import stiffopt.plant.devices  # noqa: F401 - its code is kept where it usually is
 from examples import assert_same_text, blocks, run_examples
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -14,7 +14,7 @@ from stiffopt.errors import DeviceError, FileError, InputError, MissingExtraErro
 from stiffopt.files import read_file, save_file
 from stiffopt.model.description import Recordings
 from stiffopt.model.robot_files import load_description, save_robot
-from stiffopt.plant.rig import SimulatedRig
+from stiffopt.plant.devices import SimulatedRig
 from stiffopt.registration import Placement, Registration
 from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import RigDescription, limits_of, load_rig_description, slew_of

@@ -16,6 +16,7 @@ from fake_bench import FakeBench
 pytest.register_assert_rewrite("supply_contract")
 
 from stiffopt.rig.interface import PressureLimits  # noqa: E402
+from stiffopt.rig.registry import driver_names  # noqa: E402
 from supply_contract import Case, SupplyContract  # noqa: E402
 
 LIMITS = PressureLimits(np.zeros(3), np.array([1.5e5, 1.2e5, 0.9e5]))
@@ -89,7 +90,7 @@ def nidaq() -> Iterator[Case]:
 @contextmanager
 def simulated(valve: bool = False) -> Iterator[Case]:
     from stiffopt.model.robot_files import load_description
-    from stiffopt.plant.rig import simulated_rig
+    from stiffopt.plant.devices import simulated_rig
     from stiffopt.rig.config import RigDescription
 
     description = RigDescription(
@@ -106,13 +107,40 @@ def simulated(valve: bool = False) -> Iterator[Case]:
     )
 
 
+@contextmanager
+def line() -> Iterator[Case]:
+    import third_party
+    from stiffopt.rig.registry import driver_class, load
+
+    third_party.install()
+    settings = driver_class("supply", "line")(timeout=2.0, watchdog=None, channels=[{}] * 3)
+    bench = FakeBench()
+    peer = load(settings.peer)(settings, bench)
+    try:
+        yield Case(
+            peer.start().device(LIMITS),
+            wire=lambda: bench.pressures,
+            tolerance=1.0,
+            disturb=lambda: bench.command(1, 5e4),
+        )
+    finally:
+        peer.close()
+
+
 CASES: dict[str, Callable[[], AbstractContextManager[Case]]] = {
     "modbus": modbus,
     "modbus-at-once": lambda: modbus(table="holding", valve=True),
     "nidaq": nidaq,
     "simulated": simulated,
     "simulated-with-valve": lambda: simulated(valve=True),
+    "line": line,
 }
+"""The cases, each by the name of its driver and what is special about it."""
+
+
+def test_every_supply_is_held_to_the_contract() -> None:
+    tested = {name.split("-")[0] for name in CASES}
+    assert tested >= set(driver_names("supply"))
 
 
 @pytest.fixture(params=CASES)

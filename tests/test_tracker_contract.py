@@ -14,13 +14,14 @@ from fake_bench import FakeBench
 from stiffopt.lab.aurora_peer import AuroraPeer
 from stiffopt.lab.openigtlink_peer import OpenIGTLinkPeer
 from stiffopt.model.robot_files import load_description
-from stiffopt.plant.rig import simulated_rig
+from stiffopt.plant.devices import simulated_rig
 from stiffopt.plant.world import World
 from stiffopt.registration import Registration
 from stiffopt.rig.config import RigDescription, limits_of
 from stiffopt.rig.drivers.aurora import AuroraSettings
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
 from stiffopt.rig.interface import PoseTracker
+from stiffopt.rig.registry import driver_names
 from tracker_contract import CHECKS, PLACE, TURN, Control, Factory
 
 
@@ -124,7 +125,14 @@ def simulated(registration: Registration) -> Iterator[tuple[PoseTracker, Control
     yield rig.tracker, WorldControl(rig.world)
 
 
-@pytest.mark.parametrize("factory", [aurora, openigtlink, simulated])
+FACTORIES = {"aurora": aurora, "openigtlink": openigtlink, "simulated": simulated}
+
+
+def test_every_tracker_is_held_to_the_contract() -> None:
+    assert set(FACTORIES) >= set(driver_names("tracker"))
+
+
+@pytest.mark.parametrize("factory", FACTORIES.values(), ids=FACTORIES)
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__.removeprefix("check_"))
 def test_contract(check: Callable[[Factory], None], factory: Factory) -> None:
     check(factory)

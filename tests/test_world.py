@@ -9,9 +9,9 @@ import pytest
 
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
+from stiffopt.plant.devices import SimulatedRig, simulated_rig
 from stiffopt.plant.plant import Plant, SimulationError
-from stiffopt.plant.rig import SimulatedRig, simulated_rig
-from stiffopt.plant.settings import Discretisation, Load, PlantSettings
+from stiffopt.plant.settings import Discretisation, PlantLoad, PlantSettings
 from stiffopt.plant.world import FAULTS
 from stiffopt.rig.config import RigDescription, limits_of
 from stiffopt.rig.interface import PressureCommand
@@ -463,7 +463,7 @@ def with_connectors() -> Any:
     return ROBOT.model_copy(update={"segments": (link, link)})
 
 
-def bent(load: Load | None, plant: dict[str, Any] | None = None) -> np.ndarray:
+def bent(load: PlantLoad | None, plant: dict[str, Any] | None = None) -> np.ndarray:
     silicone = {"law": "linear", "creep": (), "hysteresis": ()}
     arm = Plant(with_connectors(), PlantSettings(silicone=silicone, **(plant or {})))
     arm.settle(np.zeros(6), load)
@@ -472,7 +472,7 @@ def bent(load: Load | None, plant: dict[str, Any] | None = None) -> np.ndarray:
 
 def test_a_load_at_the_full_length_is_at_the_tip() -> None:
     for frame in ("base", "tip"):
-        force = Load(force=(0.05, 0.02, 0.0), moment=(0.0, 0.001, 0.0005), frame=frame)
+        force = PlantLoad(force=(0.05, 0.02, 0.0), moment=(0.0, 0.001, 0.0005), frame=frame)
         there = force.model_copy(update={"at": 0.22})
         np.testing.assert_allclose(bent(there), bent(force), atol=1e-9)
 
@@ -481,23 +481,25 @@ def test_a_connector_is_a_lever() -> None:
     """A force on a connector is the force at its beginning and a moment."""
     for far in (0.095, 0.105, 0.11):
         lever = far - 0.09
-        force = Load(force=(0.1, 0.0, 0.0), frame="tip", at=far)
-        same = Load(force=(0.1, 0.0, 0.0), moment=(0.0, 0.1 * lever, 0.0), frame="tip", at=0.09)
+        force = PlantLoad(force=(0.1, 0.0, 0.0), frame="tip", at=far)
+        same = PlantLoad(
+            force=(0.1, 0.0, 0.0), moment=(0.0, 0.1 * lever, 0.0), frame="tip", at=0.09
+        )
         np.testing.assert_allclose(bent(force), bent(same), atol=1e-9)
-    a, b = (bent(Load(force=(0.1, 0, 0), at=at))[0, 3] for at in (0.09, 0.11))
+    a, b = (bent(PlantLoad(force=(0.1, 0, 0), at=at))[0, 3] for at in (0.09, 0.11))
     assert b > a * 1.1
 
 
 def test_a_load_off_the_arm_is_refused() -> None:
     with pytest.raises(InputError, match="220 mm long"):
-        bent(Load(force=(0.1, 0, 0), at=0.23))
+        bent(PlantLoad(force=(0.1, 0, 0), at=0.23))
     with pytest.raises(InputError, match="at least 0"):
-        Load(force=(0.1, 0, 0), at=-0.01)
+        PlantLoad(force=(0.1, 0, 0), at=-0.01)
 
 
 def test_a_load_finds_its_place_on_an_arm_that_is_shorter_than_its_file() -> None:
     short = {"mismatch": {"length": (0.9, 0.9)}}
-    tip, there = Load(force=(0.05, 0, 0)), Load(force=(0.05, 0, 0), at=0.22)
+    tip, there = PlantLoad(force=(0.05, 0, 0)), PlantLoad(force=(0.05, 0, 0), at=0.22)
     np.testing.assert_allclose(bent(there, short), bent(tip, short), atol=1e-9)
 
 

@@ -1,56 +1,58 @@
-"""A supply whose driver is not ours: as docs/extending.md says, and not a line more careful."""
+"""A supply whose driver is not ours: the example package `examples/line-driver`, installed.
+
+`careless` gives settings whose driver forgets the limits that it is given.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+import atexit
+import importlib
+import os
+import shutil
+import sys
+import tempfile
+import zipfile
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from hatchling.builders.wheel import WheelBuilder
 
-from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
-from stiffopt.schema import Items, Schema
-from stiffopt.units import Pressure
+from stiffopt.rig.interface import Clock, PressureLimits
 
-Array = NDArray[np.float64]
+EXAMPLE = Path(__file__).parent.parent / "examples" / "line-driver"
 
 
-class BoxChannel(Schema):
-    """One regulator."""
-
-    port: int
-    min: Pressure | None = None
-    max: Pressure | None = None
-
-
-class BoxSettings(SupplySettings):
-    """A box with a regulator at each port."""
-
-    driver: Literal["box"] = "box"
-    channels: Items[BoxChannel]
-
-    def _make(self, limits: PressureLimits, clock: Clock | None) -> BoxSupply:
-        return BoxSupply(
-            self, PressureLimits(np.full(limits.n, -1e6), np.full(limits.n, 1e6)), clock
-        )
+def install() -> None:
+    """Install the example for this process and all that it starts, where that is not done yet."""
+    if find_spec("line_driver") is not None:
+        return
+    folder = tempfile.mkdtemp(prefix="line-driver-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    install_into(Path(folder))
+    sys.path.append(folder)
+    importlib.invalidate_caches()
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [before, folder]))
 
 
-class BoxSupply(PressureSupply):
-    """Forgets the limits that it is given."""
+def install_into(folder: Path) -> None:
+    """Build the wheel of the example and unpack it, as `pip install --target` does."""
+    (wheel,) = WheelBuilder(str(EXAMPLE)).build(directory=str(folder), versions=["standard"])
+    with zipfile.ZipFile(wheel) as packed:
+        packed.extractall(folder)
+    Path(wheel).unlink()
 
-    has_watchdog = True
 
-    def __init__(self, settings: BoxSettings, limits: PressureLimits, clock: Clock | None) -> None:
-        super().__init__(limits, clock)
-        self.settings = settings
-        self.wire = np.zeros(limits.n)
-        self.log: list[tuple[float, Array]] = []
+def careless(**settings: Any) -> Any:
+    """Return settings of the example whose supply is made with far too wide limits."""
+    install()
+    from line_driver import LineSettings, LineSupply
 
-    def _open(self) -> None: ...
-    def _close(self) -> None: ...
+    class CarelessSettings(LineSettings):
+        def _make(self, limits: PressureLimits, clock: Clock | None) -> LineSupply:
+            wide = PressureLimits(np.full(limits.n, -1e6), np.full(limits.n, 1e6))
+            return LineSupply(self, wide, clock)
 
-    def _write(self, pressures: Array) -> None:
-        self.wire = np.array(pressures)
-        self.log.append((self.clock.now(), self.wire))
-
-    def _read(self) -> ArrayLike:
-        return self.wire
+    return CarelessSettings(**settings)

@@ -1,4 +1,7 @@
-"""Where a tracker and its sensor are with respect to the arm; applied here and nowhere else."""
+"""Registration: where a tracker and its sensor are with respect to the arm.
+
+A tracker measures its sensor in its own frame; only here does that become the tip in the base.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +59,7 @@ def _with_sign(quaternion: Array) -> Array:
 
 
 class Placement(Schema):
-    """A frame in another.
+    """Pose of one frame in another.
 
     Attributes
     ----------

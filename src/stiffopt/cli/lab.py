@@ -37,12 +37,17 @@ def lab(
         typer.Option(metavar="FILE", help="Write the rig file here instead of printing it."),
     ] = None,
     supply: Annotated[
-        str, typer.Option(metavar="DRIVER", help="modbus or nidaq: in place of a simulated supply.")
+        str,
+        typer.Option(
+            metavar="DRIVER",
+            help="In place of a simulated supply: modbus, nidaq or that of an installed package.",
+        ),
     ] = "modbus",
     tracker: Annotated[
         str,
         typer.Option(
-            metavar="DRIVER", help="aurora or openigtlink: in place of a simulated tracker."
+            metavar="DRIVER",
+            help="In place of a simulated tracker: aurora, openigtlink or that of a package.",
         ),
     ] = "aurora",
     quiet: Annotated[

@@ -1,4 +1,4 @@
-"""What `stiffopt lab` does: start the virtual lab, take commands, end in good order."""
+"""Running `stiffopt lab`: start the virtual lab, carry out typed commands, stop it in order."""
 
 from __future__ import annotations
 

@@ -482,5 +482,5 @@ class _Shape:
 
 def _vibrates(description: RigDescription) -> bool:
     """Return whether the arm has inertia: all have, but one that is simulated without."""
-    simulated, plant = description.supply.driver == "simulated", description.plant
-    return not (simulated and plant is not None and plant.dynamics == "quasi-static")
+    dynamics = getattr(description.plant, "dynamics", None)
+    return not (description.supply.simulated and dynamics == "quasi-static")

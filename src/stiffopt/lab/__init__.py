@@ -1,1 +1,1 @@
-"""The virtual lab: the simulated arm behind real protocol peers."""
+"""The virtual lab: a simulated arm behind emulated devices that speak the real protocols."""

@@ -1,7 +1,9 @@
-"""An NDI Aurora on a pseudo-terminal: the tracker of the virtual lab.
+"""The virtual lab's tracker: an NDI Aurora on a pseudo-terminal.
 
 It follows NDI's description of the protocol (Aurora Application Program Interface Guide), not the
-library that reads it. How commands and replies are written is in `stiffopt.lab.ndi_wire`.
+library that reads it. A command is ``NAME:parameters``, a CRC-16 in hexadecimal digits and a
+carriage return, or ``NAME parameters`` without a CRC; a reply ends with its CRC-16, and binary ones
+have a header.
 """
 
 from __future__ import annotations
@@ -12,22 +14,23 @@ import select
 import struct
 import threading
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from stiffopt.errors import DeviceError
-from stiffopt.lab.bench import Bench, Peer, TrackerFrame
-from stiffopt.lab.ndi_wire import (
-    RefusedError,
-    crc16,
-    framed,
-    hexadecimal,
-    parse,
-    pose_as_text,
-)
+from stiffopt.lab.bench import Bench, DevicePeer, TrackerFrame
 from stiffopt.rig.drivers.aurora import AuroraSettings
 
-__all__ = ["AuroraPeer"]
+__all__ = [
+    "AuroraPeer",
+    "NdiRefusedError",
+    "crc16",
+    "framed",
+    "hexadecimal",
+    "parse",
+    "pose_as_text",
+]
 
 FIRST_HANDLE = 0x0A  # that an Aurora gives to a wired tool
 SLOW = 0.2  # s, by which a slow device answers late
@@ -40,7 +43,7 @@ VERSION = (
 )
 
 
-class AuroraPeer(Peer[AuroraSettings]):
+class AuroraPeer(DevicePeer[AuroraSettings]):
     """The tracker's control unit with one sensor or more, the bench's at the driver's port.
 
     Attributes
@@ -60,6 +63,11 @@ class AuroraPeer(Peer[AuroraSettings]):
         self._thread: threading.Thread | None = None
         self._speed = 9600
         self._forget()
+
+    @classmethod
+    def stand_in(cls, simulated: Any, n: int) -> AuroraSettings:
+        """Return settings with the simulated tracker's registration and latency."""
+        return AuroraSettings(registration=simulated.registration, latency=simulated.latency)
 
     def start(self) -> AuroraSettings:
         """Make a pseudo-terminal and answer on it."""
@@ -140,7 +148,7 @@ class AuroraPeer(Peer[AuroraSettings]):
             if name == "BX":
                 return self._binary_frame(parameters)
             text = self._obey(name, parameters)
-        except RefusedError as refused:
+        except NdiRefusedError as refused:
             text = f"ERROR{refused.args[0]:02X}"
         return f"{text}{crc16(text.encode()):04X}\r".encode()
 
@@ -164,9 +172,9 @@ class AuroraPeer(Peer[AuroraSettings]):
             "TX": self._text_frame,
         }
         if name not in commands:
-            raise RefusedError(RefusedError.INVALID)
+            raise NdiRefusedError(NdiRefusedError.INVALID)
         if not self._initialised and name not in ("INIT", "RESET", "COMM", "VER", "BEEP"):
-            raise RefusedError(RefusedError.SYSTEM_NOT_INITIALISED)
+            raise NdiRefusedError(NdiRefusedError.SYSTEM_NOT_INITIALISED)
         return commands[name](parameters)
 
     def _init(self, _: str) -> str:
@@ -180,7 +188,7 @@ class AuroraPeer(Peer[AuroraSettings]):
 
     def _comm(self, parameters: str) -> str:
         if len(parameters) != 5 or parameters[0] not in SPEEDS or parameters[1:] != "0000":
-            raise RefusedError(RefusedError.BAD_PARAMETERS)
+            raise NdiRefusedError(NdiRefusedError.BAD_PARAMETERS)
         return "OKAY"
 
     def _list_handles(self, parameters: str) -> str:
@@ -194,7 +202,7 @@ class AuroraPeer(Peer[AuroraSettings]):
         }
         listed = known.get(hexadecimal(parameters or "0"))
         if listed is None:
-            raise RefusedError(RefusedError.BAD_PARAMETERS)
+            raise NdiRefusedError(NdiRefusedError.BAD_PARAMETERS)
         rows = (f"{handle:02X}{self._status(handle):03X}" for handle in sorted(listed))
         return f"{len(listed):02X}{''.join(rows)}"
 
@@ -219,9 +227,9 @@ class AuroraPeer(Peer[AuroraSettings]):
         self._must_not_track()
         handle = self._handle(parameters)
         if parameters[2:] not in ("S", "D", "B"):
-            raise RefusedError(0x09)
+            raise NdiRefusedError(0x09)
         if handle not in self._ready:
-            raise RefusedError(RefusedError.NOT_INITIALISED)
+            raise NdiRefusedError(NdiRefusedError.NOT_INITIALISED)
         self._enabled.add(handle)
         return "OKAY"
 
@@ -231,18 +239,18 @@ class AuroraPeer(Peer[AuroraSettings]):
 
     def _stop_tracking(self, _: str) -> str:
         if not self._tracking:
-            raise RefusedError(RefusedError.WRONG_MODE)
+            raise NdiRefusedError(NdiRefusedError.WRONG_MODE)
         self._tracking = False
         return "OKAY"
 
     def _must_not_track(self) -> None:
         if self._tracking:
-            raise RefusedError(RefusedError.WRONG_MODE)
+            raise NdiRefusedError(NdiRefusedError.WRONG_MODE)
 
     def _handle(self, parameters: str) -> int:
         handle = hexadecimal(parameters[:2])
         if handle not in self._handles:
-            raise RefusedError(RefusedError.BAD_HANDLE)
+            raise NdiRefusedError(NdiRefusedError.BAD_HANDLE)
         return handle
 
     def _status(self, handle: int) -> int:
@@ -254,9 +262,9 @@ class AuroraPeer(Peer[AuroraSettings]):
     def _poses(self, parameters: str) -> list[tuple[int, TrackerFrame | None]]:
         """Return what each enabled sensor sees; all see the same."""
         if not self._tracking:
-            raise RefusedError(RefusedError.WRONG_MODE)
+            raise NdiRefusedError(NdiRefusedError.WRONG_MODE)
         if not hexadecimal(parameters or "0001") & 0x0001:
-            raise RefusedError(RefusedError.BAD_PARAMETERS)
+            raise NdiRefusedError(NdiRefusedError.BAD_PARAMETERS)
         frame = self.bench.frame()
         return [(handle, frame) for handle in sorted(self._enabled)]
 
@@ -280,3 +288,62 @@ class AuroraPeer(Peer[AuroraSettings]):
                 body += struct.pack("<BB8f", handle, 0x01, *numbers)
             body += struct.pack("<II", self._status(handle), number)
         return framed(body + struct.pack("<H", 0))
+
+
+class NdiRefusedError(Exception):
+    """A command that the device answers with an error code."""
+
+    INVALID = 0x01
+    BAD_CRC = 0x04
+    BAD_PARAMETERS = 0x07
+    BAD_HANDLE = 0x08
+    WRONG_MODE = 0x0C
+    NOT_INITIALISED = 0x0E
+    SYSTEM_NOT_INITIALISED = 0x10
+
+
+def crc16(data: bytes) -> int:
+    """Return the CRC-16 of the protocol: polynomial x^16 + x^15 + x^2 + 1, reflected, from 0."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc
+
+
+def parse(command: bytes) -> tuple[str, str]:
+    """Return name and parameters of a command, whose CRC must be right where there is one."""
+    text = command.decode("latin-1")
+    name, colon, rest = text.partition(":")
+    if not colon:
+        name, _, parameters = text.partition(" ")
+        return name, parameters
+    if f"{crc16(text[:-4].encode('latin-1')):04X}" != rest[-4:].upper():
+        raise NdiRefusedError(NdiRefusedError.BAD_CRC)
+    return name, rest[:-4]
+
+
+def hexadecimal(text: str) -> int:
+    """Return a number of hexadecimal digits."""
+    try:
+        return int(text, 16)
+    except ValueError:
+        raise NdiRefusedError(NdiRefusedError.BAD_PARAMETERS) from None
+
+
+def pose_as_text(frame: TrackerFrame) -> str:
+    """Return signs and digits, without the points: 1e-4 of the quaternion, 0.01 mm, 1e-4 mm."""
+    numbers = np.array([*frame.quaternion * 1e4, *frame.position * 1e5])
+    if not np.isfinite(numbers).all() or np.abs(numbers[4:]).max() > 999999:
+        return "MISSING"
+    turns = "".join(f"{round(x):+06d}" for x in numbers[:4])
+    places = "".join(f"{round(x):+07d}" for x in numbers[4:])
+    return f"{turns}{places}{1000:+06d}"
+
+
+def framed(body: bytes) -> bytes:
+    """Return a binary reply: start, length and their CRC-16, the body and its CRC-16."""
+    header = struct.pack("<HH", 0xA5C4, len(body))
+    parts = (header, struct.pack("<H", crc16(header)), body, struct.pack("<H", crc16(body)))
+    return b"".join(parts)

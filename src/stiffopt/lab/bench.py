@@ -1,20 +1,32 @@
-"""What the protocol peers of the virtual lab see of the simulated arm."""
+"""The bench of the virtual lab: a simulated arm in real time, and the base of its devices."""
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.schema import Schema
+from stiffopt.errors import InputError
+from stiffopt.rig.device import DeviceSettings
 
-__all__ = ["Bench", "Peer", "TrackerFrame"]
+if TYPE_CHECKING:  # numba takes its time, and peers need none of it
+    from stiffopt.plant.hardware import Frame
+    from stiffopt.plant.world import World
+
+__all__ = ["FULL_SCALE", "Bench", "DevicePeer", "TrackerFrame"]
 
 Array = NDArray[np.float64]
-SettingsT = TypeVar("SettingsT", bound=Schema)
+SettingsT = TypeVar("SettingsT", bound=DeviceSettings)
+
+FULL_SCALE = 10e5
+"""Pressure in Pa that a regulator of the lab reaches at full scale, as of a K8P at 10 V."""
+
+_TICK = 0.005  # s, at most, by which the world is behind
 
 
 @dataclass(frozen=True)
@@ -35,64 +47,120 @@ class TrackerFrame:
     quaternion: Array
 
 
-class Bench(ABC):
-    """The simulated arm and its devices in real time. Every method may be called by any thread.
+class Bench:
+    """The simulated arm and its devices, kept going by a thread between `start` and `close`.
 
-    Peers carry its faults over to the wire: when `fault` of their device is ``off`` they do not
-    answer at all, when it is ``slow`` they answer late. All other faults (``stuck``, ``garbage``,
-    ``wrong``) show in what the methods return.
+    Every method may be called by any thread. Peers carry the faults of their device over to the
+    wire: when `fault` is ``off`` they do not answer at all, when it is ``slow`` they answer late.
+    All other faults (``stuck``, ``garbage``, ``wrong``) show in what the methods return.
+
+    Parameters
+    ----------
+    world :
+        Made for real time.
+
+    Attributes
+    ----------
+    failure : what ended the world, if something did.
     """
 
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.failure: BaseException | None = None
+        self._mounted_at = 0.0  # where the stage was, on its own scale, when it was mounted
+        self._newest: Frame | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Let time pass."""
+        self._thread = threading.Thread(target=self._keep_going, name="virtual-lab", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop; to close twice does nothing."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(2.0)
+            self._thread = None
+
+    def _keep_going(self) -> None:
+        while not self._stop.wait(_TICK):
+            try:
+                self.world.catch_up()
+            except Exception as error:  # told by whoever waits for the lab
+                self.failure = error
+                return
+
+    def fault(self, device: str) -> str:
+        """Return the fault of ``supply``, ``tracker`` or ``probe``; ``ok`` if there is none."""
+        return self.world.faults[device]
+
     @property
-    @abstractmethod
     def n(self) -> int:
         """Number of channels."""
+        return len(self.world.pressures)
 
-    @abstractmethod
     def command(self, channel: int, pressure: float) -> None:
         """Give a regulator (counted from 0) its set-point, in Pa."""
+        self.world.command_channel(channel, pressure)
 
-    @abstractmethod
     def measured(self) -> Array:
         """Pressures (n,) that the regulators report, in Pa."""
+        return self.world.measured()
 
-    @abstractmethod
     def dump(self, *, open_valve: bool) -> None:
         """Open or close the dump valve: open, it empties all chambers."""
+        self.world.dump(open_valve=open_valve)
 
-    @abstractmethod
     def frame(self) -> TrackerFrame | None:
         """Return the newest frame that has left the tracker, or None before the first."""
+        with self.world.lock:
+            for frame in self.world.frames():
+                self._newest = frame
+            newest = self._newest
+        if newest is None:
+            return None
+        captured = self.world.epoch + newest.captured
+        return TrackerFrame(newest.number, captured, newest.position, newest.quaternion)
 
-    @abstractmethod
-    def fault(self, device: str) -> str:
-        """Fault of ``supply``, ``tracker`` or ``probe``: ``ok``, ``off``, ``slow`` and others."""
+    def mount(self, direction: Iterable[float]) -> None:
+        """Mount the stage along a unit vector (3,) in the base frame, just clear of the tip.
+
+        It keeps its place on its own scale: only the rail is moved.
+        """
+        with self.world.lock:
+            self.world.catch_up()
+            self._mounted_at = self.stage_position
+            self.world.mount_stage(tuple(direction))
 
     @property
-    @abstractmethod
     def stage_position(self) -> float:
-        """Where the probe's stage is, in m."""
+        """Place of the probe's stage along its axis, in m."""
+        return self._mounted_at + self.world.stage_position
 
     @property
-    @abstractmethod
     def stage_moving(self) -> bool:
-        """Whether it moves."""
+        """Whether the stage moves."""
+        return self.world.stage_moving
 
-    @abstractmethod
     def stage_move(self, position: float, speed: float) -> None:
-        """Let the stage start to move, m and m/s."""
+        """Let the stage start to move, to a place in m at a speed in m/s."""
+        with self.world.lock:
+            self.world.catch_up()
+            self.world.move_stage(position - self._mounted_at, speed)
 
-    @abstractmethod
     def stage_stop(self) -> None:
-        """Stop it."""
+        """Stop the stage."""
+        self.world.stop_stage()
 
-    @abstractmethod
     def force(self) -> float:
         """Force that the probe's sensor feels, in N."""
+        return self.world.force()
 
 
-class Peer(ABC, Generic[SettingsT]):
-    """A device as others see it: it speaks the real protocol, and the bench is behind it.
+class DevicePeer(ABC, Generic[SettingsT]):
+    """A device as its driver sees it: it speaks the real protocol, with the bench behind it.
 
     Parameters
     ----------
@@ -106,6 +174,24 @@ class Peer(ABC, Generic[SettingsT]):
     def __init__(self, settings: SettingsT, bench: Bench) -> None:
         self.settings = settings
         self.bench = bench
+
+    @classmethod
+    def stand_in(cls, simulated: Any, n: int) -> SettingsT:
+        """Return settings with which this device takes the place of a simulated one.
+
+        Parameters
+        ----------
+        simulated :
+            Settings of the simulated device.
+        n :
+            Number of the arm's channels.
+
+        Raises
+        ------
+        InputError
+            It has no settings that go without saying.
+        """
+        raise InputError(f"{cls.__name__} needs settings in the rig file")
 
     @abstractmethod
     def start(self) -> SettingsT:

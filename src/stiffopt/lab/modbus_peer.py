@@ -1,4 +1,4 @@
-"""A Modbus device for the virtual lab: pymodbus's server, with the register map of the rig file."""
+"""The virtual lab's Modbus device: pymodbus's server with the register map of the rig file."""
 
 from __future__ import annotations
 
@@ -14,10 +14,14 @@ from typing import Any
 import numpy as np
 
 from stiffopt.errors import DeviceError
-from stiffopt.lab.bench import Bench, Peer
-from stiffopt.rig.drivers.modbus import ModbusSettings, SerialLine, Tcp
-from stiffopt.rig.drivers.modbus_line import library
-from stiffopt.rig.drivers.modbus_registers import Point
+from stiffopt.lab.bench import FULL_SCALE, Bench, DevicePeer
+from stiffopt.rig.drivers.modbus import (
+    ModbusSerial,
+    ModbusSettings,
+    ModbusTcp,
+    pymodbus_library,
+)
+from stiffopt.rig.drivers.modbus_registers import PressureRegister
 
 __all__ = ["ModbusPeer"]
 
@@ -27,7 +31,7 @@ _COILS, _INPUTS = (1, 5, 15), 4  # function codes
 _START = 5.0  # s, within which the server must listen
 
 
-class ModbusPeer(Peer[ModbusSettings]):
+class ModbusPeer(DevicePeer[ModbusSettings]):
     """A coupler with regulators on its outputs.
 
     What is written to set-points goes to the bench, readings come from it. An address that the
@@ -43,13 +47,25 @@ class ModbusPeer(Peer[ModbusSettings]):
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None
 
+    @classmethod
+    def stand_in(cls, simulated: Any, n: int) -> ModbusSettings:
+        """Return a coupler with a set-point and a reading per channel, watchdog and dump valve."""
+        return ModbusSettings(
+            tcp={"host": "127.0.0.1", "port": 0},
+            scale={"counts": (0, 32767), "pressure": (0.0, FULL_SCALE)},
+            table="holding",
+            channels=[{"setpoint": 0x0800 + i, "reading": i} for i in range(n)],
+            watchdog={"address": 0x1120, "timeout": 0.5},
+            dump_valve={"coil": 0},
+        )
+
     def start(self) -> ModbusSettings:
         """Listen on loopback or a pseudo-terminal; return the settings that lead here."""
-        library("pymodbus.server")
+        pymodbus_library("pymodbus.server")
         if self._thread is not None:
             raise DeviceError(f"{self.settings.connection} of the virtual lab runs already")
         self._fall()
-        started: Future[Tcp | SerialLine] = Future()
+        started: Future[ModbusTcp | ModbusSerial] = Future()
         self._thread = Thread(target=self._run, args=(started,), name="modbus-peer", daemon=True)
         self._thread.start()
         try:
@@ -57,7 +73,7 @@ class ModbusPeer(Peer[ModbusSettings]):
         except BaseException:
             self.close()
             raise
-        kind = "tcp" if isinstance(connection, Tcp) else "serial"
+        kind = "tcp" if isinstance(connection, ModbusTcp) else "serial"
         return self.settings.model_copy(update={kind: connection})
 
     def close(self) -> None:
@@ -72,7 +88,7 @@ class ModbusPeer(Peer[ModbusSettings]):
 
     # server --------------------------------------------------------------------------------------
 
-    def _run(self, started: Future[Tcp | SerialLine]) -> None:
+    def _run(self, started: Future[ModbusTcp | ModbusSerial]) -> None:
         try:
             asyncio.run(self._serve(started))
         except BaseException as error:
@@ -80,7 +96,7 @@ class ModbusPeer(Peer[ModbusSettings]):
                 raise
             started.set_exception(error)
 
-    async def _serve(self, started: Future[Tcp | SerialLine]) -> None:
+    async def _serve(self, started: Future[ModbusTcp | ModbusSerial]) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         terminals = _Terminals() if self.settings.serial is not None else None
         try:
@@ -95,24 +111,24 @@ class ModbusPeer(Peer[ModbusSettings]):
             if terminals is not None:
                 terminals.close()
 
-    async def _listen(self, terminals: _Terminals | None) -> tuple[Any, Tcp | SerialLine]:
-        servers = library("pymodbus.server")
+    async def _listen(self, terminals: _Terminals | None) -> tuple[Any, ModbusTcp | ModbusSerial]:
+        servers = pymodbus_library("pymodbus.server")
         options = {"trace_packet": self._trace}
         if terminals is not None:
-            asked = self.settings.serial or SerialLine(port="")
+            asked = self.settings.serial or ModbusSerial(port="")
             line = asked.model_copy(update={"parity": "none"})  # such terminals know no parity
             server = servers.ModbusSerialServer(
                 self._device(), port=terminals.inner, **line.options(), **options
             )
             await _begin(server, f"the pseudo-terminal {terminals.inner} cannot be opened")
             return server, line.model_copy(update={"port": terminals.outer})
-        host, port = _address(self.settings.tcp or Tcp(host="localhost", port=0))
+        host, port = _address(self.settings.tcp or ModbusTcp(host="localhost", port=0))
         server = servers.ModbusTcpServer(self._device(), address=(host, port), **options)
         await _begin(server, f"port {port} of {host} is in use; give another one or 0 for any")
-        return server, Tcp(host=host, port=server.transport.sockets[0].getsockname()[1])
+        return server, ModbusTcp(host=host, port=server.transport.sockets[0].getsockname()[1])
 
     def _device(self) -> Any:
-        simulator = library("pymodbus.simulator")
+        simulator = pymodbus_library("pymodbus.simulator")
 
         def block(addresses: set[int]) -> list[Any]:
             kind = simulator.DataType.REGISTERS
@@ -155,7 +171,9 @@ class ModbusPeer(Peer[ModbusSettings]):
         """Carry out a request; pymodbus answers with what is left in ``registers``."""
         fault = self.bench.fault("supply")
         if fault == "off":
-            return library("pymodbus.constants").ExcCodes.DEVICE_FAILURE  # `_trace` keeps it back
+            return pymodbus_library(
+                "pymodbus.constants"
+            ).ExcCodes.DEVICE_FAILURE  # `_trace` keeps it back
         if fault == "slow":
             await asyncio.sleep(LATE)
         if function in _COILS:
@@ -254,13 +272,13 @@ async def _begin(server: Any, failure: str) -> None:
         raise DeviceError(failure) from None
 
 
-def _address(asked: Tcp) -> tuple[str, int]:
+def _address(asked: ModbusTcp) -> tuple[str, int]:
     """Return where to listen: where asked, if that is on loopback, else on any free port there."""
     local = asked.host == "localhost" or asked.host.startswith("127.")
     return ("127.0.0.1", asked.port if local else 0)
 
 
-def _counts(point: Point, pressure: float) -> tuple[int, ...]:
+def _counts(point: PressureRegister, pressure: float) -> tuple[int, ...]:
     """Return the registers of a reading; integers know no NaN and then read as full."""
     if np.isfinite(pressure):
         return point.encode(float(pressure))

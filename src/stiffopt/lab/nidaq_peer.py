@@ -1,17 +1,377 @@
-"""The virtual lab's NI-DAQ device: volts on its terminals, the bench's regulators behind them."""
+"""The virtual lab's NI-DAQ devices: a gRPC server for the real nidaqmx, and regulators behind it.
+
+The server is built on nidaqmx's own stubs. It knows the calls that tasks for voltages, digital
+lines and watchdogs make, and refuses all others as NI's server refuses what it does not know.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor, Future
+from dataclasses import dataclass, field
 from functools import partial
+from queue import SimpleQueue
+from threading import Event, RLock, Thread, Timer
+from typing import Any
+from uuid import uuid4
 
-from stiffopt.lab.bench import Bench, Peer
-from stiffopt.lab.daq_server import DaqHardware, DaqServer
-from stiffopt.rig.drivers.nidaq import Input, NidaqSettings, Output
+from stiffopt.errors import DeviceError
+from stiffopt.lab.bench import FULL_SCALE, Bench, DevicePeer
+from stiffopt.rig.device import library
+from stiffopt.rig.drivers.nidaq import NidaqInput, NidaqOutput, NidaqSettings
 
-__all__ = ["NidaqPeer", "local"]
+__all__ = ["DaqHardware", "DaqServer", "NidaqPeer", "local"]
 
+LATE = 0.3  # s after which a slow device answers
+THREADS = 8
+
+_VERSION = {0x1272: 24, 0x1923: 5, 0x2F22: 0}  # of the driver: major, minor, update
+_EXPIRED = 0x21A8
+_HIGH = 10192
+_CHANNEL_MISSING = (-200170, "Physical channel specified does not exist on this device.")
+_NO_TASK = (-200088, "Task specified is invalid or does not exist.")
+_RESERVED = (-50103, "The specified resource is reserved.")
+_OUT_OF_RANGE = (-200561, "Attempted writing analog data that is too large or too small.")
+_WRITE_EXPIRED = (-200678, "Write cannot be performed because the watchdog timer has expired.")
+_RESET_EXPIRED = (-200644, "Watchdog timer cannot be reset because it has expired.")
+_BAD_ATTRIBUTE = (-200233, "Specified property is not supported by the device.")
+_START, _STOP, _ABORT = 0, 1, 6
+_FEED, _CLEAR = 0, 1
 _LOOPBACK = ("127.0.0.1", "localhost")
+
+
+@dataclass(frozen=True)
+class DaqHardware:
+    """What is wired to an emulated NI-DAQ device.
+
+    Attributes
+    ----------
+    outputs : takes the volts of each analogue output.
+    inputs : gives those of each analogue input.
+    lines : takes the level of each digital line.
+    fault : of the device: ``ok``, ``off``, ``slow`` and others.
+    """
+
+    outputs: Mapping[str, Callable[[float], None]] = field(default_factory=dict)
+    inputs: Mapping[str, Callable[[], float]] = field(default_factory=dict)
+    lines: Mapping[str, Callable[[bool], None]] = field(default_factory=dict)
+    fault: Callable[[], str] = lambda: "ok"
+
+
+class _NiError(Exception):
+    """An error that the server answers with: number and text."""
+
+
+@dataclass
+class _Session:
+    """A task; `ranges` are those of its channels, in V."""
+
+    kind: str = ""
+    channels: list[str] = field(default_factory=list)
+    ranges: list[tuple[float, float]] = field(default_factory=list)
+    started: bool = False
+    watchdog: _Watchdog | None = None
+
+    @property
+    def device(self) -> str:
+        return self.channels[0].split("/")[0] if self.channels else ""
+
+
+class _Watchdog:
+    """Drives its lines and locks them when it is not fed in time."""
+
+    def __init__(self, timeout: float, act: Callable[[dict[str, bool]], None]) -> None:
+        self.timeout = timeout
+        self.states: dict[str, bool] = {}
+        self.expired = False
+        self._act = act
+        self._timer: Timer | None = None
+
+    def start(self) -> None:
+        self.stop()
+        self._timer = Timer(self.timeout, self._expire)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def stop(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = None
+
+    @property
+    def running(self) -> bool:
+        return self._timer is not None
+
+    def _expire(self) -> None:
+        self._act(self.states)
+        self.expired = True
+
+
+class DaqServer:
+    """Serves the hardware until it is closed.
+
+    Parameters
+    ----------
+    hardware :
+        What is wired.
+    address :
+        To listen on, on this machine; None: any free port.
+    """
+
+    def __init__(self, hardware: DaqHardware, address: str | None, extra: str) -> None:
+        self._hardware = hardware
+        self._wanted = address
+        self._extra = extra
+        self._sessions: dict[str, _Session] = {}
+        self._locked = False  # by a watchdog that has expired: digital writes are refused
+        self._lock = RLock()
+        self._closing = Event()
+        self._server: Any = None
+        self._threads: LastingThreads | None = None
+
+    def start(self) -> str:
+        """Listen, and return the address."""
+        grpc = library("grpc", "nidaqmx[grpc]", self._extra)
+        self._messages = library("nidaqmx._stubs.nidaqmx_pb2", "nidaqmx[grpc]", self._extra)
+        threads = LastingThreads(THREADS, "daq-server")
+        # Without this option two servers may listen on one port, and each gets some of the calls.
+        server = grpc.server(threads, options=[("grpc.so_reuseport", 0)])
+        handlers = {name: self._handler(grpc, name, call) for name, call in self._calls().items()}
+        service = grpc.method_handlers_generic_handler("nidaqmx_grpc.NiDAQmx", handlers)
+        server.add_generic_rpc_handlers((service,))
+        wanted = self._wanted or "127.0.0.1:0"
+        try:
+            port = server.add_insecure_port(wanted)
+        except RuntimeError:
+            threads.shutdown()
+            raise DeviceError(
+                f"the virtual NI-DAQ device cannot listen on {wanted}: the port is in use; "
+                "end what uses it, or remove 'grpc' to take a free one"
+            ) from None
+        server.start()
+        self._server, self._threads = server, threads
+        return f"127.0.0.1:{port}"
+
+    def close(self) -> None:
+        """End all sessions and threads; to close twice does nothing."""
+        self._closing.set()
+        if sys.is_finalizing():  # to stop takes a thread, and none starts any more
+            return
+        server, self._server = self._server, None
+        threads, self._threads = self._threads, None
+        if server is not None:
+            server.stop(grace=0).wait()
+        if threads is not None:
+            threads.shutdown()
+        with self._lock:
+            for session in self._sessions.values():
+                if session.watchdog is not None:
+                    session.watchdog.stop()
+            self._sessions.clear()
+
+    def _calls(self) -> dict[str, Callable[[Any], dict[str, Any]]]:
+        return {
+            "GetSystemInfoAttributeUInt32": self._version,
+            "GetErrorString": lambda request: {"error_string": f"Error {request.error_code}"},
+            "CreateTask": lambda request: self._created(_Session()),
+            "CreateWatchdogTimerTaskEx": self._create_watchdog,
+            "ClearTask": self._clear,
+            "StartTask": lambda request: self._control(request, _START),
+            "StopTask": lambda request: self._control(request, _STOP),
+            "TaskControl": lambda request: self._control(request, request.action_raw),
+            "GetTaskAttributeString": lambda request: {"value": request.task.name},
+            "CreateAOVoltageChan": lambda r: self._add(r, "ao", r.physical_channel),
+            "CreateAIVoltageChan": lambda r: self._add(r, "ai", r.physical_channel),
+            "CreateDOChan": lambda r: self._add(r, "do", r.lines),
+            "WriteAnalogF64": self._write,
+            "ReadAnalogF64": self._read,
+            "WriteDigitalLines": self._write_lines,
+            "CfgWatchdogDOExpirStates": self._expiration,
+            "ControlWatchdogTask": self._control_watchdog,
+            "GetWatchdogAttributeBool": self._watchdog_attribute,
+        }
+
+    def _handler(self, grpc: Any, name: str, call: Callable[[Any], dict[str, Any]]) -> Any:
+        response = getattr(self._messages, f"{name}Response")
+
+        def answer(request: Any, context: Any) -> Any:
+            if not self._answers(context):
+                context.abort(grpc.StatusCode.CANCELLED, "")
+            try:
+                with self._lock:
+                    return response(status=0, **call(request))
+            except _NiError as error:
+                code, text = error.args
+                context.set_trailing_metadata((("ni-error", str(code)),))
+                context.abort(grpc.StatusCode.UNKNOWN, text)
+
+        return grpc.unary_unary_rpc_method_handler(
+            answer,
+            request_deserializer=getattr(self._messages, f"{name}Request").FromString,
+            response_serializer=response.SerializeToString,
+        )
+
+    def _answers(self, context: Any) -> bool:
+        """Say whether the call is answered; while the device is off, wait until nobody listens."""
+        fault = self._hardware.fault()
+        if fault == "slow":
+            self._closing.wait(LATE)
+        while fault == "off" and context.is_active() and not self._closing.wait(0.02):
+            pass
+        return fault != "off"
+
+    def _created(self, session: _Session) -> dict[str, Any]:
+        name = f"task-{uuid4()}"  # one that no server before this one has given away
+        self._sessions[name] = session
+        return {"task": {"name": name}, "new_session_initialized": True}
+
+    def _session(self, request: Any) -> _Session:
+        if request.task.name not in self._sessions:
+            raise _NiError(*_NO_TASK)
+        return self._sessions[request.task.name]
+
+    def _watchdog(self, request: Any) -> _Watchdog:
+        watchdog = self._session(request).watchdog
+        if watchdog is None:
+            raise _NiError(*_NO_TASK)
+        return watchdog
+
+    def _version(self, request: Any) -> dict[str, Any]:
+        return {"value": _VERSION.get(request.attribute_raw, 0)}
+
+    def _clear(self, request: Any) -> dict[str, Any]:
+        session = self._session(request)
+        if session.watchdog is not None:
+            session.watchdog.stop()
+        del self._sessions[request.task.name]
+        return {}
+
+    def _add(self, request: Any, kind: str, channel: str) -> dict[str, Any]:
+        known: Mapping[str, Any] = {
+            "ao": self._hardware.outputs,
+            "ai": self._hardware.inputs,
+            "do": self._hardware.lines,
+        }[kind]
+        session = self._session(request)
+        if channel not in known or session.kind not in ("", kind):
+            raise _NiError(*_CHANNEL_MISSING)
+        session.kind = kind
+        session.channels.append(channel)
+        if kind != "do":
+            session.ranges.append((request.min_val, request.max_val))
+        return {}
+
+    def _control(self, request: Any, action: int) -> dict[str, Any]:
+        session = self._session(request)
+        if action == _START:
+            self._must_be_free(session)
+        if action in (_START, _STOP, _ABORT):
+            session.started = action == _START
+            if session.watchdog is not None:
+                (session.watchdog.start if session.started else session.watchdog.stop)()
+        return {}
+
+    def _must_be_free(self, session: _Session) -> None:
+        """Refuse as NI's driver does: a device runs one task of a kind at a time."""
+        for other in self._sessions.values():
+            same = (other.kind, other.device) == (session.kind, session.device)
+            if other is not session and other.started and same:
+                raise _NiError(*_RESERVED)
+
+    def _write(self, request: Any) -> dict[str, Any]:
+        session = self._session(request)
+        self._must_be_free(session)
+        values = list(request.write_array)
+        for volts, (low, high) in zip(values, session.ranges, strict=True):
+            if not low <= volts <= high:
+                raise _NiError(*_OUT_OF_RANGE)
+        for channel, volts in zip(session.channels, values, strict=True):
+            self._hardware.outputs[channel](volts)
+        return {"samps_per_chan_written": 1}
+
+    def _read(self, request: Any) -> dict[str, Any]:
+        session = self._session(request)
+        self._must_be_free(session)
+        volts = [self._hardware.inputs[channel]() for channel in session.channels]
+        pairs = zip(volts, session.ranges, strict=True)  # the converter saturates
+        clipped = [min(max(value, low), high) for value, (low, high) in pairs]
+        return {"read_array": clipped, "samps_per_chan_read": 1}
+
+    def _write_lines(self, request: Any) -> dict[str, Any]:
+        session = self._session(request)
+        if self._locked:
+            raise _NiError(*_WRITE_EXPIRED)
+        for line, level in zip(session.channels, request.write_array, strict=True):
+            self._hardware.lines[line](bool(level))
+        return {"samps_per_chan_written": 1}
+
+    def _create_watchdog(self, request: Any) -> dict[str, Any]:
+        return self._created(_Session("watchdog", watchdog=_Watchdog(request.timeout, self._drive)))
+
+    def _drive(self, states: dict[str, bool]) -> None:
+        with self._lock:
+            self._locked = True
+            for line, level in states.items():
+                self._hardware.lines[line](level)
+
+    def _expiration(self, request: Any) -> dict[str, Any]:
+        lines = [name.strip() for name in request.channel_names.split(",")]
+        if any(line not in self._hardware.lines for line in lines):
+            raise _NiError(*_CHANNEL_MISSING)
+        levels = [state == _HIGH for state in request.expir_state_array]
+        self._watchdog(request).states = dict(zip(lines, levels, strict=True))
+        return {}
+
+    def _control_watchdog(self, request: Any) -> dict[str, Any]:
+        watchdog = self._watchdog(request)
+        if request.action_raw == _FEED and watchdog.expired:
+            raise _NiError(*_RESET_EXPIRED)
+        if request.action_raw == _CLEAR:
+            watchdog.expired = self._locked = False
+        if watchdog.running:
+            watchdog.start()
+        return {}
+
+    def _watchdog_attribute(self, request: Any) -> dict[str, Any]:
+        if request.attribute_raw != _EXPIRED:
+            raise _NiError(*_BAD_ATTRIBUTE)
+        return {"value": self._watchdog(request).expired}
+
+
+class LastingThreads(Executor):
+    """Threads that serve on while the interpreter exits, which is when supplies vent."""
+
+    def __init__(self, n: int, name: str) -> None:
+        self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._threads = [Thread(target=self._work, name=name, daemon=True) for _ in range(n)]
+        for thread in self._threads:
+            thread.start()
+
+    def submit(self, call: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """See `Executor`."""
+        future: Future[Any] = Future()
+
+        def job() -> None:
+            if future.set_running_or_notify_cancel():
+                try:
+                    future.set_result(call(*args, **kwargs))
+                except BaseException as error:
+                    future.set_exception(error)
+
+        self._jobs.put(job)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the threads end after what was submitted, and wait for that."""
+        for _ in self._threads:
+            self._jobs.put(None)
+        for thread in self._threads:
+            thread.join()
+
+    def _work(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job()
 
 
 def local(address: str | None) -> str | None:
@@ -21,7 +381,7 @@ def local(address: str | None) -> str | None:
     return f"127.0.0.1:{address.rpartition(':')[2]}"
 
 
-class NidaqPeer(Peer[NidaqSettings]):
+class NidaqPeer(DevicePeer[NidaqSettings]):
     """An NI-DAQ device with regulators, and a dump valve where the settings name one.
 
     It listens where ``grpc`` says if that is on this machine, else on a free port.
@@ -39,7 +399,20 @@ class NidaqPeer(Peer[NidaqSettings]):
             lines=self._lines(),
             fault=partial(bench.fault, "supply"),
         )
-        self._server = DaqServer(hardware, local(settings.grpc), "nidaq")
+        self._server = DaqServer(hardware, local(settings.grpc), settings.extra)
+
+    @classmethod
+    def stand_in(cls, simulated: Any, n: int) -> NidaqSettings:
+        """Return analogue outputs and inputs of 0 to 10 V, and a dump valve on a digital line."""
+        pressures = (0.0, FULL_SCALE)
+        channels = [
+            {
+                "output": {"channel": f"Dev1/ao{i}", "pressures": pressures},
+                "input": {"channel": f"Dev1/ai{i}", "pressures": pressures},
+            }
+            for i in range(n)
+        ]
+        return NidaqSettings(channels=channels, dump_valve={"line": "Dev1/port0/line0"})
 
     def start(self) -> NidaqSettings:
         """Listen, and return the settings with the address."""
@@ -67,9 +440,9 @@ class NidaqPeer(Peer[NidaqSettings]):
         shut = valve.closed_when == "high"
         return {valve.line: lambda level: self.bench.dump(open_valve=level != shut)}
 
-    def _set(self, index: int, output: Output, volts: float) -> None:
+    def _set(self, index: int, output: NidaqOutput, volts: float) -> None:
         self._volts[output.channel] = volts
         self.bench.command(index, output.pressure_at(volts))
 
-    def _get(self, index: int, wired: Input) -> float:
+    def _get(self, index: int, wired: NidaqInput) -> float:
         return wired.volts_for(float(self.bench.measured()[index]))

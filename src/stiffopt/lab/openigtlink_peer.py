@@ -1,4 +1,4 @@
-"""An OpenIGTLink server such as PLUS: the tracker of the virtual lab, over TCP."""
+"""The virtual lab's tracker behind an OpenIGTLink server, such as PLUS, over TCP."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 
 from stiffopt import lie
 from stiffopt.errors import DeviceError
-from stiffopt.lab.bench import Bench, Peer, TrackerFrame
+from stiffopt.lab.bench import Bench, DevicePeer, TrackerFrame
 from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings, pyigtl_messages
 
 __all__ = ["OpenIGTLinkPeer"]
@@ -23,7 +23,7 @@ PAUSE = 0.002  # s between two looks at the bench
 SLOW = 0.2  # s, by which a slow server sends late
 
 
-class OpenIGTLinkPeer(Peer[OpenIGTLinkSettings]):
+class OpenIGTLinkPeer(DevicePeer[OpenIGTLinkSettings]):
     """Sends each frame once to whoever is connected, and nothing when the tool is not seen.
 
     Frames carry the time of their capture on a clock of the server's own, as PLUS does. pyigtl
@@ -41,6 +41,11 @@ class OpenIGTLinkPeer(Peer[OpenIGTLinkSettings]):
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._messages: Any = None
+
+    @classmethod
+    def stand_in(cls, simulated: Any, n: int) -> OpenIGTLinkSettings:
+        """Return settings with the simulated tracker's registration and latency."""
+        return OpenIGTLinkSettings(registration=simulated.registration, latency=simulated.latency)
 
     def start(self) -> OpenIGTLinkSettings:
         """Listen on loopback."""

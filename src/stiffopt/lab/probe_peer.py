@@ -1,18 +1,271 @@
-"""The virtual lab's probe: its stage and, beside it, the NI-DAQ device that reads its sensor."""
+"""The virtual lab's probe: a Zaber stage on TCP, and the NI-DAQ device that reads its sensor.
+
+The stage speaks Zaber's ASCII protocol. It knows what a program needs that identifies, homes,
+moves, stops and watches one axis, and rejects the rest as the real device does.
+"""
 
 from __future__ import annotations
 
+import socket
+import socketserver
+from collections.abc import Callable
 from functools import partial
+from threading import Event, RLock, Thread
+from typing import Any, NamedTuple
 
-from stiffopt.lab.bench import Bench, Peer
-from stiffopt.lab.daq_server import DaqHardware, DaqServer
-from stiffopt.lab.zaber_peer import ZaberPeer
-from stiffopt.rig.drivers.probe import ProbeSettings
+from stiffopt.errors import DeviceError
+from stiffopt.lab.bench import Bench, DevicePeer
+from stiffopt.lab.nidaq_peer import DaqHardware, DaqServer
+from stiffopt.rig.drivers.probe import SPEED_FACTOR, ZaberProbeSettings
 
-__all__ = ["ProbePeer"]
+__all__ = ["ProbePeer", "ZaberPeer"]
+
+LATE = 0.3  # s after which a slow device answers
+
+_LOOPBACK = ("127.0.0.1", "localhost")
+_NOT_HOMED, _INTERRUPTED = "WR", "NI"
+_IDENTITY = {
+    "device.id": "50081",
+    "deviceid": "50081",
+    "system.serial": "12345",
+    "system.axiscount": "1",
+    "system.access": "1",
+    "version": "7.38",
+    "version.build": "15000",
+    "peripheral.id": "0",
+    "peripheralid": "0",
+    "device.hw.modified": "0",
+    "peripheral.hw.modified": "0",
+    "resolution": "64",
+    "comm.alert": "0",
+}
 
 
-class ProbePeer(Peer[ProbeSettings]):
+class _Request(NamedTuple):
+    """A line: device, axis and number of the message as written, and words."""
+
+    device: int
+    axis: int
+    number: str
+    words: list[str]
+
+
+class _Answer(NamedTuple):
+    data: str = "0"
+    accepted: bool = True
+
+
+_BAD_COMMAND = _Answer("BADCOMMAND", accepted=False)
+_BAD_DATA = _Answer("BADDATA", accepted=False)
+
+
+class ZaberPeer(DevicePeer[ZaberProbeSettings]):
+    """The stage of a probe; its middle of travel is where the bench has it aligned.
+
+    Parameters
+    ----------
+    homed :
+        Whether it has been homed since it was switched on.
+    """
+
+    def __init__(self, settings: ZaberProbeSettings, bench: Bench, *, homed: bool = True) -> None:
+        super().__init__(settings, bench)
+        stage = settings.stage
+        self._stage = stage
+        self._middle = 0.5 * (stage.travel[0] + stage.travel[1])
+        self._flags: set[str] = set() if homed else {_NOT_HOMED}
+        self._lock = RLock()
+        self._closing = Event()
+        self._server: _Server | None = None
+        self._thread: Thread | None = None
+
+    def start(self) -> ZaberProbeSettings:
+        """Listen, and return the settings with the address."""
+        on_loopback = self._stage.host in _LOOPBACK
+        port = self._stage.port if on_loopback else 0
+        try:
+            self._server = _Server(port, self._reply)
+        except OSError:
+            raise DeviceError(
+                f"the virtual stage cannot listen on 127.0.0.1:{port}: the port is in use; end "
+                "what uses it, or remove 'host' to take a free one"
+            ) from None
+        self._thread = Thread(
+            target=partial(self._server.serve_forever, poll_interval=0.05), name="zaber-peer"
+        )
+        self._thread.start()
+        host, port = self._server.socket.getsockname()
+        stage = self._stage.model_copy(update={"host": host, "port": port, "serial": None})
+        return self.settings.model_copy(update={"stage": stage})
+
+    def close(self) -> None:
+        """Stop listening, end all connections and threads."""
+        self._closing.set()
+        server, self._server = self._server, None
+        if server is not None:
+            server.shutdown()
+            server.end_connections()
+            server.server_close()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _reply(self, line: str) -> str | None:
+        """Return the answer to a line, or None where the device keeps silent."""
+        fault = self.bench.fault("probe")
+        if fault == "slow":
+            self._closing.wait(LATE)
+        request = _parsed(line)
+        if fault == "off" or request is None or request.device not in (0, self._stage.device):
+            return None
+        with self._lock:
+            answer = self._carry_out(request)
+            status = "BUSY" if self.bench.stage_moving else "IDLE"
+            flag = max(self._flags, default="--")  # WR outranks NI
+        number = f" {request.number}" if request.number else ""
+        verdict = "OK" if answer.accepted else "RJ"
+        text = f"{self._stage.device:02d} {request.axis}{number} {verdict} {status} {flag}"
+        reply = f"{text} {answer.data}"
+        checked = f"{reply}:{_checksum(reply):02X}" if ":" in line else reply
+        return f"@{checked}\r\n"
+
+    def _carry_out(self, request: _Request) -> _Answer:
+        if request.axis not in (0, self._stage.axis):
+            return _Answer("BADAXIS", accepted=False)
+        commands: dict[str, Callable[[list[str]], _Answer]] = {
+            "get": self._get,
+            "warnings": self._warnings,
+            "home": self._home,
+            "move": self._move,
+            "stop": self._stop,
+            "estop": self._stop,
+        }
+        if not request.words:
+            return _Answer()
+        name, *words = request.words
+        return commands[name](words) if name in commands else _BAD_COMMAND
+
+    def _get(self, words: list[str]) -> _Answer:
+        low, high = (round(place / self._stage.microstep) for place in self._stage.travel)
+        values = {
+            **_IDENTITY,
+            "pos": str(round(self._place() / self._stage.microstep)),
+            "limit.min": str(low),
+            "limit.max": str(high),
+            "maxspeed": str(self._native_max_speed),
+            "limit.home.triggered": str(int(_NOT_HOMED not in self._flags)),
+        }
+        return _Answer(values[words[0]]) if words and words[0] in values else _BAD_COMMAND
+
+    def _warnings(self, words: list[str]) -> _Answer:
+        flags = sorted(self._flags, reverse=True)
+        if words == ["clear"]:
+            self._flags.discard(_INTERRUPTED)
+        return _Answer(" ".join([f"{len(flags):02d}", *flags]))
+
+    def _home(self, words: list[str]) -> _Answer:
+        self._flags.clear()
+        self._go(self._stage.travel[0], self._native_max_speed)
+        return _Answer()
+
+    def _move(self, words: list[str]) -> _Answer:
+        if len(words) < 2 or words[0] not in ("abs", "rel"):
+            return _BAD_COMMAND
+        try:
+            position, speed, *_ = *(float(word) for word in words[1:]), self._native_max_speed
+        except ValueError:
+            return _BAD_DATA
+        place = position * self._stage.microstep + (self._place() if words[0] == "rel" else 0.0)
+        low, high = self._stage.travel
+        slack = self._stage.microstep
+        if not (low - slack <= place <= high + slack and 0 < speed <= self._native_max_speed):
+            return _BAD_DATA
+        if _NOT_HOMED in self._flags and words[0] == "abs":
+            return _BAD_DATA
+        self._flags.discard(_INTERRUPTED)
+        self._go(place, speed)
+        return _Answer()
+
+    def _stop(self, words: list[str]) -> _Answer:
+        if self.bench.stage_moving:
+            self._flags.add(_INTERRUPTED)
+        self.bench.stage_stop()
+        return _Answer()
+
+    @property
+    def _native_max_speed(self) -> int:
+        return round(self._stage.max_speed / self._stage.microstep * SPEED_FACTOR)
+
+    def _place(self) -> float:
+        """Place on the rail, in m from home."""
+        return self._middle + self._stage.towards_tip * self.bench.stage_position
+
+    def _go(self, place: float, native_speed: float) -> None:
+        speed = native_speed / SPEED_FACTOR * self._stage.microstep
+        self.bench.stage_move(self._stage.towards_tip * (place - self._middle), speed)
+
+
+def _checksum(text: str) -> int:
+    return -sum(text.encode()) & 0xFF
+
+
+def _parsed(line: str) -> _Request | None:
+    """Return what a line says, or None if it is damaged, which a device ignores."""
+    body, colon, checksum = line.removeprefix("/").partition(":")
+    if not line.startswith("/") or (colon and checksum != f"{_checksum(body):02X}"):
+        return None
+    words = body.split()
+    numbers: list[str] = []
+    while words and len(numbers) < 3 and words[0].isdecimal():
+        numbers.append(words.pop(0))
+    device, axis, number = [*numbers, *["0", "0", ""][len(numbers) :]]
+    return _Request(int(device), int(axis), number, words)
+
+
+class _Server(socketserver.ThreadingTCPServer):
+    """A thread for each connection, all of which can be ended."""
+
+    allow_reuse_address = True  # else the port stays taken for a minute after each run
+
+    def __init__(self, port: int, reply: Callable[[str], str | None]) -> None:
+        self.reply = reply
+        self._connections: set[socket.socket] = set()
+        super().__init__(("127.0.0.1", port), _Handler)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Remember a connection, and serve it."""
+        request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._connections.add(request)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Forget a connection that has ended."""
+        self._connections.discard(request)
+        super().shutdown_request(request)
+
+    def end_connections(self) -> None:
+        """Shut all connections, so that their threads end."""
+        for connection in list(self._connections):
+            try:
+                connection.shutdown(socket.SHUT_RDWR)
+            except OSError:  # it has just ended by itself
+                continue
+
+
+class _Handler(socketserver.StreamRequestHandler):
+    server: _Server
+
+    def handle(self) -> None:
+        try:
+            for line in self.rfile:
+                if text := line.decode("ascii", "replace").strip():
+                    reply = self.server.reply(text)
+                    if reply is not None:
+                        self.wfile.write(reply.encode())
+        except OSError:
+            return  # the other side has gone
+
+
+class ProbePeer(DevicePeer[ZaberProbeSettings]):
     """Stage and sensor.
 
     The sensor's device listens on a free port, whatever ``grpc`` says: on a real rig one server
@@ -24,15 +277,20 @@ class ProbePeer(Peer[ProbeSettings]):
         Whether the stage has been homed since it was switched on.
     """
 
-    def __init__(self, settings: ProbeSettings, bench: Bench, *, homed: bool = True) -> None:
+    def __init__(self, settings: ZaberProbeSettings, bench: Bench, *, homed: bool = True) -> None:
         super().__init__(settings, bench)
         self._stage = ZaberPeer(settings, bench, homed=homed)
         hardware = DaqHardware(
             inputs={settings.force.channel: self._volts}, fault=partial(bench.fault, "probe")
         )
-        self._sensor = DaqServer(hardware, None, "probe")
+        self._sensor = DaqServer(hardware, None, settings.extra)
 
-    def start(self) -> ProbeSettings:
+    @classmethod
+    def stand_in(cls, simulated: Any, n: int) -> ZaberProbeSettings:
+        """Return a stage on TCP and a sensor of 2 N/V."""
+        return ZaberProbeSettings(stage={}, force={"channel": "Dev2/ai0", "sensitivity": 2.0})
+
+    def start(self) -> ZaberProbeSettings:
         """Listen, and return the settings with both addresses."""
         try:
             settings = self._stage.start()

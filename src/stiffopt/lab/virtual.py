@@ -1,43 +1,80 @@
-"""The virtual lab: the devices of a rig file as real protocol peers of a simulated arm."""
+"""The virtual lab: a simulated arm in real time behind the protocols of a rig file's devices."""
 
 from __future__ import annotations
 
 from contextlib import ExitStack
-from importlib import import_module
 from types import TracebackType
 from typing import Any, Self
 
-from stiffopt.lab.bench import Peer
-from stiffopt.lab.defaults import with_real_devices
-from stiffopt.lab.real_time import RealTimeBench
+from stiffopt.errors import InputError
+from stiffopt.lab.bench import Bench, DevicePeer
 from stiffopt.model.description import RobotDescription
-from stiffopt.plant.settings import PlantSettings
+from stiffopt.plant.settings import LabSettings, plant_of
 from stiffopt.plant.world import World
-from stiffopt.rig.config import LabSettings, RigDescription, limits_of
+from stiffopt.rig.config import RigDescription, limits_of
+from stiffopt.rig.device import DeviceSettings
+from stiffopt.rig.registry import driver_class, driver_names, load, one_of
 
-__all__ = ["VirtualLab"]
+__all__ = ["VirtualLab", "with_real_devices"]
 
-_PEERS = {
-    "modbus": "modbus_peer:ModbusPeer",
-    "nidaq": "nidaq_peer:NidaqPeer",
-    "aurora": "aurora_peer:AuroraPeer",
-    "openigtlink": "openigtlink_peer:OpenIGTLinkPeer",
-    "probe": "probe_peer:ProbePeer",
-}
+
+def with_real_devices(
+    description: RigDescription, robot: RobotDescription, **drivers: str
+) -> RigDescription:
+    """Return a rig whose simulated devices are replaced by real ones on this machine.
+
+    Parameters
+    ----------
+    description, robot :
+        The rig and its robot.
+    drivers :
+        That take the place of a simulated `supply`, `tracker` and `probe`.
+
+    Raises
+    ------
+    InputError
+        There is no such driver, or no peer for it.
+    """
+    real: dict[str, Any] = {}
+    lab: dict[str, Any] = {}
+    for kind, driver in drivers.items():
+        model = driver_class(kind, driver)
+        if model.simulated:
+            known = one_of(name for name in driver_names(kind) if name != driver)
+            raise InputError(f"the driver '{driver}' is simulated itself; expected {known}")
+        settings = getattr(description, kind)
+        if settings is not None and settings.simulated:
+            lab[kind] = settings
+            real[kind] = _peer_class(model).stand_in(settings, robot.n_pressures)
+    if not real:
+        return description
+    before = description.lab.model_dump() if description.lab else {}
+    fields = {**{name: getattr(description, name) for name in RigDescription.model_fields}, **real}
+    return RigDescription(**{**fields, "lab": {**before, **lab}})
+
+
+def _peer_class(settings: type[DeviceSettings]) -> type[DevicePeer[Any]]:
+    """Return the class that plays a device in the lab."""
+    if not settings.peer:
+        raise InputError(
+            f"the driver of {settings.__name__} cannot be used in the virtual lab: it has no peer"
+        )
+    found: type[DevicePeer[Any]] = load(settings.peer)
+    return found
 
 
 class VirtualLab:
-    """A simulated arm in real time behind the protocols of a rig file's devices.
+    """A simulated arm in real time, and a peer for each device of a rig file.
 
     Parameters
     ----------
     description :
-        The rig; where its devices are simulated, `supply` and `tracker` name the drivers of the
-        real ones that take their place.
+        The rig; where its devices are simulated, `supply`, `tracker` and `probe` name the drivers
+        of the real ones that take their place.
     robot :
         Its robot.
-    supply, tracker :
-        ``modbus`` or ``nidaq``, ``aurora`` or ``openigtlink``.
+    supply, tracker, probe :
+        Drivers that have a peer.
     """
 
     def __init__(
@@ -46,18 +83,20 @@ class VirtualLab:
         robot: RobotDescription,
         supply: str = "modbus",
         tracker: str = "aurora",
+        probe: str = "probe",
     ) -> None:
-        self.description = with_real_devices(description, robot, supply, tracker)
-        lab = self.description.lab or LabSettings()
+        drivers = {"supply": supply, "tracker": tracker, "probe": probe}
+        self.description = with_real_devices(description, robot, **drivers)
+        given = self.description.lab
+        lab = given if isinstance(given, LabSettings) else LabSettings()
         seen = lab.tracker
         if self.description.tracker is not None:
             registration = self.description.tracker.registration
             seen = seen.model_copy(update={"registration": registration})
-        plant = self.description.plant or PlantSettings()
-        limits = limits_of(self.description, robot)
+        plant, limits = plant_of(self.description), limits_of(self.description, robot)
         world = World(robot, limits, plant, lab.supply, seen, lab.probe, real_time=True)
-        self.bench = RealTimeBench(world)
-        self._peers: list[Peer[Any]] = []
+        self.bench = Bench(world)
+        self._peers: list[DevicePeer[Any]] = []
 
     @property
     def world(self) -> World:
@@ -77,6 +116,8 @@ class VirtualLab:
             An address is in use.
         MissingExtraError
             A library is not installed.
+        InputError
+            There is no peer for a driver.
         """
         addressed: dict[str, Any] = {"plant": None, "lab": None}
         with ExitStack() as stack:
@@ -85,9 +126,7 @@ class VirtualLab:
                 settings = getattr(self.description, name)
                 if settings is None:
                     continue
-                module, kind = _PEERS[settings.driver].split(":")
-                peer_class = getattr(import_module(f"stiffopt.lab.{module}"), kind)
-                peer: Peer[Any] = peer_class(settings, self.bench)
+                peer = _peer_class(type(settings))(settings, self.bench)
                 self._peers.append(peer)
                 addressed[name] = peer.start()
             self.bench.start()

@@ -1,1 +1,1 @@
-"""The simulated arm and its devices."""
+"""The plant: a simulated arm, deliberately unlike the optimiser's model, and its devices."""

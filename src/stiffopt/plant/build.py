@@ -1,4 +1,4 @@
-"""From the robot file and the plant's block to the arrays that the compiled loops work on."""
+"""From a robot file and the plant's settings to the arrays that the simulation works on."""
 
 from __future__ import annotations
 
@@ -9,14 +9,24 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
+from stiffopt import lie
 from stiffopt.errors import InputError
 from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
 from stiffopt.model.history import NO_HISTORY, Memory
-from stiffopt.plant.material import LINEAR, YEOH, Material
-from stiffopt.plant.rod import Rod
+from stiffopt.plant.material import LINEAR, YEOH, SectionMaterial
+from stiffopt.plant.rod import DiscreteRod
 from stiffopt.plant.settings import Mismatch, PlantSettings
+from stiffopt.registration import Placement
 
-__all__ = ["Channels", "make_channels", "make_material", "make_memory", "make_rod", "node_at"]
+__all__ = [
+    "ChannelEffects",
+    "draw",
+    "make_channels",
+    "make_material",
+    "make_memory",
+    "make_rod",
+    "node_at",
+]
 
 Array = NDArray[np.float64]
 
@@ -25,7 +35,7 @@ _SAME = 1e-6  # of a segment's length; a load so near to a node acts on the node
 _DENSITY = 1070.0  # kg/m^3; of silicone, for robots that have no gravity and name no density
 
 
-class Channels(NamedTuple):
+class ChannelEffects(NamedTuple):
     """How the channels act: as the robot file corrects them, and the mismatch on top.
 
     Attributes
@@ -49,14 +59,14 @@ class Channels(NamedTuple):
         return np.ascontiguousarray(effective * self.gain + self.offset)
 
 
-def make_channels(robot: RobotDescription, mismatch: Mismatch) -> Channels:
+def make_channels(robot: RobotDescription, mismatch: Mismatch) -> ChannelEffects:
     """Return how the channels of an arm act that differs from its robot file by a mismatch."""
     parts = [(s.corrections or Corrections(), s.n_channels) for s in robot.segments]
     gain = np.concatenate([corrections.gain or (1.0,) * n for corrections, n in parts])
     offset = np.concatenate([corrections.offset or (0.0,) * n for corrections, n in parts])
     angle = np.concatenate([corrections.azimuth or (0.0,) * n for corrections, n in parts])
     further = np.array(mismatch.gain or (1.0,) * robot.n_pressures)
-    return Channels(
+    return ChannelEffects(
         dead_band=np.concatenate([np.full(n, corrections.dead_band) for corrections, n in parts]),
         gain=further * gain,
         offset=further * offset + np.array(mismatch.offset or (0.0,) * robot.n_pressures),
@@ -85,7 +95,7 @@ def make_memory(robot: RobotDescription) -> Memory | None:
 
 def make_rod(
     robot: RobotDescription, settings: PlantSettings, mismatch: Mismatch, station: float | None
-) -> Rod:
+) -> DiscreteRod:
     """Discretise the arm.
 
     Parameters
@@ -124,7 +134,7 @@ def make_rod(
     first_node = np.concatenate(([0], np.cumsum(intervals + 1)[:-1]))
     base = mismatch.base.transform()
     gravity = robot.gravity if settings.gravity is None else settings.gravity
-    return Rod(
+    return DiscreteRod(
         first=np.concatenate(([0], np.cumsum(count)[:-1])),
         count=count,
         per_segment=int(count.sum()),
@@ -225,9 +235,9 @@ def make_material(
     robot: RobotDescription,
     settings: PlantSettings,
     mismatch: Mismatch,
-    channels: Channels,
+    channels: ChannelEffects,
     viscosity: float,
-) -> Material:
+) -> SectionMaterial:
     """Return the sections of the arm; `viscosity` is that of the dashpot over E, in s.
 
     Raises
@@ -255,7 +265,7 @@ def make_material(
         shear[s] = in_shear * area[s].sum()
         torsion[s] = in_shear * (area[s] @ ((fibres[s] - centroid[s]) ** 2).sum(axis=1))
     force, first = _chambers(robot, channels)
-    return Material(
+    return SectionMaterial(
         law=LINEAR if silicone.law == "linear" else YEOH,
         stiffening=silicone.stiffening if silicone.law == "yeoh" else 0.0,
         viscosity=viscosity,
@@ -328,7 +338,7 @@ def _quadrature(segment: Segment) -> tuple[Array, Array, Array]:
     return np.concatenate(xs), np.concatenate(ys), np.concatenate(areas)
 
 
-def _chambers(robot: RobotDescription, channels: Channels) -> tuple[Array, Array]:
+def _chambers(robot: RobotDescription, channels: ChannelEffects) -> tuple[Array, Array]:
     """Area (n,) and first moments of area (n, 2) of the channels' chambers."""
     force, first = [], []
     turns = iter(channels.angle)
@@ -343,9 +353,51 @@ def _chambers(robot: RobotDescription, channels: Channels) -> tuple[Array, Array
     return np.array(force), np.array(first)
 
 
-def node_at(robot: RobotDescription, rod: Rod, at: float) -> tuple[int, float]:
+def node_at(robot: RobotDescription, rod: DiscreteRod, at: float) -> tuple[int, float]:
     """Node and lever (m) of a place on a rod that was made with a station there."""
     segment, place, lever = station_of(robot, at)
     m = int(rod.intervals[segment])
     cuts = np.concatenate(([0.0], np.cumsum(rod.interval[segment, :m]))) / rod.length[segment]
     return int(rod.first_node[segment]) + int(np.abs(cuts - place).argmin()), lever
+
+
+def draw(robot: RobotDescription, settings: PlantSettings) -> Mismatch:
+    """Return the mismatch of the settings with what their spread and seed add to it.
+
+    Raises
+    ------
+    InputError
+        A list has not one value per channel or per segment.
+    """
+    given = settings.mismatch
+    channels, segments = robot.n_pressures, robot.n_segments
+    given.check_lengths(robot)
+    if settings.spread is None:
+        return given
+    spread = settings.spread
+    rng = np.random.default_rng([settings.seed, 1])  # the noise of the devices has other streams
+
+    def factors(values: tuple[float, ...], size: int, deviation: float) -> tuple[float, ...]:
+        drawn = 1 + deviation * np.clip(rng.standard_normal(size), -3, 3)
+        return tuple((np.array(values or (1.0,) * size) * np.maximum(drawn, 0.1)).tolist())
+
+    def added(values: tuple[float, ...], size: int, deviation: float) -> tuple[float, ...]:
+        drawn = deviation * np.clip(rng.standard_normal(size), -3, 3)
+        return tuple((np.array(values or (0.0,) * size) + drawn).tolist())
+
+    return Mismatch(
+        gain=factors(given.gain, channels, spread.gain),
+        offset=added(given.offset, channels, spread.offset),
+        angle=added(given.angle, channels, spread.angle),
+        modulus=factors(given.modulus, segments, spread.modulus),
+        length=factors(given.length, segments, spread.length),
+        base=_moved(given.base, rng, spread.base_position, spread.base_tilt),
+        registration=_moved(
+            given.registration, rng, spread.registration_position, spread.registration_angle
+        ),
+    )
+
+
+def _moved(given: Placement, rng: np.random.Generator, shift: float, turn: float) -> Placement:
+    twist = np.clip(rng.standard_normal(6), -3, 3) * np.repeat([shift, turn], 3)
+    return Placement.of(given.transform() @ np.asarray(lie.exp(twist)))

@@ -1,16 +1,19 @@
-"""The simulated devices: a world seen through the interface of the rig."""
+"""The simulated rig: supply, tracker and probe that act on a simulated world and measure it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import CommandError, DeviceError
+from stiffopt.model.description import RobotDescription
 from stiffopt.plant.plant import SimulationError
-from stiffopt.plant.world import World
+from stiffopt.plant.settings import plant_of
+from stiffopt.plant.world import World, WorldClock
 from stiffopt.registration import Registration
 from stiffopt.rig.interface import (
     Clock,
@@ -20,9 +23,16 @@ from stiffopt.rig.interface import (
     PressureLimits,
     PressureSupply,
     RawPose,
+    Rig,
 )
 
-__all__ = ["SimulatedProbe", "SimulatedSupply", "SimulatedTracker"]
+__all__ = [
+    "SimulatedProbe",
+    "SimulatedRig",
+    "SimulatedSupply",
+    "SimulatedTracker",
+    "simulated_rig",
+]
 
 Array = NDArray[np.float64]
 
@@ -174,3 +184,43 @@ class SimulatedProbe(ForceProbe):
         self._must_be_open()
         self._answer()
         return ForceSample(self.clock.now(), self._world.force(), self._world.stage_position)
+
+
+class SimulatedRig(Rig):
+    """A rig whose arm is simulated.
+
+    Attributes
+    ----------
+    world :
+        What is true, which no controller may look at, and where faults are injected.
+    """
+
+    def __init__(self, world: World, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.world = world
+
+
+def simulated_rig(
+    description: Any,
+    robot: RobotDescription,
+    limits: PressureLimits,
+    slew: NDArray[np.float64] | None = None,
+    *,
+    real_time: bool = False,
+) -> SimulatedRig:
+    """Make the world that a `RigDescription` with simulated devices speaks of, and its devices."""
+    plant = plant_of(description)
+    supply, tracker, probe = description.supply, description.tracker, description.probe
+    world = World(robot, limits, plant, supply, tracker, probe, real_time=real_time)
+    clock = WorldClock(world, real_time=real_time)
+    return SimulatedRig(
+        world,
+        robot,
+        SimulatedSupply(world, limits, clock),
+        None if tracker is None else SimulatedTracker(world, tracker.registration, clock),
+        None if probe is None else SimulatedProbe(world, clock),
+        clock=clock,
+        slew=slew,
+        max_force=description.safety.max_force,
+        settings=description,
+    )

@@ -1,4 +1,4 @@
-"""The motion of the rod: one step in time, many steps, and what is conserved.
+"""Time stepping of the rod: one step, and many steps at given pressures.
 
 With inertia, a variational integrator: the discrete Lagrangian of a step from q0 to q1 is
 
@@ -20,22 +20,24 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stiffopt.plant.jit import jit
-from stiffopt.plant.loads import (
-    Loads,
+from stiffopt.plant.material import (
+    FibreMemory,
+    Scheme,
+    SectionMaterial,
+    internal_forces,
+    remember,
+)
+from stiffopt.plant.rod import (
+    DiscreteRod,
+    RodLoads,
     add_contact,
     contact_force,
     depth_of,
     external_forces,
+    jacobians,
     loads_after,
+    poses,
 )
-from stiffopt.plant.material import (
-    Material,
-    Memory,
-    Scheme,
-    internal_forces,
-    remember,
-)
-from stiffopt.plant.rod import Rod, jacobians, poses
 
 Array = Any
 
@@ -49,8 +51,8 @@ _STRIDE = 0.3  # strain; no iteration goes further
 _REACH = 0.015  # m; turns curvatures into strains
 
 
-class State(NamedTuple):
-    """What of an arm changes in time. n coefficients, N nodes.
+class RodState(NamedTuple):
+    """State of the rod: what changes in time. n coefficients, N nodes.
 
     Attributes
     ----------
@@ -73,12 +75,12 @@ class State(NamedTuple):
     inverse: Array
     tangent_of: Array
     totals: Array
-    memory: Memory
+    memory: FibreMemory
 
 
 @jit
 def _inertia(
-    rod: Rod, J: Array, R: Array, R0: Array, r0: Array, R1: Array, r1: Array, out: Array
+    rod: DiscreteRod, J: Array, R: Array, R0: Array, r0: Array, R1: Array, r1: Array, out: Array
 ) -> None:
     """``J' m (X1 - X0)`` (n,), with Jacobians J and axes R of one of the two ends."""
     out[:] = 0.0
@@ -142,7 +144,7 @@ def _invert(A: Array, out: Array) -> bool:
 
 
 class Step(NamedTuple):
-    """A step to be taken.
+    """Everything that determines one step but the state that it begins from.
 
     Attributes
     ----------
@@ -152,16 +154,16 @@ class Step(NamedTuple):
     pressures : in the chambers, constant (n,), Pa.
     """
 
-    rod: Rod
-    material: Material
+    rod: DiscreteRod
+    material: SectionMaterial
     scheme: Scheme
-    loads: Loads
+    loads: RodLoads
     inertia: bool
     pressures: Array
 
 
-class Work(NamedTuple):
-    """Room for a step: Jacobians, poses and forces. Made once per call."""
+class StepBuffers(NamedTuple):
+    """Arrays that a step works in: Jacobians, poses and forces. Made once per call."""
 
     jacobian: Array
     rotations: Array
@@ -177,7 +179,7 @@ class Work(NamedTuple):
 
 
 @jit
-def residual(step: Step, state: State, work: Work, q: Array, out: Array) -> None:
+def residual(step: Step, state: RodState, work: StepBuffers, q: Array, out: Array) -> None:
     """Imbalance (n,) of a step that ends at q, in N m or the like."""
     rod, loads, h = step.rod, step.loads, step.scheme.step
     last = len(state.positions) - 1
@@ -212,13 +214,13 @@ def residual(step: Step, state: State, work: Work, q: Array, out: Array) -> None
 
 
 @jit
-def in_strain(rod: Rod, k: int) -> float:
+def in_strain(rod: DiscreteRod, k: int) -> float:
     """How much strain a unit of a coefficient is."""
     return _REACH if k % rod.per_segment >= rod.first[3] else 1.0
 
 
 @jit
-def _correction(rod: Rod, state: State, work: Work) -> float:
+def _correction(rod: DiscreteRod, state: RodState, work: StepBuffers) -> float:
     """Put Newton's correction (n,) into work.trial; return the largest in it, as a strain."""
     largest = 0.0
     for i in range(len(work.trial)):
@@ -233,7 +235,7 @@ def _correction(rod: Rod, state: State, work: Work) -> float:
 
 
 @jit
-def _make_tangent(step: Step, state: State, work: Work, q: Array) -> bool:
+def _make_tangent(step: Step, state: RodState, work: StepBuffers, q: Array) -> bool:
     """Put the inverse of the tangent (n, n) at q into the state; return whether there is one."""
     n = len(q)
     for k in range(n):
@@ -248,7 +250,7 @@ def _make_tangent(step: Step, state: State, work: Work, q: Array) -> bool:
 
 
 @jit
-def _solve(step: Step, state: State, work: Work, q: Array) -> bool:
+def _solve(step: Step, state: RodState, work: StepBuffers, q: Array) -> bool:
     """Bring q (n,), at first a guess, to the end of a step; return whether that worked.
 
     What `residual` leaves in `work` is then that of q.
@@ -283,9 +285,9 @@ def _solve(step: Step, state: State, work: Work, q: Array) -> bool:
 
 
 @jit
-def make_work(n: int, nodes: int) -> Work:
+def make_work(n: int, nodes: int) -> StepBuffers:
     """Room for a step."""
-    return Work(
+    return StepBuffers(
         np.empty((nodes, n, 6)),
         np.empty((nodes, 3, 3)),
         np.empty((nodes, 3)),
@@ -301,7 +303,7 @@ def make_work(n: int, nodes: int) -> Work:
 
 
 @jit
-def take(step: Step, before: Loads, state: State, work: Work) -> bool:
+def take(step: Step, before: RodLoads, state: RodState, work: StepBuffers) -> bool:
     """Take one step; return whether that worked.
 
     `before` are the loads at its beginning, those of the step are at its end. With inertia, the
@@ -366,12 +368,12 @@ def take(step: Step, before: Loads, state: State, work: Work) -> bool:
 
 @jit
 def run(
-    rod: Rod,
-    material: Material,
+    rod: DiscreteRod,
+    material: SectionMaterial,
     scheme: Scheme,
-    loads: Loads,
+    loads: RodLoads,
     inertia: bool,
-    state: State,
+    state: RodState,
     pressures: Array,
 ) -> int:
     """Take a step at each row of pressures (m, n), in parts where it is too long.

@@ -1,7 +1,7 @@
-"""The silicone: stresses of the fibres of a section, with what they remember.
+"""The silicone: stress in the fibres of a section, with viscosity, creep and hysteresis.
 
-A section is made of fibres along the arm that strain by ``v_z + u_x y - u_y x``. Beside a fibre's
-hyperelastic stress there are, in parallel: a dashpot (Kelvin-Voigt), springs in series with a
+A section is made of fibres along the arm that strain by ``v_z + u_x y - u_y x``. In parallel
+with a fibre's hyperelastic spring there are a dashpot (Kelvin-Voigt), springs in series with a
 dashpot (Maxwell: creep), and springs in series with a slider (Jenkin: hysteresis). Shear and twist
 are linear and have the dashpot alone. Stresses and strains are nominal: per area and length at
 rest.
@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from stiffopt.plant.jit import jit
-from stiffopt.plant.rod import Rod, strain_at
+from stiffopt.plant.rod import DiscreteRod, strain_at
 
 Array = Any
 
@@ -23,8 +23,8 @@ _SOFTEST = 0.05  # share of the modulus that no pressure takes away
 _THINNEST = 0.1  # stretch below which the hyperelastic law is continued by its tangent
 
 
-class Material(NamedTuple):
-    """What of the sections does not change in time. S segments, f fibres, n channels.
+class SectionMaterial(NamedTuple):
+    """The sections and their material, constant in time. S segments, f fibres, n channels.
 
     Attributes
     ----------
@@ -67,8 +67,8 @@ class Material(NamedTuple):
     channel_y: Array
 
 
-class Memory(NamedTuple):
-    """What the fibres remember. S segments, g Gauss points, f fibres.
+class FibreMemory(NamedTuple):
+    """History variables of the fibres. S segments, g Gauss points, f fibres.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Memory(NamedTuple):
 
 
 class Scheme(NamedTuple):
-    """How a step in time is taken.
+    """Time discretisation of one step.
 
     Attributes
     ----------
@@ -100,7 +100,7 @@ class Scheme(NamedTuple):
 
 
 @jit
-def stress(material: Material, strain: float) -> float:
+def stress(material: SectionMaterial, strain: float) -> float:
     """Hyperelastic stress over Young's modulus."""
     if material.law == LINEAR:
         return strain
@@ -114,7 +114,7 @@ def stress(material: Material, strain: float) -> float:
 
 
 @jit
-def energy(material: Material, strain: float) -> float:
+def energy(material: SectionMaterial, strain: float) -> float:
     """Hyperelastic energy over Young's modulus."""
     if material.law == LINEAR:
         return 0.5 * strain * strain
@@ -124,11 +124,13 @@ def energy(material: Material, strain: float) -> float:
 
 
 @jit
-def pressed_modulus(material: Material, segment: int, pressures: Array) -> tuple[float, float]:
+def pressed_modulus(
+    material: SectionMaterial, segment: int, pressures: Array
+) -> tuple[float, float]:
     """Young's modulus at these pressures (n,), over that at rest; and what acts per pressure.
 
     The latter is such that the arm's free shapes are those of a modulus with the slope
-    `Material.actuation_slope`, and not affected by `Material.actuation`.
+    `SectionMaterial.actuation_slope`, and not affected by `SectionMaterial.actuation`.
     """
     total = 0.0
     for channel in range(material.first_channel[segment], material.first_channel[segment + 1]):
@@ -141,7 +143,7 @@ def pressed_modulus(material: Material, segment: int, pressures: Array) -> tuple
 
 
 @jit
-def creep_coefficients(material: Material, scheme: Scheme, out: Array) -> None:
+def creep_coefficients(material: SectionMaterial, scheme: Scheme, out: Array) -> None:
     """For each Maxwell branch (c, 2): its dashpot ends at ``out[0] creep + out[1] mean``.
 
     That is the theta method, with the fibre's strain at theta between the ends as `mean`.
@@ -163,10 +165,10 @@ def slip_after(limit: float, spring: float, change: float) -> float:
 
 @jit
 def internal_forces(
-    rod: Rod,
-    material: Material,
+    rod: DiscreteRod,
+    material: SectionMaterial,
     scheme: Scheme,
-    memory: Memory,
+    memory: FibreMemory,
     pressures: Array,
     before: Array,
     after: Array,
@@ -241,10 +243,10 @@ def internal_forces(
 
 @jit
 def remember(
-    rod: Rod,
-    material: Material,
+    rod: DiscreteRod,
+    material: SectionMaterial,
     scheme: Scheme,
-    memory: Memory,
+    memory: FibreMemory,
     pressures: Array,
     before: Array,
     after: Array,
@@ -299,7 +301,9 @@ def remember(
 
 
 @jit
-def stored(rod: Rod, material: Material, memory: Memory, pressures: Array, q: Array) -> float:
+def stored(
+    rod: DiscreteRod, material: SectionMaterial, memory: FibreMemory, pressures: Array, q: Array
+) -> float:
     """Elastic energy of the segments, of creep and hysteresis too, in J."""
     e = np.empty(6)
     total = 0.0

@@ -1,4 +1,4 @@
-"""The simulated arm: a rod whose mechanics are not the optimiser's model.
+"""The plant: a simulated arm whose mechanics differ from the optimiser's model.
 
 The differences are meant: the rod is per reference length and has distributed weight, inertia,
 shear and stretch; its silicone is hyperelastic, creeps and has hysteresis. Pressure acts normal to
@@ -6,8 +6,8 @@ the section: the force p A on each section at the chamber's centre, constant in 
 which is conjugate to the volume that a chamber of constant bore sweeps. (Along the chamber instead
 of normal to the section would change the compliance of a bent arm by about 3 %.)
 
-What the robot file says of its channels, this arm does: their history, between the pressures in
-the chambers and those that act, then their corrections. Silicone and mismatch come on top.
+The channels behave as the robot file says: its history lies between the pressures in the chambers
+and those that act, its corrections come after. Silicone and mismatch come on top.
 """
 
 from __future__ import annotations
@@ -23,27 +23,23 @@ from stiffopt.errors import DeviceError, EquilibriumError, InputError, PressureE
 from stiffopt.model.description import RobotDescription
 from stiffopt.plant import dynamics, material, rod
 from stiffopt.plant.build import (
+    draw,
     make_channels,
     make_material,
     make_memory,
     make_rod,
     node_at,
 )
-from stiffopt.plant.dynamics import State
+from stiffopt.plant.dynamics import RodState
 from stiffopt.plant.jit import tell_if_new
-from stiffopt.plant.loads import Loads, contact_energy, contact_force, depth_of
-from stiffopt.plant.material import Memory, Scheme
-from stiffopt.plant.mismatch import draw
-from stiffopt.plant.settings import Load, PlantSettings
+from stiffopt.plant.material import FibreMemory, Scheme
+from stiffopt.plant.rod import RodLoads, contact_energy, contact_force, depth_of
+from stiffopt.plant.settings import PlantLoad, PlantSettings
 
 __all__ = ["Energies", "Plant", "SimulationError"]
 
 Array = NDArray[np.float64]
 
-_LONG = 1e9  # s; a step after which viscosity has nothing more to say
-_FIRST_STEP = 0.02  # s
-_SHORTEST = 1e-6  # s
-_TRIES = 400
 _STILL = 1e-3  # s; step for stiffness to motions so fast that nothing creeps or slips
 
 
@@ -53,7 +49,7 @@ class SimulationError(DeviceError):
 
 @dataclass(frozen=True)
 class Energies:
-    """Where the energy is, in J.
+    """Energies of the plant, in J.
 
     Attributes
     ----------
@@ -75,8 +71,30 @@ class Energies:
     load_work: float
 
 
+@dataclass(frozen=True)
+class Settling:
+    """How `Plant.settle` follows a slow arm to rest: by steps of growing length.
+
+    Attributes
+    ----------
+    first, shortest, last : lengths of steps, in s: the first, the one below which it gives up, and
+        the one after which viscosity has no effect any more.
+    growth, cut : factor on the next step after one that has worked, and divisor after a failure.
+    tries : steps at most.
+    viscosity : least viscosity that slows the arm down, over the modulus, in s.
+    """
+
+    first: float = 0.02
+    shortest: float = 1e-6
+    last: float = 1e9
+    growth: float = 3.0
+    cut: float = 5.0
+    tries: int = 400
+    viscosity: float = 0.02
+
+
 class Plant:
-    """An arm in time.
+    """The simulated arm: chamber pressures in, poses out, step by step.
 
     Parameters
     ----------
@@ -93,6 +111,8 @@ class Plant:
         numba is not installed.
     """
 
+    settling = Settling()
+
     def __init__(self, robot: RobotDescription, settings: PlantSettings | None = None) -> None:
         tell_if_new()
         self.robot = robot
@@ -101,7 +121,7 @@ class Plant:
         self._channels = make_channels(robot, self.mismatch)
         self._past = make_memory(robot)
         self._steps = 0
-        self._load: Load | None = None
+        self._load: PlantLoad | None = None
         self._plate: tuple[Array, float, float, float] | None = None
         self._material = make_material(robot, self.settings, self.mismatch, self._channels, 0.0)
         self._mesh(None)
@@ -121,11 +141,11 @@ class Plant:
     def _mesh(self, station: float | None) -> None:
         self._rod = make_rod(self.robot, self.settings, self.mismatch, station)
 
-    def _at_rest(self) -> State:
+    def _at_rest(self) -> RodState:
         parts, n = self._material, self._rod.per_segment * self.robot.n_segments
         nodes = len(self._rod.mass)
         shape = (self.robot.n_segments, len(self._rod.weight), parts.fibre_x.shape[1])
-        state = State(
+        state = RodState(
             q=np.zeros(n),
             momentum=np.zeros(n),
             rate=np.zeros(n),
@@ -135,7 +155,7 @@ class Plant:
             inverse=np.zeros((n, n)),
             tangent_of=np.zeros(2),
             totals=np.zeros(3),
-            memory=Memory(
+            memory=FibreMemory(
                 strain=np.zeros(shape),
                 creep=np.zeros((*shape[:2], len(parts.creep_share), shape[2])),
                 slip=np.zeros((*shape[:2], len(parts.slip_share), shape[2])),
@@ -166,7 +186,7 @@ class Plant:
         T[:, :3, 3] = self._state.positions
         return T
 
-    def set_load(self, load: Load | None) -> None:
+    def set_load(self, load: PlantLoad | None) -> None:
         """Let a wrench act from now on, or none.
 
         Raises
@@ -266,7 +286,7 @@ class Plant:
         """Let time pass in which nothing happens, in s; rounded down to whole steps."""
         self._steps += int(duration / self.step)
 
-    def settle(self, pressures: ArrayLike, load: Load | None = None) -> None:
+    def settle(self, pressures: ArrayLike, load: PlantLoad | None = None) -> None:
         """Bring the arm to rest in equilibrium, with all creep done and no hysteresis left.
 
         That is, none of its silicone. A history in the robot file begins anew with a rise from no
@@ -292,21 +312,22 @@ class Plant:
             p = self._past.effective
         acting = self._acting(p[None, :])
         # Viscosity slows an arm without inertia down: steps of growing length follow it to rest.
-        slow = self._material._replace(viscosity=max(self._material.viscosity, 0.02))
+        settling = self.settling
+        slow = self._material._replace(viscosity=max(self._material.viscosity, settling.viscosity))
         self._state.rate[:] = 0.0
         self._state.last_rate[:] = 0.0
-        step = _FIRST_STEP
-        for _ in range(_TRIES):
+        step = settling.first
+        for _ in range(settling.tries):
             scheme = Scheme(step, 1.0, False)
             args = (self._rod, slow, scheme, self._loads(), False, self._state)
             self._state.tangent_of[:] = 0.0
             if dynamics.run(*args, acting):
-                if step >= _LONG:
+                if step >= settling.last:
                     break
-                step *= 3
+                step *= settling.growth
             else:
-                step /= 5
-                if step < _SHORTEST:
+                step /= settling.cut
+                if step < settling.shortest:
                     raise EquilibriumError("the simulated arm finds no equilibrium")
             self._state.rate[:] = 0.0
             self._state.last_rate[:] = 0.0
@@ -358,7 +379,7 @@ class Plant:
         damped = np.einsum("ik,ij,jk->k", shapes, half @ C @ half.T, shapes)[:count]
         return omega / (2 * math.pi), damped / (2 * omega)
 
-    def _tangent(self, parts: material.Material, scheme: Scheme) -> Array:
+    def _tangent(self, parts: material.SectionMaterial, scheme: Scheme) -> Array:
         """Change of the imbalance without inertia (n, n) with the end of a step from here."""
         q, n = self._state.q.copy(), len(self._state.q)
         work = dynamics.make_work(n, len(self._state.positions))
@@ -381,7 +402,7 @@ class Plant:
         rod.mass_matrix(self._rod, self._state.rotations, J, M)
         return M
 
-    def _loads(self) -> Loads:
+    def _loads(self) -> RodLoads:
         load, plate = self._load, self._plate
         last = len(self._rod.mass) - 1
         normal, at, speed, stiffness = (np.zeros(3), 0.0, 0.0, 0.0) if plate is None else plate
@@ -391,7 +412,7 @@ class Plant:
                 node, lever = node_at(self.robot, self._rod, load.at)
             force, moment = np.array(load.force), np.array(load.moment)
             follows = load.frame == "tip"
-        return Loads(node, lever, force, moment, follows, normal, at, speed, stiffness)
+        return RodLoads(node, lever, force, moment, follows, normal, at, speed, stiffness)
 
     def _checked(self, pressures: ArrayLike) -> Array:
         p = np.array(pressures, dtype=float)

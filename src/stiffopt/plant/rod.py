@@ -1,4 +1,4 @@
-"""The rod: from polynomial strains to poses along the arm and their derivatives.
+"""The rod: shape, derivatives and mass of the simulated arm, and the loads on it.
 
 A geometrically exact Cosserat rod, per reference length. The strain of a segment (linear part
 first: shear, stretch; then curvature, twist) is a sum of Legendre polynomials with coefficients q;
@@ -7,6 +7,7 @@ of order four (two Gauss points):
 
     T(b) = T(a) exp(X),   X = h/2 (x1 + x2) + sqrt(3)/12 h^2 [x1, x2].
 
+RodLoads from outside are the weight, a wrench at one place and the plate of a probe at the tip.
 Everything here is compiled and works on arrays that the caller owns.
 """
 
@@ -21,9 +22,15 @@ from stiffopt.plant.jit import jit
 
 Array = Any  # an array of floats; numba infers the rest
 
+_COMMUTATOR = math.sqrt(3) / 12
+_SMALL = 0.04  # squared angle below which series are used
+_SOFT = 1e-6  # m, over which contact sets in: a kink would upset Newton's method
 
-class Rod(NamedTuple):
-    """What of an arm does not change in time. S segments, n coefficients, N nodes.
+
+class DiscreteRod(NamedTuple):
+    """The discretised rod: what of an arm does not change in time.
+
+    There are S segments, n coefficients and N nodes.
 
     The first node of a segment is its proximal end; the very last node is the tip, after the last
     connector.
@@ -61,12 +68,8 @@ class Rod(NamedTuple):
     gravity: Array
 
 
-_COMMUTATOR = math.sqrt(3) / 12
-_SMALL = 0.04  # squared angle below which series are used
-
-
 @jit
-def strain_at(rod: Rod, segment: int, basis: Array, q: Array, out: Array) -> None:
+def strain_at(rod: DiscreteRod, segment: int, basis: Array, q: Array, out: Array) -> None:
     """Strain (6,) at a point with these values of the polynomials; the rod at rest has zero."""
     offset = segment * rod.per_segment
     for c in range(6):
@@ -125,7 +128,9 @@ def _exponential(X: Array, R: Array, p: Array) -> None:
 
 
 @jit
-def _interval_twist(rod: Rod, s: int, m: int, q: Array, x1: Array, x2: Array, X: Array) -> None:
+def _interval_twist(
+    rod: DiscreteRod, s: int, m: int, q: Array, x1: Array, x2: Array, X: Array
+) -> None:
     """Twist X (6,) over interval m of segment s, and the strains x1, x2 (with e) it is made of."""
     h = rod.interval[s, m]
     strain_at(rod, s, rod.interval_basis[s, m, 0], q, x1)
@@ -146,7 +151,7 @@ def _compose(R: Array, r: Array, dR: Array, dr: Array, R_out: Array, r_out: Arra
 
 
 @jit
-def poses(rod: Rod, q: Array, R: Array, r: Array) -> None:
+def poses(rod: DiscreteRod, q: Array, R: Array, r: Array) -> None:
     """Rotations (N, 3, 3) and positions (N, 3) of the nodes."""
     x1, x2, X = np.empty(6), np.empty(6), np.empty(6)
     dR, dr = np.empty((3, 3)), np.empty(3)
@@ -197,7 +202,7 @@ def _exponential_derivative(X: Array, dX: Array, out: Array, work: Array) -> Non
 
 
 @jit
-def jacobians(rod: Rod, q: Array, J: Array) -> None:
+def jacobians(rod: DiscreteRod, q: Array, J: Array) -> None:
     """Body Jacobians of the nodes, transposed (N, n, 6): their twist in their own axes per q."""
     x1, x2, X = np.empty(6), np.empty(6), np.empty(6)
     d1, dX, at1, at2 = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
@@ -258,7 +263,7 @@ def _carry(twist: Array, dR: Array, dr: Array, out: Array) -> None:
 
 
 @jit
-def mass_matrix(rod: Rod, R: Array, J: Array, out: Array) -> None:
+def mass_matrix(rod: DiscreteRod, R: Array, J: Array, out: Array) -> None:
     """Mass matrix (n, n) of the coefficients."""
     n = len(out)
     out[:] = 0.0
@@ -286,3 +291,120 @@ def mass_matrix(rod: Rod, R: Array, J: Array, out: Array) -> None:
     for k in range(n):
         for j in range(k):
             out[j, k] = out[k, j]
+
+
+class RodLoads(NamedTuple):
+    """Loads on the rod from outside.
+
+    Attributes
+    ----------
+    node : on which the wrench acts.
+    lever : how far beyond the node along its z axis, on a connector, m.
+    force, moment : (3,), N and N m.
+    follows : whether they turn with the node's section.
+    plate : unit normal of the probe's plate (3,), from the probe towards the tip.
+    plate_at : where the plate is along its normal, m.
+    plate_speed : at which it moves, m/s.
+    plate_stiffness : N/m; 0 where there is no plate.
+    """
+
+    node: int
+    lever: float
+    force: Array
+    moment: Array
+    follows: bool
+    plate: Array
+    plate_at: float
+    plate_speed: float
+    plate_stiffness: float
+
+
+@jit
+def loads_after(loads: RodLoads, duration: float) -> RodLoads:
+    """RodLoads after some time: the plate moves."""
+    return RodLoads(
+        loads.node,
+        loads.lever,
+        loads.force,
+        loads.moment,
+        loads.follows,
+        loads.plate,
+        loads.plate_at + duration * loads.plate_speed,
+        loads.plate_speed,
+        loads.plate_stiffness,
+    )
+
+
+@jit
+def depth_of(loads: RodLoads, tip: Array) -> float:
+    """How far the tip is behind the plate's face, m; negative where it is clear of it."""
+    along: float = loads.plate[0] * tip[0] + loads.plate[1] * tip[1] + loads.plate[2] * tip[2]
+    return loads.plate_at - along
+
+
+@jit
+def contact_force(loads: RodLoads, depth: float) -> float:
+    """Force of the plate on the tip at some depth, N: ``k max(depth, 0)``, rounded at 0."""
+    if loads.plate_stiffness == 0:
+        return 0.0
+    rounded: float = 0.5 * loads.plate_stiffness * (depth + math.hypot(depth, _SOFT))
+    return rounded
+
+
+@jit
+def contact_energy(loads: RodLoads, depth: float) -> float:
+    """Integral of `contact_force`, J, but for a constant."""
+    around = math.hypot(depth, _SOFT)
+    energy: float = depth * (depth + around) + _SOFT**2 * math.asinh(depth / _SOFT)
+    return 0.25 * loads.plate_stiffness * energy
+
+
+@jit
+def external_forces(
+    rod: DiscreteRod, loads: RodLoads, R: Array, r: Array, J: Array, out: Array
+) -> None:
+    """Generalised forces (n,) of gravity and wrench."""
+    n = len(out)
+    last = len(r) - 1
+    out[:] = 0.0
+    wrench, down = np.empty(6), np.empty(3)
+    for node in range(1, last + 1):
+        turn = R[node]
+        mass, mx, my = rod.mass[node, 0, 0], rod.mass[node, 0, 1], rod.mass[node, 0, 2]
+        for i in range(3):
+            down[i] = 0.0
+            for j in range(3):
+                down[i] += turn[j, i] * rod.gravity[j]
+            wrench[i] = mass * down[i]
+        wrench[3] = my * down[2]
+        wrench[4] = -mx * down[2]
+        wrench[5] = mx * down[1] - my * down[0]
+        if node == loads.node:
+            for i in range(3):
+                down[i] = 0.0
+                for j in range(3):
+                    along = (1.0 if i == j else 0.0) if loads.follows else turn[j, i]
+                    down[i] += along * loads.force[j]
+                    wrench[3 + i] += along * loads.moment[j]
+                wrench[i] += down[i]
+            wrench[3] -= loads.lever * down[1]
+            wrench[4] += loads.lever * down[0]
+        for k in range(n):
+            total = 0.0
+            for i in range(6):
+                total += J[node, k, i] * wrench[i]
+            out[k] += total
+
+
+@jit
+def add_contact(loads: RodLoads, depth: float, R: Array, J: Array, out: Array) -> None:
+    """Add the plate's generalised forces (n,) on the tip, with axes R (3, 3) and Jacobian J."""
+    push = contact_force(loads, depth)
+    if push == 0:
+        return
+    for i in range(3):
+        along = push * (
+            R[0, i] * loads.plate[0] + R[1, i] * loads.plate[1] + R[2, i] * loads.plate[2]
+        )
+        for k in range(len(out)):
+            out[k] += J[k, i] * along

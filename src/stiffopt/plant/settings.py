@@ -1,17 +1,23 @@
-"""The simulated arm and its devices, as the rig file describes them.
+"""Settings of the simulated arm and its devices: the rig file's ``plant``, ``lab`` and drivers.
 
-What the plant's block says is the difference between the arm and its robot file, and what the
-robot file has no words for: how the silicone stretches, creeps and loses energy. All default
-values are those of a perfect copy but for the material's, which are typical of soft silicones.
+The plant's settings say how the arm differs from its robot file, and what a robot file does not
+describe: how the silicone stretches, creeps and dissipates. By default the arm is a perfect copy of
+its robot file but for the material, whose values are typical of soft silicones.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from stiffopt.registration import Placement, Registration
+from stiffopt.model.description import RobotDescription
+from stiffopt.registration import Placement
+from stiffopt.rig.device import MisfitError, RigSection
+from stiffopt.rig.pressure import SupplySettings
+from stiffopt.rig.probing import ProbeSettings
+from stiffopt.rig.tracking import TrackerSettings
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import (
     Acceleration,
@@ -30,16 +36,21 @@ from stiffopt.units import (
 )
 
 __all__ = [
-    "Creep",
+    "FAULT_SIZES",
     "Discretisation",
-    "Hysteresis",
+    "FaultSizes",
+    "LabSettings",
     "Mismatch",
+    "PlantLoad",
     "PlantSettings",
     "Silicone",
+    "SiliconeCreep",
+    "SiliconeHysteresis",
     "SimulatedProbeSettings",
     "SimulatedSupplySettings",
     "SimulatedTrackerSettings",
     "Spread",
+    "plant_of",
 ]
 
 Positive = Field(gt=0)
@@ -47,8 +58,8 @@ NotNegative = Field(ge=0)
 Share = Annotated[Ratio, Field(ge=0, le=1)]
 
 
-class Creep(Schema):
-    """One Maxwell branch of the silicone, beside its equilibrium modulus.
+class SiliconeCreep(Schema):
+    """One Maxwell branch of the silicone, in parallel with its equilibrium modulus.
 
     Attributes
     ----------
@@ -60,7 +71,7 @@ class Creep(Schema):
     time: Annotated[Duration, Positive]
 
 
-class Hysteresis(Schema):
+class SiliconeHysteresis(Schema):
     """One elastic, ideally plastic element (Jenkin) of the silicone: Maxwell slip.
 
     Attributes
@@ -90,10 +101,13 @@ class Silicone(Schema):
     law: Literal["linear", "neo-hookean", "yeoh"] = "yeoh"
     stiffening: Annotated[Ratio, Field(ge=0, le=2)] = 0.1
     damping: Annotated[Ratio, Field(ge=0, le=1)] = 0.1
-    creep: Items[Creep] = (Creep(share=0.05, time=2.0), Creep(share=0.05, time=20.0))
-    hysteresis: Items[Hysteresis] = (
-        Hysteresis(share=0.06, strain=0.01),
-        Hysteresis(share=0.06, strain=0.04),
+    creep: Items[SiliconeCreep] = (
+        SiliconeCreep(share=0.05, time=2.0),
+        SiliconeCreep(share=0.05, time=20.0),
+    )
+    hysteresis: Items[SiliconeHysteresis] = (
+        SiliconeHysteresis(share=0.06, strain=0.01),
+        SiliconeHysteresis(share=0.06, strain=0.04),
     )
 
 
@@ -121,6 +135,27 @@ class Mismatch(Schema):
     base: Placement = Placement()
     registration: Placement = Placement()
 
+    def check_lengths(self, robot: RobotDescription) -> None:
+        """Refuse a list that has not one value per channel or per segment of a robot.
+
+        Raises
+        ------
+        MisfitError
+            It names the list.
+        """
+        channels, segments = robot.n_pressures, robot.n_segments
+        for name, length, noun in (
+            *((name, channels, "channel") for name in ("gain", "offset", "angle")),
+            *((name, segments, "segment") for name in ("modulus", "length")),
+        ):
+            values = getattr(self, name)
+            if values and len(values) != length:
+                raise MisfitError(
+                    f"mismatch.{name} has {len(values)} values; expected {length}, one for each "
+                    f"{noun} of the robot, the proximal segment first",
+                    "plant",
+                )
+
 
 class Spread(Schema):
     """Standard deviations from which a mismatch is drawn, on top of the one that is given."""
@@ -136,7 +171,7 @@ class Spread(Schema):
     registration_angle: Annotated[Angle, NotNegative] = 0.005
 
 
-class Load(Schema):
+class PlantLoad(Schema):
     """A wrench on the arm.
 
     Attributes
@@ -181,7 +216,7 @@ class Discretisation(Schema):
         return self
 
 
-class PlantSettings(Schema):
+class PlantSettings(RigSection):
     """The simulated arm.
 
     Attributes
@@ -203,12 +238,22 @@ class PlantSettings(Schema):
     seed: Annotated[int, NotNegative] = 0
     payload: Annotated[Mass, NotNegative] = 0.0
     gravity: Vector[Acceleration] | None = None
-    load: Load | None = None
+    load: PlantLoad | None = None
     faults: bool = False
     discretisation: Discretisation = Discretisation()
 
+    def check_against(self, rig: Any, robot: RobotDescription) -> None:
+        """Refuse a mismatch of another number of channels or segments than the robot's."""
+        self.mismatch.check_lengths(robot)
 
-class SimulatedSupplySettings(Schema):
+
+def plant_of(description: Any) -> PlantSettings:
+    """Return the plant of a `RigDescription`, or the default one if it has none."""
+    plant = description.plant
+    return plant if isinstance(plant, PlantSettings) else PlantSettings()
+
+
+class SimulatedSupplySettings(SupplySettings):
     """Regulators, one per channel.
 
     Attributes
@@ -225,6 +270,8 @@ class SimulatedSupplySettings(Schema):
     dump_valve : whether there is a valve that empties all chambers, see `PressureSupply.arm`.
     """
 
+    simulated: ClassVar[bool] = True
+
     driver: Literal["simulated"] = "simulated"
     dead_time: Annotated[Duration, Field(ge=0, le=1)] = 0.01
     lag: Annotated[Duration, NotNegative] = 0.06
@@ -237,8 +284,14 @@ class SimulatedSupplySettings(Schema):
     watchdog: Annotated[Duration, Positive] | None = None
     dump_valve: bool = False
 
+    def simulated_rig(self, description: Any, robot: RobotDescription, **options: Any) -> Any:
+        """Return the rig of a simulated arm, see `stiffopt.plant.devices.simulated_rig`."""
+        from stiffopt.plant.devices import simulated_rig  # here: numba takes its time
 
-class SimulatedTrackerSettings(Schema):
+        return simulated_rig(description, robot, **options)
+
+
+class SimulatedTrackerSettings(TrackerSettings):
     """An electromagnetic tracker.
 
     Attributes
@@ -249,9 +302,9 @@ class SimulatedTrackerSettings(Schema):
     dropouts : share of the frames in which the tool is not seen.
     missing : share of the frames that never arrive.
     flips : share of the frames with the other sign of the quaternion.
-    registration : where tracker and sensor are.
-    calibrated : whether the robot file's own registration then corrects the poses.
     """
+
+    simulated: ClassVar[bool] = True
 
     driver: Literal["simulated"] = "simulated"
     rate: Annotated[Frequency, Positive] = 40.0
@@ -261,11 +314,18 @@ class SimulatedTrackerSettings(Schema):
     dropouts: Share = 0.0
     missing: Share = 0.0
     flips: Share = 0.0
-    registration: Registration = Registration()
-    calibrated: bool = False
+
+    def check_against(self, rig: Any, robot: RobotDescription) -> None:
+        """Refuse more frames a second than the simulation has steps."""
+        fastest = 1 / plant_of(rig).discretisation.step
+        if self.rate > fastest * (1 + 1e-9):
+            raise MisfitError(
+                f"{self.rate:g} Hz is faster than the steps of the simulation, {fastest:g} Hz",
+                *("tracker", "rate"),
+            )
 
 
-class SimulatedProbeSettings(Schema):
+class SimulatedProbeSettings(ProbeSettings):
     """A flat plate on a linear stage that pushes the tip, and its force sensor.
 
     Attributes
@@ -276,8 +336,54 @@ class SimulatedProbeSettings(Schema):
     noise : standard deviation of the force, in N.
     """
 
+    simulated: ClassVar[bool] = True
+
     driver: Literal["simulated"] = "simulated"
     stiffness: Annotated[TranslationalStiffness, Positive] = 2000.0
     speed: Annotated[Speed, Positive] = 0.02
     clearance: Annotated[Length, NotNegative] = 0.001
     noise: Annotated[Force, NotNegative] = 0.0005
+
+
+@dataclass(frozen=True)
+class FaultSizes:
+    """How far the devices are off while a fault is injected, see `stiffopt.plant.world.FAULTS`.
+
+    Attributes
+    ----------
+    lag : added to the time constant of a slow regulator, in s.
+    leak_time : time constant with which a leaking chamber empties, in s.
+    reading_gain, reading_offset : of a supply that reads wrong pressures, and in Pa.
+    frame_delay : by which the frames of a slow tracker arrive later, in s.
+    tracker_offset : by which a wrong tracker is off (3,), in m.
+    stage_speed : of a slow stage, as a share of its speed.
+    force_gain, force_offset : of a force sensor that reads wrong forces, and in N.
+    """
+
+    lag: float = 0.5
+    leak_time: float = 0.3
+    reading_gain: float = 0.7
+    reading_offset: float = 2e4
+    frame_delay: float = 0.5
+    tracker_offset: tuple[float, float, float] = (0.02, -0.015, 0.01)
+    stage_speed: float = 0.1
+    force_gain: float = 0.5
+    force_offset: float = 0.1
+
+
+FAULT_SIZES = FaultSizes()
+
+
+class LabSettings(RigSection):
+    """The devices behind the protocols of the virtual lab (`stiffopt lab`).
+
+    Attributes
+    ----------
+    supply : the regulators.
+    tracker : its registration is that of the rig's own tracker.
+    probe : stage and force sensor.
+    """
+
+    supply: SimulatedSupplySettings = SimulatedSupplySettings()
+    tracker: SimulatedTrackerSettings = SimulatedTrackerSettings()
+    probe: SimulatedProbeSettings = SimulatedProbeSettings()

@@ -1,7 +1,8 @@
-"""The simulated lab: plant, regulators, tracker and stage under one clock.
+"""The simulated world: plant, regulators, tracker and probe under one clock.
 
-What devices are told and tell is in their terms; what is true (`tip_pose`, `pressures`) is here
-and nowhere in the interface of the rig, so that no controller reads it by accident.
+The devices show what real ones would: rounded, late and noisy. The truth (`Plant.tip_pose`,
+`World.pressures`) is here and nowhere in the interface of the rig, so that no controller reads it
+by accident.
 """
 
 from __future__ import annotations
@@ -14,16 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
-from stiffopt.plant.camera import Camera, Frame
+from stiffopt.plant.hardware import Camera, Frame, Regulators, SimulatedStage, regulate
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.regulators import Regulators, regulate
 from stiffopt.plant.settings import (
+    FAULT_SIZES,
     PlantSettings,
     SimulatedProbeSettings,
     SimulatedSupplySettings,
     SimulatedTrackerSettings,
 )
-from stiffopt.plant.stage import Stage
 from stiffopt.rig.interface import Clock, PressureLimits
 
 __all__ = ["FAULTS", "World", "WorldClock"]
@@ -38,14 +38,12 @@ FAULTS = {
 """What can be injected, by device. ``stuck`` holds the last value, ``wrong`` is plausible but off,
 ``garbage`` is not plausible at all; ``high`` is a regulator stuck at its highest pressure."""
 
-_SLOW = 0.5  # s, by which the lag of a slow regulator is longer
-_LEAK = 0.3  # s; time constant of an injected leak
 _LONG = 1_000_000  # steps; there is no need to stop for this long
 _LONGEST = 30.0  # s of real time that is caught up with at once; more than that is skipped
 
 
 class World:
-    """An arm and its devices in time. Methods may be called by any thread.
+    """The simulated arm and its devices in time. Methods may be called by any thread.
 
     Parameters
     ----------
@@ -98,7 +96,7 @@ class World:
         streams = np.random.SeedSequence([plant.seed, 2]).spawn(4)
         self._ripple, self._gauge, optics, balance = map(np.random.default_rng, streams)
         self.camera = None if tracker is None else Camera(tracker, self.plant, optics)
-        self.stage = None if probe is None else Stage(probe, self.plant, balance)
+        self.stage = None if probe is None else SimulatedStage(probe, self.plant, balance)
         self._run(0)  # compiles what has not been compiled yet: no time for that later
         self.plant.contact_force()
         self._epoch = time.monotonic()
@@ -204,7 +202,7 @@ class World:
                 if fault == "garbage":
                     p[channel] = np.nan if self._gauge.random() < 0.5 else 9.9e9
                 elif fault == "wrong":
-                    p[channel] = 0.7 * p[channel] + 2e4
+                    p[channel] = FAULT_SIZES.reading_gain * p[channel] + FAULT_SIZES.reading_offset
             return p
 
     def dump(self, *, open_valve: bool) -> None:
@@ -297,15 +295,15 @@ class World:
                 self._faulty[c] = fault
             held = {"stuck": self.pressures[c], "high": regulators.saturation[c]}
             regulators.held[c] = held.get(fault, np.nan)
-            regulators.lag[c] = settings.lag + (_SLOW if fault == "slow" else 0.0)
+            regulators.lag[c] = settings.lag + (FAULT_SIZES.lag if fault == "slow" else 0.0)
             leak = 0.0 if settings.leak is None else 1 / settings.leak
-            regulators.leak[c] = 1 / _LEAK if fault == "leak" else leak
+            regulators.leak[c] = 1 / FAULT_SIZES.leak_time if fault == "leak" else leak
         if not self._faulty:
             self.faults["supply"] = "ok"
 
 
 class WorldClock(Clock):
-    """The clock of a world: real, or one that only moves when somebody sleeps."""
+    """Clock of a world: real time, or time that passes only while somebody sleeps."""
 
     def __init__(self, world: World, *, real_time: bool) -> None:
         self._world = world

@@ -1,1 +1,1 @@
-"""One interface to pressure, tracking and force; simulated and real devices behind it alike."""
+"""Rigs: one interface to pressure supply, tracker and force probe, real or simulated."""

@@ -1,4 +1,4 @@
-"""The bare devices of a rig file: nothing here limits what is commanded.
+"""Making the devices of a rig file, with nothing in front of them that limits commands.
 
 Whoever commands an arm takes `stiffopt.open_rig`, whose supply has the safety gate in front of it;
 only `stiffopt.safety`, the virtual lab and tests make devices themselves.
@@ -6,11 +6,8 @@ only `stiffopt.safety`, the virtual lab and tests make devices themselves.
 
 from __future__ import annotations
 
-from typing import Any
-
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
-from stiffopt.plant.settings import SimulatedSupplySettings
 from stiffopt.rig.config import RigDescription, limits_of, registration_of, slew_of
 from stiffopt.rig.interface import Rig, SystemClock
 
@@ -24,19 +21,20 @@ def make_rig(
     limits, slew = limits_of(description, robot), slew_of(description, robot)
     supply, tracker, probe = description.supply, description.tracker, description.probe
     registration = None if tracker is None else registration_of(tracker, robot)
-    if isinstance(supply, SimulatedSupplySettings):
-        from stiffopt.plant.rig import simulated_rig  # here: numba takes its time
-
-        rig: Rig = simulated_rig(description, robot, limits, slew, real_time=real_time)
+    if any(device.simulated != supply.simulated for device in (tracker, probe) if device):
+        raise InputError("a real supply cannot be combined with simulated devices, nor vice versa")
+    if supply.simulated:
+        options = {"limits": limits, "slew": slew, "real_time": real_time}
+        rig: Rig = supply.simulated_rig(description, robot, **options)
     else:
         clock = SystemClock()
-        real = supply.device(limits, clock)
-        real.restrict(supply.limits_within(limits))  # whatever its driver makes of them
+        device = supply.device(limits, clock)
+        device.restrict(supply.limits_within(limits))  # whatever its driver makes of them
         rig = Rig(
             robot,
-            real,
-            None if tracker is None else _real(tracker).device(clock),
-            None if probe is None else _real(probe).device(clock),
+            device,
+            None if tracker is None else tracker.device(clock),
+            None if probe is None else probe.device(clock),
             clock=clock,
             slew=slew,
             max_force=description.safety.max_force,
@@ -45,9 +43,3 @@ def make_rig(
     if rig.tracker is not None and registration is not None:
         rig.tracker.registration = registration
     return rig
-
-
-def _real(settings: Any) -> Any:
-    if settings.driver == "simulated":
-        raise InputError("a real supply cannot be combined with simulated devices")
-    return settings

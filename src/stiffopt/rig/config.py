@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-import difflib
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Discriminator, Field, Tag
+from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError, ValidationInfo
+from pydantic_core import InitErrorDetails
 
-from stiffopt.errors import FileError, InputError, dotted, shown
+from stiffopt.errors import FileError, InputError, dotted
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
-from stiffopt.plant.mismatch import check_mismatch
-from stiffopt.plant.settings import (
-    PlantSettings,
-    SimulatedProbeSettings,
-    SimulatedSupplySettings,
-    SimulatedTrackerSettings,
-)
 from stiffopt.registration import Registration
-from stiffopt.rig.drivers.aurora import AuroraSettings
-from stiffopt.rig.drivers.modbus import ModbusSettings
-from stiffopt.rig.drivers.nidaq import NidaqSettings
-from stiffopt.rig.drivers.openigtlink import OpenIGTLinkSettings
-from stiffopt.rig.drivers.probe import ProbeSettings
+from stiffopt.rig.device import DeviceSettings, MisfitError, RigSection
 from stiffopt.rig.interface import PressureLimits
+from stiffopt.rig.pressure import SupplySettings
+from stiffopt.rig.probing import ProbeSettings
+from stiffopt.rig.registry import driver_class, driver_names, load, one_of
 from stiffopt.rig.settings import ControlSettings, LogSettings, Safety, ServiceSettings
-from stiffopt.schema import BadKeyError, Schema
-from stiffopt.units import Frequency
+from stiffopt.rig.tracking import TrackerSettings
+from stiffopt.schema import BadKeyError, Schema, explain
+from stiffopt.units import Frequency, read_from_file
 
 __all__ = [
-    "LabSettings",
     "LogSettings",
     "RigDescription",
     "Safety",
@@ -44,74 +37,58 @@ __all__ = [
     "slew_of",
 ]
 
+_SECTIONS = {
+    "plant": "stiffopt.plant.settings:PlantSettings",
+    "lab": "stiffopt.plant.settings:LabSettings",
+}
+"""Parts of a rig file that belong to other packages, which are imported where they are needed."""
 
-def _known(*drivers: str) -> BeforeValidator:
-    """Return the validator that refuses a block without a driver or with an unknown one."""
 
-    def check(value: Any) -> Any:
-        if isinstance(value, dict):
-            if "driver" not in value:
-                raise ValueError(f"the key 'driver' is missing; expected {_one_of(drivers)}")
-            driver = value["driver"]
-            if driver not in drivers:
-                near = difflib.get_close_matches(str(driver), drivers, n=1)
-                hint = f"did you mean '{near[0]}'? " if near else ""
-                raise BadKeyError(
-                    "driver",
-                    f"there is no driver {shown(driver)} for this; {hint}"
-                    f"expected {_one_of(drivers)}",
+def _reader(class_of: Callable[[dict[str, Any]], type[Schema]]) -> BeforeValidator:
+    """Return the validator of a part of a rig file whose class depends on what it says."""
+
+    def read(value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, dict):
+            return value
+        model = class_of(value)
+        try:
+            return model.model_validate(value, context=info.context)
+        except ValidationError as error:
+            # told here, where the class is known: which keys it has, and which is the nearest
+            mistakes = []
+            for details in error.errors():
+                loc, reason = explain(model, details, value if read_from_file(info) else None)
+                mistakes.append(
+                    InitErrorDetails(
+                        type="value_error",
+                        loc=loc,
+                        input=details["input"],
+                        ctx={"error": ValueError(reason)},
+                    )
                 )
-        return value
+            raise ValidationError.from_exception_data(model.__name__, mistakes) from None
 
-    return BeforeValidator(check)
-
-
-def _one_of(words: tuple[str, ...]) -> str:
-    return ", ".join(words[:-1]) + f" or {words[-1]}"
+    return BeforeValidator(read)
 
 
-def _driver_of(value: Any) -> str:
-    driver = value.get("driver") if isinstance(value, dict) else getattr(value, "driver", None)
-    return f"<{driver}>"
+def _device(kind: str) -> BeforeValidator:
+    """Return the validator of a device, whose class is that of its driver."""
+
+    def class_of(value: dict[str, Any]) -> type[DeviceSettings]:
+        if "driver" not in value:
+            names = one_of(driver_names(kind))
+            raise ValueError(f"the key 'driver' is missing; expected {names}")
+        try:
+            return driver_class(kind, value["driver"])
+        except InputError as error:
+            raise BadKeyError("driver", str(error)) from None
+
+    return _reader(class_of)
 
 
-_BY_DRIVER = Discriminator(_driver_of)
-
-SupplyBlock = Annotated[
-    Annotated[SimulatedSupplySettings, Tag("<simulated>")]
-    | Annotated[ModbusSettings, Tag("<modbus>")]
-    | Annotated[NidaqSettings, Tag("<nidaq>")],
-    _BY_DRIVER,
-    _known("simulated", "modbus", "nidaq"),
-]
-TrackerBlock = Annotated[
-    Annotated[SimulatedTrackerSettings, Tag("<simulated>")]
-    | Annotated[AuroraSettings, Tag("<aurora>")]
-    | Annotated[OpenIGTLinkSettings, Tag("<openigtlink>")],
-    _BY_DRIVER,
-    _known("simulated", "aurora", "openigtlink"),
-]
-ProbeBlock = Annotated[
-    Annotated[SimulatedProbeSettings, Tag("<simulated>")]
-    | Annotated[ProbeSettings, Tag("<probe>")],
-    _BY_DRIVER,
-    _known("simulated", "probe"),
-]
-
-
-class LabSettings(Schema):
-    """What stands behind the protocols of the virtual lab (`stiffopt lab`).
-
-    Attributes
-    ----------
-    supply : the regulators.
-    tracker : its registration is that of the rig's own tracker.
-    probe : stage and force sensor.
-    """
-
-    supply: SimulatedSupplySettings = SimulatedSupplySettings()
-    tracker: SimulatedTrackerSettings = SimulatedTrackerSettings()
-    probe: SimulatedProbeSettings = SimulatedProbeSettings()
+def _section(name: str) -> BeforeValidator:
+    """Return the validator of a part whose class is that of another package."""
+    return _reader(lambda _: load(_SECTIONS[name]))
 
 
 class RigDescription(Schema):
@@ -122,27 +99,28 @@ class RigDescription(Schema):
     name : for people.
     robot : name of a built-in robot, or path of a robot file, relative to the rig file.
     rate : of the loop that commands, in Hz.
-    supply, tracker, probe : the devices; each has a ``driver``.
+    supply, tracker, probe : the devices; each has a ``driver``, see `stiffopt.rig.registry`.
     safety : limits.
     control : how the daemon's loop steers.
     service : where the daemon listens.
     log : recordings.
-    plant : the arm behind simulated devices, and in the virtual lab.
-    lab : the devices in the virtual lab.
+    plant : the arm behind simulated devices, and in the virtual lab; a
+        `stiffopt.plant.settings.PlantSettings`.
+    lab : the devices in the virtual lab; a `stiffopt.plant.settings.LabSettings`.
     """
 
     name: Annotated[str, Field(min_length=1)] = "rig"
     robot: Annotated[str, Field(min_length=1)]
     rate: Annotated[Frequency, Field(gt=0, le=1000)] = 100.0
-    supply: SupplyBlock
-    tracker: TrackerBlock | None = None
-    probe: ProbeBlock | None = None
+    supply: Annotated[SerializeAsAny[SupplySettings], _device("supply")]
+    tracker: Annotated[SerializeAsAny[TrackerSettings] | None, _device("tracker")] = None
+    probe: Annotated[SerializeAsAny[ProbeSettings] | None, _device("probe")] = None
     safety: Safety = Safety()
     control: ControlSettings = ControlSettings()
     service: ServiceSettings = ServiceSettings()
     log: LogSettings = LogSettings()
-    plant: PlantSettings | None = None
-    lab: LabSettings | None = None
+    plant: Annotated[SerializeAsAny[RigSection] | None, _section("plant")] = None
+    lab: Annotated[SerializeAsAny[RigSection] | None, _section("lab")] = None
 
 
 def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
@@ -159,21 +137,13 @@ def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
         _check_against(description, robot)
     except FileError:
         raise
-    except _MisfitError as error:
+    except MisfitError as error:
         raise FileError(
             path, str(error), line=line_of(path, *error.place), key=dotted(error.place)
         ) from None
     except InputError as error:
         raise FileError(path, str(error), line=line_of(path, "robot"), key="robot") from None
     return description
-
-
-class _MisfitError(InputError):
-    """A part of the rig file does not fit the robot."""
-
-    def __init__(self, reason: str, *place: str | int) -> None:
-        super().__init__(reason)
-        self.place = place
 
 
 def _check_against(description: RigDescription, robot: RobotDescription) -> None:
@@ -188,13 +158,13 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
     supply = description.supply
     channels = getattr(supply, "channels", None)
     if channels is not None and len(channels) != n:
-        raise _MisfitError(
+        raise MisfitError(
             f"has {len(channels)} channels; the robot '{robot.name}' has {n}", "supply", "channels"
         )
     for index, channel in enumerate(channels or ()):
         limit = robot.pressure_max[index]
         if channel.max is not None and channel.max > limit * (1 + 1e-9):
-            raise _MisfitError(
+            raise MisfitError(
                 f"{channel.max * 1e-5:g} bar is above the robot's {limit * 1e-5:g} bar "
                 f"({robot.channel_name(index)})",
                 *("supply", "channels", index, "max"),
@@ -208,10 +178,10 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
             continue
         values = value if isinstance(value, tuple) else (value,) * n
         if len(values) != n:
-            raise _MisfitError(f"has {len(values)} values; expected one, or {n}", "safety", key)
+            raise MisfitError(f"has {len(values)} values; expected one, or {n}", "safety", key)
         for index, (given, limit) in enumerate(zip(values, highest or values, strict=True)):
             if given > limit * (1 + 1e-9):
-                raise _MisfitError(
+                raise MisfitError(
                     f"{given * factor:g} {unit} is above the robot's {limit * factor:g} {unit} "
                     f"({robot.channel_name(index)})",
                     "safety",
@@ -221,47 +191,30 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
     if highest_allowed is not None:
         for index, given in enumerate(np.broadcast_to(highest_allowed, n)):
             if given < robot.pressure_min[index]:
-                raise _MisfitError(
+                raise MisfitError(
                     f"{given * 1e-5:g} bar is below the robot's min of "
                     f"{robot.pressure_min[index] * 1e-5:g} bar ({robot.channel_name(index)})",
                     "safety",
                     "max_pressure",
                 )
-    plant, tracker = description.plant or PlantSettings(), description.tracker
+    tracker = description.tracker
     if tracker is not None:
         try:
             registration_of(tracker, robot)
         except InputError as error:
-            raise _MisfitError(str(error), "tracker", "calibrated") from None
-    if isinstance(tracker, SimulatedTrackerSettings):
-        fastest = 1 / plant.discretisation.step
-        if tracker.rate > fastest * (1 + 1e-9):
-            raise _MisfitError(
-                f"{tracker.rate:g} Hz is faster than the steps of the simulation, {fastest:g} Hz",
-                "tracker",
-                "rate",
-            )
-    simulated = [
-        name
-        for name in ("supply", "tracker", "probe")
-        if getattr(getattr(description, name), "driver", None) == "simulated"
-    ]
-    real = [
-        name
-        for name in ("supply", "tracker", "probe")
-        if getattr(description, name) is not None and name not in simulated
-    ]
+            raise MisfitError(str(error), "tracker", "calibrated") from None
+    for part in (tracker, description.probe, supply, description.plant, description.lab):
+        if part is not None:
+            part.check_against(description, robot)
+    devices = {"supply": supply, "tracker": tracker, "probe": description.probe}
+    simulated = [name for name, device in devices.items() if device and device.simulated]
+    real = [name for name, device in devices.items() if device and not device.simulated]
     if simulated and real:
-        raise _MisfitError(
+        raise MisfitError(
             f"is simulated and the {real[0]} is not; a simulated arm has simulated devices only "
             "('stiffopt lab' puts a simulated arm behind real protocols)",
             simulated[0],
         )
-    if description.plant is not None:
-        try:
-            check_mismatch(description.plant.mismatch, robot)
-        except InputError as error:
-            raise _MisfitError(str(error), "plant") from None
 
 
 def limits_of(description: RigDescription, robot: RobotDescription) -> PressureLimits:
@@ -282,7 +235,7 @@ def slew_of(description: RigDescription, robot: RobotDescription) -> NDArray[np.
     return slew
 
 
-def registration_of(tracker: Any, robot: RobotDescription) -> Registration:
+def registration_of(tracker: TrackerSettings, robot: RobotDescription) -> Registration:
     """What makes a tracker's readings poses of the tip in the base frame.
 
     Raises
@@ -290,7 +243,7 @@ def registration_of(tracker: Any, robot: RobotDescription) -> Registration:
     InputError
         The robot file shall correct the poses, and cannot.
     """
-    given: Registration = tracker.registration
+    given = tracker.registration
     if not tracker.calibrated:
         return given
     recordings = robot.recordings

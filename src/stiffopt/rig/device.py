@@ -1,19 +1,33 @@
-"""What all devices have in common: they are opened, used and closed, under one clock."""
+"""What all devices have in common: a clock, an open and a closed state, and settings."""
 
 from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from importlib import import_module
 from types import TracebackType
-from typing import Self
+from typing import Annotated, Any, ClassVar, Self
 
-from stiffopt.errors import DeviceError
+from pydantic import Field, model_validator
 
-__all__ = ["Clock", "Device", "Opened", "SystemClock"]
+from stiffopt.errors import DeviceError, InputError, MissingExtraError
+from stiffopt.model.description import RobotDescription
+from stiffopt.schema import Schema
+
+__all__ = [
+    "Clock",
+    "Device",
+    "DeviceSettings",
+    "MisfitError",
+    "Opened",
+    "RigSection",
+    "SystemClock",
+    "library",
+]
 
 
 class Clock(ABC):
-    """The time of a rig."""
+    """Base of the clocks of a rig."""
 
     @abstractmethod
     def now(self) -> float:
@@ -29,7 +43,7 @@ class Clock(ABC):
 
 
 class SystemClock(Clock):
-    """Real time; changes of the wall clock do not touch it."""
+    """Real time, unaffected by changes of the wall clock."""
 
     def now(self) -> float:
         """Time in s since some moment in the past."""
@@ -43,7 +57,7 @@ class SystemClock(Clock):
 
 
 class Opened(ABC):
-    """Something that `with` opens, and closes at its end."""
+    """Base of what is opened and closed, by `with` or by hand."""
 
     @abstractmethod
     def open(self) -> None:
@@ -67,7 +81,7 @@ class Opened(ABC):
 
 
 class Device(Opened):
-    """Something that is opened once, used and closed.
+    """Base of all devices: opened, used, closed.
 
     A driver's `_open` must leave nothing open when it raises.
     """
@@ -112,3 +126,71 @@ class Device(Opened):
     @abstractmethod
     def _close(self) -> None:
         """Disconnect, whatever state the device is in; raise nothing."""
+
+
+class MisfitError(InputError):
+    """A part of a rig file contradicts another part of it, or the robot.
+
+    Attributes
+    ----------
+    place : the keys that lead to the part at fault, from the top of the rig file.
+    """
+
+    def __init__(self, reason: str, *place: str | int) -> None:
+        super().__init__(reason)
+        self.place = place
+
+
+class RigSection(Schema):
+    """A part of a rig file that another package defines, such as a device or the plant."""
+
+    def check_against(self, rig: Any, robot: RobotDescription) -> None:
+        """Check this part against the rest of the rig (a `RigDescription`) and its robot.
+
+        Raises
+        ------
+        MisfitError
+            They contradict each other.
+        """
+
+
+class DeviceSettings(RigSection):
+    """Base of a device's settings in a rig file.
+
+    Attributes
+    ----------
+    driver : name of the driver, or its class as ``package.module:Class``. A driver that may only be
+        named in one way declares it as a `Literal`.
+    extra : of stiffopt, that installs the libraries of this driver; empty: it needs none.
+    peer : ``module:Class`` of the `stiffopt.lab.bench.Peer` that plays this device in the virtual
+        lab; empty: there is none.
+    simulated : whether the device belongs to a simulated arm.
+    """
+
+    extra: ClassVar[str] = ""
+    peer: ClassVar[str] = ""
+    simulated: ClassVar[bool] = False
+
+    driver: Annotated[str, Field(min_length=1)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_its_class(cls, value: Any) -> Any:
+        """Give settings that are made in code the name by which a rig file finds this class."""
+        if isinstance(value, dict) and cls.model_fields["driver"].is_required():
+            return {"driver": f"{cls.__module__}:{cls.__qualname__}", **value}
+        return value
+
+
+def library(module: str, package: str, extra: str) -> Any:
+    """Import a library that one of stiffopt's extras installs.
+
+    Raises
+    ------
+    MissingExtraError
+        It is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise MissingExtraError(package, extra) from None

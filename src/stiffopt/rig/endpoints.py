@@ -1,4 +1,4 @@
-"""Endpoints: one name for each device, however a rig file addresses it.
+"""Endpoints: one name for each device, whichever of its addresses a rig file gives.
 
 Two addresses of the same device must give the same endpoint, so that a supply can be claimed by it:
 a link in ``/dev/serial/by-id`` and the port it leads to, a host name and the address it stands for.

@@ -1,18 +1,19 @@
-"""The one interface to pressure, tracking and force, in front of real and simulated devices alike.
+"""The rig: one interface to supply, tracker and probe, and all that a driver needs to import.
 
-A supply sets and reads the pressures of the channels, a tracker tells where the tip is, a probe
-pushes on the tip and feels the force. What all devices of a kind must do (refuse, clamp, vent,
-check, register) is done here, once; a driver only moves data, in the methods that begin with an
-underscore. Everything is in SI: Pa (gauge), m, N, s; poses are those of the tip in the base frame.
+A supply sets and reads the pressures of the channels, a tracker measures the pose of the tip, a
+probe pushes the tip and measures the force. What all devices of a kind must do (refuse, clamp,
+vent, check, register) is done here, once; a driver only moves data, in the methods that begin with
+an underscore.
 
-All times are seconds on the clock of the rig, which never jumps.
+Everything is in SI: Pa (gauge), m, N, s; poses are those of the tip in the base frame. All times
+are seconds on the clock of the rig, which never jumps.
 """
 
 from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,11 +31,15 @@ from stiffopt.rig.pressure import (
     total_force,
     vent_at_exit,
 )
-from stiffopt.rig.probing import ForceProbe, ForceSample
-from stiffopt.rig.tracking import PoseSample, PoseTracker, RawPose
-
-if TYPE_CHECKING:
-    from stiffopt.rig.config import RigDescription
+from stiffopt.rig.probing import ForceProbe, ForceSample, ProbeSettings
+from stiffopt.rig.tracking import (
+    PoseSample,
+    PoseTracker,
+    RawPose,
+    StreamedSettings,
+    StreamedTracker,
+    TrackerSettings,
+)
 
 __all__ = [
     "Clock",
@@ -48,11 +53,15 @@ __all__ = [
     "PressureLimits",
     "PressureReading",
     "PressureSupply",
+    "ProbeSettings",
     "RawPose",
     "Rig",
+    "StreamedSettings",
+    "StreamedTracker",
     "Supply",
     "SupplySettings",
     "SystemClock",
+    "TrackerSettings",
     "total_force",
     "vent_at_exit",
 ]
@@ -60,7 +69,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class Observation:
-    """Everything that is new on a rig.
+    """The latest pressures, and the poses since the observation before.
 
     Attributes
     ----------
@@ -83,7 +92,7 @@ class Rig(Opened):
     Parameters
     ----------
     robot :
-        What the arm is believed to be.
+        Description of the arm.
     supply, tracker, probe :
         The devices; a tracker and a probe need not be there.
     clock :
@@ -93,7 +102,7 @@ class Rig(Opened):
     max_force :
         Greatest sum over the channels of pressure times chamber area, in N; None: no limit.
     settings :
-        The `RigDescription` that the rig was made from, if it was.
+        What the rig was made from, such as the content of a rig file; None: nothing of the kind.
     """
 
     def __init__(
@@ -106,7 +115,7 @@ class Rig(Opened):
         clock: Clock | None = None,
         slew: ArrayLike | None = None,
         max_force: float | None = None,
-        settings: RigDescription | None = None,
+        settings: Any = None,
     ) -> None:
         self.robot = robot
         self.supply = supply

@@ -1,4 +1,4 @@
-"""Supplies: what sets and reads the pressures, and what no supply may do."""
+"""Pressure supplies: the commands that they take, the limits that they keep, and how they vent."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import sys
 import threading
 from abc import abstractmethod
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import CommandError, DeviceError, InputError
-from stiffopt.rig.device import Clock, Device
-from stiffopt.schema import Schema
+from stiffopt.model.description import RobotDescription
+from stiffopt.rig.device import Clock, Device, DeviceSettings
 
 __all__ = [
     "PressureCommand",
@@ -35,7 +36,7 @@ _SLACK = 1e-6  # of a channel's range
 
 @dataclass(frozen=True)
 class PressureLimits:
-    """What may be commanded, for each channel.
+    """Lowest and highest pressure that may be commanded, for each channel.
 
     Attributes
     ----------
@@ -142,7 +143,7 @@ class PressureLimits:
 
 @dataclass(frozen=True)
 class PressureReading:
-    """What a supply measures.
+    """Pressures that a supply has measured.
 
     Attributes
     ----------
@@ -158,7 +159,7 @@ class PressureReading:
 
 @dataclass(frozen=True)
 class PressureCommand:
-    """What a supply shall do, and until when: commands expire.
+    """Pressures to be set, and for how long: commands expire.
 
     Attributes
     ----------
@@ -185,7 +186,7 @@ def total_force(pressures: ArrayLike, areas: ArrayLike) -> float:
 
 
 class Supply(Device):
-    """Whatever sets and reads the pressures of all channels; see `Rig.supply`.
+    """Interface of all that sets and reads the pressures of the channels; see `Rig.supply`.
 
     Attributes
     ----------
@@ -239,12 +240,12 @@ class Supply(Device):
         """Let all pressure out at once; no pressure is taken until `arm`."""
 
 
-class SupplySettings(Schema):
-    """Base of the settings of a supply in a rig file: how to reach it, and its channels.
+class SupplySettings(DeviceSettings):
+    """Base of a supply's settings in a rig file: how to reach it, and its channels.
 
-    A subclass has the key ``driver``, and ``channels`` with an item for each channel of the robot.
-    Where such an item has ``min`` or ``max``, in Pa, no supply that `device` returns commands less
-    or more, whatever its driver does.
+    A subclass has the key ``channels`` with an item for each channel of the robot. Where such an
+    item has ``min`` or ``max``, in Pa, no supply that `device` returns commands less or more,
+    whatever its driver does.
     """
 
     def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
@@ -284,6 +285,13 @@ class SupplySettings(Schema):
             if low[index] > high[index]:
                 raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
         return PressureLimits(low, high)
+
+    def simulated_rig(self, description: Any, robot: RobotDescription, **options: Any) -> Any:
+        """Return the `Rig` of a whole simulated arm; only for settings that are `simulated`.
+
+        See `stiffopt.rig.assembly.make_rig`, which passes on limits, slew and kind of time.
+        """
+        raise NotImplementedError(f"{type(self).__name__} simulates nothing")
 
     def _make(self, limits: PressureLimits, clock: Clock | None) -> PressureSupply:
         """Return the supply, not yet open, with these limits."""

@@ -1,4 +1,4 @@
-"""Probes: what pushes on the tip and feels the force."""
+"""Force probes: devices that push the tip along one axis and measure the force."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from stiffopt.rig.device import Device
+from stiffopt.rig.device import Clock, Device, DeviceSettings
 
-__all__ = ["ForceProbe", "ForceSample"]
+__all__ = ["ForceProbe", "ForceSample", "ProbeSettings"]
 
 
 @dataclass(frozen=True)
 class ForceSample:
-    """What a probe feels.
+    """One measurement of a probe.
 
     Attributes
     ----------
@@ -28,6 +28,14 @@ class ForceSample:
     time: float
     force: float
     position: float
+
+
+class ProbeSettings(DeviceSettings):
+    """Base of a probe's settings in a rig file."""
+
+    def device(self, clock: Clock | None = None) -> ForceProbe:
+        """Return the probe, not yet open."""
+        raise NotImplementedError(f"{type(self).__name__} makes no probe")
 
 
 class ForceProbe(Device):

@@ -1,4 +1,4 @@
-"""What the rig file says beside its devices: limits, control, service and log."""
+"""Settings of a rig that belong to no device: safety, control, service and recordings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _PortOrNone = Annotated[_Port | None, BeforeValidator(_none)]
 
 
 class Safety(Schema):
-    """What may be done to the arm, and what is taken for a fault.
+    """Limits of what may be commanded, and what counts as a fault.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Safety(Schema):
 
 
 class ControlSettings(Schema):
-    """How the loop steers.
+    """Settings of the control loop.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class ServiceSettings(Schema):
 
 
 class LogSettings(Schema):
-    """Where recordings go.
+    """Settings of recordings.
 
     Attributes
     ----------

@@ -1,23 +1,35 @@
-"""Trackers: where the tip is, and when that was seen."""
+"""Trackers: devices that measure the pose of the tip, with the time of each capture."""
 
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from stiffopt.registration import Registration
-from stiffopt.rig.device import Clock, Device
+from stiffopt.rig.device import Clock, Device, DeviceSettings
+from stiffopt.units import Duration, Length
 
-__all__ = ["PoseSample", "PoseTracker", "RawPose"]
+__all__ = [
+    "PoseSample",
+    "PoseTracker",
+    "RawPose",
+    "StreamedSettings",
+    "StreamedTracker",
+    "TrackerSettings",
+]
 
 Array = NDArray[np.float64]
 
 _QUEUED = 4096  # samples that a tracker keeps until they are read; the oldest go first
 _NORM_SLACK = 0.05  # by which the norm of a tracker's quaternion may differ from 1
+_NOWHERE = (np.nan, np.nan, np.nan)
 
 
 @dataclass(frozen=True)
@@ -52,7 +64,7 @@ class PoseSample:
 
 @dataclass(frozen=True)
 class RawPose:
-    """What a tracker's driver hands over: the sensor in the tracker's frame.
+    """Pose of the sensor in the tracker's frame, as a driver delivers it.
 
     Attributes
     ----------
@@ -75,8 +87,25 @@ class RawPose:
     received: float | None = None
 
 
+class TrackerSettings(DeviceSettings):
+    """Base of a tracker's settings in a rig file.
+
+    Attributes
+    ----------
+    registration : where tracker and sensor are.
+    calibrated : whether the robot file's own registration then corrects the poses.
+    """
+
+    registration: Registration = Registration()
+    calibrated: bool = False
+
+    def device(self, clock: Clock | None = None) -> PoseTracker:
+        """Return the tracker, not yet open."""
+        raise NotImplementedError(f"{type(self).__name__} makes no tracker")
+
+
 class PoseTracker(Device):
-    """Tells where the tip is.
+    """Base of trackers.
 
     A driver calls `_deliver` with what the device sends, from whatever thread; registration, signs
     and sense are seen to here. `read` never waits for the device: a silent device delivers
@@ -151,3 +180,53 @@ class PoseTracker(Device):
             return PoseSample(raw.time, received, raw.frame, nowhere, None)
         position, quaternion = self.registration.tip_in_base(position, quaternion)
         return PoseSample(raw.time, received, raw.frame, position, quaternion)
+
+
+class StreamedSettings(TrackerSettings):
+    """Base of the settings of a tracker that streams poses.
+
+    Attributes
+    ----------
+    latency : the least time from the capture of a pose to its arrival here, in s.
+    range : what is farther from the tracker than this is not believed, in m.
+    connect_timeout : what does not answer for this long when it is opened is not there, in s.
+    """
+
+    latency: Annotated[Duration, Field(ge=0, le=1)] = 0.025
+    range: Annotated[Length, Field(gt=0, le=100)] = 2.0
+    connect_timeout: Annotated[Duration, Field(gt=0, le=60)] = 10.0
+
+
+class StreamedTracker(PoseTracker):
+    """A tracker whose samples a thread delivers.
+
+    Attributes
+    ----------
+    errors : bad or missing replies, lost connections; they are survived and counted.
+    last_error : the last of them, as a sentence; empty before the first.
+    out_of_range : samples that were not believed.
+    """
+
+    def __init__(self, settings: StreamedSettings, clock: Clock | None = None) -> None:
+        super().__init__(settings.registration, clock)
+        self.errors = 0
+        self.last_error = ""
+        self.out_of_range = 0
+        self._longest = settings.range
+        self._stopping = threading.Event()
+
+    def _count(self, error: str) -> None:
+        self.errors += 1
+        self.last_error = error
+
+    def _hand_over(
+        self, time: float, frame: int, position: ArrayLike, quaternion: ArrayLike | None
+    ) -> None:
+        """Deliver a pose in m, unless it is out of range; then deliver that nothing was seen."""
+        if np.linalg.norm(position) > self._longest:
+            self.out_of_range += 1
+            position = _NOWHERE
+        self._deliver(RawPose(time, frame, position, quaternion))
+
+    def _hand_over_nothing(self, time: float, frame: int) -> None:
+        self._deliver(RawPose(time, frame, _NOWHERE, None))

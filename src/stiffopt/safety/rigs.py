@@ -130,7 +130,7 @@ def guarded_rig(
     probe: ForceProbe | None
     if description.supply.driver == "simulated":
         link = GuardLink(description, robot, limits, json_lines=json_lines)
-        link.has_dump_valve = description.supply.dump_valve
+        link.has_dump_valve = bool(getattr(description.supply, "dump_valve", False))
         tracker = None if description.tracker is None else ForwardedTracker(link)
         probe = None if description.probe is None else ForwardedProbe(link)
     else:

@@ -1,4 +1,4 @@
-"""The NDI Aurora electromagnetic tracker, over its serial protocol (ndicapi)."""
+"""The driver ``aurora``: the NDI Aurora electromagnetic tracker on a serial port (ndicapi)."""
 
 from __future__ import annotations
 
@@ -9,14 +9,13 @@ import threading
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
 from stiffopt.errors import DeviceError, MissingExtraError
-from stiffopt.rig.drivers.streamed import StreamedSettings, StreamedTracker
-from stiffopt.rig.interface import Clock
+from stiffopt.rig.interface import Clock, StreamedSettings, StreamedTracker
 from stiffopt.units import Duration, Frequency
 
 __all__ = ["AuroraSettings", "AuroraTracker"]
@@ -46,7 +45,10 @@ class AuroraSettings(StreamedSettings):
     reconnect_after : a device that is silent for this long is connected anew, in s.
     """
 
-    driver: Literal["aurora"]
+    extra: ClassVar[str] = "aurora"
+    peer: ClassVar[str] = "stiffopt.lab.aurora_peer:AuroraPeer"
+
+    driver: Literal["aurora"] = "aurora"
     port: Annotated[str, Field(min_length=1)] = "auto"
     baud: Literal[9600, 19200, 38400, 57600, 115200] = 115200
     sensor: Annotated[int, Field(ge=1, le=16)] = 1
@@ -72,7 +74,7 @@ class AuroraTracker(StreamedTracker):
     """
 
     def __init__(self, settings: AuroraSettings, clock: Clock | None = None) -> None:
-        super().__init__(settings.range, settings.registration, clock)
+        super().__init__(settings, clock)
         self.settings = settings
         self._process: subprocess.Popen[str] | None = None
         self._thread: threading.Thread | None = None
@@ -86,7 +88,7 @@ class AuroraTracker(StreamedTracker):
     def _open(self) -> None:
         for module, package in (("ndicapy", "ndicapi"), ("serial", "pyserial")):
             if find_spec(module) is None:
-                raise MissingExtraError(package, "aurora")
+                raise MissingExtraError(package, self.settings.extra)
         self._stopping.clear()
         self._settled.clear()
         self._refusal = self._lost = ""

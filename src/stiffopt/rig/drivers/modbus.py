@@ -1,49 +1,140 @@
-"""A supply behind Modbus, over TCP or a serial line: output couplers, IO-Link masters, valves.
+"""The driver ``modbus``: a supply over Modbus, such as output couplers, IO-Link masters, valves.
 
-pymodbus speaks the protocol. Where the pressures are is in `stiffopt.rig.drivers.modbus_registers`.
+pymodbus speaks the protocol, over TCP or a serial line. Where the pressures are, and how they are
+written, is in `stiffopt.rig.drivers.modbus_registers`.
 """
 
 from __future__ import annotations
 
+import logging
+import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Annotated, Any, Literal, Self
+from threading import RLock
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
 from stiffopt.errors import DeviceError, InputError
-from stiffopt.rig.drivers.modbus_line import (
-    ModbusLine,
-    RefusedError,
-    SerialLine,
-    Tcp,
-    library,
-)
+from stiffopt.rig.device import library
 from stiffopt.rig.drivers.modbus_registers import (
-    Channel,
-    DumpValve,
-    Point,
+    ModbusChannel,
+    ModbusDumpValve,
+    ModbusWatchdog,
+    PressureRegister,
+    PressureScale,
+    RegisterRun,
+    RegisterTable,
     RegisterType,
-    Run,
-    Scale,
-    Table,
-    Watchdog,
     WordOrder,
     runs_of,
     values_of,
 )
+from stiffopt.rig.endpoints import serial_endpoints, tcp_endpoints
 from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
-from stiffopt.schema import BadKeyError, Items
+from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration
 
-__all__ = ["DumpValve", "ModbusSettings", "ModbusSupply", "SerialLine", "Tcp", "Watchdog"]
+__all__ = [
+    "ModbusLine",
+    "ModbusRefusedError",
+    "ModbusSerial",
+    "ModbusSettings",
+    "ModbusSupply",
+    "ModbusTcp",
+    "pymodbus_library",
+]
 
 Array = NDArray[np.float64]
 Registers = dict[int, tuple[int, ...]]
 
 _ILLEGAL_FUNCTION = 1
+_EXCEPTIONS = {
+    1: "it does not know this function",
+    2: "it has no such address",
+    3: "it does not take this value",
+    4: "it has failed, or its watchdog has run out",
+    6: "it is busy",
+    10: "the gateway has no path to it",
+    11: "it does not answer the gateway",
+}
+
+
+_CODES = {
+    "read_holding_registers": 3,
+    "read_input_registers": 4,
+    "write_coil": 5,
+    "write_register": 6,
+    "write_registers": 16,
+    "readwrite_registers": 23,
+}
+_FAILURES = (OSError, struct.error, IndexError, ValueError)
+"""What pymodbus lets through when a device is gone or talks nonsense, besides its own errors."""
+
+
+class ModbusTcp(Schema):
+    """Modbus over TCP.
+
+    Attributes
+    ----------
+    host : name or IP address of the device.
+    port : 0 stands for any free port, in the virtual lab alone.
+    """
+
+    host: Annotated[str, Field(min_length=1)]
+    port: Annotated[int, Field(ge=0, le=65535)] = 502
+
+    advice: ClassVar[str] = "is it switched on, and are host and port right?"
+
+    def __str__(self) -> str:
+        return f"the Modbus device at {self.host}:{self.port}"
+
+    def endpoints(self) -> tuple[str, ...]:
+        """Return what a supply at this address is claimed by."""
+        return tcp_endpoints(self.host, self.port)
+
+    def client(self, **options: Any) -> Any:
+        """Return pymodbus's client."""
+        return pymodbus_library("pymodbus.client").ModbusTcpClient(
+            self.host, port=self.port, **options
+        )
+
+
+class ModbusSerial(Schema):
+    """Modbus RTU on a serial line.
+
+    Attributes
+    ----------
+    port : for example ``/dev/ttyUSB0`` or ``COM3``.
+    baudrate, parity, stop_bits : as set in the device.
+    """
+
+    port: Annotated[str, Field(min_length=1)]
+    baudrate: Annotated[int, Field(ge=1200, le=4_000_000)] = 19200
+    parity: Literal["none", "even", "odd"] = "even"
+    stop_bits: Literal[1, 2] = 1
+
+    advice: ClassVar[str] = "is it plugged in, is the port right, may you use it (group dialout)?"
+
+    def __str__(self) -> str:
+        return f"the Modbus device on {self.port}"
+
+    def endpoints(self) -> tuple[str, ...]:
+        """Return what a supply on this line is claimed by."""
+        return serial_endpoints(self.port)
+
+    def options(self) -> dict[str, Any]:
+        """Return the settings by pymodbus's names."""
+        parity = self.parity[0].upper()
+        return {"baudrate": self.baudrate, "parity": parity, "stopbits": self.stop_bits}
+
+    def client(self, **options: Any) -> Any:
+        """Return pymodbus's client."""
+        pymodbus_library("serial")
+        client = pymodbus_library("pymodbus.client").ModbusSerialClient
+        return client(self.port, **self.options(), **options)
 
 
 class ModbusSettings(SupplySettings):
@@ -62,20 +153,23 @@ class ModbusSettings(SupplySettings):
     watchdog, dump_valve : of the device, where it has them.
     """
 
-    driver: Literal["modbus"]
-    tcp: Tcp | None = None
-    serial: SerialLine | None = None
+    extra: ClassVar[str] = "modbus"
+    peer: ClassVar[str] = "stiffopt.lab.modbus_peer:ModbusPeer"
+
+    driver: Literal["modbus"] = "modbus"
+    tcp: ModbusTcp | None = None
+    serial: ModbusSerial | None = None
     unit: Annotated[int, Field(ge=0, le=255)] = 1
     timeout: Annotated[Duration, Field(ge=0.005, le=5)] = 0.2
-    channels: Annotated[Items[Channel], Field(min_length=1)]
-    scale: Scale
+    channels: Annotated[Items[ModbusChannel], Field(min_length=1)]
+    scale: PressureScale
     type: RegisterType = "int16"
     word_order: WordOrder = "big"
-    table: Table = "input"
+    table: RegisterTable = "input"
     read_write: bool = True
     verify: bool = True
-    watchdog: Watchdog | None = None
-    dump_valve: DumpValve | None = None
+    watchdog: ModbusWatchdog | None = None
+    dump_valve: ModbusDumpValve | None = None
 
     @model_validator(mode="after")
     def _is_possible(self) -> Self:
@@ -115,12 +209,12 @@ class ModbusSettings(SupplySettings):
         return len(self.channels)
 
     @property
-    def setpoints(self) -> tuple[Point, ...]:
+    def setpoints(self) -> tuple[PressureRegister, ...]:
         """Where each channel is commanded."""
         return tuple(self._point(c.setpoint, "holding") for c in self.channels)
 
     @property
-    def read_backs(self) -> tuple[Point, ...]:
+    def read_backs(self) -> tuple[PressureRegister, ...]:
         """Where each channel's command can be read back."""
         pairs = zip(self.channels, self.setpoints, strict=True)
         return tuple(
@@ -129,7 +223,7 @@ class ModbusSettings(SupplySettings):
         )
 
     @property
-    def readings(self) -> dict[int, Point]:
+    def readings(self) -> dict[int, PressureRegister]:
         """Where the channels that are measured, counted from 0, are read."""
         return {
             index: self._point(c.reading, c.reading.table or self.table)
@@ -138,7 +232,7 @@ class ModbusSettings(SupplySettings):
         }
 
     @property
-    def connection(self) -> Tcp | SerialLine:
+    def connection(self) -> ModbusTcp | ModbusSerial:
         """How the device is reached."""
         connection = self.tcp or self.serial
         if connection is None:
@@ -157,9 +251,9 @@ class ModbusSettings(SupplySettings):
                 raise InputError(f"channel {index + 1}: {error}; widen its limits") from None
         return ModbusSupply(self, limits, clock)
 
-    def _point(self, register: Any, table: str) -> Point:
+    def _point(self, register: Any, table: str) -> PressureRegister:
         kind, scale = register.type or self.type, register.scale or self.scale
-        return Point(register.address, table, kind, self.word_order, scale)
+        return PressureRegister(register.address, table, kind, self.word_order, scale)
 
 
 class ModbusSupply(PressureSupply):
@@ -205,9 +299,9 @@ class ModbusSupply(PressureSupply):
 
     def prepare(self) -> None:
         """Import pymodbus, which takes a third of a second."""
-        library("pymodbus.client")
+        pymodbus_library("pymodbus.client")
 
-    def _joint_run(self) -> Run | None:
+    def _joint_run(self) -> RegisterRun | None:
         """Return what function 23 reads, if it can write and read all in one request."""
         readings = list(self._readings.items())
         verified = [item for run in self._verified for item in run.points]
@@ -300,10 +394,10 @@ class ModbusSupply(PressureSupply):
         for run in self._verified:
             self._read_back(run, told)
 
-    def _read_back(self, run: Run, registers: Registers) -> None:
+    def _read_back(self, run: RegisterRun, registers: Registers) -> None:
         self._verify(run, self._line.read(str(run), run.table, run.start, run.count), registers)
 
-    def _verify(self, run: Run, values: Sequence[int], registers: Registers) -> None:
+    def _verify(self, run: RegisterRun, values: Sequence[int], registers: Registers) -> None:
         for channel, point in run.points:
             held, written = tuple(run.cut(values, point)), tuple(registers[channel])
             if point == self._read_backs[channel] and held != written:
@@ -324,7 +418,7 @@ class ModbusSupply(PressureSupply):
             self._decode(run, values, pressures)
         return pressures
 
-    def _decode(self, run: Run, values: Sequence[int], pressures: Array) -> None:
+    def _decode(self, run: RegisterRun, values: Sequence[int], pressures: Array) -> None:
         for channel, point in run.points:
             if self._readings.get(channel) == point:
                 pressures[channel] = point.decode(run.cut(values, point))
@@ -347,7 +441,7 @@ class ModbusSupply(PressureSupply):
                 read_count=joint.count,
                 values=values_of(written, registers),
             )
-        except RefusedError as error:
+        except ModbusRefusedError as error:
             if error.code != _ILLEGAL_FUNCTION:
                 raise
             self._joint = None  # it has done nothing; from now on it gets two requests
@@ -388,3 +482,154 @@ def _insist(act: Callable[[], object]) -> None:
         act()
     except DeviceError:
         act()
+
+
+class ModbusRefusedError(DeviceError):
+    """The device has answered that it will not do it.
+
+    Attributes
+    ----------
+    code : exception code of the protocol.
+    """
+
+    def __init__(self, message: str, code: int) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class ModbusLine:
+    """Sends requests to a device and returns its answers.
+
+    A request that fails ends the connection; the next one connects anew, once. No request is
+    ever sent twice, and none is sent after `close`: a closed line stays closed. Any thread may call
+    any method.
+
+    Parameters
+    ----------
+    address :
+        How the device is reached.
+    unit :
+        Its number on the line.
+    timeout :
+        For each answer, in s.
+
+    Attributes
+    ----------
+    connections : how often it has connected.
+    """
+
+    def __init__(
+        self,
+        address: ModbusTcp | ModbusSerial,
+        unit: int,
+        timeout: float,
+    ) -> None:
+        self.address = address
+        self.unit = unit
+        self.timeout = timeout
+        self.connections = 0
+        self._client = address.client(timeout=timeout, retries=0)
+        self._failures = (pymodbus_library("pymodbus.exceptions").ModbusException, *_FAILURES)
+        self._connected = self._closed = False
+        self._lock = RLock()
+
+    def connect(self) -> None:
+        """Connect, where there is no connection."""
+        with self._lock:
+            if self._closed:
+                raise DeviceError(f"the connection to {self.address} is closed; nothing was sent")
+            if self._connected:
+                return
+            if not self._client.connect():
+                raise DeviceError(f"{self.address} cannot be reached; {self.address.advice}")
+            self._connected = True
+            self.connections += 1
+
+    def disconnect(self) -> None:
+        """End the connection; the next request makes a new one."""
+        with self._lock:
+            self._connected = False
+            self._client.close()
+
+    def close(self) -> None:
+        """End the connection for good, when the request that is under way has its answer."""
+        with self._lock:
+            self._closed = True
+            self.disconnect()
+
+    def ask(self, what: str, function: str, *args: Any, **options: Any) -> Any:
+        """Send one request and return the answer.
+
+        Parameters
+        ----------
+        what :
+            What is asked for, in words, for messages.
+        function, args, options :
+            Method of pymodbus's client and its arguments.
+
+        Raises
+        ------
+        ModbusRefusedError
+            The device refuses.
+        DeviceError
+            It does not answer, or not as it should.
+        """
+        with self._lock:
+            self.connect()
+            try:
+                method = getattr(self._client, function)
+                answer = method(*args, device_id=self.unit, **options)
+            except BaseException as error:
+                # Whatever it was: a late answer must not be taken for that to the next request.
+                self.disconnect()
+                if not isinstance(error, self._failures):
+                    raise
+                reason = _reason(error, self.timeout)
+                raise DeviceError(f"{self.address} does not answer: {what}; {reason}") from None
+            code = answer.function_code
+            echo = answer.address if function.startswith("write") and code < 0x80 else None
+            if code & 0x7F != _CODES[function] or (echo is not None and echo != args[0]):
+                self.disconnect()  # it may answer an earlier request; pymodbus lets it pass
+                raise DeviceError(f"{self.address} answers something else: {what}")
+        if code >= 0x80:
+            reason = _EXCEPTIONS.get(answer.exception_code, "it does not say why")
+            message = f"{self.address} refuses: {what}; exception {answer.exception_code}, {reason}"
+            raise ModbusRefusedError(message, answer.exception_code)
+        return answer
+
+    def ask_registers(self, what: str, n: int, function: str, *args: Any, **opts: Any) -> list[int]:
+        """Send a request that is answered with `n` registers, and return these."""
+        with self._lock:
+            registers = self.ask(what, function, *args, **opts).registers
+            if len(registers) != n:
+                self.disconnect()
+                got = len(registers)
+                raise DeviceError(f"{self.address} sends {got} registers, not {n}: {what}")
+        return list(registers)
+
+    def read(self, what: str, table: str, start: int, n: int) -> list[int]:
+        """Read `n` registers of the table ``holding`` or ``input``."""
+        return self.ask_registers(f"read {what}", n, f"read_{table}_registers", start, count=n)
+
+    def write(self, address: int, value: int) -> None:
+        """Write one holding register."""
+        self.ask(f"write {value} to register {address}", "write_register", address, value)
+
+
+def _reason(error: BaseException, timeout: float) -> str:
+    text = str(getattr(error, "string", "") or error).strip().rstrip(".")
+    if "No response" in text:
+        return f"nothing came within {timeout:g} s"
+    if type(error).__name__ == "ConnectionException":
+        return "the connection broke"
+    return text or type(error).__name__
+
+
+def pymodbus_library(name: str) -> Any:
+    """Import a part of pymodbus, or pyserial, which it needs for serial lines."""
+    package = "pyserial" if name == "serial" else "pymodbus"
+    module = library(name, package, ModbusSettings.extra)
+    log = logging.getLogger("pymodbus.logging")
+    if not log.handlers:  # else it prints what is raised as an error anyway
+        log.addHandler(logging.NullHandler())
+    return module

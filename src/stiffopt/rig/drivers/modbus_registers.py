@@ -1,4 +1,4 @@
-"""The register map of a Modbus supply: where things are, and how pressures are counts there."""
+"""The register map of a Modbus supply: where pressures are, and how counts stand for them."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from stiffopt.units import Duration, Number, Pressure, finite_number, parse_quan
 
 __all__ = [
     "Address",
-    "Channel",
-    "DumpValve",
-    "Point",
-    "Reading",
+    "ModbusChannel",
+    "ModbusDumpValve",
+    "ModbusWatchdog",
+    "PressureRegister",
+    "PressureScale",
+    "ReadingRegister",
+    "RegisterRun",
+    "RegisterTable",
     "RegisterType",
     "RegisterValue",
-    "Run",
-    "Scale",
-    "SetPoint",
-    "Table",
-    "Watchdog",
+    "SetPointRegister",
     "WordOrder",
     "runs_of",
     "values_of",
@@ -38,7 +38,7 @@ Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
 RegisterType = Literal["int16", "uint16", "int32", "uint32", "float32"]
 WordOrder = Literal["big", "little"]
-Table = Literal["input", "holding"]
+RegisterTable = Literal["input", "holding"]
 
 _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f"}
 _RANGES = {
@@ -51,7 +51,7 @@ _RANGES = {
 _LONGEST = 120  # registers; what every request, also to read and write at once, may carry
 
 
-class Scale(Schema):
+class PressureScale(Schema):
     """The straight line between counts and pressure, through two points.
 
     In a file, one pressure such as ``1 mbar`` stands for that pressure per count.
@@ -68,7 +68,7 @@ class Scale(Schema):
     @model_validator(mode="before")
     @classmethod
     def _per_count(cls, value: Any, info: ValidationInfo) -> Any:
-        if isinstance(value, dict | Scale):
+        if isinstance(value, dict | PressureScale):
             return value
         if isinstance(value, str) or read_from_file(info):
             per_count = parse_quantity(value, "Pa", "pressure per count")
@@ -109,7 +109,7 @@ class Register(Schema):
 
     address: Address
     type: RegisterType | None = None
-    scale: Scale | None = None
+    scale: PressureScale | None = None
 
     @model_validator(mode="before")
     @classmethod
@@ -118,7 +118,7 @@ class Register(Schema):
         return {"address": value} if bare else value
 
 
-class SetPoint(Register):
+class SetPointRegister(Register):
     """A holding register that sets a pressure.
 
     Attributes
@@ -129,7 +129,7 @@ class SetPoint(Register):
     read_back: Address | None = None
 
 
-class Reading(Register):
+class ReadingRegister(Register):
     """A register that tells a measured pressure.
 
     Attributes
@@ -137,10 +137,10 @@ class Reading(Register):
     table : where it differs from that of the supply.
     """
 
-    table: Table | None = None
+    table: RegisterTable | None = None
 
 
-class Channel(Schema):
+class ModbusChannel(Schema):
     """One regulator.
 
     Attributes
@@ -150,8 +150,8 @@ class Channel(Schema):
     min, max : limits that hold where they are tighter than those of the rig, in Pa.
     """
 
-    setpoint: SetPoint
-    reading: Reading | None = None
+    setpoint: SetPointRegister
+    reading: ReadingRegister | None = None
     min: Pressure | None = None
     max: Pressure | None = None
 
@@ -163,7 +163,7 @@ class RegisterValue(Schema):
     value: Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
-class Watchdog(Schema):
+class ModbusWatchdog(Schema):
     """The device's own watchdog, which turns its outputs off when no command comes.
 
     It is set up whenever a connection is made: first ``before``, then the time, unless the
@@ -204,7 +204,7 @@ class Watchdog(Schema):
         return self
 
 
-class DumpValve(Schema):
+class ModbusDumpValve(Schema):
     """A valve on a digital output that empties all chambers.
 
     Attributes
@@ -222,8 +222,8 @@ class DumpValve(Schema):
 
 
 @dataclass(frozen=True)
-class Point:
-    """A pressure in one or two registers, with everything that is known of it.
+class PressureRegister:
+    """The registers of one pressure, and how it is written in them.
 
     Attributes
     ----------
@@ -235,7 +235,7 @@ class Point:
     table: str
     type: RegisterType
     word_order: WordOrder
-    scale: Scale
+    scale: PressureScale
 
     @property
     def width(self) -> int:
@@ -247,9 +247,9 @@ class Point:
         """Its registers."""
         return range(self.address, self.address + self.width)
 
-    def at(self, address: int) -> Point:
+    def at(self, address: int) -> PressureRegister:
         """Return the same at another address."""
-        return Point(address, self.table, self.type, self.word_order, self.scale)
+        return PressureRegister(address, self.table, self.type, self.word_order, self.scale)
 
     def pressure_range(self) -> tuple[float, float]:
         """Lowest and highest pressure that can be written, in Pa."""
@@ -307,7 +307,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Run:
+class RegisterRun:
     """Registers without a gap, which one request reads or writes.
 
     Attributes
@@ -319,7 +319,7 @@ class Run:
     table: str
     start: int
     count: int
-    points: tuple[tuple[int, Point], ...]
+    points: tuple[tuple[int, PressureRegister], ...]
 
     def __str__(self) -> str:
         channels = sorted({channel + 1 for channel, _ in self.points})
@@ -333,15 +333,15 @@ class Run:
         what = f"{self.start} to {last}" if self.count > 1 else f"{self.start}"
         return f"{self.table} register{'s' if self.count > 1 else ''} {what}"
 
-    def cut(self, registers: Sequence[int], point: Point) -> Sequence[int]:
+    def cut(self, registers: Sequence[int], point: PressureRegister) -> Sequence[int]:
         """Return the registers of a point out of those of the run."""
         offset = point.address - self.start
         return registers[offset : offset + point.width]
 
 
-def runs_of(points: Iterable[tuple[int, Point]]) -> tuple[Run, ...]:
+def runs_of(points: Iterable[tuple[int, PressureRegister]]) -> tuple[RegisterRun, ...]:
     """Return the fewest runs that cover points; they never cover a register that has none."""
-    found: list[Run] = []
+    found: list[RegisterRun] = []
     for item in sorted(points, key=lambda item: (item[1].table, item[1].address)):
         point = item[1]
         end = point.address + point.width
@@ -349,13 +349,13 @@ def runs_of(points: Iterable[tuple[int, Point]]) -> tuple[Run, ...]:
             last = found[-1]
             count = max(last.count, end - last.start)
             if point.address <= last.start + last.count and count <= _LONGEST:
-                found[-1] = Run(last.table, last.start, count, (*last.points, item))
+                found[-1] = RegisterRun(last.table, last.start, count, (*last.points, item))
                 continue
-        found.append(Run(point.table, point.address, point.width, (item,)))
+        found.append(RegisterRun(point.table, point.address, point.width, (item,)))
     return tuple(found)
 
 
-def values_of(run: Run, registers: Mapping[int, Sequence[int]]) -> list[int]:
+def values_of(run: RegisterRun, registers: Mapping[int, Sequence[int]]) -> list[int]:
     """Return the values of all registers of a run from those of its channels."""
     values = [0] * run.count
     for channel, point in run.points:

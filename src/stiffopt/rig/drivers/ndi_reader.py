@@ -36,11 +36,11 @@ NDI_VENDOR = 0x23F2
 
 
 class LostError(Exception):
-    """The device cannot be used, or no more."""
+    """The tracker cannot be used, or no longer."""
 
 
-class Line:
-    """The serial line beside the library, to know why it fails and to shorten its patience."""
+class SerialPort:
+    """The serial port, opened a second time to tell why it fails and to shorten timeouts."""
 
     def __init__(self, port: str) -> None:
         self.fd = -1
@@ -106,13 +106,13 @@ def find_port() -> str:
 
 
 class Session:
-    """One connection, from the first command to the last."""
+    """A connection to the tracker, from the first command to the last."""
 
     def __init__(self, ndi: Any, port: str, baud: int) -> None:
         self.ndi = ndi
         self.port = port
         self.baud = baud
-        self.line = Line(port)
+        self.line = SerialPort(port)
         self.device = ndi.ndiOpen(port)
         if not self.device:
             self.line.close()

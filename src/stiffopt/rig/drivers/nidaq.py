@@ -1,29 +1,48 @@
-"""Regulators on the analogue outputs of NI-DAQ devices, with a dump valve on a digital line."""
+"""The driver ``nidaq``: regulators on analogue outputs of NI-DAQ devices, and a dump valve."""
 
 from __future__ import annotations
 
 from contextlib import ExitStack, suppress
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from stiffopt.errors import DeviceError
-from stiffopt.rig.drivers.daqmx import Address, Daqmx, InputName, OutputName, Pair, Terminals
-from stiffopt.rig.drivers.daqmx_tasks import AnalogueInput, AnalogueOutput, InputChannel
-from stiffopt.rig.drivers.nidaq_valve import DumpValve, Valve
+from stiffopt.rig.drivers.daqmx import (
+    Address,
+    AnalogueInput,
+    AnalogueOutput,
+    Daqmx,
+    DigitalOutput,
+    InputChannel,
+    InputName,
+    LineName,
+    OutputName,
+    Pair,
+    Terminals,
+    WatchdogExpiredError,
+    WatchdogTask,
+)
 from stiffopt.rig.endpoints import tcp_endpoints
 from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Pressure, Voltage
 
-__all__ = ["Input", "NidaqSettings", "NidaqSupply", "Output", "RegulatorChannel"]
+__all__ = [
+    "NidaqChannel",
+    "NidaqDumpValve",
+    "NidaqInput",
+    "NidaqOutput",
+    "NidaqSettings",
+    "NidaqSupply",
+]
 
 Array = NDArray[np.float64]
 
 
-class _Line(Schema):
+class _VoltageLine(Schema):
     """A voltage that stands for a pressure: a straight line through two points.
 
     Attributes
@@ -54,7 +73,7 @@ def _through(x: float, xs: tuple[float, float], ys: tuple[float, float]) -> floa
     return ys[0] + (x - xs[0]) * (ys[1] - ys[0]) / (xs[1] - xs[0])
 
 
-class Output(_Line):
+class NidaqOutput(_VoltageLine):
     """The set-point of a regulator. No voltage beyond the two points is ever written.
 
     Attributes
@@ -74,7 +93,7 @@ class Output(_Line):
         return self
 
 
-class Input(_Line):
+class NidaqInput(_VoltageLine):
     """What a regulator or a sensor measures.
 
     Attributes
@@ -95,7 +114,7 @@ class Input(_Line):
         return self
 
 
-class RegulatorChannel(Schema):
+class NidaqChannel(Schema):
     """One channel of the arm.
 
     Attributes
@@ -105,10 +124,24 @@ class RegulatorChannel(Schema):
     min, max : lowest and highest pressure, where less is allowed than elsewhere, in Pa.
     """
 
-    output: Output
-    input: Input | None = None
+    output: NidaqOutput
+    input: NidaqInput | None = None
     min: Pressure | None = None
     max: Pressure | None = None
+
+
+class NidaqDumpValve(Schema):
+    """A valve that empties all chambers.
+
+    Attributes
+    ----------
+    line : digital line, such as ``Dev1/port0/line0``.
+    closed_when : level of the line that holds the valve shut. Wire it so that the valve opens
+        when the power fails.
+    """
+
+    line: LineName
+    closed_when: Literal["high", "low"] = "high"
 
 
 class NidaqSettings(SupplySettings):
@@ -126,13 +159,16 @@ class NidaqSettings(SupplySettings):
         s; None: it does not.
     """
 
-    driver: Literal["nidaq"]
+    extra: ClassVar[str] = "nidaq"
+    peer: ClassVar[str] = "stiffopt.lab.nidaq_peer:NidaqPeer"
+
+    driver: Literal["nidaq"] = "nidaq"
     grpc: Address | None = None
     timeout: Annotated[Duration, Field(gt=0, le=10)] = 1.0
-    channels: Annotated[Items[RegulatorChannel], Field(min_length=1)]
+    channels: Annotated[Items[NidaqChannel], Field(min_length=1)]
     read_back_tolerance: Annotated[Voltage, Field(gt=0)] = 0.05
     share_inputs: bool = False
-    dump_valve: DumpValve | None = None
+    dump_valve: NidaqDumpValve | None = None
     watchdog: Annotated[Duration, Field(ge=0.01, le=5)] | None = None
 
     @model_validator(mode="after")
@@ -204,7 +240,7 @@ class NidaqSupply(PressureSupply):
     def _open(self) -> None:
         settings = self._settings
         with ExitStack() as stack:
-            daq = Daqmx(settings.grpc, settings.timeout, "nidaq")
+            daq = Daqmx(settings.grpc, settings.timeout, settings.extra)
             stack.callback(daq.close)
             self._outputs = AnalogueOutput(
                 daq,
@@ -231,9 +267,9 @@ class NidaqSupply(PressureSupply):
         if channels := self._input_channels():
             self._inputs = AnalogueInput(daq, channels, shared=settings.share_inputs)
             stack.callback(self._inputs.close)
-        self._valve: Valve | None = None
+        self._valve: _Valve | None = None
         if settings.dump_valve is not None:
-            self._valve = Valve(daq, settings.dump_valve, settings.watchdog)
+            self._valve = _Valve(daq, settings.dump_valve, settings.watchdog)
             stack.callback(self._valve.close, self.clock)
 
     def _close(self) -> None:
@@ -306,3 +342,57 @@ class NidaqSupply(PressureSupply):
                 self._valve.open()
             else:
                 self._valve.shut()
+
+
+class _Valve:
+    """The valve; a watchdog with a timeout in s opens it when the software is silent."""
+
+    def __init__(self, daq: Daqmx, settings: NidaqDumpValve, timeout: float | None) -> None:
+        self._opens_when_high = settings.closed_when == "low"
+        self._timeout = timeout or 0.0
+        self._line = DigitalOutput(daq, settings.line)
+        self._watchdog: WatchdogTask | None = None
+        try:
+            if timeout is not None:
+                high = self._opens_when_high
+                self._watchdog = WatchdogTask(daq, settings.line, timeout, high=high)
+        except BaseException:
+            self._line.close()
+            raise
+
+    def open(self) -> None:
+        """Empty the arm."""
+        try:
+            self._line.write(high=self._opens_when_high)
+        except WatchdogExpiredError:
+            if self._watchdog is None:
+                raise
+            # The device holds the valve open, but takes no other word for it until it is told.
+            self._watchdog.clear()
+            self._line.write(high=self._opens_when_high)
+        # Only now: if the line could not be written, the watchdog still opens the valve.
+        if self._watchdog is not None and self._watchdog.running:
+            self._watchdog.stop()
+
+    def shut(self) -> None:
+        """Let the arm be filled, watched from before the valve shuts."""
+        if self._watchdog is not None:
+            self._watchdog.start()
+        self._line.write(high=not self._opens_when_high)
+
+    def feed(self) -> bool:
+        """Tell the watchdog that the software lives; return False if it comes too late."""
+        if self._watchdog is not None and self._watchdog.running:
+            try:
+                self._watchdog.feed()
+            except WatchdogExpiredError:
+                return False
+        return True
+
+    def close(self, clock: Clock) -> None:
+        """Let go of the line, which keeps its level."""
+        if self._watchdog is not None:
+            if self._watchdog.running:  # the valve could not be opened: the device shall do it
+                clock.sleep(1.2 * self._timeout)
+            self._watchdog.close()
+        self._line.close()

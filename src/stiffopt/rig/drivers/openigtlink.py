@@ -1,4 +1,4 @@
-"""Trackers behind an OpenIGTLink server: PLUS, 3D Slicer and others (pyigtl)."""
+"""The driver ``openigtlink``: trackers behind an OpenIGTLink server such as PLUS (pyigtl)."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import socket
 import struct
 import threading
 import time
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from stiffopt import lie
-from stiffopt.errors import DeviceError, MissingExtraError
-from stiffopt.rig.drivers.streamed import StreamedSettings, StreamedTracker
-from stiffopt.rig.interface import Clock
+from stiffopt.errors import DeviceError
+from stiffopt.rig.device import library
+from stiffopt.rig.interface import Clock, StreamedSettings, StreamedTracker
 from stiffopt.units import Duration
 
 __all__ = ["OpenIGTLinkSettings", "OpenIGTLinkTracker", "SenderClock", "pyigtl_messages"]
@@ -40,7 +40,10 @@ class OpenIGTLinkSettings(StreamedSettings):
         called anew, in s.
     """
 
-    driver: Literal["openigtlink"]
+    extra: ClassVar[str] = "openigtlink"
+    peer: ClassVar[str] = "stiffopt.lab.openigtlink_peer:OpenIGTLinkPeer"
+
+    driver: Literal["openigtlink"] = "openigtlink"
     host: Annotated[str, Field(min_length=1)] = "127.0.0.1"
     port: Annotated[int, Field(ge=1, le=65535)] = 18944
     name: Annotated[str, Field(min_length=1, max_length=20)] = "TipToTracker"
@@ -93,7 +96,7 @@ class OpenIGTLinkTracker(StreamedTracker):
     """
 
     def __init__(self, settings: OpenIGTLinkSettings, clock: Clock | None = None) -> None:
-        super().__init__(settings.range, settings.registration, clock)
+        super().__init__(settings, clock)
         self.settings = settings
         self.heard: set[str] = set()
         self._thread: threading.Thread | None = None
@@ -222,8 +225,4 @@ class OpenIGTLinkTracker(StreamedTracker):
 
 def pyigtl_messages() -> Any:
     """Return the part of pyigtl that packs and unpacks messages."""
-    try:
-        from pyigtl import messages
-    except ImportError:
-        raise MissingExtraError("pyigtl", "openigtlink") from None
-    return messages
+    return library("pyigtl", "pyigtl", OpenIGTLinkSettings.extra).messages

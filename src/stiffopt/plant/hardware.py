@@ -1,0 +1,293 @@
+"""The hardware of the simulated devices: regulators, a tracking camera, a stage with a sensor.
+
+Each acts on the plant or measures it, step by step, and can be made to fail.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt import lie
+from stiffopt.plant.jit import jit
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import (
+    FAULT_SIZES,
+    SimulatedProbeSettings,
+    SimulatedTrackerSettings,
+)
+
+__all__ = ["Camera", "Frame", "Regulators", "SimulatedStage", "regulate"]
+
+Array = NDArray[np.float64]
+Compiled = Any  # an array of floats in compiled code; numba infers the rest
+
+_KEPT = 4096  # frames that wait to be read
+_IMMOBILE = ("off", "stuck")  # faults of a stage that does not move
+_EMPTYING = 0.02  # s; time constant with which a chamber empties through the dump valve
+
+
+class Regulators(NamedTuple):
+    """Parameters of the regulators of n channels.
+
+    Attributes
+    ----------
+    step : of time, s.
+    lag, slew, saturation : (n,), s, Pa/s and Pa.
+    leak : share of the pressure that a leak takes per second (n,).
+    held : pressure at which a regulator is stuck (n,), Pa; NaN where it is not.
+    dumped : whether the dump valve is open.
+    """
+
+    step: float
+    lag: Compiled
+    slew: Compiled
+    saturation: Compiled
+    leak: Compiled
+    held: Compiled
+    dumped: bool
+
+
+@jit
+def regulate(
+    regulators: Regulators,
+    delayed: Compiled,
+    first: int,
+    set_point: Compiled,
+    pressure: Compiled,
+    ripple: Compiled,
+    trace: Compiled,
+) -> int:
+    """Let the regulators work for a number of steps.
+
+    Parameters
+    ----------
+    regulators :
+        What they do.
+    delayed :
+        Set-points that have not reached the regulators yet (d, n), a ring.
+    first :
+        Place in the ring of the oldest.
+    set_point :
+        The newest (n,).
+    pressure :
+        In the chambers (n,), without ripple; it is changed.
+    ripple :
+        To be added at each step (m, n).
+    trace :
+        Becomes the pressure midway through each step (m, n).
+
+    Returns
+    -------
+    Place in the ring of the oldest set-point afterwards.
+    """
+    h = regulators.step
+    depth = len(delayed)
+    emptying = 1 - math.exp(-h / _EMPTYING)
+    for i in range(len(trace)):
+        for c in range(len(pressure)):
+            wanted = set_point[c]
+            if depth > 0:
+                wanted, delayed[first, c] = delayed[first, c], wanted
+            before = pressure[c]
+            if not math.isnan(regulators.held[c]):
+                wanted = regulators.held[c]
+            wanted = min(wanted, regulators.saturation[c])
+            change = wanted - before
+            if regulators.lag[c] > 0:
+                change *= 1 - math.exp(-h / regulators.lag[c])
+            limit = regulators.slew[c] * h
+            change = min(max(change, -limit), limit)
+            change -= (1 - math.exp(-regulators.leak[c] * h)) * before
+            if regulators.dumped:
+                change = -emptying * before
+            pressure[c] = before + change
+            trace[i, c] = before + 0.5 * change + ripple[i, c]
+        if depth > 0:
+            first = (first + 1) % depth
+    return first
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of the camera: the sensor in the tracker's frame.
+
+    Attributes
+    ----------
+    number : counted from 1.
+    captured, delivered : when, in s.
+    position : of the sensor in the tracker's frame (3,), in m; NaN where it is not seen.
+    quaternion : (4,), w first, of any sign.
+    """
+
+    number: int
+    captured: float
+    delivered: float
+    position: Array
+    quaternion: Array
+
+
+class Camera:
+    """Simulated tracking camera: captures the sensor at the tip and sends frames late.
+
+    Attributes
+    ----------
+    count : frames captured so far, lost ones included.
+    """
+
+    def __init__(
+        self, settings: SimulatedTrackerSettings, plant: Plant, rng: np.random.Generator
+    ) -> None:
+        self.settings = settings
+        self.count = 0
+        self._plant = plant
+        self._rng = rng
+        self._sent: deque[Frame] = deque(maxlen=_KEPT)
+        self._last: Frame | None = None
+
+    def next_step(self) -> int:
+        """Step of the plant in which the next frame is captured."""
+        return round((self.count + 1) / self.settings.rate / self._plant.step)
+
+    def skip(self) -> None:
+        """Lose the frames of a time that was skipped."""
+        self.count = max(self.count, int(self._plant.time * self.settings.rate))
+
+    def delivered(self, now: float) -> list[Frame]:
+        """Return the frames that have arrived by now and were not returned before."""
+        ready = []
+        while self._sent and self._sent[0].delivered <= now + 1e-9:
+            ready.append(self._sent.popleft())
+        return ready
+
+    def capture(self, fault: str) -> None:
+        """Capture a frame, or lose it."""
+        self.count += 1
+        settings = self.settings
+        chances = self._rng.random(3)  # drawn in every frame, so that faults shift no stream
+        noise = self._rng.standard_normal(6)
+        if fault == "off" or chances[0] < settings.missing:
+            return
+        T = self.sensor_in_tracker(noise)
+        position, q = T[:3, 3].copy(), np.asarray(lie.quaternion_from_rotation(T[:3, :3]))
+        if fault == "missing" or chances[1] < settings.dropouts:
+            position, q = np.full(3, np.nan), np.full(4, np.nan)
+        elif fault == "wrong":
+            position = position + FAULT_SIZES.tracker_offset
+        elif fault == "garbage":
+            position, q = position * 1e3 * noise[:3], np.full(4, np.nan)
+        if chances[2] < settings.flips or (fault == "flip" and self.count % 2):
+            q = -q
+        now = self._plant.time
+        arrival = now + settings.latency + (FAULT_SIZES.frame_delay if fault == "slow" else 0.0)
+        if self._last is not None:
+            arrival = max(arrival, self._last.delivered)  # none overtakes another
+        if fault == "stuck" and self._last is not None:
+            frame = replace(self._last, delivered=arrival)
+        else:
+            frame = Frame(self.count, now, arrival, position, q)
+        self._last = frame
+        self._sent.append(frame)
+
+    def sensor_in_tracker(self, noise: Array) -> Array:
+        """Pose (4, 4) of the sensor in the tracker's frame; `noise` (6,) in standard deviations."""
+        settings = self.settings
+        off = self._plant.mismatch.registration.inverse()
+        T = settings.registration.sensor_in_tracker(off @ self._plant.tip_pose())
+        T[:3, 3] += settings.noise * noise[:3]
+        small = np.concatenate(([1.0], 0.5 * settings.angular_noise * noise[3:]))
+        turn = lie.rotation_from_quaternion(small / np.linalg.norm(small))
+        T[:3, :3] = T[:3, :3] @ turn
+        return T
+
+
+class SimulatedStage:
+    """A stage that can be mounted along any direction.
+
+    Attributes
+    ----------
+    position : m, along its axis.
+    speed : at which it moves now, m/s; 0 while it rests.
+    """
+
+    def __init__(
+        self, settings: SimulatedProbeSettings, plant: Plant, rng: np.random.Generator
+    ) -> None:
+        self.settings = settings
+        self.position = 0.0
+        self.speed = 0.0
+        self._plant = plant
+        self._rng = rng
+        self._axis: Array | None = None
+        self._origin = 0.0
+        self._target = 0.0
+
+    def mount(self, direction: ArrayLike | None) -> None:
+        """Mount the stage along a vector (3,) just clear of the tip, or take it away."""
+        self._axis = None
+        if direction is not None:
+            self._axis = np.array(direction, dtype=float)
+            self._axis /= np.linalg.norm(self._axis)
+            tip = self._plant.tip_pose()[:3, 3]
+            self._origin = float(self._axis @ tip) - self.settings.clearance
+        self.position = self._target = self.speed = 0.0
+        self.place_plate(0)
+
+    def move(self, position: float, speed: float, fault: str) -> None:
+        """Start to move to a place, m, at a speed, m/s."""
+        speed = min(speed, self.settings.speed)
+        if fault == "slow":
+            speed *= FAULT_SIZES.stage_speed
+        self._target = position
+        moves = position != self.position and fault not in _IMMOBILE
+        self.speed = speed if moves else 0.0
+
+    def stop_if(self, fault: str) -> None:
+        """Stop if this fault holds the stage."""
+        if fault in _IMMOBILE:
+            self.speed = 0.0
+
+    def steps_left(self) -> int | None:
+        """Steps of the plant until the stage is there, or None while it rests."""
+        if not self.speed:
+            return None
+        steps = abs(self._target - self.position) / self.speed / self._plant.step
+        return max(1, math.ceil(steps - 1e-6))
+
+    def place_plate(self, steps: int) -> None:
+        """Tell the plant where the plate is, and how it moves in the steps to come."""
+        if self._axis is None:
+            self._plant.set_plate(None)
+            return
+        duration = steps * self._plant.step
+        speed = self._movement(duration) / duration if steps else 0.0
+        at = self._origin + self.position
+        self._plant.set_plate(self._axis, at, self.settings.stiffness, speed)
+
+    def advance(self, steps: int) -> None:
+        """Be where the stage is after some steps of the plant."""
+        if self.speed:
+            self.position += self._movement(steps * self._plant.step)
+            if abs(self._target - self.position) < 1e-9:
+                self.position, self.speed = self._target, 0.0
+        self.place_plate(0)
+
+    def _movement(self, duration: float) -> float:
+        """How far the stage goes in some time, m; not beyond its target."""
+        far = self.speed * duration
+        return float(np.clip(self._target - self.position, -far, far))
+
+    def force(self, fault: str) -> float:
+        """Force that the sensor feels, N."""
+        noise = float(self.settings.noise * self._rng.standard_normal())
+        force = self._plant.contact_force() if self._axis is not None else 0.0
+        if fault == "garbage":
+            return float("nan") if noise > 0 else 1e6 * noise
+        if fault == "wrong":
+            force = FAULT_SIZES.force_gain * force + FAULT_SIZES.force_offset
+        return force + noise
