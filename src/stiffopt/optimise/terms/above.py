@@ -39,7 +39,8 @@ class AboveTerm(Term):
 
     @property
     def _height(self) -> float:
-        return float(sum(n * p for n, p in zip(self.value.normal, self.value.point, strict=True)))
+        pairs = zip(self.value.normal, self.value.point, strict=True)
+        return float(sum(n * p for n, p in pairs))
 
     def residual(self, tip: Any, parameters: Any) -> Any:
         """``n . (r - point)``; see `Term.residual`."""
