@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from results import Section, Verdict, at_most
+from report import Section, Verdict, at_most, table
 from settings import Settings
 
 if TYPE_CHECKING:
@@ -480,15 +480,32 @@ def judged(result: CalibrationResult, true: dict[str, tuple[str, float]], found:
 # -- targets -----------------------------------------------------------------------------------
 
 
-def places(truth: Truth, high: Array, count: int, rng: np.random.Generator) -> list[Array]:
-    """Poses (4, 4) of the true tip at random pressures, each a step from the one before."""
-    last = truth.settled(np.zeros(len(high)))
-    found: list[Array] = []
+def places(
+    settled: Callable[[Array], Array],
+    high: Array,
+    count: int,
+    up_to: float,
+    rng: np.random.Generator,
+) -> list[tuple[Array, Array]]:
+    """Poses (4, 4) or positions (3,) at rest and their pressures, each a step from the last one.
+
+    Parameters
+    ----------
+    settled : where an arm comes to rest at pressures (n,).
+    high : highest pressures (n,), in Pa; up to this share of them are drawn.
+    """  # fmt: skip
+
+    def position(place: Array) -> Array:
+        return place if place.ndim == 1 else place[:3, 3]
+
+    last = settled(np.zeros(len(high)))
+    found: list[tuple[Array, Array]] = []
     while len(found) < count:
-        pose = truth.settled(rng.uniform(0, TARGETS_UP_TO, len(high)) * high)
-        if STEPS[0] <= np.linalg.norm(pose[:3, 3] - last[:3, 3]) <= STEPS[1]:
-            found.append(pose)
-            last = pose
+        pressures = rng.uniform(0, up_to, len(high)) * high
+        place = settled(pressures)
+        if STEPS[0] <= np.linalg.norm(position(place) - position(last)) <= STEPS[1]:
+            found.append((place, pressures))
+            last = place
     return found
 
 
@@ -567,7 +584,8 @@ def to_targets(
     found: Found,
 ) -> None:
     """Steps from target to target, open loop and with feedback."""
-    poses = places(truth, np.array(robot.pressure_max), count, rng)
+    high = np.array(robot.pressure_max)
+    poses = [pose for pose, _ in places(truth.settled, high, count, TARGETS_UP_TO, rng)]
     for name, known in files.items():
         wanted = [(pose[:3, 3], known.seen(truth.registered(pose))) for pose in poses]
         for what, own in (("open loop", replace(loop, gain=0.0)), ("feedback", loop)):
@@ -703,9 +721,7 @@ def verdicts(name: str, found: Found) -> list[Verdict]:
 
 def markdown(name: str, found: Found) -> str:
     """Table of an arm, and what to know of it."""
-    header = [f"| measure | {' | '.join(COLUMNS)} |", "| --- " * (len(COLUMNS) + 1) + "|"]
-    lines = [f"### {name}", "", *header]
-    lines += ["| " + " | ".join(row) + " |" for row in rows(found)]
+    lines = [f"### {name}", "", *table(("measure", *COLUMNS), rows(found))]
     if found.inside:
         groups = (f"{group} {sum(f)}/{len(f)}" for group, f in found.inside.items())
         lines += ["", "Inside their intervals: " + ", ".join(groups) + "."]

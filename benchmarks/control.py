@@ -37,9 +37,16 @@ from typing import Any
 import numpy as np
 
 from control_baselines import CONTROLLERS, GRID, Gains, IntegralFeedback, MakeSteering
-from control_calibration import with_calibrated_file
-from control_cases import DYNAMICS, Case, draw_case, draw_path, with_true_file
+from control_cases import (
+    DYNAMICS,
+    Case,
+    draw_case,
+    draw_path,
+    with_calibrated_file,
+    with_true_file,
+)
 from control_runs import Follow, Step, run_case, run_path
+from report import table
 
 ROBOT_FILES = ("nominal", "calibrated", "true")
 STEADY_BAR = {"quasi-static": 1e-4, "full": 3e-4}
@@ -179,15 +186,10 @@ def tables(found: Sequence[Step | Follow]) -> str:
         columns = []
         for name in names:
             mine = [each for each in own if each.controller == name]
-            rows: Any = path_rows if isinstance(mine[0], Follow) else step_rows
-            columns.append(dict(rows(mine, dynamics)))
-        lines += [f"### plant: {dynamics}", "", f"| measure | {' | '.join(names)} |"]
-        lines.append("| --- " * (1 + len(names)) + "|")
-        lines += [
-            f"| {what} | {' | '.join(column.get(what, '-') for column in columns)} |"
-            for what in columns[0]
-        ]
-        lines.append("")
+            of: Any = path_rows if isinstance(mine[0], Follow) else step_rows
+            columns.append(dict(of(mine, dynamics)))
+        rows = [(what, *(column.get(what, "-") for column in columns)) for what in columns[0]]
+        lines += [f"### plant: {dynamics}", "", *table(("measure", *names), rows), ""]
     return "\n".join(lines)
 
 

@@ -7,21 +7,26 @@ where that very arm comes to rest, creep done and without hysteresis, so they ca
 
 from __future__ import annotations
 
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from control_truth import SOFT, STIFF, Choice, Truth
+from calibration import Sizes, places, recorded, settling_time, with_true_values
 
 if TYPE_CHECKING:
     from stiffopt.model.description import RobotDescription
     from stiffopt.optimise.target import Target
     from stiffopt.optimise.task import Task
     from stiffopt.plant.devices import SimulatedRig
-    from stiffopt.plant.settings import PlantSettings
+    from stiffopt.plant.settings import Mismatch, PlantSettings
     from stiffopt.registration import Registration
     from stiffopt.rig.config import RigDescription
 
@@ -31,7 +36,6 @@ RIG = Path(__file__).resolve().parent.parent / "rig" / "sim-two-segment.yaml"
 DYNAMICS = ("quasi-static", "full")
 DIRECTIONS = {"axial": (0.0, 0.0, 1.0), "lateral": (1.0, 0.0, 0.0)}
 MODULUS, CHANNELS, SHIFT, TILT = 0.20, 0.05, 2e-3, np.deg2rad(2.0)
-STEPS = (0.010, 0.040)  # m between two targets
 UP_TO = 0.8  # of the highest pressures
 NEAR = 1e-3  # m
 CORRECTED = 1e-5  # m; how well the plant's own stiffest pressures reach a target
@@ -41,6 +45,11 @@ IDEAL_HOLD, IDEAL_TICK = 1.5, 0.005  # s
 WIDTH, SPEED, WAYPOINTS = 0.040, 0.010, 0.2  # figure-eight: m, m/s, and s between waypoints
 MARGIN = (0.10, 0.85)  # of the pressures: a path that the model of the plant reaches with these
 TRIES = 300
+BAR = 1e5
+STARTS = 8  # of each search
+NUDGE = 1e-4  # bar, for derivatives of the stiffness
+REACHED = 2e-5  # m
+STIFF, SOFT = -1.0, 1.0  # signs of the value that is made small
 
 
 @dataclass(frozen=True)
@@ -82,7 +91,7 @@ class Case:
     seed: int
     description: RigDescription
     robot: RobotDescription
-    truth: Truth
+    truth: TrueModel
     aims: tuple[Aim, ...]
     believed: RobotDescription
 
@@ -158,11 +167,11 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
     plant = PlantSettings(mismatch=_mismatch(robot, rng), seed=seed, payload=payload)
     tracker = rig.tracker.model_copy(update={"noise": 5e-5})
     rig = rig.model_copy(update={"plant": plant, "tracker": tracker})
-    truth = Truth(robot, plant.mismatch, payload)
+    truth = TrueModel(robot, plant.mismatch, payload)
     arm = Arm(robot, plant, truth)
     kinds = list(DIRECTIONS)
     aims: list[Aim] = []
-    for k, (position, drawn) in enumerate(_places(arm, targets, rng)):
+    for k, (position, drawn) in enumerate(places(arm.settled, arm.high, targets, UP_TO, rng)):
         kind = kinds[(seed + k) % len(kinds)]
         stiffest = arm.stiffest(position, DIRECTIONS[kind], drawn, rng)
         aims.append(Aim(position, kind, drawn, stiffest, np.nan, np.nan))
@@ -199,7 +208,7 @@ def _mismatch(robot: RobotDescription, rng: np.random.Generator) -> Any:
 class Arm:
     """The simulated arm beside any rig, at rest, without creep and hysteresis."""
 
-    def __init__(self, robot: RobotDescription, plant: PlantSettings, truth: Truth) -> None:
+    def __init__(self, robot: RobotDescription, plant: PlantSettings, truth: TrueModel) -> None:
         from stiffopt.plant.plant import Plant
 
         self.high = np.array(robot.pressure_max)
@@ -271,22 +280,8 @@ def without_memory(plant: PlantSettings) -> PlantSettings:
     return plant.model_copy(update={"dynamics": "quasi-static", "silicone": silicone})
 
 
-def _places(arm: Arm, count: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-    """Places of the tip and pressures that bring it there, each a step from the one before."""
-    last = arm.settled(np.zeros(len(arm.high)))
-    found: list[tuple[Array, Array]] = []
-    while len(found) < count:
-        pressures = rng.uniform(0, UP_TO, len(arm.high)) * arm.high
-        position = arm.settled(pressures)
-        if STEPS[0] <= np.linalg.norm(position - last) <= STEPS[1]:
-            found.append((position, pressures))
-            last = position
-    return found
-
-
 def ideal_times(case: Case, pressures: list[Array]) -> list[float]:
     """Settling times of steps to these pressures, commanded at once, from rest at 0 Pa, in s."""
-    from calibration import settling_time
     from stiffopt.rig.assembly import make_rig
 
     supply = case.description.supply.model_copy(update={"ripple": 0.0})
@@ -353,3 +348,197 @@ def draw_path(case: Case) -> Path8:
         else:
             return Path8(times, positions)
     raise RuntimeError(f"no figure-eight was found for seed {case.seed}")
+
+
+# -- robot files as a user would make them -------------------------------------------------------
+
+RECORDING_SEED = 10_000  # to the seed, so that the noise is not that of the control's run
+RECORDED = Sizes(repetitions=1, structure="creep", rows=300, trial_rows=100)
+"""Two and a half minutes of the paper's sequence and poses; the model is named to save time."""
+
+
+def calibrated_file(case: Case, folder: Path) -> RobotDescription:
+    """The calibrated robot file of a case's arm.
+
+    Parameters
+    ----------
+    case : whose arm it is; what it carries beside the robot file's mass is put on afterwards.
+    folder : gets the recording and the file, or has them from a run before.
+    """
+    from stiffopt import CalibrationSettings, calibrate, save_robot
+    from stiffopt.model.robot_files import load_description
+
+    path = folder / f"arm-{case.seed}.yaml"
+    if not path.exists():
+        plant = case.description.plant.model_copy(
+            update={"dynamics": "full", "seed": case.seed + RECORDING_SEED, "payload": 0.0}
+        )
+        rig = case.description.model_copy(update={"plant": plant})
+        folder.mkdir(parents=True, exist_ok=True)
+        logs = recorded(rig, case.robot, RECORDED, folder / f"recording-{case.seed}")
+        settings = CalibrationSettings(
+            structure=RECORDED.structure, strain_law="keep", sequence=True,
+            rows=RECORDED.rows, trial_rows=RECORDED.trial_rows,
+        )  # fmt: skip
+        save_robot(path, calibrate(case.robot, logs, settings=settings).robot)
+    return load_description(path)
+
+
+def with_calibrated_file(case: Case, folder: Path) -> Case:
+    """The case whose controller gets that file."""
+    return replace(case, believed=calibrated_file(case, folder))
+
+
+# -- the true model -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What can be chosen at a place of the tip.
+
+    Attributes
+    ----------
+    least, most : stiffness, in N/m.
+    softest, stiffest : pressures (n,) for them, in Pa.
+    """
+
+    least: float
+    most: float
+    softest: Array
+    stiffest: Array
+
+
+class TrueModel:
+    """The model with the arm's true values, in the nominal base frame.
+
+    Attributes
+    ----------
+    model : Manipulator
+        In the arm's own, true base frame.
+    base : that frame (4, 4) in the nominal one.
+    """
+
+    def __init__(self, robot: RobotDescription, mismatch: Mismatch, payload: float = 0.0) -> None:
+        from stiffopt import load_robot
+        from stiffopt.optimise.tip import TipModel
+
+        self.base: Array = mismatch.base.transform()
+        known: Any = SimpleNamespace(mismatch=mismatch)
+        gravity = self.base[:3, :3].T @ np.array(robot.gravity)
+        update = {"gravity": tuple(gravity.tolist()), "tip_mass": robot.tip_mass + payload}
+        self.model = load_robot(with_true_values(robot, known).model_copy(update=update))
+        with _passing_cache():  # nobody needs the code of this very arm again
+            self._tip = TipModel(self.model)
+
+    def position(self, pressures: Array) -> Array:
+        """Tip (3,)."""
+        return self._place(pressures)[0]
+
+    def _place(self, pressures: Array) -> tuple[Array, Array]:
+        """Tip (3,) and its derivative (3, n) by the pressures."""
+        pose, jacobian, _ = self._tip.at(pressures)
+        pose = self.base @ pose
+        return pose[:3, 3], pose[:3, :3] @ jacobian[:3]
+
+    def stiffness(self, pressures: Array, direction: tuple[float, ...]) -> float:
+        """Of the free tip along a unit vector in the nominal base frame, in N/m."""
+        pose, _, compliance = self._tip.at(pressures)
+        d = (self.base[:3, :3] @ pose[:3, :3]).T @ np.array(direction)
+        return float(1 / (d @ compliance[:3, :3] @ d))
+
+    def reach(self, position: Array, start: Array, low: Array, high: Array) -> Array | None:
+        """Pressures (n,) that bring the tip there, near to others; None where none were found."""
+        from scipy.optimize import least_squares
+
+        x0 = np.clip(start, low + 1e-3 * (high - low), high - 1e-3 * (high - low)) / BAR
+        found = least_squares(
+            lambda x: 1e3 * (self._place(BAR * x)[0] - position),
+            x0,
+            lambda x: 1e3 * BAR * self._place(BAR * x)[1],
+            bounds=(low / BAR, high / BAR),
+            xtol=1e-6,
+        )
+        return BAR * found.x if np.linalg.norm(found.fun) < 1e3 * REACHED else None
+
+    def choice(
+        self,
+        pressures: Array,
+        direction: tuple[float, ...],
+        rng: np.random.Generator,
+        at: Array | None = None,
+    ) -> Choice:
+        """The softest and the stiffest way to hold the tip where these pressures hold it, or `at`.
+
+        Raises
+        ------
+        RuntimeError
+            The place cannot be reached.
+        """
+        low, high = (np.array(v) for v in (self.model.pressure_min, self.model.pressure_max))
+        place = self.position(pressures) if at is None else at
+        starts = [pressures]
+        for _ in range(STARTS - 1):
+            start = self.reach(place, rng.uniform(low, high), low, high)
+            if start is not None:
+                starts.append(start)
+        found = [
+            (self.stiffness(p, direction), p)
+            for start in starts
+            for sign in (STIFF, SOFT)
+            if (p := self.extreme(place, direction, start, sign)) is not None
+        ]
+        if at is None:
+            found.append((self.stiffness(pressures, direction), pressures))
+        if not found:
+            raise RuntimeError("the true model does not reach the place")
+        (least, softest), (most, stiffest) = (
+            f(found, key=lambda each: each[0]) for f in (min, max)
+        )
+        return Choice(least, most, softest, stiffest)
+
+    def extreme(
+        self, place: Array, direction: tuple[float, ...], start: Array, sign: float
+    ) -> Array | None:
+        """A local optimum (n,) of the stiffness at a place, for `STIFF` or `SOFT`."""
+        from scipy.optimize import minimize
+
+        low, high = (np.array(v) / BAR for v in (self.model.pressure_min, self.model.pressure_max))
+
+        def value(x: Array) -> float:
+            return sign * float(np.log(self.stiffness(BAR * x, direction)))
+
+        def gradient(x: Array) -> Array:
+            here, steps = value(x), np.where(x + NUDGE <= high, NUDGE, -NUDGE)
+            return np.array([
+                (value(x + step * unit) - here) / step
+                for step, unit in zip(steps, np.eye(len(x)), strict=True)
+            ])  # fmt: skip
+
+        found = minimize(
+            value, np.clip(start / BAR, low, high), jac=gradient, method="SLSQP",
+            bounds=list(zip(low, high, strict=True)),
+            constraints={
+                "type": "eq",
+                "fun": lambda x: 1e3 * (self._place(BAR * x)[0] - place),
+                "jac": lambda x: 1e3 * BAR * self._place(BAR * x)[1],
+            },
+            options={"maxiter": 80, "ftol": 1e-7},
+        )  # fmt: skip
+        p = BAR * np.clip(found.x, low, high)
+        return p if np.linalg.norm(self.position(p) - place) < REACHED else None
+
+
+@contextmanager
+def _passing_cache() -> Iterator[None]:
+    """Context whose compiled code is kept on disk no longer than that."""
+    name = "STIFFOPT_CACHE_DIR"
+    before = os.environ.get(name)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ[name] = folder
+        try:
+            yield
+        finally:
+            if before is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = before

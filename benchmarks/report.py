@@ -1,9 +1,10 @@
-"""The report in Markdown: bars, where a peer is better, environment, tables, limitations."""
+"""What a section of the benchmarks found, and the report of all sections in Markdown."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 from counts import TOLERANCE, Difference
-from results import Section, Verdict, times
 
 METRICS = """\
 All times are wall times of whole calls from Python, in one process unless said otherwise. Calls
@@ -34,6 +35,100 @@ LIMITATIONS = """\
 - Loads are covered by two kinds of tasks on the two-segment arm."""
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """A bar and what was measured.
+
+    Attributes
+    ----------
+    what : of which figure.
+    bar : in words, with its unit.
+    measured : the same.
+    met : whether it was met.
+    """
+
+    what: str
+    bar: str
+    measured: str
+    met: bool
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The same work by stiffopt and by a peer, side by side.
+
+    Attributes
+    ----------
+    work : what was done.
+    peer : by whom else.
+    times_better : how many times better stiffopt is; below 1 the peer is better.
+    measure : what "better" is about, such as "time".
+    remark : what to know of it.
+    """
+
+    work: str
+    peer: str
+    times_better: float
+    measure: str = "time"
+    remark: str = ""
+
+
+@dataclass
+class Section:
+    """One part of the report: a table with its text, verdicts and comparisons.
+
+    `data` is what results.json and the plots get, `skipped` says why a peer was left out, by name.
+    """
+
+    title: str
+    text: str
+    header: tuple[str, ...] = ()
+    rows: list[tuple[str, ...]] = field(default_factory=list)
+    verdicts: list[Verdict] = field(default_factory=list)
+    comparisons: list[Comparison] = field(default_factory=list)
+    skipped: dict[str, str] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
+
+
+def at_most(what: str, limit: float, value: float, unit: str) -> Verdict:
+    """Verdict on a figure that should be small; NaN is a miss."""
+    return Verdict(what, f"at most {_with_unit(limit, unit)}", _found(value, unit), value <= limit)
+
+
+def at_least(what: str, limit: float, value: float, unit: str) -> Verdict:
+    """Verdict on a figure that should be large; NaN is a miss."""
+    return Verdict(what, f"at least {_with_unit(limit, unit)}", _found(value, unit), value >= limit)
+
+
+def _found(value: float, unit: str) -> str:
+    return "not measured" if value != value else _with_unit(value, unit)
+
+
+def _with_unit(value: float, unit: str) -> str:
+    number = f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+    return number + ("" if unit == "x" else " ") + unit
+
+
+def times(value: float) -> str:
+    """A ratio in words of a table."""
+    if value != value:
+        return "-"
+    return f"{value:.3g}x"
+
+
+def milliseconds(seconds: float) -> str:
+    """A time for a table whose column says ms."""
+    return "-" if seconds != seconds else f"{seconds * 1e3:.3g}"
+
+
+def percent(share: float) -> str:
+    """A share in percent."""
+    return "-" if share != share else f"{100 * share:.0f} %"
+
+
+# -- Markdown -------------------------------------------------------------------------------------
+
+
 def markdown(
     sections: Sequence[Section],
     differences: Sequence[Difference],
@@ -52,12 +147,12 @@ def markdown(
         f"Load average {loads[0]:.2f} before, {loads[1]:.2f} after.",
         "", "## Metrics", "", METRICS, "", "## Bars", "", *_bars(sections), "",
         "## Where a peer is better", "", *_better(sections), "", "## Environment", "",
-        *_table(("", ""), environment.items()), "",
+        *table(("", ""), environment.items()), "",
     ]  # fmt: skip
     for section in sections:
         parts += [f"## {section.title}", "", section.text, ""]
         if section.rows:
-            parts += [*_table(section.header, section.rows), ""]
+            parts += [*table(section.header, section.rows), ""]
         parts += [f"Skipped: {name}: {why}." for name, why in section.skipped.items()]
         parts += [""] if section.skipped else []
     parts += ["## Counts", "", *_counts(differences), "", "## Limitations", "", LIMITATIONS, ""]
@@ -79,7 +174,7 @@ def _bars(sections: Sequence[Section]) -> list[str]:
     rows = [(v.what, v.bar, v.measured, "met" if v.met else "**not met**") for v in verdicts]
     return [
         f"{met} of {len(verdicts)} met.", "",
-        *_table(("figure", "bar", "measured", ""), rows),
+        *table(("figure", "bar", "measured", ""), rows),
     ]  # fmt: skip
 
 
@@ -88,7 +183,7 @@ def _better(sections: Sequence[Section]) -> list[str]:
     if not found:
         return ["Nowhere in this run."]
     rows = [(c.work, c.peer, c.measure, times(1 / c.times_better), c.remark) for c in found]
-    return _table(("work", "peer", "in", "how many times better", "remark"), rows)
+    return table(("work", "peer", "in", "how many times better", "remark"), rows)
 
 
 def _counts(differences: Sequence[Difference]) -> list[str]:
@@ -102,9 +197,10 @@ def _counts(differences: Sequence[Difference]) -> list[str]:
     rows = [(d.group, d.name, str(d.expected), str(d.found), d.state) for d in changed]
     if not rows:
         return [intro, "", "All are within their tolerance."]
-    return [intro, "", *_table(("group", "count", "on record", "found", ""), rows)]
+    return [intro, "", *table(("group", "count", "on record", "found", ""), rows)]
 
 
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return ["| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines]

@@ -23,17 +23,15 @@ import counts
 import environment
 import plots
 import report
-from results import Section
+from report import Section
 from sections import (
     full_task,
-    growth,
     kinds,
     kinematics,
     pose,
     processes,
-    simulator,
+    rates,
     statics,
-    throughput,
 )
 from settings import Settings, quick
 
@@ -49,7 +47,7 @@ def plan(sizes: Settings, done: dict[str, Section]) -> dict[str, Callable[[], Se
     def growth_with_segments() -> Section:
         if "full" not in done:
             done["full"] = full_task.section(sizes)
-        return growth.with_segments(sizes, done["full"])
+        return full_task.with_segments(sizes, done["full"])
 
     return {
         "full": lambda: full_task.section(sizes),
@@ -57,14 +55,14 @@ def plan(sizes: Settings, done: dict[str, Section]) -> dict[str, Callable[[], Se
         "without-compiler": lambda: processes.without_compiler(sizes),
         "build": lambda: processes.build(sizes),
         "command": lambda: processes.command(sizes),
-        "throughput": lambda: throughput.section(sizes),
+        "throughput": lambda: rates.batch(sizes),
         "evaluations": lambda: kinematics.section(sizes),
         "pose": lambda: pose.section(sizes),
         "statics": lambda: statics.section(sizes),
-        "simulator": lambda: simulator.section(sizes),
+        "simulator": lambda: rates.simulated_arm(sizes),
         "calibration": lambda: calibration.section(sizes),
         "segments": growth_with_segments,
-        "starts": lambda: growth.with_starts(sizes),
+        "starts": lambda: full_task.with_starts(sizes),
     }
 
 

@@ -31,9 +31,9 @@ from peers.base import Peer, PeerMissingError  # noqa: E402
 from peers.ipopt import Ipopt, IpoptEnergy  # noqa: E402
 from peers.own import Stiffopt  # noqa: E402
 from peers.pink_chain import Pink  # noqa: E402
-from results import Comparison, Section, at_least, at_most  # noqa: E402
+from report import Comparison, Section, at_least, at_most  # noqa: E402
 from stiffopt import PressureSolver, lie  # noqa: E402
-from stiffopt.identify.estimates import Estimate  # noqa: E402
+from stiffopt.identify.results import FittedEstimate  # noqa: E402
 from stiffopt.model.parameters import Parameter  # noqa: E402
 
 # -- counts -----------------------------------------------------------------------------------
@@ -285,7 +285,7 @@ def test_the_true_values_are_those_of_the_plant(exact):
 
 def test_intervals_are_counted_by_group():
     def estimate(key, low, high):
-        return Estimate("base, x", key, "", 0.0, 0.0, low, high, 1.0, 0.0)
+        return FittedEstimate("base, x", key, "", 0.0, 0.0, low, high, 1.0, 0.0)
 
     listed = (estimate("a", 1.0, 3.0), estimate("b", 1.0, 1.5), estimate("", 0.0, 1.0))
     true = {"a": ("gain", np.float64(2.0)), "b": ("gain", 2.0), "base, x": ("base", 0.5)}

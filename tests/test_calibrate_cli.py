@@ -19,7 +19,7 @@ from stiffopt.cli.calibration_logs import fixed_keys, log_names
 from stiffopt.cli.main import main
 from stiffopt.errors import FileError
 from stiffopt.files import save_file
-from stiffopt.identify.structure import STRUCTURES
+from stiffopt.identify.structures import STRUCTURES
 from stiffopt.logs import (
     Body,
     Log,
@@ -197,7 +197,7 @@ def test_several_models_are_compared_on_what_is_held_back(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
     some = tuple(each for each in STRUCTURES if each.name in ("static", "lag"))
-    monkeypatch.setattr("stiffopt.identify.settings.STRUCTURES", some)
+    monkeypatch.setattr("stiffopt.identify.calibration.STRUCTURES", some)
     code, out, _ = run(
         capsys, "calibrate", "--robot", "stiff-flop-1", folder / "monday.csv", "--out",
         tmp_path / "r.yaml", "--strain-law", "keep", "--rows", "120", "--report",

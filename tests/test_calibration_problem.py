@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from stiffopt import lie
 from stiffopt.identify.past import Past, Start
-from stiffopt.identify.problem import Begin, Noise, Point, Problem, Sample, Unknowns
+from stiffopt.identify.problem import Begin, CalibrationProblem, Noise, Sample, TrackedPoint
 from stiffopt.identify.recording import Recording, Track
-from stiffopt.identify.structure import STRUCTURES, Structure
+from stiffopt.identify.structures import STRUCTURES, ModelStructure
 from stiffopt.identify.unknowns import (
+    Unknowns,
     history_unknowns,
     placement_unknowns,
     shape_unknowns,
@@ -33,7 +34,7 @@ Array = NDArray[np.float64]
 
 BAR = 1e5
 KPA = 1e3
-EVERY = Structure(
+EVERY = ModelStructure(
     "every",
     "all that can be fitted",
     (*next(s for s in STRUCTURES if s.name == "progressive").shape, "compensation.softening"),
@@ -99,7 +100,7 @@ def table(n: int) -> StiffnessTable:
 
 
 @cache
-def problem_of(case: Case) -> Problem:
+def problem_of(case: Case) -> CalibrationProblem:
     description = EVERY.applied(load_description(case.robot), 1.0 * BAR)
     segments = tuple(s.model_copy(update={"history": HISTORY}) for s in description.segments)
     description = description.model_copy(update={"segments": segments})
@@ -111,9 +112,9 @@ def problem_of(case: Case) -> Problem:
         made = recording(n, case.count, 20 + i, bodies, case.turns)
         rows = np.unique(random.integers(0, case.count, case.rows))
         samples.append(Sample(made, rows, random.uniform(0.5, 1.0, len(rows)), begin))
-    points = [Point("tip", None, lie.exp(random.normal(0, 0.01, 6)), case.turns)]
+    points = [TrackedPoint("tip", None, lie.exp(random.normal(0, 0.01, 6)), case.turns)]
     if case.bodies:
-        points.append(Point("mid", 0.1, lie.exp(random.normal(0, 0.01, 6)), case.turns))
+        points.append(TrackedPoint("mid", 0.1, lie.exp(random.normal(0, 0.01, 6)), case.turns))
     known = Tolerances()
     unknowns = Unknowns(
         parameters=(
@@ -133,10 +134,10 @@ def problem_of(case: Case) -> Problem:
     )
     base = lie.exp(np.array([0.01, -0.02, 0.03, 0.2, -0.1, 0.3]))
     tables = [table(n)] if case.tables else []
-    return Problem(description, unknowns, samples, points, base, NOISE, tables)
+    return CalibrationProblem(description, unknowns, samples, points, base, NOISE, tables)
 
 
-def somewhere(problem: Problem, seed: int = 5) -> Array:
+def somewhere(problem: CalibrationProblem, seed: int = 5) -> Array:
     """Scaled coordinates (d,) near the middle, a little inside the bounds."""
     x = np.random.default_rng(seed).normal(0, 0.2, problem.size)
     return np.asarray(np.clip(x, problem.low + 0.02, problem.high - 0.02))
@@ -316,7 +317,7 @@ def test_what_an_arm_cannot_be_is_penalised_with_the_right_slope(kind: str) -> N
 def test_a_table_without_any_value_says_nothing() -> None:
     problem = problem_of(CASES["one segment with a table"])
     empty = replace(problem.tables[0], stiffness=np.full(4, np.nan))
-    other = Problem(
+    other = CalibrationProblem(
         problem.description, problem.unknowns, problem.samples, problem.points,
         problem.base_in_tracker, problem.noise, [empty],
     )  # fmt: skip

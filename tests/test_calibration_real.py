@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from recordings import ASU, UCL, needs_asu, needs_ucl
 from stiffopt.identify.calibration import CalibrationResult, calibrate
-from stiffopt.identify.comparison import Errors, together
+from stiffopt.identify.results import Errors, together
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Log, read_log

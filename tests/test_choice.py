@@ -10,16 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from made_logs import course, made_log
-from stiffopt.identify import choice
-from stiffopt.identify.calibration import _can_be_told
-from stiffopt.identify.choice import Candidate, best, held_back_errors
-from stiffopt.identify.comparison import Errors
+from stiffopt.identify import structures
 from stiffopt.identify.fit import fit
-from stiffopt.identify.problem import Problem
+from stiffopt.identify.problem import CalibrationProblem
+from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import CalibrationSettings
-from stiffopt.identify.setup import Setup, named, started, without
-from stiffopt.identify.structure import STRUCTURES
-from stiffopt.identify.validation import recordings_of
+from stiffopt.identify.setup import Setup, recordings_of
+from stiffopt.identify.structures import STRUCTURES, Candidate, best, held_back_errors
 from stiffopt.logs import Log
 from stiffopt.model.robot_files import load_description
 
@@ -71,7 +68,9 @@ def log_of(seed: int, duration: float = 20.0, skip: float = 0.0) -> Log:
     return Log(time[kept], pressures[kept], log.tip_position[kept])
 
 
-def problem_of(logs: list[tuple[str, Log]], rows: int = 200, structure: str = "static") -> Problem:
+def problem_of(
+    logs: list[tuple[str, Log]], rows: int = 200, structure: str = "static"
+) -> CalibrationProblem:
     told = CalibrationSettings(structure=structure)
     setup = Setup.of(ONE, recordings_of(ONE, logs, told), [], told)
     return setup.problem(BY_NAME[structure], rows)
@@ -79,7 +78,7 @@ def problem_of(logs: list[tuple[str, Log]], rows: int = 200, structure: str = "s
 
 def test_parts_and_highest_pressures_of_few_logs_are_held_back() -> None:
     problem = problem_of([("a", log_of(1)), ("b", log_of(2))])
-    folds = choice._folds(problem)
+    folds = structures._folds(problem)
     parts = [f"part {i} of 4" for i in (1, 2, 3, 4)]
     assert list(folds) == [*parts, "highest pressures"]
     for k in range(2):
@@ -95,7 +94,7 @@ def test_parts_and_highest_pressures_of_few_logs_are_held_back() -> None:
 
 def test_logs_are_held_back_one_by_one() -> None:
     problem = problem_of([(name, log_of(i)) for i, name in enumerate("abc")])
-    folds = choice._folds(problem)
+    folds = structures._folds(problem)
     assert list(folds) == ["a", "b", "c"]
     assert [[bool(rows.all()) for rows in away] for away in folds.values()] == np.eye(3).tolist()
     assert [[bool(rows.any()) for rows in away] for away in folds.values()] == np.eye(3).tolist()
@@ -111,7 +110,7 @@ def test_what_is_held_back_has_no_say() -> None:
     assert errors["c"].n == len(problem.samples[2].rows)
     away = [np.zeros(len(s.rows), dtype=bool) for s in problem.samples]
     away[2][:] = True
-    value, slope = without(problem, away).residuals(found.x)
+    value, slope = problem.without(away).residuals(found.x)
     rows = slice(3 * problem.starts[2], 3 * problem.starts[3])
     assert not value[rows].any()
     assert not slope[rows].any()
@@ -124,25 +123,25 @@ def test_the_beginning_of_a_log_in_an_unknown_state_is_for_its_state() -> None:
     problem = problem_of(logs, structure="hysteresis")
     assert problem.samples[0].begin == "unknown"
     everything = np.ones(len(problem.samples[0].rows), dtype=bool)
-    kept = choice._without_beginning(everything, problem, 0, 2.0)
+    kept = structures._without_beginning(everything, problem, 0, 2.0)
     time = problem.samples[0].recording.time[problem.samples[0].rows]
     assert kept.tolist() == (time > time[0] + 2.0).tolist()
     part = everything.copy()
     part[:10] = False
-    assert choice._without_beginning(part, problem, 0, 2.0) is part
+    assert structures._without_beginning(part, problem, 0, 2.0) is part
 
 
 def test_coordinates_by_name_go_from_model_to_model() -> None:
     one = problem_of([("a", log_of(1))], structure="lag")
     other = problem_of([("a", log_of(1))], structure="hysteresis")
     x = np.random.default_rng(0).normal(0, 0.3, one.size)
-    near = named(one, np.clip(x, one.low, one.high))
-    begun = named(other, started(other, near))
+    near = one.named(np.clip(x, one.low, one.high))
+    begun = other.named(other.start(near))
     assert {name: begun[name] for name in near} == near
     new = set(begun) - set(near)
     assert new
     assert all(begun[name] == 0 for name in new)
-    low = started(other, dict.fromkeys(begun, -1000000000.0))
+    low = other.start(dict.fromkeys(begun, -1000000000.0))
     assert low == pytest.approx(np.maximum(other.low, -1e9))
 
 
@@ -157,7 +156,7 @@ def test_what_these_logs_cannot_tell_is_not_tried() -> None:
 
     def tells(name: str, pressures: Array) -> bool:
         recordings = recordings_of(ONE, [recorded(pressures)], CalibrationSettings())
-        return _can_be_told(BY_NAME[name], recordings)
+        return BY_NAME[name].can_be_told(recordings)
 
     assert tells("creep", steps)
     assert not tells("creep", circle)

@@ -14,10 +14,11 @@ import stiffopt.plant.devices  # noqa: F401 - its code is kept where it always i
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
 import control
-import control_calibration
+import control_cases
 import control_runs
+from calibration import STEPS
 from control_baselines import CONTROLLERS, Gains, IntegralFeedback
-from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, with_true_file
+from control_cases import DIRECTIONS, draw_case, draw_path, with_true_file
 from stiffopt.model.description import Recordings
 from stiffopt.registration import Placement, Registration
 
@@ -125,7 +126,7 @@ def test_a_calibrated_file_comes_from_a_recording_without_the_run_s_noise_and_is
         assert (robot, logs) == (case.robot, ["log"])
         return SimpleNamespace(robot=robot.model_copy(update={"tip_mass": 0.021}))
 
-    monkeypatch.setattr(control_calibration, "recorded", recorded)
+    monkeypatch.setattr(control_cases, "recorded", recorded)
     monkeypatch.setattr("stiffopt.calibrate", calibrate)
     for _ in range(2):
         known = control.with_file(case, "calibrated", tmp_path)

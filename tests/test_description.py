@@ -18,7 +18,7 @@ from stiffopt.model.description import (
     Chambers,
     Compensation,
     Material,
-    PressureLimits,
+    RegulatorLimits,
     RobotDescription,
     Segment,
 )
@@ -67,7 +67,7 @@ def robot(**changes: Any) -> RobotDescription:
     data: dict[str, Any] = {
         "name": "arm",
         "segments": [segment(), segment()],
-        "pressure": PressureLimits(min=0, max=1.5e5),
+        "pressure": RegulatorLimits(min=0, max=1.5e5),
         **changes,
     }
     return RobotDescription(**data)

@@ -23,8 +23,8 @@ from stiffopt.model.description import (
     Compensation,
     Corrections,
     Material,
-    PressureLimits,
     Recordings,
+    RegulatorLimits,
     RobotDescription,
     Segment,
     Tolerances,
@@ -75,7 +75,7 @@ def driver_schemas() -> dict[type[BaseModel], None]:
 
 
 SCHEMAS: list[type[BaseModel]] = [
-    *(RobotDescription, Segment, Chambers, Material, Compensation, PressureLimits),
+    *(RobotDescription, Segment, Chambers, Material, Compensation, RegulatorLimits),
     *(Corrections, History, Play, Creep, Recordings, TrackedBody, Tolerances),
     *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
@@ -101,13 +101,14 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
 
 
 def yaml_examples() -> list[object]:
-    """Return every YAML block of the pages that is a whole file."""
+    """Return every YAML block of the pages that is a whole file; an indented one is a part."""
     found: list[object] = []
     for page in PAGES:
         blocks = re.findall(r"^```yaml\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S)
         found += [
             pytest.param(block, id=f"{page.name}-{number}")
             for number, block in enumerate(blocks, start=1)
+            if not block.startswith(" ")
         ]
     return found
 

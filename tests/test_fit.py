@@ -15,11 +15,11 @@ from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.identify.calibration import CalibrationResult, calibrate
 from stiffopt.identify.fit import Fit, fit
-from stiffopt.identify.problem import Problem
+from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.settings import CalibrationSettings
-from stiffopt.identify.setup import Setup
-from stiffopt.identify.structure import STRUCTURES
-from stiffopt.identify.validation import recordings_of, validate
+from stiffopt.identify.setup import Setup, recordings_of
+from stiffopt.identify.structures import STRUCTURES
+from stiffopt.identify.validation import validate
 from stiffopt.logs import Log, StiffnessTable
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.history import History, Play
@@ -162,7 +162,7 @@ def recovered(seed: int, structure: str, rho: float, turns: bool = False) -> tup
     time, pressures = course(3, 40.0, seed)
     told = settings(structure)
 
-    def problem_of(log: Log) -> Problem:
+    def problem_of(log: Log) -> CalibrationProblem:
         setup = Setup.of(KNOWN, recordings_of(KNOWN, [("a", log)], told), [], told)
         return setup.problem(BY_NAME[structure], 240)
 

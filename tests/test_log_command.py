@@ -232,12 +232,12 @@ def test_a_run_in_which_nothing_was_asked_can_be_drawn(tmp_path: Path) -> None:
 
 
 def test_a_long_run_is_thinned_and_keeps_its_extremes() -> None:
-    from stiffopt.plots.run import _thinned
+    from stiffopt.plots.style import thinned
 
     time = np.linspace(0, 100, 50_000)
     values = np.sin(time)
     values[23_456], values[31_000] = 7.0, np.nan
-    moments, kept = _thinned(time, values)
+    moments, kept = thinned(time, values)
     assert len(moments) <= 4001
     assert np.nanmax(kept) == 7.0
     assert np.all(np.diff(moments) > 0)

@@ -14,7 +14,7 @@ import stiffopt
 from stiffopt.cli.main import main
 from stiffopt.errors import InputError
 from stiffopt.experiments.arm_map import first_channels, map_arm, map_tip
-from stiffopt.plots.scales import round_steps
+from stiffopt.plots.style import round_steps
 
 GOLDEN = {  # bar: stiffness along x, y, z in N/cm; reference/paper-notes.md
     0.0: (0.1403, 0.1403, 7.3042),

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from stiffopt import InputError, load_robot
-from stiffopt.identify.problem import Noise, Problem, Unknowns
-from stiffopt.identify.unknowns import history_unknowns, shape_unknowns
+from stiffopt.identify.problem import CalibrationProblem, Noise
+from stiffopt.identify.unknowns import Unknowns, history_unknowns, shape_unknowns
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.history import Creep, History, Memory, Play
@@ -83,7 +83,7 @@ def test_a_table_is_compared_with_the_quick_stiffness_and_knows_its_slopes() -> 
         *shape_unknowns(description, ["compensation.stiffness"], tolerances),
         *history_unknowns(description, tolerances),
     )
-    problem = Problem(
+    problem = CalibrationProblem(
         description, Unknowns(parameters), [], (), np.eye(4), Noise(1e-3, 0.05), [table]
     )
     x = np.zeros(problem.size)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from recordings import ASU, UCL, needs_asu, needs_ucl
 from stiffopt.errors import InputError
-from stiffopt.identify.orientations import CUBE
-from stiffopt.identify.recording import Recording, aligned, prepare
+from stiffopt.identify.recording import Recording, prepare
+from stiffopt.identify.tracker_faults import CUBE, aligned
 from stiffopt.logs import Body, Log, read_log
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description

@@ -13,9 +13,9 @@ from made_logs import course, effective_pressures
 from stiffopt.identify.calibration import calibrate
 from stiffopt.identify.past import Past, Start
 from stiffopt.identify.recording import Recording, Track
-from stiffopt.identify.samples import begins, chosen_rows, sample, thinned
-from stiffopt.identify.settings import CalibrationSettings
-from stiffopt.identify.validation import MOST_ROWS, validate
+from stiffopt.identify.settings import SAMPLING, CalibrationSettings
+from stiffopt.identify.setup import begins, chosen_rows, sample, thinned
+from stiffopt.identify.validation import validate
 from stiffopt.logs import Log
 from stiffopt.model.history import History, Play
 from stiffopt.model.manipulator import Manipulator
@@ -195,7 +195,7 @@ def test_a_million_rows_are_calibrated_in_minutes() -> None:
     (found,) = (e for e in result.estimates if e.key.endswith("youngs_modulus"))
     assert found.value == pytest.approx(1.15e5, rel=0.03)
     assert result.calibrated[0].errors.mean < 0.5e-3
-    assert result.calibrated[0].errors.n == MOST_ROWS
+    assert result.calibrated[0].errors.n == SAMPLING.rows
     begun = clock.process_time()
     (compared,) = validate(result.robot, [("long", log)])
     assert clock.process_time() - begun < 100

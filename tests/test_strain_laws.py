@@ -16,7 +16,8 @@ import stiffopt
 from made_logs import course, made_log
 from stiffopt import CalibrationSettings
 from stiffopt.errors import FileError, InputError
-from stiffopt.identify.calibration import calibrate, other_laws
+from stiffopt.identify.calibration import calibrate
+from stiffopt.identify.structures import other_laws
 from stiffopt.model import laws
 from stiffopt.model.actuation import Section, StrainLaw
 from stiffopt.model.calibration import FittedNumber

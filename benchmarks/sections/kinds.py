@@ -8,7 +8,7 @@ import settings as bars
 import tasks
 from peers.base import Vector
 from peers.own import Stiffopt
-from results import Section, at_least, at_most, milliseconds, percent, times
+from report import Section, at_least, at_most, milliseconds, percent, times
 from settings import Settings
 from timing import interleaved, median
 

@@ -10,7 +10,7 @@ import tasks
 from peers import paper
 from peers.base import PeerMissingError, Vector
 from peers.soromox_rod import Soromox
-from results import Comparison, Section, at_least, times
+from report import Comparison, Section, at_least, times
 from settings import Settings
 from timing import Times, interleaved, looped, median, ratio
 

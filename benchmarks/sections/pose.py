@@ -8,7 +8,7 @@ import tasks
 from peers.base import PeerMissingError, PoseSolver, Vector
 from peers.own import Stiffopt
 from peers.pink_chain import Pink
-from results import Comparison, Section, milliseconds, percent, times
+from report import Comparison, Section, milliseconds, percent, times
 from settings import Settings
 from timing import interleaved, median, ratio
 

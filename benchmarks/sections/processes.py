@@ -1,4 +1,7 @@
-"""What needs processes of its own: first solutions, no compiler, the command line."""
+"""What needs a process of its own: first solutions, no compiler, the command line.
+
+python -m sections.processes first|full SEGMENTS SETTINGS   # one of these processes
+"""
 
 import json
 import os
@@ -9,13 +12,19 @@ from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 
+import numpy as np
+
 import settings as bars
-from results import Section, at_most, milliseconds, times
+import tasks
+from peers.ipopt import Ipopt
+from peers.own import Stiffopt
+from report import Section, at_most, milliseconds, times
+from sections.full_task import measure
 from settings import Settings
+from stiffopt import solve_pressure
 from timing import interleaved, median
 
 HERE = Path(__file__).resolve().parent.parent
-WORKER = HERE / "worker.py"
 TASK = HERE.parent / "problems" / "two_segment_stiff_x.yaml"
 IMPORTS = "import casadi, numpy, pint, pydantic, rich, typer"
 
@@ -135,13 +144,51 @@ def _environment(**changes: str) -> dict[str, str]:
 
 
 def _run(command: list[str], environment: dict[str, str]) -> str:
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command, env=environment, cwd=HERE, capture_output=True, text=True, check=True
+    )
     return done.stdout
 
 
 def _worker(what: str, segments: int, sizes: Settings, **environment: str) -> dict[str, dict]:
-    """What `worker.py` measures in a process of its own."""
-    command = [sys.executable, str(WORKER), what, str(segments)]
+    """What `main` measures in a process of its own."""
+    command = [sys.executable, "-m", "sections.processes", what, str(segments)]
     command.append(json.dumps(asdict(sizes)))
     lines = _run(command, _environment(**environment)).splitlines()
     return dict(json.loads(lines[-1]))
+
+
+# -- in a process of its own ----------------------------------------------------------------------
+
+
+def first(segments: int, sizes: Settings) -> dict[str, float]:
+    """Time of the first solution in this process, of later ones, and size of the code it left."""
+    robot = tasks.arm(segments)
+    cases = [tasks.task_of("position", segments, sizes.seed, i)[1] for i in range(6)]
+    seconds = []
+    for task in cases:
+        begin = perf_counter()
+        solve_pressure(robot, task)
+        seconds.append(perf_counter() - begin)
+    cache = Path(os.environ["STIFFOPT_CACHE_DIR"])
+    code = sum(file.stat().st_size for file in cache.rglob("*.so"))
+    return {"first_s": seconds[0], "later_s": float(np.median(seconds[1:])), "code_bytes": code}
+
+
+def full(segments: int, sizes: Settings) -> dict[str, dict[str, float]]:
+    """The full task on fewer tasks, beside IPOPT."""
+    few = {"tasks": max(2, sizes.tasks // 4), "warm_tasks": max(2, sizes.warm_tasks // 4)}
+    small = Settings(**{**vars(sizes), **few, "reference_starts": 0})
+    return measure([Stiffopt, Ipopt], segments, small).record()
+
+
+def main() -> None:
+    """Print one measurement as JSON in the last line: WORK SEGMENTS SETTINGS."""
+    work, segments, given = sys.argv[1:]
+    fields = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(given).items()}
+    answer = {"first": first, "full": full}[work](int(segments), Settings(**fields))
+    print(json.dumps(answer))
+
+
+if __name__ == "__main__":
+    main()

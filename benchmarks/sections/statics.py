@@ -5,7 +5,7 @@ import numpy as np
 import tasks
 from peers.base import PeerMissingError
 from peers.elastica_rod import Elastica
-from results import Comparison, Section, milliseconds, times
+from report import Comparison, Section, milliseconds, times
 from settings import Settings
 from timing import looped, median
 

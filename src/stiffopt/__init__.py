@@ -1,121 +1,77 @@
 """Run a fluidic soft arm stiff where it matters.
 
-The model (`load_robot`), the task (`load_task`) and the optimiser (`solve_pressure`) in SI units;
-the model of an arm from its recordings (`calibrate`); and a client of the daemon that holds the
-stiff pose on an arm (`Client`).
+`load_robot` gives the model of an arm, `load_task` a task, and `solve_pressure` the chamber
+pressures that reach the task's target and make the tip as stiff as possible. `calibrate` fits the
+model to recordings, `open_rig` commands an arm, and `Client` talks to the daemon that holds an arm
+at its task. All quantities are in SI units.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from stiffopt.control.trajectory import Trajectory, Waypoint
-    from stiffopt.daemon.client import Client
-    from stiffopt.errors import (
-        CommandError,
-        DeviceError,
-        EquilibriumError,
-        FileError,
-        GuardTripped,
-        InputError,
-        MissingExtraError,
-        PressureError,
-        ServiceError,
-        SlowWarning,
-        StiffoptError,
-    )
-    from stiffopt.identify.api import calibrate, validate
-    from stiffopt.identify.calibration import CalibrationResult
-    from stiffopt.identify.comparison import Comparison
-    from stiffopt.identify.settings import CalibrationSettings
-    from stiffopt.logs import Log, StiffnessTable, read_log, read_mcap_log, read_stiffness_table
-    from stiffopt.model.description import RobotDescription
-    from stiffopt.model.history import History, Memory
-    from stiffopt.model.manipulator import Manipulator, load_robot
-    from stiffopt.model.robot_files import builtin_robots, save_robot
-    from stiffopt.model.screws import Twist, Wrench
-    from stiffopt.model.uncertainty import TipUncertainty
-    from stiffopt.optimise.goal import (
-        AtLeast,
-        MatchMatrix,
-        MatchValue,
-        StiffnessGoal,
-        StiffnessMeasure,
-    )
-    from stiffopt.optimise.pareto import pareto_front
-    from stiffopt.optimise.solution import PressureSolution
-    from stiffopt.optimise.solver import PressureSolver, solve_batch, solve_pressure
-    from stiffopt.optimise.target import Target, Tolerance
-    from stiffopt.optimise.task import Load, Task, load_task
-    from stiffopt.rig.interface import Observation, PoseSample, PressureCommand, Rig
-    from stiffopt.safety.rigs import open_rig
-    from stiffopt.workspace import WorkspaceMap, map_workspace, open_workspace_map
+    from stiffopt.control.trajectory import Trajectory as Trajectory
+    from stiffopt.control.trajectory import Waypoint as Waypoint
+    from stiffopt.daemon.client import Client as Client
+    from stiffopt.errors import CommandError as CommandError
+    from stiffopt.errors import DeviceError as DeviceError
+    from stiffopt.errors import EquilibriumError as EquilibriumError
+    from stiffopt.errors import FileError as FileError
+    from stiffopt.errors import GuardTripped as GuardTripped
+    from stiffopt.errors import InputError as InputError
+    from stiffopt.errors import MissingExtraError as MissingExtraError
+    from stiffopt.errors import PressureError as PressureError
+    from stiffopt.errors import ServiceError as ServiceError
+    from stiffopt.errors import SlowWarning as SlowWarning
+    from stiffopt.errors import StiffoptError as StiffoptError
+    from stiffopt.identify.calibration import CalibrationResult as CalibrationResult
+    from stiffopt.identify.calibration import calibrate as calibrate
+    from stiffopt.identify.results import Comparison as Comparison
+    from stiffopt.identify.settings import CalibrationSettings as CalibrationSettings
+    from stiffopt.identify.validation import validate as validate
+    from stiffopt.logs import Log as Log
+    from stiffopt.logs import StiffnessTable as StiffnessTable
+    from stiffopt.logs import read_log as read_log
+    from stiffopt.logs import read_mcap_log as read_mcap_log
+    from stiffopt.logs import read_stiffness_table as read_stiffness_table
+    from stiffopt.model.description import RobotDescription as RobotDescription
+    from stiffopt.model.history import History as History
+    from stiffopt.model.history import Memory as Memory
+    from stiffopt.model.manipulator import Manipulator as Manipulator
+    from stiffopt.model.manipulator import load_robot as load_robot
+    from stiffopt.model.robot_files import builtin_robots as builtin_robots
+    from stiffopt.model.robot_files import save_robot as save_robot
+    from stiffopt.model.screws import Twist as Twist
+    from stiffopt.model.screws import Wrench as Wrench
+    from stiffopt.model.uncertainty import TipUncertainty as TipUncertainty
+    from stiffopt.optimise.goal import AtLeast as AtLeast
+    from stiffopt.optimise.goal import MatchMatrix as MatchMatrix
+    from stiffopt.optimise.goal import MatchValue as MatchValue
+    from stiffopt.optimise.goal import StiffnessGoal as StiffnessGoal
+    from stiffopt.optimise.goal import StiffnessMeasure as StiffnessMeasure
+    from stiffopt.optimise.pareto import pareto_front as pareto_front
+    from stiffopt.optimise.solution import PressureSolution as PressureSolution
+    from stiffopt.optimise.solver import PressureSolver as PressureSolver
+    from stiffopt.optimise.solver import solve_batch as solve_batch
+    from stiffopt.optimise.solver import solve_pressure as solve_pressure
+    from stiffopt.optimise.target import Target as Target
+    from stiffopt.optimise.target import Tolerance as Tolerance
+    from stiffopt.optimise.task import Load as Load
+    from stiffopt.optimise.task import Task as Task
+    from stiffopt.optimise.task import load_task as load_task
+    from stiffopt.rig.interface import Observation as Observation
+    from stiffopt.rig.interface import PoseSample as PoseSample
+    from stiffopt.rig.interface import PressureCommand as PressureCommand
+    from stiffopt.rig.interface import Rig as Rig
+    from stiffopt.safety.rigs import open_rig as open_rig
+    from stiffopt.workspace import WorkspaceMap as WorkspaceMap
+    from stiffopt.workspace import map_workspace as map_workspace
+    from stiffopt.workspace import open_workspace_map as open_workspace_map
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "AtLeast",
-    "CalibrationResult",
-    "CalibrationSettings",
-    "Client",
-    "CommandError",
-    "Comparison",
-    "DeviceError",
-    "EquilibriumError",
-    "FileError",
-    "GuardTripped",
-    "History",
-    "InputError",
-    "Load",
-    "Log",
-    "Manipulator",
-    "MatchMatrix",
-    "MatchValue",
-    "Memory",
-    "MissingExtraError",
-    "Observation",
-    "PoseSample",
-    "PressureCommand",
-    "PressureError",
-    "PressureSolution",
-    "PressureSolver",
-    "Rig",
-    "RobotDescription",
-    "ServiceError",
-    "SlowWarning",
-    "StiffnessGoal",
-    "StiffnessMeasure",
-    "StiffnessTable",
-    "StiffoptError",
-    "Target",
-    "Task",
-    "TipUncertainty",
-    "Tolerance",
-    "Trajectory",
-    "Twist",
-    "Waypoint",
-    "WorkspaceMap",
-    "Wrench",
-    "__version__",
-    "builtin_robots",
-    "calibrate",
-    "load_robot",
-    "load_task",
-    "map_workspace",
-    "open_rig",
-    "open_workspace_map",
-    "pareto_front",
-    "read_log",
-    "read_mcap_log",
-    "read_stiffness_table",
-    "save_robot",
-    "solve_batch",
-    "solve_pressure",
-    "validate",
-]
-
-# Names are imported when they are first asked for: NumPy, CasADi and pydantic take a quarter of a
-# second, for which neither `--help` nor a wrong option should wait.
+# Names are imported at their first use: NumPy, CasADi and pydantic take a quarter of a second, for
+# which neither `--help` nor a wrong option should wait.
 _NAMES = {
     "stiffopt.control.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.daemon.client": ("Client",),
@@ -124,10 +80,10 @@ _NAMES = {
         *("InputError", "MissingExtraError", "PressureError", "ServiceError"),
         *("SlowWarning", "StiffoptError"),
     ),
-    "stiffopt.identify.api": ("calibrate", "validate"),
-    "stiffopt.identify.calibration": ("CalibrationResult",),
-    "stiffopt.identify.comparison": ("Comparison",),
+    "stiffopt.identify.calibration": ("CalibrationResult", "calibrate"),
+    "stiffopt.identify.results": ("Comparison",),
     "stiffopt.identify.settings": ("CalibrationSettings",),
+    "stiffopt.identify.validation": ("validate",),
     "stiffopt.logs": (
         *("Log", "StiffnessTable", "read_log", "read_mcap_log", "read_stiffness_table"),
     ),
@@ -150,6 +106,7 @@ _NAMES = {
     "stiffopt.workspace": ("WorkspaceMap", "map_workspace", "open_workspace_map"),
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
+__all__ = sorted((*_MODULE_OF, "__version__"))
 _MODULES = (
     "control",
     "daemon",

@@ -1,8 +1,8 @@
-"""YAML documents: plain data with the line of everything in them, read and written.
+"""YAML documents, read as plain data with the line number of every value, and written.
 
 The core schema of YAML 1.2 holds: ``1e-3`` is a number, ``yes``, ``on``, ``1:30`` and dates are
-text. What a hand-written file does not need and a malicious one does (anchors, aliases, tags,
-several documents, bottomless nesting) is refused.
+text. Anchors, aliases, tags, several documents in a file and deep nesting are refused: no file that
+is written by hand needs them, and a malicious one does.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_DEPTH = 20
 
 @dataclass(frozen=True)
 class Document:
-    """Plain data and the line of everything in them."""
+    """Plain data and the line number of every value in them."""
 
     path: str
     data: dict[str, Any]

@@ -1,4 +1,4 @@
-"""The error tree: every error says what was wrong, where, and what to do about it."""
+"""The errors of stiffopt: each says what was wrong, where, and what to do about it."""
 
 from __future__ import annotations
 

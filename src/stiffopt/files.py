@@ -1,7 +1,7 @@
-"""Strict reading of every file kind, with the line to blame in every error.
+"""Robot, task, rig and other stiffopt files: read strictly, with the line in every error.
 
-A file is a YAML document (`stiffopt.documents`) that names its kind and version. Its data are
-validated by the frozen model that is also the description in code (`stiffopt.schema`).
+A file is a YAML document (`stiffopt.documents`) that names its kind and version in the key
+``format``. Its data are validated by the model that describes it in code (`stiffopt.schema`).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What a description is: a frozen pydantic model, whose mistakes are told as sentences.
+"""Base of all descriptions: frozen pydantic models whose errors are sentences.
 
-The same model is the schema of a file and the description in code, see `Schema`.
+One model is both the schema of a kind of file and the description in code, see `Schema`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Quantities with units in files, SI in code.
+"""Quantities: text with a unit in files, floats in SI in code.
 
 A quantity in a file is a string, a decimal number and its unit: ``90 mm``. pint knows the units;
 this module asks it for exact decimal factors, so that ``90 mm`` is the float ``0.09``, and refuses
@@ -55,7 +55,7 @@ __all__ = [
 ]
 
 FROM_FILE = {"from_file": True}
-"""The pydantic validation context that says: this comes from a file, units are due."""
+"""The pydantic validation context of data that come from a file: quantities must have units."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
 _UNIT = re.compile(r"(?=[A-Za-zµμ°%(])(?:[A-Za-zµμ°%²³·*/^() ]|-?[0-9](?![0-9]))+")
@@ -74,7 +74,7 @@ _MOST, _DEEPEST = 10, 2  # factors of a unit, and parentheses in each other
 
 @dataclass(frozen=True)
 class QuantityKind:
-    """A kind of quantity: its SI unit, an example, and the unit to write it in.
+    """A kind of quantity: its SI unit, its name, an example, and the unit in which it is written.
 
     It is part of the types below, so that the unit of a field can be found from its type.
     """

@@ -177,5 +177,4 @@ def validate(
     recordings = calibrate_run.RecordingOptions(
         robot, tuple(logs), sequence, rezero, pressures, channels, frame
     )
-    options = calibrate_run.ValidateOptions(recordings, report, as_json, quiet)
-    raise typer.Exit(calibrate_run.run_validate(options))
+    raise typer.Exit(calibrate_run.run_validate(recordings, report, as_json=as_json, quiet=quiet))

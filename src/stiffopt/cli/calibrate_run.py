@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import degrees, isfinite
+from math import degrees
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +19,15 @@ from stiffopt.cli.calibration_logs import (
     fixed_keys,
     read_tables,
 )
-from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_line
+from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_json
 from stiffopt.cli.exits import Interruptible, exit_code
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
 from stiffopt.errors import InputError
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
-from stiffopt.identify.comparison import Comparison, Errors, together
+from stiffopt.identify.results import Comparison, Errors, together
+from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.validation import validate as compare_robot
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots.wording import MM
@@ -35,13 +35,11 @@ from stiffopt.plots.wording import MM
 __all__ = [
     "CalibrateOptions",
     "RecordingOptions",
-    "ValidateOptions",
     "run_calibrate",
     "run_validate",
 ]
 
 _ENDINGS = (".yaml", ".yml")
-_FEW_ROWS = 600  # while models are compared
 
 Progress = Callable[[float, float, str], None]
 
@@ -57,16 +55,6 @@ class CalibrateOptions:
     strain_law: str
     fix: tuple[str, ...]
     rows: int | None
-    report: str | None
-    as_json: bool
-    quiet: bool
-
-
-@dataclass(frozen=True)
-class ValidateOptions:
-    """The arguments of `stiffopt validate`, as they were given."""
-
-    recordings: RecordingOptions
     report: str | None
     as_json: bool
     quiet: bool
@@ -89,23 +77,34 @@ def run_calibrate(options: CalibrateOptions) -> int:
     return _run(work, quiet=options.quiet)
 
 
-def run_validate(options: ValidateOptions) -> int:
+def run_validate(
+    recordings: RecordingOptions, report: str | None, *, as_json: bool, quiet: bool
+) -> int:
     """Compare a robot with logs; report and draw; return the exit code."""
 
     def work(progress: Progress) -> Callable[[], None]:
-        _check_report(options.report)
-        settings = options.recordings.settings()
-        robot = options.recordings.description()
-        logs = options.recordings.read(robot, progress)
+        _check_report(report)
+        settings = recordings.settings()
+        robot = recordings.description()
+        logs = recordings.read(robot, progress)
         found = compare_robot(robot, logs, settings, progress)
-        with new_folder(options.report) as folder:
+        with new_folder(report) as folder:
             if folder is not None:
                 from stiffopt.cli.calibration_report import write_validation
 
                 write_validation(folder, robot, found)
-        return lambda: _print_validation(robot, found, options)
 
-    return _run(work, quiet=options.quiet)
+        def print_result() -> None:
+            if as_json:
+                write_json(validation_record(robot, found))
+            elif not quiet:
+                from stiffopt.cli.calibration_report import validation
+
+                show(validation(robot, found, report))
+
+        return print_result
+
+    return _run(work, quiet=quiet)
 
 
 def _run(work: Callable[[Progress], Callable[[], None]], *, quiet: bool) -> int:
@@ -138,7 +137,10 @@ def _calibrated(options: CalibrateOptions, progress: Progress) -> CalibrationRes
     quantities.choice("--strain-law", options.strain_law, ("auto", "keep"))
     rows = {}
     if options.rows is not None:
-        rows = {"rows": options.rows, "trial_rows": min(options.rows, _FEW_ROWS)}
+        rows = {
+            "rows": options.rows,
+            "trial_rows": min(options.rows, CalibrationSettings().trial_rows),
+        }
     robot = options.recordings.description()
     settings = options.recordings.settings(
         structure=options.model,
@@ -160,7 +162,7 @@ def _check_report(path: str | None) -> None:
 
 
 def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
-    """Say at the top of the file what it came from."""
+    """The comment at the top of the robot file: the data and options that it came from."""
     recordings = options.recordings
     lines = [f"Calibrated by stiffopt {stiffopt.__version__} from {Path(recordings.robot).name}."]
     names = [each.name for each in result.calibrated]
@@ -190,30 +192,18 @@ def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
 
 def _print_calibration(result: CalibrationResult, options: CalibrateOptions) -> None:
     if options.as_json:
-        record = calibration_record(result, options.out, options.report)
-        write_line(json.dumps(record, allow_nan=False))
+        write_json(calibration_record(result, options.out, options.report))
     elif not options.quiet:
         from stiffopt.cli.calibration_report import calibration
 
         show(calibration(result, options.out, options.report))
 
 
-def _print_validation(
-    robot: RobotDescription, found: tuple[Comparison, ...], options: ValidateOptions
-) -> None:
-    if options.as_json:
-        write_line(json.dumps(validation_record(robot, found), allow_nan=False))
-    elif not options.quiet:
-        from stiffopt.cli.calibration_report import validation
-
-        show(validation(robot, found, options.report))
-
-
 # -- for programs ---------------------------------------------------------------------------------
 
 
 def validation_record(robot: RobotDescription, found: Sequence[Comparison]) -> dict[str, Any]:
-    """Return errors of all logs together and of each."""
+    """Return the errors of all logs together and of each, for JSON."""
     return {
         **_with_outside(robot, found),
         "robot": robot.name,
@@ -223,7 +213,7 @@ def validation_record(robot: RobotDescription, found: Sequence[Comparison]) -> d
 
 
 def calibration_record(result: CalibrationResult, out: str, report: str | None) -> dict[str, Any]:
-    """Return what a calibration has found."""
+    """Return the result of a calibration for JSON."""
     length = result.before.length
     return {
         "robot": result.robot.name,
@@ -234,7 +224,7 @@ def calibration_record(result: CalibrationResult, out: str, report: str | None) 
         "models": [
             {
                 "name": each.structure.name,
-                "held_back_mean_mm": _number(each.score * MM),
+                "held_back_mean_mm": each.score * MM,
                 "held_back": {name: _errors(e, length) for name, e in each.folds.items()},
             }
             for each in result.candidates
@@ -249,7 +239,7 @@ def calibration_record(result: CalibrationResult, out: str, report: str | None) 
                 "unit": each.unit,
                 "before": each.before,
                 "value": each.value,
-                "interval_95": [_number(each.low), _number(each.high)],
+                "interval_95": [each.low, each.high],
                 "learnt": each.learnt,
                 "tolerances_from_before": each.far,
             }
@@ -280,19 +270,10 @@ def _with_outside(robot: RobotDescription, found: Sequence[Comparison]) -> dict[
 
 
 def _errors(errors: Errors, length: float) -> dict[str, Any]:
-    values = {
-        "mean": errors.mean,
-        "median": errors.median,
-        "p95": errors.p95,
-        "max": errors.max,
-    }
+    names = ("mean", "median", "p95", "max")
     return {
         "n": errors.n,
-        "position_error_mm": {name: _number(value * MM) for name, value in values.items()},
-        "position_error_percent_of_length": _number(errors.mean / length * 100),
+        "position_error_mm": {name: getattr(errors, name) * MM for name in names},
+        "position_error_percent_of_length": errors.mean / length * 100,
         "angle_error_deg": None if errors.angle is None else degrees(errors.angle),
     }
-
-
-def _number(value: float) -> float | None:
-    return float(value) if isfinite(value) else None

@@ -11,7 +11,7 @@ from typing import Any
 from stiffopt.cli import quantities
 from stiffopt.errors import FileError, InputError, shown
 from stiffopt.identify.settings import CalibrationSettings
-from stiffopt.identify.structure import STRUCTURES
+from stiffopt.identify.structures import STRUCTURES
 from stiffopt.identify.unknowns import history_unknowns, shape_unknowns
 from stiffopt.logs import (
     Log,

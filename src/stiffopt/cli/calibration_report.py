@@ -13,9 +13,8 @@ from stiffopt.cli import calibration_tables as tables
 from stiffopt.cli.tables import MarkdownPage, title
 from stiffopt.errors import printable
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.comparison import Comparison
-from stiffopt.identify.estimates import TIED
-from stiffopt.identify.stiffness_comparison import compare_stiffness
+from stiffopt.identify.results import TIED, Comparison
+from stiffopt.identify.validation import compare_stiffness
 from stiffopt.model.description import RobotDescription
 from stiffopt.plots import calibration as plots
 
@@ -28,20 +27,20 @@ _MOST_DRAWN = 60  # measured stiffnesses
 
 
 def calibration(result: CalibrationResult, out: str, report: str | None) -> RenderableType:
-    """Return what a calibration has found."""
+    """Return the report of a calibration for the terminal."""
     blocks: list[RenderableType] = [title(f"{result.robot.name}: calibration")]
     blocks.append(Text(f"  model  {result.structure.name}: {result.structure.words}"))
     if len(result.candidates) > 1:
-        blocks += [Text(""), tables.models(result).renderable()]
+        blocks += [Text(""), tables.models_compared(result).renderable()]
     if result.calibrated:
-        blocks += [Text(""), tables.before_and_after(result).renderable()]
+        blocks += [Text(""), tables.errors_before_and_after(result).renderable()]
     if result.held_back:
-        blocks += [Text(""), tables.held_back(result).renderable()]
+        blocks += [Text(""), tables.errors_held_back(result).renderable()]
     if result.tables:
         rows = compare_stiffness(result.tables, result.before, result.robot)
-        blocks += [Text(""), tables.stiffnesses(rows[:_MOST_STIFFNESSES]).renderable()]
+        blocks += [Text(""), tables.stiffnesses_compared(rows[:_MOST_STIFFNESSES]).renderable()]
         blocks += _more(len(rows) - _MOST_STIFFNESSES, "of these", report)
-    for table in tables.numbers(result, beginnings=False):
+    for table in tables.fitted_numbers(result, beginnings=False):
         blocks += [Text(""), table.renderable()]
     found = [f"{each.name}: {remark}" for each in result.calibrated for remark in each.remarks]
     blocks += _list("What was found in the logs", found, report)
@@ -60,10 +59,10 @@ def calibration(result: CalibrationResult, out: str, report: str | None) -> Rend
 def validation(
     robot: RobotDescription, found: Sequence[Comparison], report: str | None
 ) -> RenderableType:
-    """Return what a validation has found."""
+    """Return the report of a validation for the terminal."""
     blocks: list[RenderableType] = [title(f"{robot.name}: validation")]
-    blocks += [Text(""), tables.after_only(robot, found).renderable()]
-    blocks += _list("Training range", tables.ranges(robot, found), report, most=None)
+    blocks += [Text(""), tables.errors_of_logs(robot, found).renderable()]
+    blocks += _list("Training range", tables.range_remarks(robot, found), report, most=None)
     remarks = [f"{each.name}: {remark}" for each in found for remark in each.remarks]
     blocks += _list("What was found in the logs", remarks, report)
     if report is not None:
@@ -116,15 +115,15 @@ def write_calibration(folder: Path, result: CalibrationResult, out: str) -> None
     )
     if result.calibrated:
         page.heading("Errors of the tip")
-        page.table(tables.before_and_after(result))
+        page.table(tables.errors_before_and_after(result))
         _errors(page, result.robot, result.calibrated, result.nominal)
     if result.held_back:
         page.heading("What was held back")
         page.text("The model fitted to the rest predicts what it has not seen:")
-        page.table(tables.held_back(result))
+        page.table(tables.errors_held_back(result))
     if len(result.candidates) > 1:
         page.heading("Models")
-        page.table(tables.models(result))
+        page.table(tables.models_compared(result))
         page.figure(
             "models.png", "Errors of each model in what was held back",
             plots.plot_models(
@@ -139,7 +138,7 @@ def write_calibration(folder: Path, result: CalibrationResult, out: str) -> None
         "the share of the robot file's own uncertainty (its variance) that the data removed: near "
         "0 %, a number is still what the robot file said."
     )
-    for table in tables.numbers(result, beginnings=True):
+    for table in tables.fitted_numbers(result, beginnings=True):
         page.text(f"**{table.title[:1].upper()}{table.title[1:]}**")
         page.table(table)
     _remarks(page, result.remarks)
@@ -170,9 +169,9 @@ def write_validation(folder: Path, robot: RobotDescription, found: Sequence[Comp
     page = MarkdownPage(folder, f"{robot.name}: validation")
     page.text("Nothing of the robot was fitted to these logs.")
     page.heading("Errors of the tip")
-    page.table(tables.after_only(robot, found))
+    page.table(tables.errors_of_logs(robot, found))
     page.heading("Training range")
-    page.bullets(tables.ranges(robot, found))
+    page.bullets(tables.range_remarks(robot, found))
     page.heading("Figures")
     _errors(page, robot, found, ())
     _remarks(page, [f"{each.name}: {remark}" for each in found for remark in each.remarks])
@@ -209,7 +208,7 @@ def _errors(
 def _stiffness(page: MarkdownPage, result: CalibrationResult) -> None:
     rows = compare_stiffness(result.tables, result.before, result.robot)
     page.heading("Stiffness")
-    page.table(tables.stiffnesses(rows))
+    page.table(tables.stiffnesses_compared(rows))
     if rows:
         page.figure(
             "stiffness.png", "Stiffness, measured and predicted",

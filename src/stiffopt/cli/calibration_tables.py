@@ -10,10 +10,9 @@ import numpy as np
 from stiffopt.cli.tables import TextTable
 from stiffopt.directions import direction_name
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.comparison import Comparison, Errors, together
-from stiffopt.identify.estimates import Estimate
-from stiffopt.identify.stiffness_comparison import StiffnessComparison
+from stiffopt.identify.results import Comparison, Errors, FittedEstimate, together
 from stiffopt.identify.unknowns import BASE, SENSOR
+from stiffopt.identify.validation import StiffnessComparison
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.parameters import Parameter
 from stiffopt.plots.wording import BAR, MM, figures, vector_text
@@ -28,8 +27,8 @@ _BEGIN = "how the logs begin"
 # -- errors of the tip ----------------------------------------------------------------------------
 
 
-def before_and_after(result: CalibrationResult) -> TextTable:
-    """Errors of each log with the robot as it was, and calibrated."""
+def errors_before_and_after(result: CalibrationResult) -> TextTable:
+    """Errors of the tip in each log, before and after calibration."""
     turns = any(each.angle is not None for each in (*result.nominal, *result.calibrated))
     heading = ("log", "before", "95 %", "after", "95 %", "max", "%", *(("axis",) * turns))
 
@@ -54,8 +53,8 @@ def before_and_after(result: CalibrationResult) -> TextTable:
     )
 
 
-def after_only(robot: RobotDescription, found: Sequence[Comparison]) -> TextTable:
-    """Errors of each log."""
+def errors_of_logs(robot: RobotDescription, found: Sequence[Comparison]) -> TextTable:
+    """Errors of the tip in each log, and the share of rows outside the range that was seen."""
     turns = any(each.angle is not None for each in found)
     known = robot.calibration is not None
     heading = ("log", "rows", "mean", "median", "95 %", "max", "%")
@@ -80,12 +79,12 @@ def after_only(robot: RobotDescription, found: Sequence[Comparison]) -> TextTabl
     return TextTable("Error of the tip in mm", (*heading, *further), tuple(rows), remark)
 
 
-def ranges(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
-    """Say where predictions leave what the calibration has seen."""
+def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
+    """Return sentences on the logs whose pressures the calibration had not seen."""
     if robot.calibration is None:
         return [
-            f"the robot '{robot.name}' was not calibrated, so that there is no training range that "
-            "these logs could leave"
+            f"the robot '{robot.name}' was not calibrated: there is no recorded range that these "
+            "logs could leave"
         ]
     lines = []
     for each in found:
@@ -105,7 +104,7 @@ def ranges(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
 
 
 def _beyond(robot: RobotDescription, found: Comparison) -> str:
-    """Which channels go beyond their range, and how far."""
+    """Which channel exceeds the recorded range most, and by how much, in parentheses."""
     calibration = robot.calibration
     if calibration is None or not calibration.pressure_max:
         return ""
@@ -124,8 +123,8 @@ def _beyond(robot: RobotDescription, found: Comparison) -> str:
 # -- models ---------------------------------------------------------------------------------------
 
 
-def models(result: CalibrationResult) -> TextTable:
-    """Models that were compared, by the errors of what each was not fitted to."""
+def models_compared(result: CalibrationResult) -> TextTable:
+    """Models that were compared, by their errors in what each was not fitted to."""
     chosen = result.structure.name
     rows = []
     for each in result.candidates:
@@ -148,7 +147,7 @@ def models(result: CalibrationResult) -> TextTable:
     )
 
 
-def held_back(result: CalibrationResult) -> TextTable:
+def errors_held_back(result: CalibrationResult) -> TextTable:
     """Errors in what the chosen model was not fitted to."""
     return TextTable(
         "Error of the tip in what was held back (the others are fitted)",
@@ -163,10 +162,10 @@ def held_back(result: CalibrationResult) -> TextTable:
 # -- numbers that were fitted ---------------------------------------------------------------------
 
 
-def numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextTable]:
-    """Numbers that were fitted with their intervals, a table for each segment.
+def fitted_numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextTable]:
+    """The fitted numbers with their 95 % intervals, a table for each segment.
 
-    With `beginnings` also in which state and with which zero each log begins.
+    With `beginnings` also the state and the origin with which each log begins.
     """
     groups: dict[str, list[tuple[str, ...]]] = {}
     for each in result.estimates:
@@ -179,8 +178,8 @@ def numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextTable]:
     ]
 
 
-def _place(estimate: Estimate) -> tuple[str, str]:
-    """Under which title a number stands, and what it is called there."""
+def _place(estimate: FittedEstimate) -> tuple[str, str]:
+    """The title of the table in which a number stands, and its name there."""
     if not estimate.key:
         begins = estimate.name.startswith("zero of ") or " at the beginning of " in estimate.name
         words = estimate.name.replace(f"{BASE},", "base,").replace(f"{SENSOR},", "sensor,")
@@ -189,7 +188,7 @@ def _place(estimate: Estimate) -> tuple[str, str]:
     return title, estimate.name.replace(f", {title}", ",").removesuffix(",")
 
 
-def _number_row(estimate: Estimate, words: str) -> tuple[str, ...]:
+def _number_row(estimate: FittedEstimate, words: str) -> tuple[str, ...]:
     unit, factor = _UNITS.get(estimate.unit, ("", 1.0))
     if estimate.key.endswith(".share"):
         unit, factor = "%", 100.0
@@ -213,7 +212,7 @@ def _plain(value: float, places: int) -> str:
 # -- stiffness ------------------------------------------------------------------------------------
 
 
-def stiffnesses(rows: Sequence[StiffnessComparison]) -> TextTable:
+def stiffnesses_compared(rows: Sequence[StiffnessComparison]) -> TextTable:
     """Stiffness, measured and predicted."""
 
     def text(value: float | None) -> str:

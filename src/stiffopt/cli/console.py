@@ -6,13 +6,15 @@ shown and not before: JSON and help need none of it.
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from time import monotonic
-from typing import TYPE_CHECKING, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from stiffopt.errors import SlowWarning, printable
 
@@ -73,6 +75,29 @@ def write_line(text: str) -> None:
     with _noticing_closed_pipe():
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
+
+
+def write_json(record: Mapping[str, Any]) -> None:
+    """Print a record as one line of strict JSON to stdout, see `json_text`."""
+    write_line(json_text(record))
+
+
+def json_text(record: Mapping[str, Any]) -> str:
+    """Return a record as one line of strict JSON: arrays are lists, NaN and infinity are null."""
+    return json.dumps(plain_data(record), allow_nan=False)
+
+
+def plain_data(value: Any) -> Any:
+    """Return arrays and tuples as lists, and numbers that are not finite as None."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {key: plain_data(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_data(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
 
 
 def report_error(message: str, *, label: str = "error: ") -> None:

@@ -35,6 +35,10 @@ _ENDING_SIGNALS = tuple(
 Handler = Callable[[int, FrameType | None], None]
 
 
+class RigFaultError(StiffoptError):
+    """The rig failed while a command used it; it was vented, or the message says otherwise."""
+
+
 def most_serious(codes: Iterable[int]) -> int:
     """Return the code that speaks for all: 2, then 4, then 3, then 0."""
     seen = set(codes)
@@ -42,14 +46,14 @@ def most_serious(codes: Iterable[int]) -> int:
 
 
 def exit_code(work: Callable[[], object]) -> int:
-    """Do the work of a command, report what is wrong with its input, and return its exit code."""
+    """Do the work of a command, report the error that ends it, and return its exit code."""
     try:
         work()
     except KeyboardInterrupt:
         return INTERRUPTED
     except StiffoptError as error:
         report_error(str(error))
-        return BAD_INPUT
+        return FAULT if isinstance(error, RigFaultError) else BAD_INPUT
     return SOLVED
 
 

@@ -1,7 +1,6 @@
 """Reports of experiments: for the terminal, as a Markdown page, and as JSON."""
 
 from dataclasses import dataclass
-from math import isfinite
 from pathlib import Path
 from typing import Any
 
@@ -115,10 +114,9 @@ def kinematics_record(
     if coverage is not None:
         combined = {
             "poses": len(coverage.errors), **errors(coverage),
-            "pressures_pa": coverage.pressures.tolist(), "errors_m": coverage.errors.tolist(),
-            "speeds_m_per_s": coverage.speed.tolist(), "doubts": list(coverage.doubts),
+            "pressures_pa": coverage.pressures, "errors_m": coverage.errors,
+            "speeds_m_per_s": coverage.speed, "doubts": coverage.doubts,
         }  # fmt: skip
-    spread = result.repeatability
     return {
         "rig": settings.rig,
         "model": model.description.name,
@@ -126,8 +124,8 @@ def kinematics_record(
         "repetitions": result.repetitions,
         "samples": len(result.errors),
         **errors(result),
-        "repeatability_m": spread if result.repetitions > 1 and isfinite(spread) else None,
-        "doubts": list(result.doubts),
+        "repeatability_m": result.repeatability if result.repetitions > 1 else None,
+        "doubts": result.doubts,
         "combined": combined,
     }
 

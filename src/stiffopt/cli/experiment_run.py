@@ -1,6 +1,5 @@
 """What `stiffopt experiment` does: check everything, move the arm, vent it, report and draw."""
 
-import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -13,19 +12,16 @@ from typing import Any
 from stiffopt.cli import experiment_report, quantities
 from stiffopt.cli.console import (
     ProgressBar,
-    report_error,
     report_note,
     show,
     warnings_as_notes,
-    write_line,
+    write_json,
 )
 from stiffopt.cli.exits import (
-    BAD_INPUT,
-    FAULT,
-    INTERRUPTED,
-    SOLVED,
     InterruptBetweenSteps,
     Interruptible,
+    RigFaultError,
+    exit_code,
 )
 from stiffopt.errors import DeviceError, InputError, StiffoptError
 from stiffopt.experiments import (
@@ -66,7 +62,7 @@ Settings = KinematicsSettings | StiffnessSettings
 
 @dataclass(frozen=True)
 class ExperimentOptions:
-    """The arguments of a command; `given` are those that say what is done, None where absent."""
+    """The arguments of a command; `given` are the settings of the experiment, None where absent."""
 
     rig: str
     out: str | None
@@ -102,41 +98,28 @@ class _Plan:
 
 def run(experiment: str, options: ExperimentOptions) -> int:
     """Do an experiment, or go on with it; report and draw; return the exit code."""
-    try:
+
+    def work() -> None:
         with Interruptible(), warnings_as_notes(quiet=options.quiet):
             plan = _planned(experiment, options)
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    except StiffoptError as error:
-        report_error(str(error))
-        return BAD_INPUT
-    try:
-        with warnings_as_notes(quiet=options.quiet):
-            _do(plan, options)
-            with Interruptible():
-                _report(plan, options)
-    except KeyboardInterrupt:
-        _say_where(experiment, plan, options)
-        return INTERRUPTED
-    except _NoRigError as error:
-        report_error(str(error))
-        return FAULT
-    except _FaultError as error:
-        report_error(str(error))
-        _say_where(experiment, plan, options)
-        return FAULT
-    except StiffoptError as error:
-        report_error(str(error))
-        return BAD_INPUT
-    return SOLVED
+        try:
+            with warnings_as_notes(quiet=options.quiet):
+                _do(plan, options)
+                with Interruptible():
+                    _report(plan, options)
+        except (KeyboardInterrupt, _StoppedError):
+            if not options.quiet:
+                report_note(
+                    f"what was recorded is in {plan.folder}; go on with: "
+                    f"stiffopt experiment {experiment} {options.rig} --resume {plan.folder}"
+                )
+            raise
+
+    return exit_code(work)
 
 
-class _FaultError(StiffoptError):
-    """The rig was opened, and something went wrong."""
-
-
-class _NoRigError(StiffoptError):
-    """The rig could not be opened."""
+class _StoppedError(RigFaultError):
+    """The rig was opened, and something went wrong on it."""
 
 
 # -- before anything moves ------------------------------------------------------------------------
@@ -220,7 +203,7 @@ def _settings(
 
 
 def _kinematics_settings(folder: Path) -> KinematicsSettings:
-    """Settings of a folder; one that does not speak of combined poses was begun without them."""
+    """Settings of a folder; an old one that does not mention combined poses has none."""
     settings = open_folder(folder, KinematicsSettings)
     begun_with = settings.poses if "poses" in settings.model_fields_set else 0
     return settings.model_copy(update={"poses": begun_with})
@@ -292,7 +275,7 @@ def _open(plan: _Plan) -> None:
     except StiffoptError as error:
         if plan.is_new:
             remove_folder(plan.folder)
-        raise _NoRigError(str(error)) if isinstance(error, DeviceError) else error from error
+        raise RigFaultError(str(error)) if isinstance(error, DeviceError) else error from error
 
 
 def _on_rig(rig: Rig, work: Callable[[], list[str]], interrupt: InterruptBetweenSteps) -> list[str]:
@@ -308,20 +291,12 @@ def _on_rig(rig: Rig, work: Callable[[], list[str]], interrupt: InterruptBetween
         rig.close()
     except StiffoptError as error:
         first = f" (after: {failure})" if isinstance(failure, StiffoptError) else ""
-        raise _FaultError(f"THE ARM MAY STILL BE UNDER PRESSURE: {error}{first}") from error
+        raise _StoppedError(f"THE ARM MAY STILL BE UNDER PRESSURE: {error}{first}") from error
     if isinstance(failure, StiffoptError):
-        raise _FaultError(f"{failure}; the arm is vented") from failure
+        raise _StoppedError(f"{failure}; the arm is vented") from failure
     if failure is not None:
         raise failure
     return notes
-
-
-def _say_where(experiment: str, plan: _Plan, options: ExperimentOptions) -> None:
-    if not options.quiet:
-        report_note(
-            f"what was recorded is in {plan.folder}; go on with: "
-            f"stiffopt experiment {experiment} {options.rig} --resume {plan.folder}"
-        )
 
 
 # -- afterwards -----------------------------------------------------------------------------------
@@ -353,7 +328,7 @@ def _report_kinematics(
             save_figure(plot_coverage(coverage, title=title), folder / POSES_FIGURE)
     if options.as_json:
         record = experiment_report.kinematics_record(result, coverage, settings, model)
-        write_line(json.dumps({**record, "folder": str(folder)}, allow_nan=False))
+        write_json({**record, "folder": str(folder)})
     elif not options.quiet:
         show(report.renderable(str(folder)))
 

@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, cast
@@ -12,7 +11,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from stiffopt.cli import quantities
-from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_line
+from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_json
 from stiffopt.cli.exits import Interruptible, exit_code
 from stiffopt.cli.outputs import check_ending, check_picture, check_writable
 from stiffopt.cli.tables import number_table, title
@@ -57,7 +56,7 @@ def run(options: ArmOptions) -> int:
         if options.plot is not None:
             _draw(found, options.plot)
         if options.as_json:
-            write_line(json.dumps(_record(found), allow_nan=False))
+            write_json(_record(found))
         elif not options.quiet:
             show(_arm_summary(found) if isinstance(found, ArmMap) else _tip_summary(found))
 
@@ -156,26 +155,26 @@ def _tip_summary(found: TipMap) -> RenderableType:
 def _record(found: ArmMap | TipMap) -> dict[str, Any]:
     common = {
         "robot": found.robot,
-        "directions": found.directions.tolist(),
+        "directions": found.directions,
         "boundary": found.boundary,
         "frame": found.frame,
-        "stiffness_n_per_m": found.stiffness.tolist(),
+        "stiffness_n_per_m": found.stiffness,
     }
     if isinstance(found, ArmMap):
         return {
             "map": "arm",
-            "channels": [list(group) for group in found.groups],
-            "pressures_pa": found.pressures.tolist(),
-            "at_m": found.at.tolist(),
-            "positions_m": found.positions.tolist(),
+            "channels": found.groups,
+            "pressures_pa": found.pressures,
+            "at_m": found.at,
+            "positions_m": found.positions,
             **common,
         }
     return {
         "map": "tip",
-        "channels": list(found.channels),
-        "first_pa": found.first.tolist(),
-        "second_pa": found.second.tolist(),
-        "others_pa": found.others.tolist(),
+        "channels": found.channels,
+        "first_pa": found.first,
+        "second_pa": found.second,
+        "others_pa": found.others,
         **common,
     }
 

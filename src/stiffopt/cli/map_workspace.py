@@ -1,6 +1,5 @@
 """What `stiffopt map workspace` does: make or continue a map, print it, draw it."""
 
-import json
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from rich.console import Group, RenderableType
 from rich.text import Text
 
 from stiffopt.cli import quantities
-from stiffopt.cli.console import ProgressBar, report_note, show, warnings_as_notes, write_line
+from stiffopt.cli.console import ProgressBar, report_note, show, warnings_as_notes, write_json
 from stiffopt.cli.exits import InterruptBetweenSteps, exit_code
 from stiffopt.cli.outputs import check_picture
 from stiffopt.cli.tables import labelled, number_table, title
@@ -56,7 +55,7 @@ def run(options: WorkspaceOptions) -> int:
         if options.out is not None and not found.evaluated and not options.quiet:
             report_note(f"{options.out} is complete; there was nothing left to sample")
         if options.as_json:
-            write_line(json.dumps(_record(found, options.out, seconds), allow_nan=False))
+            write_json(_record(found, options.out, seconds))
         elif not options.quiet:
             show(_summary(found, options.out, seconds))
         if options.plot is not None:
@@ -129,7 +128,7 @@ class _Progress:
 
 
 def _summary(found: WorkspaceMap, out: str | None, seconds: float) -> RenderableType:
-    """All there is to say about a map, about 80 columns wide."""
+    """The report of a map, about 80 columns wide."""
     parts: list[RenderableType] = [title(out or "workspace"), labelled(_facts(found, seconds))]
     if len(found.table):
         parts += [Text(""), _stiffnesses(found)]
@@ -205,15 +204,15 @@ def _record(found: WorkspaceMap, out: str | None, seconds: float) -> dict[str, A
         "cell_m": plan.cell,
         "cells": len(found.table),
         "reach_volume_m3": found.volume,
-        "tip_low_m": _numbers(found.low),
-        "tip_high_m": _numbers(found.high),
+        "tip_low_m": found.low,
+        "tip_high_m": found.high,
         "kind": plan.measures[0].kind,
         "boundary": plan.measures[0].boundary,
         "frame": plan.measures[0].frame,
         "stiffness_unit": plan.unit,
         "stiffnesses": [
             {
-                "direction": list(measure.direction),
+                "direction": measure.direction,
                 "best": _extreme(found.best_in(number)),
                 "worst": _extreme(found.worst_in(number)),
                 "median_ratio": float(np.median(found.ratio[number])) if len(found.table) else None,
@@ -229,11 +228,7 @@ def _extreme(extreme: Extreme | None) -> dict[str, Any] | None:
         return None
     return {
         "stiffness": extreme.stiffness,
-        "cell_centre_m": extreme.cell_centre.tolist(),
+        "cell_centre_m": extreme.cell_centre,
         "sample": extreme.sample,
-        "pressures_pa": extreme.pressures.tolist(),
+        "pressures_pa": extreme.pressures,
     }
-
-
-def _numbers(values: Any) -> list[float | None]:
-    return [float(value) if np.isfinite(value) else None for value in values]

@@ -1,12 +1,10 @@
 """A solved task as data: a line of JSON in SI units, or an entry of a result file with units."""
 
-import json
 import math
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
+from stiffopt.cli.console import plain_data
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.optimise.solution import PressureSolution, Sensitivities
 from stiffopt.optimise.term import Term
@@ -16,12 +14,8 @@ from stiffopt.units import format_quantity
 Record = dict[str, Any]
 
 
-def json_line(solved: SolvedTask) -> str:
-    """Return a solved task as one line of strict JSON: no NaN, no infinity."""
-    return json.dumps(_strict(_json_record(solved)), allow_nan=False)
-
-
-def _json_record(solved: SolvedTask) -> Record:
+def json_record(solved: SolvedTask) -> Record:
+    """Return a solved task for JSON, in SI units."""
     solution = solved.solution
     record: Record = {
         "task": solved.file,
@@ -101,24 +95,11 @@ def _json_point(solution: PressureSolution) -> Record:
 
 
 def priced(solution: PressureSolution) -> Sensitivities | None:
-    """Return the sensitivities if they are worth something in stiffness, else None."""
+    """Return the sensitivities if they are prices in stiffness, else None."""
     given = solution.sensitivities
     if given is None or not solution.found or given.objective_unit not in ("N/m", "N*m/rad"):
         return None
     return given
-
-
-def _strict(value: Any) -> Any:
-    """Return plain data; what is not finite becomes null."""
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {key: _strict(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_strict(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
 
 
 # -- the result file ------------------------------------------------------------------------
@@ -177,7 +158,7 @@ def _uncertainty(solved: SolvedTask) -> Record | None:
         return None
     return {
         "tip_semi_axes": _quantities(known.semi_axes, "m", "mm"),
-        "tip_axes": _strict(known.axes.T),
+        "tip_axes": plain_data(known.axes.T),
         "inside_recorded_range": known.inside,
     }
 
@@ -206,10 +187,10 @@ def _compliance(solution: PressureSolution) -> Record | None:
         return None
     return {
         "frame": "tip",
-        "translation_per_force": {"matrix": _strict(matrix[:3, :3]), "unit": "m/N"},
-        "translation_per_moment": {"matrix": _strict(matrix[:3, 3:]), "unit": "m/(N*m)"},
-        "rotation_per_force": {"matrix": _strict(matrix[3:, :3]), "unit": "rad/N"},
-        "rotation_per_moment": {"matrix": _strict(matrix[3:, 3:]), "unit": "rad/(N*m)"},
+        "translation_per_force": {"matrix": plain_data(matrix[:3, :3]), "unit": "m/N"},
+        "translation_per_moment": {"matrix": plain_data(matrix[:3, 3:]), "unit": "m/(N*m)"},
+        "rotation_per_force": {"matrix": plain_data(matrix[3:, :3]), "unit": "rad/N"},
+        "rotation_per_moment": {"matrix": plain_data(matrix[3:, 3:]), "unit": "rad/(N*m)"},
     }
 
 

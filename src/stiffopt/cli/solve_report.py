@@ -40,7 +40,7 @@ Line = tuple[str, RenderableType]
 
 
 def block(solved: SolvedTask) -> RenderableType:
-    """Return all there is to say about one task, at least 80 columns wide."""
+    """Return the full report of one task, about 80 columns wide."""
     solution = solved.solution
     heading = Text.assemble(
         (printable(solved.file), "bold"),
@@ -289,7 +289,7 @@ class SummaryRow:
 
     @classmethod
     def of(cls, solved: SolvedTask, seconds: float) -> "SummaryRow":
-        """Return the row of an answer that took so long altogether."""
+        """Return the row of a task that took this time altogether."""
         solution = solved.solution
         position, angle = solution.position_error, solution.angle_error
         unit = unit_text(solution.stiffness_unit)

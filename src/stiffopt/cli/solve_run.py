@@ -20,7 +20,7 @@ from stiffopt.cli.console import (
     report_note,
     show,
     warnings_as_notes,
-    write_line,
+    write_json,
 )
 from stiffopt.cli.exits import Interruptible
 from stiffopt.cli.solved_task import SolvedTask, solve_file
@@ -154,7 +154,7 @@ class _Batch:
         self.solved.append(solved)
         self.codes.append(exits.OF_STATUS[solved.solution.status])
         if self.options.as_json:
-            self._print(lambda: write_line(solve_records.json_line(solved)))
+            self._print(lambda: write_json(solve_records.json_record(solved)))
         if self.options.tables:
             from stiffopt.cli.solve_report import SummaryRow, block
 

@@ -1,4 +1,4 @@
-"""A solved task: the solution with all that is printed, written and drawn beside it."""
+"""A solved task: its solution, and all that is printed, written and drawn with it."""
 
 import os
 from dataclasses import dataclass, replace

@@ -1,9 +1,10 @@
 """The command `stiffopt vent`: let the pressure out of a rig, whoever commands it."""
 
-import json
 from typing import Annotated
 
 import typer
+
+from stiffopt.cli.options import RigArgument
 
 VENT_HELP = """\
 Let all pressure out of the arm of RIG at once.
@@ -29,13 +30,13 @@ Exit codes:
 
 
 def vent(
-    rig: Annotated[str, typer.Argument(metavar="RIG", help="A rig file.")],
+    rig: RigArgument,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object: vented, text.")
     ] = False,
 ) -> None:
     """Vent a rig."""
-    from stiffopt.cli.console import report_error, write_line
+    from stiffopt.cli.console import report_error, write_json, write_line
     from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED
     from stiffopt.errors import DeviceError, StiffoptError
     from stiffopt.safety.vent import vent_rig
@@ -48,7 +49,7 @@ def vent(
     except StiffoptError as error:
         text, code = str(error), BAD_INPUT
     if as_json:
-        write_line(json.dumps({"vented": vented, "text": text}))
+        write_json({"vented": vented, "text": text})
     elif vented:
         write_line(text)
     if not vented:

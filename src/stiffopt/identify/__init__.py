@@ -1,1 +1,1 @@
-"""Recordings of an arm in, the model of this arm out."""
+"""Calibration and validation: the model of one arm from its recordings."""

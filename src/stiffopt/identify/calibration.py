@@ -1,4 +1,8 @@
-"""Calibrate: from recordings of an arm to a robot file that predicts it, with its uncertainty."""
+"""Calibration: from recordings of an arm to a robot file that predicts it, with its covariance.
+
+Models of growing complexity are fitted and compared by their errors in what was held back; the
+chosen one is then compared under the other strain laws, and fitted to all rows at the end.
+"""
 
 from __future__ import annotations
 
@@ -11,21 +15,39 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import InputError, PressureError
-from stiffopt.identify.choice import Candidate, best, held_back_errors
-from stiffopt.identify.comparison import Comparison, Errors
-from stiffopt.identify.estimates import Estimate, doubts, estimates
 from stiffopt.identify.fit import Fit, fit
-from stiffopt.identify.recording import Recording
-from stiffopt.identify.settings import CalibrationSettings
-from stiffopt.identify.setup import Setup, named, started
-from stiffopt.identify.structure import STRUCTURES, Structure
+from stiffopt.identify.results import (
+    Comparison,
+    Errors,
+    FittedEstimate,
+    doubts,
+    estimates,
+    outliers,
+)
+from stiffopt.identify.settings import REPORT, START, CalibrationSettings
+from stiffopt.identify.setup import (
+    LogSource,
+    RobotSource,
+    Setup,
+    TableSource,
+    description_of,
+    placements,
+    recordings_of,
+    tables_of,
+)
+from stiffopt.identify.structures import (
+    STRUCTURES,
+    Candidate,
+    ModelStructure,
+    best,
+    held_back_errors,
+    other_laws,
+)
 from stiffopt.identify.unknowns import BASE
-from stiffopt.identify.validation import compare, placements, recordings_of
-from stiffopt.logs import Log, StiffnessTable
-from stiffopt.model.actuation import StrainLaw
+from stiffopt.identify.validation import compare
+from stiffopt.logs import StiffnessTable
 from stiffopt.model.calibration import Calibration, FittedParameter
-from stiffopt.model.description import Recordings, RobotDescription, Segment
-from stiffopt.model.laws import strain_laws
+from stiffopt.model.description import Recordings, RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.registration import Placement, Registration
@@ -35,45 +57,36 @@ __all__ = ["CalibrationResult", "calibrate"]
 Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
 
-_SCREENING_ROWS = 150
-_TURNS = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)  # rad; starts where the turn is not known
-_UNKNOWN_TURN = 0.5  # rad; a base that may be turned further has several starts
-_MODULI = (0.0, -1.0, 1.0)  # deviations of the modulus; further starts
-_STILL = 1e-3  # of the range of pressures; smaller changes are none
-_A_WHILE = 1.0  # s
-_HELD = 0.2  # share of the time that pressures must be held for creep to be told
-_FAR = 4.0  # deviations from the model; such rows are outliers
-_DIGITS = 4  # of correlations in the file
-
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """What a calibration found.
+    """The result of a calibration.
 
     Attributes
     ----------
     before, robot : RobotDescription
-        The robot file as it was, and calibrated.
-    structure : Structure
-        That was chosen.
+        The robot file before the calibration, and after it.
+    structure : ModelStructure
+        The model that was chosen.
     candidates : tuple of Candidate
-        That it was chosen from, the simplest first.
-    estimates : tuple of Estimate
+        The models that were compared, the simplest first.
+    estimates : tuple of FittedEstimate
         Every number that was fitted.
     nominal, calibrated : tuple of Comparison
-        The logs beside what the robot predicts before and after.
+        The logs with the predictions of the robot before and after.
     held_back : dict of str to Errors
         Errors in logs (or parts of a log) when the others are fitted.
     tables : tuple of StiffnessTable
+        Measured stiffness that was fitted.
     remarks : tuple of str
         What was found in the logs, and what to make of the result, one sentence each.
     """
 
     before: RobotDescription
     robot: RobotDescription
-    structure: Structure
+    structure: ModelStructure
     candidates: tuple[Candidate, ...]
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedEstimate, ...]
     nominal: tuple[Comparison, ...]
     calibrated: tuple[Comparison, ...]
     held_back: dict[str, Errors]
@@ -82,9 +95,9 @@ class CalibrationResult:
 
 
 def calibrate(
-    description: RobotDescription,
-    logs: Sequence[tuple[str, Log]],
-    tables: Sequence[StiffnessTable] = (),
+    robot: RobotSource,
+    logs: Sequence[LogSource] = (),
+    tables: Sequence[TableSource] = (),
     settings: CalibrationSettings | None = None,
     progress: Progress | None = None,
 ) -> CalibrationResult:
@@ -92,42 +105,44 @@ def calibrate(
 
     Parameters
     ----------
-    description : RobotDescription
+    robot : str, path, RobotDescription or Manipulator
         Where the fit begins; its tolerances say how far it may be expected to go.
-    logs : sequence of (name, Log)
+    logs : sequence of path, Log or (name, Log)
         In the order in which they were recorded.
-    tables : sequence of StiffnessTable
-        Fitted together with the logs.
+    tables : sequence of path or StiffnessTable
+        Measured stiffness, fitted together with the logs.
     settings : CalibrationSettings, optional
     progress : callable, optional
         Is told what is done, of how much, and in words.
+
+    Returns
+    -------
+    The result; `stiffopt.save_robot` writes its `robot` to a file, `stiffopt.load_robot` makes it a
+    `Manipulator`.
 
     Raises
     ------
     InputError
         There is nothing to fit, or a log is not usable; it names the log.
+    FileError
+        A file cannot be read or is wrong.
     EquilibriumError
         An arm under gravity buckles on the way.
     """
-    settings = settings or CalibrationSettings()
+    description, settings = description_of(robot), settings or CalibrationSettings()
     if not logs and not tables:
         raise InputError("there is nothing to fit to; expected a log or a table of stiffness")
-    for table in tables:
-        if table.n != description.n_pressures:
-            raise InputError(
-                f"a table of stiffness has {table.n} pressures and robot '{description.name}' "
-                f"{description.n_pressures} channels; expected as many"
-            )
-    structures = _structures(settings)
+    read = tables_of(tables, description)
+    structures = _structures(settings.structure)
     for key in settings.fixed:
         Parameter(key).value(description)  # raises if there is no such number
     laws = other_laws(description) if settings.strain_law == "auto" else []
     teller = _Teller(progress, len(structures) + len(laws))
     recordings = recordings_of(description, logs, settings)
-    setup = Setup.of(description, recordings, tables, settings)
+    setup = Setup.of(description, recordings, read, settings)
     if not recordings:  # poses are taken to be as the robot file has them
         teller.begin("fitting the stiffness")
-        alone = Structure(
+        alone = ModelStructure(
             "stiffness", "stiffness alone", ("compensation.stiffness",), as_given=True
         )
         return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
@@ -135,17 +150,17 @@ def calibrate(
     candidates: list[Candidate] = []
     for structure in structures:
         if len(structures) > 1 and not (
-            _is_possible(structure, description)
-            and _can_be_told(structure, recordings)
+            structure.is_possible(description)
+            and structure.can_be_told(recordings)
             and _is_worth_it(structure, candidates)
         ):
             continue
         candidates.append(_candidate(setup, structure, (first, near), teller))
         leader = min(candidates, key=lambda each: each.score).fit
-        near = {**near, **named(leader.problem, leader.x)}
+        near = {**near, **leader.problem.named(leader.x)}
     chosen = best(candidates)
     if laws:  # the robot file's, unless another predicts clearly better
-        near = named(chosen.fit.problem, chosen.fit.x)
+        near = chosen.fit.problem.named(chosen.fit.x)
         others = [chosen]
         for law in laws:
             structure = replace(
@@ -158,38 +173,21 @@ def calibrate(
         candidates += others[1:]
         chosen = best(others)
     teller.begin(f"final fit: {chosen.structure.words}")
-    near = named(chosen.fit.problem, chosen.fit.x)
+    near = chosen.fit.problem.named(chosen.fit.x)
     final = _final(setup, chosen.structure, near, teller)
     return _result(setup, final, chosen.structure, candidates, teller)
 
 
 def _candidate(
-    setup: Setup, structure: Structure, near: Sequence[Mapping[str, float]], teller: _Teller
+    setup: Setup, structure: ModelStructure, near: Sequence[Mapping[str, float]], teller: _Teller
 ) -> Candidate:
     """Fit a structure to few rows, and to what is left of them when parts are held back."""
     settings = setup.settings
     teller.begin(f"fitting {structure.words}")
     problem = setup.problem(structure, settings.trial_rows)
-    found = fit(problem, [started(problem, each) for each in near], teller, rounds=1)
+    found = fit(problem, [problem.start(each) for each in near], teller, rounds=1)
     teller.begin(f"predicting held-back logs: {structure.words}")
     return Candidate(structure, found, held_back_errors(found, settings.settle, teller))
-
-
-def other_laws(description: RobotDescription) -> list[type[StrainLaw]]:
-    """Strain laws that all segments of a robot could have instead of their own, simplest first."""
-    own = {segment.strain_law for segment in description.segments}
-    if len(own) != 1:
-        return []
-    found = []
-    for name, law in strain_laws().items():
-        try:
-            for segment in description.segments:
-                Segment(**segment.model_dump() | {"strain_law": name, "law": None})
-        except InputError:  # the law cannot describe such a segment
-            continue
-        if name not in own:
-            found.append(law)
-    return found
 
 
 class _Teller:
@@ -217,68 +215,44 @@ class _Teller:
         self._evaluations += 1
 
 
-def _structures(settings: CalibrationSettings) -> list[Structure]:
+def _structures(name: str) -> list[ModelStructure]:
+    """Models of this name, or all of them where it is ``auto``."""
     known = {structure.name: structure for structure in STRUCTURES}
-    for name in settings.structures:
-        if name not in known:
-            raise InputError(f"there is no model '{name}'; choose one of auto, {', '.join(known)}")
-    return [known[name] for name in settings.structures]
+    if name == "auto":
+        return list(STRUCTURES)
+    if name not in known:
+        raise InputError(f"there is no model '{name}'; choose one of auto, {', '.join(known)}")
+    return [known[name]]
 
 
-def _is_possible(structure: Structure, description: RobotDescription) -> bool:
-    """Whether the robot can have what a structure has: a dead band is of positive pressures."""
-    return "corrections.dead_band" not in structure.shape or min(description.pressure_min) >= 0
-
-
-def _can_be_told(structure: Structure, recordings: Sequence[Recording]) -> bool:
-    """Whether recordings can tell what a structure has, whatever its error on them.
-
-    On a path of even speed creep is taken for amplitude, and then predicts other runs worse than
-    nothing.
-    """
-    return not structure.creep or _held(recordings) > _HELD
-
-
-def _is_worth_it(structure: Structure, candidates: Sequence[Candidate]) -> bool:
+def _is_worth_it(structure: ModelStructure, candidates: Sequence[Candidate]) -> bool:
     """Whether one of those that a structure adds to is the best so far."""
     if not structure.after:
         return True
     return min(candidates, key=lambda each: each.score).structure.name in structure.after
 
 
-def _held(recordings: Sequence[Recording]) -> float:
-    """Share of the time in which no pressure had changed for a while."""
-    held = total = 0.0
-    for recording in recordings:
-        range_of = np.ptp(recording.pressures, axis=0).max() or 1.0
-        change = np.abs(np.diff(recording.pressures, axis=0)).max(axis=1) > _STILL * range_of
-        moves = np.concatenate([[recording.time[0]], recording.time[1:][change]])
-        last = moves[np.searchsorted(moves, recording.time, side="right") - 1]
-        steps = np.diff(recording.time, append=recording.time[-1])
-        held += float(steps[recording.time - last > _A_WHILE].sum())
-        total += float(steps.sum())
-    return held / total if total else 0.0
-
-
 def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
     """Coordinates by name near the best of several starts, from few rows."""
     teller.begin("looking for a start")
-    problem = setup.problem(STRUCTURES[1], _SCREENING_ROWS)
+    problem = setup.problem(STRUCTURES[1], START.rows)
     tolerances = setup.tolerances
-    turns = _TURNS if tolerances.base_turn > _UNKNOWN_TURN else (0.0,)
+    turns = START.turns if tolerances.base_turn > START.unknown_turn else (0.0,)
     starts = []
-    for turn, modulus in itertools.product(turns, _MODULI):
-        start = started(problem, {})
+    for turn, modulus in itertools.product(turns, START.moduli):
+        start = problem.start({})
         for i, unknown in enumerate(problem.unknowns.all):
             if unknown.name == f"{BASE}, about z":
                 start[i] = turn / unknown.deviation
             if unknown.parameter is not None and unknown.parameter.key.endswith("youngs_modulus"):
                 start[i] = modulus
         starts.append(start)
-    return named(problem, fit(problem, starts, teller, rounds=1).x)
+    return problem.named(fit(problem, starts, teller, rounds=1).x)
 
 
-def _final(setup: Setup, structure: Structure, near: Mapping[str, float], teller: _Teller) -> Fit:
+def _final(
+    setup: Setup, structure: ModelStructure, near: Mapping[str, float], teller: _Teller
+) -> Fit:
     """Fit all that counts; with tables, both as soft as poses say and not softened by pressure.
 
     Poses alone do not tell whether pressure softens the arm or acts ever more strongly on it;
@@ -288,7 +262,7 @@ def _final(setup: Setup, structure: Structure, near: Mapping[str, float], teller
     for description in _softenings(setup):
         own = replace(setup, description=description)
         problem = own.problem(structure, setup.settings.rows)
-        found.append(fit(problem, [started(problem, near)], teller))
+        found.append(fit(problem, [problem.start(near)], teller))
     return min(found, key=_misfit_of_tables)
 
 
@@ -317,7 +291,7 @@ def _softenings(setup: Setup) -> list[RobotDescription]:
 def _result(
     setup: Setup,
     found: Fit,
-    structure: Structure,
+    structure: ModelStructure,
     candidates: Sequence[Candidate],
     teller: _Teller,
 ) -> CalibrationResult:
@@ -359,32 +333,15 @@ def _result(
         candidates=tuple(candidates),
         estimates=listed,
         nominal=compared(setup.description, {}) if setup.recordings else (),
-        calibrated=compared(robot, named(found.problem, found.x)) if setup.recordings else (),
+        calibrated=compared(robot, found.problem.named(found.x)) if setup.recordings else (),
         held_back=folds[0] if folds else {},
         tables=setup.tables,
-        remarks=(*remarks, *_outliers(found), *doubts(found, listed)),
+        remarks=(*remarks, *outliers(found), *doubts(found, listed)),
     )
 
 
-def _outliers(found: Fit) -> list[str]:
-    """How many rows of each recording are far from the model, so that they count less."""
-    remarks = []
-    starts = found.problem.starts
-    error = np.linalg.norm(found.predicted.errors[0], axis=1) if starts[-1] else np.zeros(0)
-    far = error > _FAR * np.sqrt(3) * found.problem.noise.position
-    for sample, (a, b) in zip(found.problem.samples, itertools.pairwise(starts), strict=True):
-        if far[a:b].any():
-            times = sample.recording.time[sample.rows][far[a:b]]
-            remarks.append(
-                f"{sample.recording.name}: {far[a:b].sum()} of {b - a} rows are more than {_FAR:g} "
-                f"deviations from the model, first at {times[0]:.4g} s, last at {times[-1]:.4g} s; "
-                "they count less"
-            )
-    return remarks
-
-
 def _robot(setup: Setup, found: Fit) -> RobotDescription:
-    """The calibrated robot, with where the tracker is and how well all is known."""
+    """Return the calibrated robot with its registration and its covariance."""
     problem, x = found.problem, found.x
     given = placements(setup.description)
     recordings = setup.description.recordings
@@ -455,7 +412,7 @@ def _check_usable(robot: RobotDescription) -> None:
 
 
 def _record(setup: Setup, found: Fit) -> Calibration:
-    """What the robot file says of how well it is known.
+    """Return the covariance and the range of the calibration, for the robot file.
 
     A fit to tables alone keeps what an earlier calibration knew of everything else.
     """
@@ -467,7 +424,7 @@ def _record(setup: Setup, found: Fit) -> Calibration:
     unknowns = [found.problem.unknowns.all[i] for i in shape]
     covariance = found.covariance[np.ix_(shape, shape)]
     deviation = np.sqrt(np.diag(covariance))
-    correlation = np.round(covariance / np.outer(deviation, deviation), _DIGITS)
+    correlation = np.round(covariance / np.outer(deviation, deviation), REPORT.correlation_digits)
     known = setup.description.calibration
     fitted = {unknown.parameter.key for unknown in unknowns if unknown.parameter is not None}
     unlearnt = _softening(setup, found)
@@ -513,7 +470,7 @@ def _record(setup: Setup, found: Fit) -> Calibration:
 
 
 def _softening(setup: Setup, found: Fit) -> tuple[FittedParameter, ...]:
-    """What poses alone leave open: whether pressure softens the arm or acts ever more strongly."""
+    """Softening, which poses alone cannot tell from pressure that acts ever more strongly."""
     if setup.tables:
         return ()
     return tuple(

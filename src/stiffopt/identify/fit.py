@@ -1,9 +1,9 @@
-"""Robust nonlinear least squares with priors, and how well the result is known.
+"""Robust nonlinear least squares with priors, and the covariance of the result.
 
-Residuals of real arms are not noise: what a model cannot say changes slowly, so that neighbouring
-rows err alike.  Rows therefore count for as many as are independent, by the autocorrelation of
-the residuals, and are divided by their own robust spread; only so are priors and covariance what
-they claim to be.
+Residuals of real arms are not white noise: what a model cannot describe changes slowly, so that
+neighbouring rows err alike.  Rows are therefore weighted by the number of independent rows among
+them, from the autocorrelation of the residuals, and residuals are divided by their own robust
+spread.  Only then do priors and covariance mean what they say.
 """
 
 from __future__ import annotations
@@ -16,18 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
-from stiffopt.identify.problem import Noise, Predicted, Problem
+from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted
+from stiffopt.identify.settings import FIT
 from stiffopt.model.description import RobotDescription
 
 __all__ = ["Fit", "fit"]
 
 Array = NDArray[np.float64]
-
-_LOSS_SCALE = 2.0  # residuals beyond so many deviations count less and less (soft L1)
-ROUNDS = 3  # of fitting with the spread that the last one left
-_TOLERANCE = 1e-6
-MOST_EVALUATIONS = 60
-_LEAST_POSITION, _LEAST_ANGLE = 1e-6, 1e-5  # m and rad, of the spread: logs have few digits
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +31,7 @@ class Fit:
 
     Attributes
     ----------
-    problem : Problem
+    problem : CalibrationProblem
         With the noise and the weights that were used at last.
     x : ndarray
         Scaled coordinates (d,).
@@ -48,7 +43,7 @@ class Fit:
         How many rows are one independent one.
     """
 
-    problem: Problem
+    problem: CalibrationProblem
     x: Array
     cost: float
     covariance: Array
@@ -66,17 +61,17 @@ class Fit:
 
 
 def fit(
-    problem: Problem,
+    problem: CalibrationProblem,
     starts: Sequence[Array],
     tell: Callable[[], None] = lambda: None,
-    rounds: int = ROUNDS,
-    most: int = MOST_EVALUATIONS,
+    rounds: int = FIT.rounds,
+    most: int = FIT.evaluations,
 ) -> Fit:
     """Fit from several starts and return the best minimum.
 
     Parameters
     ----------
-    problem : Problem
+    problem : CalibrationProblem
     starts : sequence of (d,)
         Scaled coordinates.
     tell :
@@ -96,7 +91,7 @@ def fit(
 
 
 def _minimum(
-    problem: Problem, start: Array, tell: Callable[[], None], most: int
+    problem: CalibrationProblem, start: Array, tell: Callable[[], None], most: int
 ) -> tuple[Array, float]:
     """Scaled coordinates (d,) of a minimum near a start, and its cost."""
     from scipy.optimize import least_squares  # a large library; only fits need it
@@ -129,9 +124,9 @@ def _minimum(
         bounds=(problem.low, problem.high),
         method="trf",
         loss=_loss(problem.size),
-        ftol=_TOLERANCE,
-        xtol=_TOLERANCE,
-        gtol=_TOLERANCE,
+        ftol=FIT.tolerance,
+        xtol=FIT.tolerance,
+        gtol=FIT.tolerance,
         max_nfev=most,
     )
     return np.asarray(found.x), float(found.cost)
@@ -141,23 +136,27 @@ def _loss(n_prior: int) -> Callable[[Array], Array]:
     """Soft L1 for the data, none for the prior: values, first and second derivatives."""
 
     def loss(squared: Array) -> Array:
-        z = squared / _LOSS_SCALE**2
+        z = squared / FIT.loss_scale**2
         root = np.sqrt(1 + z)
-        rho = np.stack([2 * _LOSS_SCALE**2 * (root - 1), 1 / root, -0.5 / root**3 / _LOSS_SCALE**2])
+        rho = np.stack(
+            [2 * FIT.loss_scale**2 * (root - 1), 1 / root, -0.5 / root**3 / FIT.loss_scale**2]
+        )
         rho[:, -n_prior:] = np.stack([squared[-n_prior:], np.ones(n_prior), np.zeros(n_prior)])
         return rho
 
     return loss
 
 
-def _reweighted(problem: Problem, x: Array, independent: float) -> tuple[Problem, float]:
+def _reweighted(
+    problem: CalibrationProblem, x: Array, independent: float
+) -> tuple[CalibrationProblem, float]:
     """The problem with the noise and weights that fit its residuals, and rows per independent."""
     if not problem.samples:
         return problem, 1.0
     predicted = problem.predict(x)
-    position = _spread(np.concatenate(predicted.errors), _LEAST_POSITION)
+    position = _spread(np.concatenate(predicted.errors), FIT.least_position)
     turns = [read.turn for read in predicted.read if read.turn is not None]
-    angle = _spread(np.concatenate(turns), _LEAST_ANGLE) if turns else problem.noise.angle
+    angle = _spread(np.concatenate(turns), FIT.least_angle) if turns else problem.noise.angle
     found = _rows_per_independent(problem, predicted)
     factor = np.sqrt(independent / found)
     samples = [replace(sample, weight=sample.weight * factor) for sample in problem.samples]
@@ -174,7 +173,7 @@ def _spread(errors: Array, least: float) -> float:
     return max(float(np.sqrt(np.mean(kept**2))), least)
 
 
-def _rows_per_independent(problem: Problem, predicted: Predicted) -> float:
+def _rows_per_independent(problem: CalibrationProblem, predicted: Predicted) -> float:
     """Integrated autocorrelation of the tip's errors along the rows, at least 1."""
     starts = problem.starts
     longest = max(1, max(len(sample.rows) for sample in problem.samples) // 3)
@@ -194,10 +193,10 @@ def _rows_per_independent(problem: Problem, predicted: Predicted) -> float:
     return float(max(1.0, 1 + 2 * correlation[1:stop].sum()))
 
 
-def _covariance(problem: Problem, x: Array) -> Array:
+def _covariance(problem: CalibrationProblem, x: Array) -> Array:
     """Inverse of the normal matrix with the weights of the loss; the prior is part of it."""
     value, slope = problem.residuals(x)
-    weight = 1 / np.sqrt(1 + value**2 / _LOSS_SCALE**2)
+    weight = 1 / np.sqrt(1 + value**2 / FIT.loss_scale**2)
     normal = slope.T @ (slope * weight[:, np.newaxis]) + np.eye(problem.size)
     found = np.linalg.inv(normal)
     return np.asarray((found + found.T) / 2, dtype=float)

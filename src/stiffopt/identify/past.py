@@ -1,7 +1,7 @@
-"""Effective pressures along a recording, and how they depend on the history of a segment.
+"""Effective pressures along a recording, with their derivatives by the history's numbers.
 
-The operators are those of `stiffopt.model.history`; here they are run over a whole log at once,
-with their derivatives by lag, dead time, shares and the state in which the log begins.
+The operators are those of `stiffopt.model.history`.  Here they are run over a whole log at once,
+with derivatives by lag, dead time, shares and the state in which the log begins.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.identify.settings import FIT
 from stiffopt.model.compiled import library
 from stiffopt.model.history import NO_HISTORY, History
 from stiffopt.model.native_calls import CompiledFunction
@@ -24,12 +25,11 @@ Array = NDArray[np.float64]
 _CHUNKS = (1, 32, 128, 512, 2048)  # rows that may be run at once; fewer are filled up
 _WORTH_COMPILING = 50  # runs of the longest kind; compiling takes a second
 _CARRIED = 5  # values and four derivatives
-_BETWEEN_LOGS = 60.0  # s at the last pressures, between two logs of a sequence
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """In which state the channels of a segment (c) begin.
+    """State in which the c channels of a segment begin a log.
 
     Attributes
     ----------
@@ -105,7 +105,7 @@ class Past:
     def __init__(self, history: History | None, channels: int) -> None:
         self.history = history or NO_HISTORY
         self._channels = channels
-        self._runs: dict[tuple[bool, bool], _Run] = {}
+        self._runs: dict[tuple[bool, bool], _HistoryRun] = {}
 
     def effective(
         self,
@@ -177,31 +177,31 @@ class Past:
         """State a while later, at the last pressures."""
         same, none = end.before[np.newaxis], np.zeros((1, self._channels))
         (state,) = self._run(history)(
-            _carried(end), same, same, none, none, np.array([_BETWEEN_LOGS]),
+            _carried(end), same, same, none, none, np.array([FIT.between_logs]),
             (history.lag, history.lag_falling),
         )  # fmt: skip
         return self._start(state, end.before)
 
     def _start(self, state: Array, before: Array) -> Start:
-        """Where another log begins, after a state (m, 5 c) of `_Run`."""
+        """Where another log begins, after a state (m, 5 c) of `_HistoryRun`."""
         states, *per_time, per_side = np.split(state, _CARRIED, axis=1)
         return Start(states, per_side, before, np.stack(per_time))
 
-    def _run(self, history: History) -> _Run:
+    def _run(self, history: History) -> _HistoryRun:
         kind = (history.lag > 0, history.lag_falling > 0)
         if kind not in self._runs:
-            self._runs[kind] = _Run(self.history, self._channels, *kind)
+            self._runs[kind] = _HistoryRun(self.history, self._channels, *kind)
         return self._runs[kind]
 
 
 def _carried(start: Start) -> Array:
-    """State of `_Run` (m, 5 c)."""
+    """State of `_HistoryRun` (m, 5 c)."""
     none = np.zeros((_CARRIED - 2, *start.states.shape))
     per_time = none if start.per_time is None else start.per_time
     return np.concatenate([start.states, *per_time, start.per_side], axis=1)
 
 
-class _Run:
+class _HistoryRun:
     """The operators of several channels over many rows, with their derivatives carried along.
 
     A state is (m, 5 c): the operators of each channel, then their derivatives by lag, falling
@@ -260,7 +260,7 @@ class _Run:
 
 
 def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Function:
-    """One step of `_Run`: state, pressures, their changes, length and lags in s -> state."""
+    """One step of `_HistoryRun`: state, pressures, their changes, length and lags in s -> state."""
     m = history.n_states
     value, *slopes = (ca.SX.sym(name, m) for name in ("y", "l", "f", "d", "s"))
     before, now, before_change, now_change = (ca.SX.sym(name) for name in ("a", "b", "da", "db"))

@@ -1,13 +1,13 @@
-"""The least-squares problem of a calibration: residuals of logs and tables, and their slopes.
+"""The least-squares problem of a calibration: residuals of logs and tables, and their Jacobian.
 
-What is read of a point of the arm follows from the commanded pressures in three steps, each with
-its derivatives: the history of every segment (`stiffopt.identify.past`), the equilibrium at the
-effective pressures (`stiffopt.model.parametric`) and the tracker (`stiffopt.identify.sensing`).
+A tracker's reading of a point of the arm follows from the commanded pressures in three steps, each
+with its derivatives: the history of every segment (`stiffopt.identify.past`), the equilibrium at
+the effective pressures (`stiffopt.model.parametric`) and the tracker (`stiffopt.identify.sensing`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import Literal, cast
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from stiffopt.identify.past import Effective, Past, Start
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.sensing import Readings, readings
-from stiffopt.identify.unknowns import Unknown
+from stiffopt.identify.settings import FIT
+from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.arguments import checked_measure
 from stiffopt.model.compliance import Boundary
@@ -27,19 +28,13 @@ from stiffopt.model.history import NO_HISTORY, History
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.parametric import ParametricArm
 
-__all__ = ["Begin", "Noise", "Point", "Predicted", "Problem", "Sample", "Unknowns"]
+__all__ = ["Begin", "CalibrationProblem", "Noise", "Predicted", "Sample", "TrackedPoint"]
 
 Array = NDArray[np.float64]
 
 
-_MOST_MEMORY = 0.9  # sum of the shares of a channel, beyond which a penalty grows
-_MEMORY_SLACK = 0.01
-_LEAST_MODULUS = 0.1  # that pressure must leave of a segment's, below which a penalty grows
-_MOST_STIFFENING = 0.7  # of a modulus that rises exponentially; at 1 more pressure bends less
-_MODULUS_SLACK = 0.005
-
 Begin = Literal["rest", "previous", "unknown"]
-"""How a log begins: after a rise from no pressure, as the previous one ended, or nobody knows."""
+"""State in which a log begins: after a rise from no pressure, as the last one ended, or unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +47,9 @@ class Sample:
     rows : ndarray
         (M,), increasing.
     weight : ndarray
-        (M,): how much each counts.
+        Factor (M,) on the residuals of each row.
     begin : str
-        The state in which the arm comes to it.
+        State of the arm when the recording begins.
     """
 
     recording: Recording
@@ -64,15 +59,15 @@ class Sample:
 
 
 @dataclass(frozen=True, eq=False)
-class Point:
+class TrackedPoint:
     """A point of the arm that is tracked.
 
     Attributes
     ----------
-    name : of its track.
+    name : name of its track in the recordings.
     at : arc length at rest, in m; None is the tip.
     sensor : pose (4, 4) of the sensor in the point's frame, where its unknown twist is zero.
-    turns : whether its orientation counts.
+    turns : whether its orientation is compared too.
     """
 
     name: str
@@ -83,51 +78,15 @@ class Point:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of what a model leaves: of each axis of a position, and of an angle."""
+    """Standard deviations of the residuals: of each axis of a position in m, of an angle in rad."""
 
     position: float
     angle: float
 
 
 @dataclass(frozen=True, eq=False)
-class Unknowns:
-    """Everything that a fit may change, in this order.
-
-    Attributes
-    ----------
-    parameters : of the robot: shape, then histories.
-    base : twist of the base in the tracker's frame, six or none.
-    sensors : twists of the sensors, for each point.
-    zeros : shift of each recording, three each or none.
-    sides : on which side of its plays each channel begins, for each recording that needs it.
-    """
-
-    parameters: tuple[Unknown, ...]
-    base: tuple[Unknown, ...] = ()
-    sensors: tuple[tuple[Unknown, ...], ...] = ()
-    zeros: tuple[tuple[Unknown, ...], ...] = ()
-    sides: tuple[tuple[Unknown, ...], ...] = ()
-
-    @property
-    def all(self) -> tuple[Unknown, ...]:
-        """All of them, in order."""
-        groups = (self.parameters, self.base, *self.sensors, *self.zeros, *self.sides)
-        return tuple(unknown for group in groups for unknown in group)
-
-    def slices(self) -> tuple[slice, list[slice], list[slice], list[slice]]:
-        """Where the base's, the sensors', the zeros' and the sides' are among all."""
-        begin = len(self.parameters)
-        found: list[slice] = []
-        for group in (self.base, *self.sensors, *self.zeros, *self.sides):
-            found.append(slice(begin, begin + len(group)))
-            begin += len(group)
-        n, m = len(self.sensors), len(self.zeros)
-        return found[0], found[1 : 1 + n], found[1 + n : 1 + n + m], found[1 + n + m :]
-
-
-@dataclass(frozen=True, eq=False)
 class Predicted:
-    """What the model says of the rows of all samples.
+    """What the model predicts for the rows of all samples.
 
     Attributes
     ----------
@@ -147,7 +106,7 @@ class Predicted:
     errors: tuple[Array, ...]
 
 
-class Problem:
+class CalibrationProblem:
     """Residuals of samples and of tables of stiffness.
 
     Parameters
@@ -158,7 +117,7 @@ class Problem:
         What may change.
     samples : sequence of Sample
         In the order in which they were recorded.
-    points : sequence of Point
+    points : sequence of TrackedPoint
         The tip first.
     base_in_tracker : ndarray
         Pose (4, 4) of the base where its unknown twist is zero.
@@ -173,7 +132,7 @@ class Problem:
         description: RobotDescription,
         unknowns: Unknowns,
         samples: Sequence[Sample],
-        points: Sequence[Point],
+        points: Sequence[TrackedPoint],
         base_in_tracker: Array,
         noise: Noise,
         tables: Sequence[StiffnessTable] = (),
@@ -205,7 +164,25 @@ class Problem:
         """Where each sample begins among the rows of all, and their end."""
         return [0, *np.cumsum([len(sample.rows) for sample in self.samples]).tolist()]
 
-    def with_samples(self, samples: Sequence[Sample], noise: Noise) -> Problem:
+    def start(self, near: Mapping[str, float]) -> Array:
+        """Scaled coordinates (d,) of unknowns that are known by name, zero for the others."""
+        x = np.array([near.get(unknown.name, 0.0) for unknown in self.unknowns.all])
+        return np.asarray(np.clip(x, self.low, self.high))
+
+    def named(self, x: Array) -> dict[str, float]:
+        """Scaled coordinates (d,) by the names of their unknowns."""
+        pairs = zip(self.unknowns.all, x, strict=True)
+        return {unknown.name: float(value) for unknown, value in pairs}
+
+    def without(self, held_back: Sequence[NDArray[np.bool_]]) -> CalibrationProblem:
+        """The same problem, in which some rows of its samples do not count."""
+        samples = [
+            replace(each, weight=np.where(away, 0.0, each.weight))
+            for each, away in zip(self.samples, held_back, strict=True)
+        ]
+        return self.with_samples(samples, self.noise)
+
+    def with_samples(self, samples: Sequence[Sample], noise: Noise) -> CalibrationProblem:
         """The same problem with samples of other weights, and another noise."""
         other = copy(self)
         other.samples, other.noise = tuple(samples), noise
@@ -258,13 +235,13 @@ class Problem:
             total = sum(part.share for part in history.parts)
             for c in range(segment.n_channels):
                 memory = history.memory_of(c)
-                if memory * total > _MOST_MEMORY:
-                    value[row] = (memory * total - _MOST_MEMORY) / _MEMORY_SLACK
+                if memory * total > FIT.most_memory:
+                    value[row] = (memory * total - FIT.most_memory) / FIT.memory_slack
                     for key, i in self._index.items():
                         if key.startswith(prefix) and key.endswith("share"):
-                            slope[row, i] = memory / _MEMORY_SLACK
+                            slope[row, i] = memory / FIT.memory_slack
                         elif key == f"{prefix}.memory[{c}]":
-                            slope[row, i] = memory * total / _MEMORY_SLACK
+                            slope[row, i] = memory * total / FIT.memory_slack
                 row += 1
         return value, slope
 
@@ -292,14 +269,14 @@ class Problem:
             slopes[self._index.get(keys[0])] = -change
             slopes[self._index.get(keys[1])] = norm / modulus
             if compensation.modulus_law == "linear":
-                sign, excess = -1.0, _LEAST_MODULUS - (1 + change)
+                sign, excess = -1.0, FIT.least_modulus - (1 + change)
             else:  # beyond, more pressure would bend less
-                sign, excess = 1.0, change - _MOST_STIFFENING
+                sign, excess = 1.0, change - FIT.most_stiffening
             if excess > 0:
-                value[s] = excess / _MODULUS_SLACK
+                value[s] = excess / FIT.modulus_slack
                 for i, each in slopes.items():
                     if i is not None:
-                        slope[s, i] = sign * each / _MODULUS_SLACK
+                        slope[s, i] = sign * each / FIT.modulus_slack
         return value, slope
 
     def _value(self, key: str, x: Array) -> float:
@@ -474,7 +451,7 @@ class Problem:
             }
         )
 
-    def _measurements(self, point: Point) -> tuple[Array, Array | None]:
+    def _measurements(self, point: TrackedPoint) -> tuple[Array, Array | None]:
         """Positions (M, 3) and rotations (M, 3, 3) of a point in the rows of all samples."""
         positions, rotations = [np.zeros((0, 3))], [np.zeros((0, 3, 3))]
         for sample in self.samples:

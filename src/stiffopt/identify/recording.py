@@ -1,4 +1,8 @@
-"""A log becomes what a fit can use: checked, in one frame, without what was not measured."""
+"""From a log to a recording: checked, in one frame, without what was not measured.
+
+A log that cannot be one of the given arm in SI units, or from which nothing can be learnt, is
+refused. What is doubtful is told in remarks.
+"""
 
 from __future__ import annotations
 
@@ -10,33 +14,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import FileError, InputError, shown
-from stiffopt.identify.orientations import (
-    aligned,
+from stiffopt.identify.settings import PLAUSIBLE
+from stiffopt.identify.tracker_faults import (
+    MEDIAN_NORM,
+    dropouts,
+    jumps,
     mean_rotation,
+    norms,
+    repeats,
     rotations,
+    roughness,
     unflipped,
     unit_quaternions,
+    whole,
 )
-from stiffopt.identify.plausibility import (
-    check_excitation,
-    check_lengths,
-    check_pressures,
-    check_time,
-    counted,
-)
-from stiffopt.identify.screening import dropouts, jumps, norms, repeats, whole
 from stiffopt.logs import Body, Log
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["Recording", "Track", "aligned", "prepare"]
+__all__ = ["Recording", "Track", "prepare"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
-_MOST = 0.95  # share of the rows in which a frame must not have moved ...
-_MOVED = 2e-3  # ... by this, in m
-_TURNED = np.radians(2.0)  # ... or by this
-_LATE = 0.15  # of the range; gauges are off by less, regulators in the first row by more
+_PRESSURE_UNITS = {"MPa": 1e6, "bar": 1e5, "psi": 6894.757, "kPa": 1e3, "mbar": 1e2}
 _TIP = "tip"
 _UNUSED = "these are not used"
 
@@ -138,18 +138,18 @@ def prepare(
             _no_body(name, body, log)
     if len(set(bodies)) < len(tuple(bodies)):
         raise InputError(f"a body is asked for twice: {', '.join(bodies)}")
-    remarks = check_time(name, log.time)
-    check_lengths(name, log, frame, description.length)
+    remarks = _check_time(name, log.time)
+    _check_lengths(name, log, frame, description.length)
     p, found = _pressures(log, name, columns, pressures)
     remarks += found
-    remarks += check_pressures(name, p, description)
+    remarks += _check_pressures(name, p, description)
 
     used = {_TIP: Body(log.tip_position, log.tip_quaternion)}
     used |= {body: log.bodies[body] for body in bodies}
     if frame is not None:
         used[frame] = log.bodies[frame]
     stale = _stale(log)
-    remarks += counted(stale, log.time, "every tracker reading repeats the row before", _UNUSED)
+    remarks += _counted(stale, log.time, "every tracker reading repeats the row before", _UNUSED)
     reach = _reach(p, description)
     tracks = {}
     for body, poses in used.items():
@@ -159,7 +159,7 @@ def prepare(
         tracks, found = _in_frame(name, tracks, frame)
         remarks += found
     kept = tuple(tracks[body] for body in (_TIP, *bodies))
-    check_excitation(name, log.time, p, kept[0].position, description)
+    _check_excitation(name, log.time, p, kept[0].position, description)
     before = _before(log, columns, p, description)
     return Recording(name, log.time, p, before, kept, remarks)
 
@@ -223,7 +223,7 @@ def _pressures(
             filled[:, channel] = p[at[np.maximum(last, 0)], channel]
     how = "from the rows before and after" if which == "measured" else "as in the last row with one"
     missing = ~whole(p)
-    return filled, counted(missing, log.time, f"a {which} pressure is missing", f"taken {how}")
+    return filled, _counted(missing, log.time, f"a {which} pressure is missing", f"taken {how}")
 
 
 def _before(log: Log, columns: list[int], pressures: Array, description: RobotDescription) -> Array:
@@ -233,7 +233,7 @@ def _before(log: Log, columns: list[int], pressures: Array, description: RobotDe
         return first
     measured = log.measured[0, columns]
     span = np.subtract(description.pressure_max, description.pressure_min)
-    late = np.abs(measured - first) > _LATE * span  # not where it is missing
+    late = np.abs(measured - first) > PLAUSIBLE.late * span  # not where it is missing
     first[late] = measured[late]
     return first
 
@@ -270,9 +270,9 @@ def _track(
     jumped = jumps(time, position, reach, length)
     position[jumped] = np.nan
     remarks = (
-        *counted(missing, time, f"the position of {name} is missing"),
-        *counted(nowhere, time, f"the position of {name} is zero or impossible", _UNUSED),
-        *counted(jumped, time, f"the position of {name} jumps and comes back", _UNUSED),
+        *_counted(missing, time, f"the position of {name} is missing"),
+        *_counted(nowhere, time, f"the position of {name} is zero or impossible", _UNUSED),
+        *_counted(jumped, time, f"the position of {name} jumps and comes back", _UNUSED),
     )
     if body.quaternion is None:
         return Track(name, position, None), remarks
@@ -283,11 +283,11 @@ def _track(
     flips = np.zeros(len(time), dtype=bool)
     flips[turns.flips] = True
     remarks += (
-        *counted(missing, time, f"the orientation of {name} is missing"),
-        *counted(
+        *_counted(missing, time, f"the orientation of {name} is missing"),
+        *_counted(
             flips, time, f"the orientation of {name} flips about the body's own axes", "undone"
         ),
-        *counted(
+        *_counted(
             turns.stray, time, f"the orientation of {name} agrees with no row near it", _UNUSED
         ),
     )
@@ -312,9 +312,12 @@ def _in_frame(
         axes = mean_rotation(known)
         size = norms((known - axes).reshape(-1, 9))  # sqrt(8) sin(angle / 2)
         turned = 2 * np.arcsin(np.minimum(size / np.sqrt(8), 1.0))
-    moves, turns = float(np.quantile(away, _MOST)), float(np.quantile(turned, _MOST))
+    moves, turns = (
+        float(np.quantile(away, PLAUSIBLE.frame_share)),
+        float(np.quantile(turned, PLAUSIBLE.frame_share)),
+    )
     remarks: tuple[str, ...] = ()
-    if moves > _MOVED or turns > _TURNED:
+    if moves > PLAUSIBLE.frame_moved or turns > PLAUSIBLE.frame_turned:
         remarks = (
             f"{frame}, in whose frame everything is expressed, moves by {moves * 1e3:.1f} mm and "
             f"{np.degrees(turns):.1f} degrees about its mean; it is taken to be at rest",
@@ -328,3 +331,152 @@ def _in_frame(
         for track in tracks.values()
     }
     return moved, remarks
+
+
+# plausibility -------------------------------------------------------------------------------------
+
+
+def _counted(
+    rows: NDArray[np.bool_], time: Array, what: str, done: str | None = None
+) -> tuple[str, ...]:
+    """Return a sentence on rows (N,), with their number and their first times; none if none."""
+    at = np.flatnonzero(rows)
+    if not len(at):
+        return ()
+    times = ", ".join(f"{time[i]:.6g}" for i in at[: PLAUSIBLE.times_shown])
+    more = ", ..." if len(at) > PLAUSIBLE.times_shown else ""
+    end = f"; {done}" if done else ""
+    return (f"{what} in {len(at)} row{'s' * (len(at) > 1)} (at {times}{more} s){end}",)
+
+
+def _check_time(name: str, time: Array) -> tuple[str, ...]:
+    """Return a remark if times look like milliseconds.
+
+    Raises
+    ------
+    InputError
+        There are too few rows.
+    """
+    if len(time) < PLAUSIBLE.least_rows:
+        raise FileError(name, f"has {len(time)} rows; expected at least {PLAUSIBLE.least_rows}")
+    step = float(np.median(np.diff(time)))
+    if step > (PLAUSIBLE.slow_integers if np.all(time == np.round(time)) else PLAUSIBLE.slow):
+        return (
+            f"rows are {step:g} s apart; if these are milliseconds, time_s must be divided by 1000",
+        )
+    return ()
+
+
+def _check_lengths(name: str, log: Log, frame: str | None, length: float) -> None:
+    """Refuse positions that cannot be in m.
+
+    Raises
+    ------
+    InputError
+        The tip moves over 10 lengths of the arm, or is 100 away from the body that is the frame.
+    """
+    tip = log.tip_position
+    seen = whole(tip) & np.any(tip != 0, axis=1)  # zeros may stand for none
+    if not seen.any():
+        raise FileError(name, "the position of tip is missing in every row")
+    low, high = np.quantile(tip[seen], (0.1, 0.9), axis=0)
+    over = float(np.linalg.norm(high - low))
+    if over > PLAUSIBLE.widest * length:
+        raise FileError(name, f"the tip moves over {over:.3g} m, {_mm(length)}")
+    if frame is None:
+        return
+    apart = norms(tip - log.bodies[frame].position)[seen]
+    far = float(np.median(apart[np.isfinite(apart)])) if np.isfinite(apart).any() else 0.0
+    if far > PLAUSIBLE.farthest * length:
+        raise FileError(name, f"the tip is {far:.3g} m away from {frame}, {_mm(length)}")
+
+
+def _mm(length: float) -> str:
+    return f"and the robot is {length:.3g} m long; the positions look like mm, expected m"
+
+
+def _check_pressures(name: str, pressures: Array, description: RobotDescription) -> tuple[str, ...]:
+    """Return remarks on pressures (N, n) beyond the limits and on channels that are not used.
+
+    Raises
+    ------
+    InputError
+        They do not look like Pa; no channel is used.
+    """
+    low, high = np.array(description.pressure_min), np.array(description.pressure_max)
+    limit = np.maximum(np.abs(low), np.abs(high))
+    share = float(np.max(np.max(np.abs(pressures), axis=0) / limit))
+    if 0 < share < PLAUSIBLE.tiny_pressure:
+        near = {unit: share * factor for unit, factor in _PRESSURE_UNITS.items()}
+        unit = max((u for u in near if near[u] < 1.2), key=near.__getitem__, default="kPa")
+        raise FileError(
+            name,
+            f"the largest pressure is {np.max(np.abs(pressures)):g} Pa, {100 * share:.2g} % of "
+            f"the robot's limit; the pressures look like {unit}, expected Pa",
+        )
+    remarks = []
+    for channel, p in enumerate(pressures.T):
+        below, above = low[channel] - p.min(), p.max() - high[channel]
+        if max(below, above) > PLAUSIBLE.beyond * (high - low)[channel]:
+            worst = p.max() if above > below else p.min()
+            remarks.append(
+                f"{description.channel_name(channel)} is at {worst * 1e-5:.3g} bar, beyond the "
+                f"robot's limits of {low[channel] * 1e-5:g} to {high[channel] * 1e-5:g} bar"
+            )
+    idle = np.ptp(pressures, axis=0) <= PLAUSIBLE.idle * (high - low)
+    if idle.all():
+        raise FileError(
+            name,
+            f"no pressure moves by more than {100 * PLAUSIBLE.idle:g} % of its range; "
+            "expected a recording in which they do",
+        )
+    if idle.any():
+        names = ", ".join(description.channel_name(c) for c in np.flatnonzero(idle).tolist())
+        remarks.append(
+            f"nothing is learnt about {names}, as the pressure there never moves by more than "
+            f"{100 * PLAUSIBLE.idle:g} % of its range"
+        )
+    return tuple(remarks)
+
+
+def _check_excitation(
+    name: str, time: Array, pressures: Array, tip: Array, description: RobotDescription
+) -> None:
+    """Refuse a recording (N rows) in which too little can be used or the tip does not move.
+
+    Raises
+    ------
+    InputError
+        Fewer than 20 positions of the tip (N, 3) are left, or they are noise.
+    """
+    seen = whole(tip)
+    if seen.sum() < PLAUSIBLE.least_rows:
+        raise FileError(
+            name,
+            f"{seen.sum()} of {len(tip)} rows can be used; "
+            f"expected at least {PLAUSIBLE.least_rows}",
+        )
+    position = tip[seen]
+    spread = float(np.sqrt(np.sum(np.var(position, axis=0))))
+    # white noise is sqrt(3/2) times as far from the line between its neighbours as from its mean
+    rough = float(np.median(roughness(time[seen], position))) / MEDIAN_NORM * np.sqrt(3)
+    noise = rough / np.sqrt(3 / 2)
+    before = np.vstack([pressures[:1], pressures[:-1]])
+    causes = np.hstack([pressures, before])[seen] / np.max(np.abs(pressures))
+    moves = spread > PLAUSIBLE.noise_factor * noise or _follows(causes, position)
+    if spread < PLAUSIBLE.still * description.length or not moves:
+        raise FileError(
+            name,
+            f"the tip does not move: its positions vary by {spread * 1e3:.2g} mm, of which "
+            f"{min(noise, spread) * 1e3:.2g} mm are noise; expected motion well above that",
+        )
+
+
+def _follows(causes: Array, position: Array) -> bool:
+    """Say whether positions (N, 3) depend on causes (N, m): rows may be far apart, but no noise."""
+    known = np.column_stack([np.ones(len(causes)), causes])
+    solution, _, rank, _ = np.linalg.lstsq(known, position, rcond=1e-6)
+    freedom = max(len(position) - int(rank), 1)
+    rest = np.sum((position - known @ solution) ** 2) / freedom
+    total = np.sum(np.var(position, axis=0, ddof=1))
+    return bool(rest < PLAUSIBLE.unexplained**2 * total)

@@ -1,16 +1,26 @@
-"""What a calibration is told."""
+"""Settings of a calibration: what users choose, and the tuning values behind each of its steps."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field
 
-from stiffopt.identify.structure import STRUCTURES
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
-__all__ = ["CalibrationSettings"]
+__all__ = [
+    "CHOICE",
+    "FIT",
+    "PLAUSIBLE",
+    "REPORT",
+    "SAMPLING",
+    "START",
+    "TRACKER",
+    "CalibrationSettings",
+]
 
 
 class CalibrationSettings(Schema):
@@ -18,18 +28,19 @@ class CalibrationSettings(Schema):
 
     Attributes
     ----------
-    structure : name of a model of `STRUCTURES`, or ``auto``: the one that predicts held-back
-        logs (of a single log, held-back parts) best; of those that are as good, the simplest.
+    structure : name of a model of `stiffopt.identify.structures.STRUCTURES`, or ``auto``: the one
+        that predicts held-back logs (of a single log, held-back parts) best; of those that are as
+        good, the simplest.
     strain_law : ``auto``: the robot file's, unless another law of `stiffopt.model.laws` predicts
         what is held back clearly better; or ``keep``.
     sequence : whether the logs follow each other, so that each begins in the state in which the
         one before it ended.
     rezero : whether positions are counted anew in each log.
-    pressures : which of the recorded pressures lead.
+    pressures : which of the recorded pressures the model is run with.
     fixed : keys of parameters that stay as they are.
     settle : time at the beginning of a log that does not begin at rest, from which its state (and
         its zero) is estimated where the log is only predicted, in s.
-    rows : that are fitted, of all logs together; chosen so as to cover them.
+    rows : number of rows that are fitted, of all logs together; chosen so as to cover them.
     trial_rows : the same, while models are compared.
     """
 
@@ -43,9 +54,229 @@ class CalibrationSettings(Schema):
     rows: Annotated[int, Field(ge=50, le=100_000)] = 2000
     trial_rows: Annotated[int, Field(ge=50, le=100_000)] = 600
 
-    @property
-    def structures(self) -> tuple[str, ...]:
-        """Names of the models to compare."""
-        if self.structure == "auto":
-            return tuple(structure.name for structure in STRUCTURES)
-        return (self.structure,)
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """Which readings of a tracker count as faults (`stiffopt.identify.tracker_faults`).
+
+    Attributes
+    ----------
+    farthest : distance from the median position beyond which a reading is impossible, in lengths
+        of the arm.
+    origin, origin_rows : a tracker may have been zeroed within this distance of the origin (lengths
+        of the arm); so many rows there say that positions of zero are readings.
+    jump_rows : number of rows that a jump may last.
+    jump_pause : longest time between the rows around a jump, in usual steps of time per row.
+    jump_factor : how many times the ordinary step a jump is.
+    jump_sigmas, jump_least : smallest jump, in deviations of the noise and in lengths of the arm;
+        a robust loss deals with smaller ones.
+    turn_agrees : angle by which rows that follow each other may differ at one place, in rad.
+    turn_moving : angle by which a body may turn while it moves by one length of the arm, in rad.
+    turn_rows : so many rows in a row are no chance, however they are turned.
+    """
+
+    farthest: float = 100.0
+    origin: float = 0.05
+    origin_rows: int = 3
+    jump_rows: int = 5
+    jump_pause: float = 5.0
+    jump_factor: float = 3.0
+    jump_sigmas: float = 10.0
+    jump_least: float = 0.01
+    turn_agrees: float = float(np.radians(20.0))
+    turn_moving: float = 4.0
+    turn_rows: int = 5
+
+
+@dataclass(frozen=True)
+class PlausibilitySettings:
+    """When a log cannot be one of the given arm in SI units (`stiffopt.identify.recording`).
+
+    Attributes
+    ----------
+    least_rows : number of usable rows that a recording needs.
+    tiny_pressure : share of the pressure limits that the highest pressure in Pa exceeds.
+    beyond, idle : shares of a channel's range: beyond its limits by so much is worth a remark;
+        a channel that moves by less is not used.
+    farthest, widest : in lengths of the arm: distance of the tip from the frame's body, and
+        range of the tip's positions, that would mean other units than m.
+    slow, slow_integers : median time between rows that would mean ms, in s; and the same where all
+        times are whole numbers.
+    late : share of a channel's range by which the first measured pressure differs from the
+        commanded one if the log begins with a step. Gauges are off by less.
+    frame_share, frame_moved, frame_turned : in so many of the rows the body that is the frame may
+        not have moved by more than this, in m and rad.
+    noise_factor, still : the tip moves if its positions vary by so many deviations of their noise,
+        and by so much of the arm's length.
+    unexplained : share of their spread that noisy positions keep after a regression on pressures.
+    times_shown : number of times that a remark names.
+    """
+
+    least_rows: int = 20
+    tiny_pressure: float = 0.01
+    beyond: float = 0.1
+    idle: float = 0.02
+    farthest: float = 100.0
+    widest: float = 10.0
+    slow: float = 60.0
+    slow_integers: float = 5.0
+    late: float = 0.15
+    frame_share: float = 0.95
+    frame_moved: float = 2e-3
+    frame_turned: float = float(np.radians(2.0))
+    noise_factor: float = 3.0
+    still: float = 1e-3
+    unexplained: float = 0.8
+    times_shown: int = 3
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """Which rows of recordings are fitted and compared (`stiffopt.identify.setup`).
+
+    Attributes
+    ----------
+    straight : share of the range of pressures: commands so near to a straight line are on it.
+    fine : of commands that change in every row, one is kept per so many s, as a lag can tell.
+    longest_gap : number of rows that are left out at once.
+    rest : share of the range of pressures below which an arm is at rest.
+    loaded_fit_rows, loaded_rows : most rows of an arm under gravity, whose every pose is an
+        equilibrium to be found, in a fit and in a comparison.
+    rows : most rows of a log in a comparison.
+    dead_time_step : slowest rows from which a dead time can be told from a lag, in s.
+    """
+
+    straight: float = 1e-3
+    fine: float = 0.04
+    longest_gap: int = 64
+    rest: float = 0.02
+    loaded_fit_rows: int = 300
+    loaded_rows: int = 400
+    rows: int = 50_000
+    dead_time_step: float = 0.1
+
+
+@dataclass(frozen=True)
+class StartSettings:
+    """Where fits begin (`stiffopt.identify.structures`, `stiffopt.identify.calibration`).
+
+    Attributes
+    ----------
+    lag, dead_time : of a history that the robot file does not have, in s.
+    play_widths, play_share : of its plays; widths as shares of the highest recorded pressure.
+    creep_times, creep_share : of its creep, in s.
+    bending_radius : least bending radius, in lengths of the segment.
+    dead_band : share of the highest recorded pressure.
+    rows : number of rows of the first fit, which chooses between several starts.
+    turns, unknown_turn : turns of the base to begin with, in rad, where its tolerance is more than
+        the latter.
+    moduli : coordinates of the moduli to begin with, in prior deviations.
+    position_noise, angle_noise : what the first fit expects the model to miss, in lengths of the
+        arm and in rad.
+    """
+
+    lag: float = 0.3
+    dead_time: float = 0.05
+    play_widths: tuple[float, ...] = (0.05, 0.12, 0.24, 0.46)
+    play_share: float = 0.05
+    creep_times: tuple[float, ...] = (2.0, 20.0)
+    creep_share: float = 0.02
+    bending_radius: float = 0.6
+    dead_band: float = 0.05
+    rows: int = 150
+    turns: tuple[float, ...] = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)
+    unknown_turn: float = 0.5
+    moduli: tuple[float, ...] = (0.0, -1.0, 1.0)
+    position_noise: float = 0.01
+    angle_noise: float = float(np.radians(3.0))
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """The least-squares problem and its solution (`stiffopt.identify.problem` and ``fit``).
+
+    Attributes
+    ----------
+    loss_scale : residuals beyond so many deviations count less and less (soft L1).
+    rounds : number of fits, each with the spread of residuals that the one before left.
+    evaluations : most evaluations of the problem in each round.
+    tolerance : relative, of cost, step and gradient.
+    least_position, least_angle : smallest spread of residuals, in m and rad: logs have few digits.
+    most_memory, memory_slack : sum of the shares of a channel's history beyond which a penalty
+        grows, and the excess that counts as one deviation.
+    least_modulus, most_stiffening, modulus_slack : share of a segment's modulus that pressure must
+        leave; largest exponent by which an exponential law may raise it (at 1 more pressure bends
+        less); and the excess that counts as one deviation.
+    side : prior deviation of the side of its plays on which a channel begins, from -1 to 1.
+    between_logs : time at the last pressures between two logs of a sequence, in s.
+    """
+
+    loss_scale: float = 2.0
+    rounds: int = 3
+    evaluations: int = 60
+    tolerance: float = 1e-6
+    least_position: float = 1e-6
+    least_angle: float = 1e-5
+    most_memory: float = 0.9
+    memory_slack: float = 0.01
+    least_modulus: float = 0.1
+    most_stiffening: float = 0.7
+    modulus_slack: float = 0.005
+    side: float = 0.6
+    between_logs: float = 60.0
+
+
+@dataclass(frozen=True)
+class ChoiceSettings:
+    """How one of several models is chosen (`stiffopt.identify.structures`).
+
+    Attributes
+    ----------
+    logs : as many logs or more are held back one by one; of fewer, parts are.
+    parts : number of these parts.
+    top : share of the rows, those with the highest pressures, that are held back too.
+    evaluations : most evaluations of a fit without what is held back, which begins near its end.
+    no_worse : relative error by which a simpler model may be worse.
+    held, held_still, held_for : creep can be told if pressures are held for this share of the time;
+        held is a change of less than this share of their range, for longer than so many s.
+    """
+
+    logs: int = 3
+    parts: int = 4
+    top: float = 0.2
+    evaluations: int = 20
+    no_worse: float = 0.02
+    held: float = 0.2
+    held_still: float = 1e-3
+    held_for: float = 1.0
+
+
+@dataclass(frozen=True)
+class ReportSettings:
+    """What is remarked on in the result (`stiffopt.identify.results`).
+
+    Attributes
+    ----------
+    learnt : share of the prior's variance that the data must remove.
+    tied : correlation from which two numbers cannot be told apart.
+    far : distance from the robot file, in prior deviations.
+    tilt : of base or sensor that is doubted whatever the tolerance, in rad.
+    outlier : distance of a row from the model, in deviations.
+    correlation_digits : decimals of correlations in the robot file.
+    """
+
+    learnt: float = 0.5
+    tied: float = 0.95
+    far: float = 3.0
+    tilt: float = float(np.radians(8.0))
+    outlier: float = 4.0
+    correlation_digits: int = 4
+
+
+TRACKER = TrackerSettings()
+PLAUSIBLE = PlausibilitySettings()
+SAMPLING = SamplingSettings()
+START = StartSettings()
+FIT = FitSettings()
+CHOICE = ChoiceSettings()
+REPORT = ReportSettings()

@@ -1,45 +1,108 @@
-"""From a robot, a structure and recordings to a least-squares problem."""
+"""From a robot, logs and a model structure to a least-squares problem."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.identify.problem import Noise, Point, Problem, Sample, Unknowns
-from stiffopt.identify.recording import Recording
-from stiffopt.identify.samples import begins, sample
-from stiffopt.identify.settings import CalibrationSettings
-from stiffopt.identify.structure import Structure
+from stiffopt.errors import InputError
+from stiffopt.identify.problem import Begin, CalibrationProblem, Noise, Sample, TrackedPoint
+from stiffopt.identify.recording import Recording, Track, prepare
+from stiffopt.identify.settings import SAMPLING, START, CalibrationSettings
+from stiffopt.identify.structures import ModelStructure
+from stiffopt.identify.tracker_faults import aligned
 from stiffopt.identify.unknowns import (
     BASE,
     SENSOR,
     Unknown,
+    Unknowns,
     history_unknowns,
     placement_unknowns,
     shape_unknowns,
     side_unknowns,
     zero_unknowns,
 )
-from stiffopt.identify.validation import oriented, placements, points_of
-from stiffopt.logs import StiffnessTable
-from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.logs import Log, StiffnessTable, read_log, read_mcap_log, read_stiffness_table
+from stiffopt.model.arm import Arm
+from stiffopt.model.description import Recordings, RobotDescription, Tolerances
+from stiffopt.model.robot_files import load_description
+from stiffopt.registration import Placement
 
-__all__ = ["Setup"]
+__all__ = [
+    "NOISE", "LogSource", "RobotSource", "Setup", "TableSource", "begins", "chosen_rows",
+    "description_of", "nothing_unknown", "oriented", "placements", "points_of", "recordings_of",
+    "sample", "tables_of", "thinned",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
 
-_POSITION_SHARE = 0.01  # of the arm's length: spread of positions that a first fit expects
-_FINEST_DEAD_TIME = 0.1  # s between rows; of slower logs dead time and lag are one
-_ANGLE = np.radians(3.0)  # the same of angles
-_MOST_LOADED_ROWS = 300  # of an arm under gravity, whose every pose is an equilibrium to be found
+NOISE = Noise(1e-3, np.radians(2.0))
+"""Of readings, in m and rad, for a robot that was not calibrated."""
+
+_Path = str | os.PathLike[str]
+RobotSource = _Path | RobotDescription | Arm
+"""A built-in robot's name, the path of a robot file, a description or a `Manipulator`."""
+LogSource = _Path | Log | tuple[str, Log]
+"""The path of a log (CSV or ``.mcap``), a log, or a log with its name."""
+TableSource = _Path | StiffnessTable
+"""The path of a table of measured stiffness, or the table."""
+
+
+def description_of(robot: RobotSource) -> RobotDescription:
+    """Return the description of a robot."""
+    if isinstance(robot, RobotDescription):
+        return robot
+    return robot.description if isinstance(robot, Arm) else load_description(robot)
+
+
+def tables_of(tables: Sequence[TableSource], description: RobotDescription) -> list[StiffnessTable]:
+    """Return tables of measured stiffness.
+
+    Raises
+    ------
+    InputError
+        A table is of a robot with another number of channels.
+    """
+    found = []
+    for each in tables:
+        table = each if isinstance(each, StiffnessTable) else read_stiffness_table(each)
+        if table.n != description.n_pressures:
+            raise InputError(
+                f"a table of stiffness has {table.n} pressures and robot '{description.name}' "
+                f"{description.n_pressures} channels; expected as many"
+            )
+        found.append(table)
+    return found
+
+
+def _named(logs: Sequence[LogSource]) -> list[tuple[str, Log]]:
+    """Logs with their names: those of the files, with their folders where files share a name."""
+    if isinstance(logs, str):
+        raise InputError("expected a list of logs, not one path")
+    files = Counter(Path(log).name for log in logs if isinstance(log, str | os.PathLike))
+    found = []
+    for number, log in enumerate(logs, start=1):
+        if isinstance(log, Log):
+            found.append((f"log {number}", log))
+        elif isinstance(log, tuple):
+            found.append(log)
+        else:
+            path = Path(log)
+            read = read_mcap_log if path.suffix == ".mcap" else read_log
+            found.append((path.name if files[path.name] == 1 else str(path), read(path)))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What stays the same while models are compared.
+    """What stays the same while models are compared: the robot, the recordings and the settings.
 
     Attributes
     ----------
@@ -50,7 +113,7 @@ class Setup:
     settings : CalibrationSettings
     base : ndarray
         Pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
-    points : tuple of Point
+    points : tuple of TrackedPoint
         That are tracked.
     """
 
@@ -59,7 +122,7 @@ class Setup:
     tables: tuple[StiffnessTable, ...]
     settings: CalibrationSettings
     base: Array
-    points: tuple[Point, ...]
+    points: tuple[TrackedPoint, ...]
 
     @classmethod
     def of(
@@ -89,7 +152,7 @@ class Setup:
     def is_fine(self) -> bool:
         """Whether every log has rows so close that a dead time can be told from a lag."""
         steps = [float(np.median(np.diff(recording.time))) for recording in self.recordings]
-        return max(steps, default=0.0) <= 1.01 * _FINEST_DEAD_TIME
+        return max(steps, default=0.0) <= 1.01 * SAMPLING.dead_time_step
 
     @property
     def tolerances(self) -> Tolerances:
@@ -99,7 +162,7 @@ class Setup:
     def samples(self, rows: int) -> list[Sample]:
         """At most so many rows of all recordings, each with its share."""
         if any(self.description.gravity):
-            rows = min(rows, _MOST_LOADED_ROWS)
+            rows = min(rows, SAMPLING.loaded_fit_rows)
         total = sum(len(recording.time) for recording in self.recordings)
         states = begins(self.recordings, self.span, self.settings.sequence)
         return [
@@ -107,16 +170,18 @@ class Setup:
             for recording, begin in zip(self.recordings, states, strict=True)
         ]
 
-    def problem(self, structure: Structure, rows: int) -> Problem:
+    def problem(self, structure: ModelStructure, rows: int) -> CalibrationProblem:
         """The problem of fitting a structure to so many rows."""
         description = structure.applied(self.description, self.seen, self.is_fine)
         samples = oriented(description, self.samples(rows), self.points, self.base)
-        noise = Noise(_POSITION_SHARE * description.length, _ANGLE)
+        noise = Noise(START.position_noise * description.length, START.angle_noise)
         unknowns = self.unknowns(structure, description, samples)
-        return Problem(description, unknowns, samples, self.points, self.base, noise, self.tables)
+        return CalibrationProblem(
+            description, unknowns, samples, self.points, self.base, noise, self.tables
+        )
 
     def unknowns(
-        self, structure: Structure, description: RobotDescription, samples: Sequence[Sample]
+        self, structure: ModelStructure, description: RobotDescription, samples: Sequence[Sample]
     ) -> Unknowns:
         """What a structure may change."""
         tolerances = self.tolerances
@@ -156,7 +221,7 @@ class Setup:
             ),
         )
 
-    def _sensor(self, point: Point) -> tuple[Unknown, ...]:
+    def _sensor(self, point: TrackedPoint) -> tuple[Unknown, ...]:
         """Where a sensor is; of the tip's only if it tells turns, as moves and tilts trade off."""
         tolerances = self.tolerances
         if point.name == "tip":
@@ -170,23 +235,175 @@ class Setup:
         return tuple(placement_unknowns(name, np.full(3, position), np.full(3, angle), point.turns))
 
 
-def started(problem: Problem, near: Mapping[str, float]) -> Array:
-    """Scaled coordinates (d,) of a problem's unknowns where they are known by name, else zero."""
-    x = np.array([near.get(unknown.name, 0.0) for unknown in problem.unknowns.all])
-    return np.asarray(np.clip(x, problem.low, problem.high))
+# rows ---------------------------------------------------------------------------------------------
 
 
-def named(problem: Problem, x: Array) -> dict[str, float]:
-    """Scaled coordinates by name."""
-    return {
-        unknown.name: float(value) for unknown, value in zip(problem.unknowns.all, x, strict=True)
-    }
+def chosen_rows(recording: Recording, most: int) -> Rows:
+    """Rows (M,) to compare: at most so many of those in which the tip was seen, evenly spread."""
+    usable = np.flatnonzero(np.isfinite(recording.tracks[0].position).all(axis=1))
+    if len(usable) <= most:
+        return usable
+    chosen: Rows = usable[np.linspace(0, len(usable) - 1, most).round().astype(np.intp)]
+    return chosen
 
 
-def without(problem: Problem, held_back: Sequence[NDArray[np.bool_]]) -> Problem:
-    """The problem in which some rows of its samples do not count."""
-    samples = [
-        replace(each, weight=np.where(away, 0.0, each.weight))
-        for each, away in zip(problem.samples, held_back, strict=True)
+def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording, Rows]:
+    """Leave out rows that are neither wanted nor needed for the course of the pressures.
+
+    Returns
+    -------
+    recording, rows
+        The latter are where the wanted rows (M,) are now.
+    """
+    count = len(recording.time)
+    kept = np.zeros(count, dtype=bool)
+    kept[wanted] = True
+    kept[0] = kept[-1] = True
+    p = recording.pressures / span
+    gap = SAMPLING.longest_gap
+    open_rows = np.ones(count, dtype=bool)  # not yet known to be on a line
+    while gap > 1:
+        begins = np.arange(0, count - 1, gap)
+        ends = np.minimum(begins + gap, count - 1)
+        block = np.repeat(np.arange(len(begins)), ends - begins)
+        rows = np.arange(len(block))
+        begun, width = recording.time[begins], recording.time[ends] - recording.time[begins]
+        part = (recording.time[rows] - begun[block]) / width[block]
+        line = p[begins][block] + (p[ends] - p[begins])[block] * part[:, np.newaxis]
+        off = np.abs(p[rows] - line).max(axis=1)
+        worst = np.maximum.reduceat(off, begins)
+        straight = (worst <= SAMPLING.straight) & open_rows[begins]
+        open_rows[rows[straight[block]]] = False
+        kept[begins[straight]] = True
+        kept[ends[straight]] = True
+        gap //= 4
+    slot = np.floor(recording.time / SAMPLING.fine)
+    kept |= open_rows & np.append(slot[1:] != slot[:-1], True)
+    position = np.cumsum(kept) - 1
+    tracks = tuple(
+        Track(
+            track.name,
+            track.position[kept],
+            None if track.rotation is None else track.rotation[kept],
+        )
+        for track in recording.tracks
+    )
+    smaller = replace(
+        recording,
+        time=recording.time[kept],
+        pressures=recording.pressures[kept],
+        tracks=tracks,
+    )
+    return smaller, position[wanted]
+
+
+def sample(recording: Recording, span: Array, most: int, begin: Begin) -> Sample:
+    """Sample of at most so many rows of a recording."""
+    rows = chosen_rows(recording, most)
+    smaller, places = thinned(recording, rows, span)
+    return Sample(smaller, places, np.ones(len(places)), begin)
+
+
+def begins(recordings: Sequence[Recording], span: Array, sequence: bool) -> list[Begin]:
+    """Return the state in which each recording begins; in a sequence, as the one before ended."""
+    found: list[Begin] = []
+    for index, recording in enumerate(recordings):
+        at_rest = bool((np.abs(recording.before) <= SAMPLING.rest * span).all())
+        if sequence and index:
+            found.append("previous")
+        else:
+            found.append("rest" if at_rest else "unknown")
+    return found
+
+
+# tracked points -----------------------------------------------------------------------------------
+
+
+def recordings_of(
+    description: RobotDescription,
+    logs: Sequence[LogSource],
+    settings: CalibrationSettings,
+) -> list[Recording]:
+    """Return logs as recordings of this robot, read as its file and the settings say."""
+    given = placements(description)
+    return [
+        prepare(
+            log,
+            name,
+            description,
+            channels=given.channels or None,
+            frame=given.frame,
+            bodies=tuple(given.bodies),
+            pressures=settings.pressures,
+        )
+        for name, log in _named(logs)
     ]
-    return problem.with_samples(samples, problem.noise)
+
+
+def placements(description: RobotDescription) -> Recordings:
+    """Return how the robot's logs are read; the defaults where its file does not say."""
+    return description.recordings or Recordings()
+
+
+def points_of(
+    description: RobotDescription, recordings: Sequence[Recording]
+) -> tuple[TrackedPoint, ...]:
+    """Tracked points of an arm, the tip first, with their sensors where the robot file has them."""
+    given = placements(description)
+    places: dict[str, tuple[float | None, Placement]] = {
+        "tip": (None, given.registration.tip_in_sensor)
+    }
+    places |= {name: (body.at, body.point_in_sensor) for name, body in given.bodies.items()}
+    return tuple(
+        TrackedPoint(
+            name,
+            at,
+            placement.inverse(),
+            turns=all(recording.track(name).rotation is not None for recording in recordings),
+        )
+        for name, (at, placement) in places.items()
+    )
+
+
+def oriented(
+    description: RobotDescription,
+    samples: Sequence[Sample],
+    points: Sequence[TrackedPoint],
+    base: Array,
+) -> list[Sample]:
+    """Turn bodies whose markers look alike after quarter turns to what the model predicts."""
+    if not any(point.turns for point in points):
+        return list(samples)
+    predicted = CalibrationProblem(
+        description, nothing_unknown(samples, points), samples, points, base, NOISE
+    ).predict(np.zeros(0))
+    starts = np.cumsum([0, *(len(sample.rows) for sample in samples)])
+    found = []
+    for sample, begin, end in zip(samples, starts[:-1], starts[1:], strict=True):
+        tracks: list[Track] = []
+        for track in sample.recording.tracks:
+            k = [point.name for point in points].index(track.name)
+            if points[k].turns and track.rotation is not None:
+                expected = base[:3, :3] @ predicted.poses[k][begin:end, :3, :3]
+                expected = expected @ points[k].sensor[:3, :3]
+                track = replace(track, rotation=_turned(track.rotation, sample.rows, expected))
+            tracks.append(track)
+        found.append(replace(sample, recording=replace(sample.recording, tracks=tuple(tracks))))
+    return found
+
+
+def _turned(rotation: Array, rows: NDArray[np.intp], expected: Array) -> Array:
+    """The version of rotations (N, 3, 3) whose wanted rows are nearest to what is expected."""
+    between = np.swapaxes(expected, 1, 2) @ rotation[rows]
+    if not np.isfinite(between).all(axis=(1, 2)).any():
+        return rotation
+    version = np.swapaxes(between, 1, 2) @ aligned(between, np.eye(3))
+    known = np.isfinite(version).all(axis=(1, 2))
+    return np.asarray(rotation @ version[known][0])
+
+
+def nothing_unknown(samples: Sequence[Sample], points: Sequence[TrackedPoint]) -> Unknowns:
+    """Return the unknowns of a problem in which nothing may change."""
+    nothing: tuple[tuple[Unknown, ...], ...] = ((),)
+    each = nothing * len(samples)
+    return Unknowns((), (), nothing * len(points), each, each)

@@ -1,8 +1,7 @@
-"""What a fit is free to change: parameters of the robot, where the tracker is, how logs begin.
+"""The unknowns of a calibration: numbers of the robot, poses of the tracker, states of the arm.
 
-Every unknown has a coordinate that is zero at what the robot file says, and a standard deviation
-that says how far from there it may be expected.  The fit works in *scaled* coordinates, in which
-that deviation is one.
+Every unknown has a coordinate that is zero at the value of the robot file, and a prior standard
+deviation.  The fit works in *scaled* coordinates, in which that deviation is one.
 """
 
 from __future__ import annotations
@@ -14,18 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.identify.settings import FIT
 from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.laws import law_class
 from stiffopt.model.parameters import Parameter
 
-__all__ = ["BASE", "SENSOR", "Unknown", "history_unknowns", "placement_unknowns", "shape_unknowns"]
+__all__ = [
+    "BASE", "SENSOR", "Unknown", "Unknowns", "history_unknowns", "placement_unknowns",
+    "shape_unknowns", "side_unknowns", "zero_unknowns",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
 BASE = "base in the tracker's frame"
 SENSOR = "sensor on the tip"
-_SIDE = 0.6  # deviation; all between -1 and 1 are about as likely
 
 
 @dataclass(frozen=True)
@@ -34,11 +36,11 @@ class Unknown:
 
     Attributes
     ----------
-    name : for people.
+    name : what people call it.
     unit : SI unit of its coordinate; empty for a ratio or a plain number.
-    deviation : how far its coordinate may be expected from zero.
+    deviation : prior standard deviation of its coordinate.
     low, high : bounds of its coordinate.
-    parameter : of the robot, if it is one.
+    parameter : the number of the robot file that it is, or None.
     """
 
     name: str
@@ -51,6 +53,43 @@ class Unknown:
     def bounded(self, coordinate: float) -> float:
         """Nearest coordinate within the bounds."""
         return min(max(coordinate, self.low), self.high)
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """All unknowns of a problem, in the order of its coordinates.
+
+    Attributes
+    ----------
+    parameters : numbers of the robot file: of the equilibrium, then of the histories.
+    base : twist of the base in the tracker's frame, six or none.
+    sensors : twists of the sensors, for each tracked point.
+    zeros : shift of each recording's positions, three each or none.
+    sides : for each recording that begins in an unknown state, the side of its plays on which each
+        channel begins.
+    """
+
+    parameters: tuple[Unknown, ...]
+    base: tuple[Unknown, ...] = ()
+    sensors: tuple[tuple[Unknown, ...], ...] = ()
+    zeros: tuple[tuple[Unknown, ...], ...] = ()
+    sides: tuple[tuple[Unknown, ...], ...] = ()
+
+    @property
+    def all(self) -> tuple[Unknown, ...]:
+        """All of them, in order."""
+        groups = (self.parameters, self.base, *self.sensors, *self.zeros, *self.sides)
+        return tuple(unknown for group in groups for unknown in group)
+
+    def slices(self) -> tuple[slice, list[slice], list[slice], list[slice]]:
+        """Where the base's, the sensors', the zeros' and the sides' are among all."""
+        begin = len(self.parameters)
+        found: list[slice] = []
+        for group in (self.base, *self.sensors, *self.zeros, *self.sides):
+            found.append(slice(begin, begin + len(group)))
+            begin += len(group)
+        n, m = len(self.sensors), len(self.zeros)
+        return found[0], found[1 : 1 + n], found[1 + n : 1 + n + m], found[1 + n + m :]
 
 
 def shape_unknowns(
@@ -129,7 +168,9 @@ def placement_unknowns(name: str, position: Array, angle: Array, turns: bool) ->
 def side_unknowns(description: RobotDescription, name: str) -> list[Unknown]:
     """On which side of its plays each channel begins, from -1 after a rise to 1 after a fall."""
     return [
-        Unknown(f"{description.channel_name(c)} at the beginning of {name}", "", _SIDE, -1.0, 1.0)
+        Unknown(
+            f"{description.channel_name(c)} at the beginning of {name}", "", FIT.side, -1.0, 1.0
+        )
         for c in range(description.n_pressures)
     ]
 

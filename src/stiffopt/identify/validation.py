@@ -1,45 +1,57 @@
-"""How well a robot file predicts logs that it may not have seen."""
+"""Validation: how well a robot file predicts logs and measured stiffness."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.identify.comparison import Comparison
+from stiffopt.errors import StiffoptError
 from stiffopt.identify.fit import fit
-from stiffopt.identify.problem import Noise, Point, Predicted, Problem, Sample, Unknowns
-from stiffopt.identify.recording import Recording, Track, aligned, prepare
-from stiffopt.identify.samples import begins, chosen_rows, thinned
-from stiffopt.identify.settings import CalibrationSettings
-from stiffopt.identify.unknowns import Unknown, side_unknowns, zero_unknowns
-from stiffopt.logs import Log
-from stiffopt.model.description import Recordings, RobotDescription, Tolerances
-from stiffopt.registration import Placement
+from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample, TrackedPoint
+from stiffopt.identify.recording import Recording
+from stiffopt.identify.results import Comparison
+from stiffopt.identify.settings import SAMPLING, CalibrationSettings
+from stiffopt.identify.setup import (
+    NOISE,
+    LogSource,
+    RobotSource,
+    begins,
+    chosen_rows,
+    description_of,
+    nothing_unknown,
+    oriented,
+    placements,
+    points_of,
+    recordings_of,
+    thinned,
+)
+from stiffopt.identify.unknowns import Unknowns, side_unknowns, zero_unknowns
+from stiffopt.logs import StiffnessTable
+from stiffopt.model.compliance import Boundary
+from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.model.manipulator import Manipulator
 
-__all__ = ["compare", "recordings_of", "validate"]
+__all__ = ["StiffnessComparison", "compare", "compare_stiffness", "validate"]
 
 Array = NDArray[np.float64]
 
-MOST_ROWS = 50_000  # of a log that are compared; more say nothing more
-MOST_LOADED_ROWS = 400  # of an arm under gravity, whose every pose is an equilibrium to be found
-_NOISE = Noise(1e-3, np.radians(2.0))  # of readings, for a robot that was not calibrated
-
 
 def validate(
-    description: RobotDescription,
-    logs: Sequence[tuple[str, Log]],
+    robot: RobotSource,
+    logs: Sequence[LogSource],
     settings: CalibrationSettings | None = None,
     progress: Callable[[float, float, str], None] | None = None,
 ) -> tuple[Comparison, ...]:
-    """Run a robot along logs and compare; nothing of the robot is fitted.
+    """Run a robot along recordings and compare; nothing of the robot is fitted.
 
     Parameters
     ----------
-    description : RobotDescription
-    logs : sequence of (name, Log)
+    robot : str, path, RobotDescription or Manipulator
+    logs : sequence of path, Log or (name, Log)
         In the order in which they were recorded.
     settings : CalibrationSettings, optional
         How logs are read; what is fitted has no effect here.
@@ -50,8 +62,10 @@ def validate(
     ------
     InputError
         A log is not usable; it names the log.
+    FileError
+        A file cannot be read or is wrong.
     """
-    settings = settings or CalibrationSettings()
+    description, settings = description_of(robot), settings or CalibrationSettings()
     if progress is not None:
         progress(0, 2, "reading logs")
     recordings = recordings_of(description, logs, settings)
@@ -66,27 +80,6 @@ def validate(
     )
 
 
-def recordings_of(
-    description: RobotDescription,
-    logs: Sequence[tuple[str, Log]],
-    settings: CalibrationSettings,
-) -> list[Recording]:
-    """Return logs as a fit and a validation use them."""
-    given = placements(description)
-    return [
-        prepare(
-            log,
-            name,
-            description,
-            channels=given.channels or None,
-            frame=given.frame,
-            bodies=tuple(given.bodies),
-            pressures=settings.pressures,
-        )
-        for name, log in logs
-    ]
-
-
 def compare(
     description: RobotDescription,
     recordings: Sequence[Recording],
@@ -94,7 +87,7 @@ def compare(
     sequence: bool = False,
     rezero: bool = False,
     settle: float = 2.0,
-    most: int = MOST_ROWS,
+    most: int = SAMPLING.rows,
     known: Mapping[str, float] | None = None,
     tell: Callable[[], None] = lambda: None,
 ) -> tuple[Comparison, ...]:
@@ -121,7 +114,7 @@ def compare(
     base = placements(description).registration.tracker_in_base.inverse()
     states = begins(recordings, span, sequence)
     if any(description.gravity):
-        most = min(most, MOST_LOADED_ROWS)
+        most = min(most, SAMPLING.loaded_rows)
     samples, kept = [], []
     for recording, begin in zip(recordings, states, strict=True):
         every = np.arange(len(recording.time))
@@ -131,7 +124,7 @@ def compare(
         kept.append(rows)
     samples = oriented(description, samples, points, base)
     unknowns, x = _beginnings(description, samples, points, base, rezero, settle, known or {}, tell)
-    predicted = Problem(description, unknowns, samples, points, base, _NOISE).predict(x)
+    predicted = CalibrationProblem(description, unknowns, samples, points, base, NOISE).predict(x)
     starts = np.cumsum([0, *(len(sample.rows) for sample in samples)])
     return tuple(
         _comparison(
@@ -143,84 +136,17 @@ def compare(
     )
 
 
-def placements(description: RobotDescription) -> Recordings:
-    """How the robot's logs are read, or what is usual."""
-    return description.recordings or Recordings()
-
-
-def points_of(description: RobotDescription, recordings: Sequence[Recording]) -> tuple[Point, ...]:
-    """Tracked points of an arm, the tip first, where the robot file says that their sensors are."""
-    given = placements(description)
-    places: dict[str, tuple[float | None, Placement]] = {
-        "tip": (None, given.registration.tip_in_sensor)
-    }
-    places |= {name: (body.at, body.point_in_sensor) for name, body in given.bodies.items()}
-    return tuple(
-        Point(
-            name,
-            at,
-            placement.inverse(),
-            turns=all(recording.track(name).rotation is not None for recording in recordings),
-        )
-        for name, (at, placement) in places.items()
-    )
-
-
-def oriented(
-    description: RobotDescription,
-    samples: Sequence[Sample],
-    points: Sequence[Point],
-    base: Array,
-) -> list[Sample]:
-    """Samples whose bodies are turned by what their markers cannot tell, to what is predicted."""
-    if not any(point.turns for point in points):
-        return list(samples)
-    predicted = Problem(description, _none(samples, points), samples, points, base, _NOISE).predict(
-        np.zeros(0)
-    )
-    starts = np.cumsum([0, *(len(sample.rows) for sample in samples)])
-    found = []
-    for sample, begin, end in zip(samples, starts[:-1], starts[1:], strict=True):
-        tracks: list[Track] = []
-        for track in sample.recording.tracks:
-            k = [point.name for point in points].index(track.name)
-            if points[k].turns and track.rotation is not None:
-                expected = base[:3, :3] @ predicted.poses[k][begin:end, :3, :3]
-                expected = expected @ points[k].sensor[:3, :3]
-                track = replace(track, rotation=_turned(track.rotation, sample.rows, expected))
-            tracks.append(track)
-        found.append(replace(sample, recording=replace(sample.recording, tracks=tuple(tracks))))
-    return found
-
-
-def _turned(rotation: Array, rows: NDArray[np.intp], expected: Array) -> Array:
-    """The version of rotations (N, 3, 3) whose wanted rows are nearest to what is expected."""
-    between = np.swapaxes(expected, 1, 2) @ rotation[rows]
-    if not np.isfinite(between).all(axis=(1, 2)).any():
-        return rotation
-    version = np.swapaxes(between, 1, 2) @ aligned(between, np.eye(3))
-    known = np.isfinite(version).all(axis=(1, 2))
-    return np.asarray(rotation @ version[known][0])
-
-
-def _none(samples: Sequence[Sample], points: Sequence[Point]) -> Unknowns:
-    """Nothing that may change."""
-    nothing: tuple[tuple[Unknown, ...], ...] = ((),)
-    each = nothing * len(samples)
-    return Unknowns((), (), nothing * len(points), each, each)
-
-
 def _beginnings(
     description: RobotDescription,
     samples: Sequence[Sample],
-    points: Sequence[Point],
+    points: Sequence[TrackedPoint],
     base: Array,
     rezero: bool,
     settle: float,
     known: Mapping[str, float],
     tell: Callable[[], None],
 ) -> tuple[Unknowns, Array]:
-    """Zeros and states of the recordings, as known or as their own beginnings tell them."""
+    """Zeros and states of the recordings, as known or as estimated from their beginnings."""
     tolerances = description.tolerances or Tolerances()
     remembers = any(segment.history and segment.history.play for segment in description.segments)
     all_zeros, all_sides, found = [], [], []
@@ -240,11 +166,15 @@ def _beginnings(
             begun = replace(sample, rows=first, weight=np.ones(len(first)) / np.sqrt(len(first)))
             if begun.begin == "previous":
                 begun = replace(begun, begin="rest")
-            own = replace(_none([begun], points), zeros=(zeros,), sides=(sides,))
-            problem = Problem(description, own, [begun], points, base, _noise(description))
+            own = replace(nothing_unknown([begun], points), zeros=(zeros,), sides=(sides,))
+            problem = CalibrationProblem(
+                description, own, [begun], points, base, _noise(description)
+            )
             x = fit(problem, [x], tell, rounds=0).x
         found.append(x)
-    unknowns = replace(_none(samples, points), zeros=tuple(all_zeros), sides=tuple(all_sides))
+    unknowns = replace(
+        nothing_unknown(samples, points), zeros=tuple(all_zeros), sides=tuple(all_sides)
+    )
     # zeros of all recordings come before all sides
     zeros_first = [x[: len(zeros)] for x, zeros in zip(found, all_zeros, strict=True)]
     sides_last = [x[len(zeros) :] for x, zeros in zip(found, all_zeros, strict=True)]
@@ -252,11 +182,11 @@ def _beginnings(
 
 
 def _noise(description: RobotDescription) -> Noise:
-    """What a prediction may be expected to miss: nothing finer can be told from it."""
+    """Noise of readings about the prediction, as the calibration left it."""
     known = description.calibration
     if known is None or not known.position_residual:
-        return _NOISE
-    return Noise(known.position_residual, known.angle_residual or _NOISE.angle)
+        return NOISE
+    return Noise(known.position_residual, known.angle_residual or NOISE.angle)
 
 
 def _comparison(
@@ -267,7 +197,7 @@ def _comparison(
     predicted: Predicted,
     own: slice,
     base: Array,
-    tip: Point,
+    tip: TrackedPoint,
 ) -> Comparison:
     angle = None
     track = sample.recording.track(tip.name)
@@ -293,3 +223,68 @@ def _comparison(
         inside=inside,
         remarks=recording.remarks,
     )
+
+
+# measured stiffness -------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class StiffnessComparison:
+    """A measured stiffness and its predictions.
+
+    Attributes
+    ----------
+    pressures : of the channels, in Pa.
+    direction : unit vector in the base frame.
+    boundary : ``free``, ``guided`` or ``clamped``.
+    measured : in N/m.
+    sigma : its standard uncertainty, in N/m.
+    before, after : predictions of the robot file before and after calibration, in N/m; None where
+        the model has no equilibrium.
+    """
+
+    pressures: tuple[float, ...]
+    direction: tuple[float, float, float]
+    boundary: str
+    measured: float
+    sigma: float
+    before: float | None
+    after: float | None
+
+
+def compare_stiffness(
+    tables: Sequence[StiffnessTable], before: RobotDescription, after: RobotDescription
+) -> list[StiffnessComparison]:
+    """Compare all rows of tables in which a stiffness was measured."""
+    arms = [Manipulator(before), Manipulator(after)]
+    found = []
+    for table in tables:
+        for i in np.flatnonzero(np.isfinite(table.stiffness)):
+            pressures, boundary = table.pressures[i], table.boundaries[i]
+            x, y, z = map(float, table.directions[i])
+            predicted = [
+                _predicted(arm, pressures, (x, y, z), cast(Boundary, boundary)) for arm in arms
+            ]
+            found.append(
+                StiffnessComparison(
+                    tuple(map(float, pressures)),
+                    (x, y, z),
+                    boundary,
+                    float(table.stiffness[i]),
+                    float(table.sigma[i]),
+                    *predicted,
+                )
+            )
+    return found
+
+
+def _predicted(
+    arm: Manipulator,
+    pressures: np.ndarray,
+    direction: tuple[float, float, float],
+    boundary: Boundary,
+) -> float | None:
+    try:
+        return float(arm.stiffness(pressures, direction, boundary=boundary))
+    except StiffoptError:  # the arm buckles there, or its strain law ends
+        return None

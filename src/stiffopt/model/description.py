@@ -51,8 +51,8 @@ __all__ = [
     "Compensation",
     "Corrections",
     "Material",
-    "PressureLimits",
     "Recordings",
+    "RegulatorLimits",
     "RobotDescription",
     "Segment",
     "Tolerances",
@@ -163,15 +163,15 @@ class Compensation(Schema):
 
 
 class Corrections(Schema):
-    """How the channels of a segment act, where that is not as drawn; lists have one value for each.
+    """Corrections of a segment's channels; a list is empty or has one value for each channel.
 
     Attributes
     ----------
-    gain : pressure that acts per pressure.
+    gain : acting pressure per pressure.
     offset : pressure that acts in addition, in Pa.
-    dead_band : of all channels: pressure up to which hardly anything moves, in Pa. It comes before
-        gain and offset, and is for pressures that are never negative.
-    azimuth : turns the channel's chambers about the axis, from x towards y, in rad.
+    dead_band : pressure up to which hardly anything moves, of all channels, in Pa. It is applied
+        before gain and offset, and is for pressures that are never negative.
+    azimuth : turn of the channel's chambers about the axis, from x towards y, in rad.
     """
 
     gain: Items[Annotated[Ratio, Field(gt=0)]] = ()
@@ -319,8 +319,8 @@ def _law_class(name: str) -> type[StrainLaw]:
     return law_class(name)
 
 
-class PressureLimits(Schema):
-    """What the regulators may do; one value for all channels or one per channel.
+class RegulatorLimits(Schema):
+    """Limits of the regulators: one value for all channels, or one per channel.
 
     Attributes
     ----------
@@ -334,7 +334,7 @@ class PressureLimits(Schema):
 
 
 class TrackedBody(Schema):
-    """A body that is tracked beside the tip.
+    """A tracked body other than the tip.
 
     Attributes
     ----------
@@ -352,9 +352,9 @@ class Recordings(Schema):
     Attributes
     ----------
     channels : for each channel of the robot the pressure column of a log, counted from 1.
-    frame : tracked body in whose frame everything is meant, or None: the tracker's own.
-    registration : where that frame is with respect to the base, and the sensor to the tip.
-    bodies : tracked beside the tip, by name.
+    frame : tracked body in whose frame poses are expressed; None for the tracker's own frame.
+    registration : pose of that frame in the base frame, and of the tip in the sensor's.
+    bodies : other tracked bodies, by name.
     """
 
     channels: Items[Annotated[ChamberNumber, Field(ge=1)]] = ()
@@ -425,21 +425,21 @@ class RobotDescription(Schema):
 
     Attributes
     ----------
-    name : for people.
+    name : what people call the arm.
     segments : proximal segment first.
     tip_mass : mass fixed at the tip, in kg.
     gravity : acceleration in the base frame, in m/s^2; z runs along the straight arm.
     pressure : limits of the regulators.
     recordings : how logs of this arm are read.
-    tolerances : how well all this is known before a calibration.
-    calibration : how well it is known after one, or None.
+    tolerances : how well the numbers are known before a calibration.
+    calibration : how well they are known after one, or None.
     """
 
     name: Annotated[str, Field(min_length=1)]
     segments: Annotated[Items[Segment], Field(min_length=1, max_length=20)]
     tip_mass: Annotated[Mass, Field(ge=0)] = 0.0
     gravity: Vector[Acceleration] = (0.0, 0.0, 0.0)
-    pressure: PressureLimits
+    pressure: RegulatorLimits
     recordings: Recordings | None = None
     tolerances: Tolerances | None = None
     calibration: Calibration | None = None
@@ -484,7 +484,7 @@ class RobotDescription(Schema):
         )
 
     def channel_name(self, index: int) -> str:
-        """Return what people call a channel (counted from 0): ``segment 2 channel 1``."""
+        """Return the name of a channel (counted from 0) in messages: ``segment 2 channel 1``."""
         for number, segment in enumerate(self.segments, start=1):
             if 0 <= index < segment.n_channels:
                 return f"segment {number} channel {index + 1}"

@@ -51,7 +51,7 @@ class Play(Schema):
     Attributes
     ----------
     width : half of the way that a pressure must go back before the operator follows, in Pa.
-    share : of the pressure that acts through it.
+    share : share of the pressure that acts through the operator.
     """
 
     width: Annotated[Pressure, Field(gt=0)]
@@ -64,7 +64,7 @@ class Creep(Schema):
     Attributes
     ----------
     time : its time constant, in s.
-    share : of the pressure that acts through it.
+    share : share of the pressure that acts through the operator.
     """
 
     time: Annotated[Duration, Field(gt=0)]
@@ -104,7 +104,7 @@ class History(Schema):
 
     @property
     def parts(self) -> tuple[Play | Creep, ...]:
-        """What has a share, in the order of its states."""
+        """The operators that have a share, in the order of their states."""
         return (*self.play, *self.creep)
 
     @property
@@ -131,7 +131,7 @@ class History(Schema):
         return 1 + len(self.parts)
 
     def next_state(self, state: ca.SX, before: ca.SX, now: ca.SX, step: ca.SX) -> ca.SX:
-        """State (m,) of a channel after a step, through which the (delayed) pressure runs evenly.
+        """State (m,) of a channel after a step in which the (delayed) pressure changes linearly.
 
         Lag and creep are exact however long the step.  So is play while the lagged pressure runs
         one way, which it does under a constant pressure.
@@ -168,7 +168,7 @@ class History(Schema):
         return ca.vertcat(*end)
 
     def effective(self, state: ca.SX, channel: int = 0) -> ca.SX:
-        """Pressure u that in equilibrium gives the shape of a state (m,) of a channel, from 0."""
+        """Pressure u at which an arm in equilibrium has the shape of this state (m,)."""
         x = u = state[0]
         for index, part in enumerate(self.parts, start=1):
             u = u + self.memory_of(channel) * part.share * (state[index] - x)
@@ -212,16 +212,16 @@ def _convolution(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 class Memory:
-    """The histories of all channels of an arm, run as time goes by.
+    """State of the histories of all channels of an arm, advanced in time.
 
-    ``copy.copy`` of one goes its own way.
+    A ``copy.copy`` of it is independent of it.
 
     Parameters
     ----------
     histories : sequence
         One per channel; None for a channel whose shape follows at once.
     places : sequence of int, optional
-        Which channel of its segment each one is, from 0; matters where memories differ.
+        Index of each channel within its segment, from 0; matters where memories differ.
 
     Attributes
     ----------
@@ -245,12 +245,12 @@ class Memory:
         self.start(np.zeros(len(self._histories)))
 
     def start(self, pressures: ArrayLike) -> None:
-        """Begin anew with an arm that was brought from no pressure to these (n,), in Pa."""
+        """Set the state of an arm that was brought from no pressure to these (n,), in Pa."""
         p = self._checked(pressures)
         self._begin([h.from_rest(v) for h, v in zip(self._histories, p.tolist(), strict=True)], p)
 
     def settle(self, pressures: ArrayLike, side: float = 0.0) -> None:
-        """Begin anew with an arm long at these pressures (n,); `side` as in `History.settled`."""
+        """Set the state of an arm long at these pressures (n,); `side` as in `History.settled`."""
         p = self._checked(pressures)
         self._begin(
             [h.settled(v, side) for h, v in zip(self._histories, p.tolist(), strict=True)], p

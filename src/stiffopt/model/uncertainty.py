@@ -1,16 +1,15 @@
-"""How well the tip of a calibrated arm is known, and its stiffness.
+"""Uncertainty of the tip's position and stiffness of a calibrated arm.
 
-Three things leave the tip uncertain, and are independent of each other: the parameters, whose
-covariance the calibration found; the hysteresis, because the same pressures hold the arm anywhere
-between where loading and unloading take it; and what no parameter explained in the recordings.
-The first two are carried to the tip by their Jacobians, to first order.
+There are three independent sources: the parameters, whose covariance the calibration found; the
+hysteresis, since the same pressures hold the arm anywhere between where loading and unloading take
+it; and the residual that no parameter explained in the recordings.  The first two are propagated to
+the tip by their Jacobians, to first order.
 
-Hysteresis is what it can be long after the pressures were reached, when lag and creep are over.  A
-play operator was never dragged beyond what the robot's pressure limits allow, so that far less of
-it is possible near the limits than between them: an arm that came to rest is where loading from
-rest would leave it, or pressed further.  Each channel's effective pressure is taken to lie anywhere
-between the two ends, evenly, and its mean square is taken about the equilibrium, which `tip_pose`
-returns and which is not in the middle near the limits.
+Hysteresis is taken long after the pressures were reached, when lag and creep are over.  No play
+operator was ever dragged beyond the robot's pressure limits, so that less hysteresis is possible
+near the limits than between them.  Each channel's effective pressure is taken to be distributed
+evenly between the least and the largest possible value.  Its mean square is taken about the
+equilibrium, which is what `tip_pose` returns; near the limits that is not the middle.
 """
 
 from __future__ import annotations

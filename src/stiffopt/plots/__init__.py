@@ -1,8 +1,10 @@
-"""Pictures of answers. They need matplotlib, which the extra ``plot`` brings.
+"""Figures: of solutions, maps, experiments, calibrations and runs.
 
-matplotlib is imported when something is drawn, not before.
+They need matplotlib, which the extra ``plot`` brings; it is imported when something is drawn, not
+before. Without it every function that draws raises `MissingExtraError`.
 """
 
-from stiffopt.plots.figures import plot_pareto, plot_solution, require_matplotlib, save_figure
+from stiffopt.plots.solution import plot_pareto, plot_solution
+from stiffopt.plots.style import require_matplotlib, save_figure
 
 __all__ = ["plot_pareto", "plot_solution", "require_matplotlib", "save_figure"]

@@ -1,4 +1,4 @@
-"""The arm in space: tube, base plate, target, stiffness ellipsoid, task direction, loads."""
+"""The arm in 3-D: tube, base plate, target, stiffness ellipsoid, directions of the task, loads."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -82,22 +82,26 @@ class _Scene:
             tube = (mine[:, :3, 3, None] + mine[:, :3, :3] @ ring) * MM  # (k, 3, spokes)
             x, y, z = tube.transpose(1, 0, 2)
             self.axes.plot_surface(
-                x, y, z, color=style.colour(number), alpha=0.38, linewidth=0, rstride=1,
+                x, y, z, color=style.segment_colour(number), alpha=0.38, linewidth=0, rstride=1,
                 cstride=1, shade=True, zorder=2,
             )  # fmt: skip
             for end in (tube[0], tube[-1]):
-                self.axes.plot(*end, color=style.edge(number), linewidth=1.0, zorder=3)
+                self.axes.plot(
+                    *end, color=style.segment_text_colour(number), linewidth=1.0, zorder=3
+                )
             line = mine[:, :3, 3].T * MM
-            self.axes.plot(*line, color=style.edge(number), linewidth=2.2, zorder=4)
+            self.axes.plot(*line, color=style.segment_text_colour(number), linewidth=2.2, zorder=4)
             self.corners.append(tube.transpose(0, 2, 1).reshape(-1, 3))
-            self._patch(style.colour(number), f"segment {number + 1}")
+            self._patch(style.segment_colour(number), f"segment {number + 1}")
 
     # -- stiffness --------------------------------------------------------------------------
 
     def draw_ellipsoid(self) -> None:
-        """Forces f with f'C_vv f = 1, in base axes: the square of a radius is the stiffness there.
+        """The ellipsoid of forces f with f'C_vv f = 1, in base axes.
 
-        Its axes are those of K = C_vv^-1; the square root keeps the thin ones visible.
+        The square of a radius is the free stiffness in that direction.
+
+        Its axes are the eigenvectors of C_vv^-1; the square root keeps the thin ones visible.
         """
         compliance = np.asarray(self.solution.compliance)[:3, :3]
         stiffness = self.rotation @ np.linalg.inv((compliance + compliance.T) / 2) @ self.rotation.T
@@ -120,7 +124,7 @@ class _Scene:
         )
 
     def draw_directions(self) -> None:
-        """An arrow along each direction in which stiffness is asked for."""
+        """An arrow along each direction whose stiffness the task names."""
         pairs = zip(self.solution.task.measures, self.solution.stiffnesses, strict=False)
         for number, (measure, value) in enumerate(pairs):
             if not isinstance(measure, StiffnessMeasure):
@@ -135,10 +139,10 @@ class _Scene:
                 f"{measure.frame} axes, {measure.boundary}",
             )
 
-    # -- what is asked and what pulls -------------------------------------------------------
+    # -- target and loads -------------------------------------------------------------------
 
     def draw_target(self) -> None:
-        """Target point, or what is left of it where axes are free; pointing or orientation."""
+        """Target position, a line along each axis that is free; target pointing or orientation."""
         target = self.solution.task.target
         point = self.tip.copy()
         if target.position is not None:
@@ -149,7 +153,7 @@ class _Scene:
         length = 0.2 * self.size
         if target.pointing is not None:
             self._arrow(point, length * np.array(target.pointing), style.TARGET, 8, "--")
-            self._line(style.TARGET, "pointing asked for", "--")
+            self._line(style.TARGET, "target pointing", "--")
         if target.orientation is not None:
             self._draw_triad(point, target.orientation, length)
 
@@ -177,7 +181,7 @@ class _Scene:
         for k, shade in enumerate(("#d62728", "#2ca02c", "#1f4fd6")):
             self._arrow(point, 0.8 * length * wanted[:, k], shade, 8, "--")
             self._arrow(self.tip, 0.5 * length * self.rotation[:, k], shade, 8)
-        self._line("#555555", "orientation asked for\n(x red, y green, z blue)", "--")
+        self._line("#555555", "target orientation\n(x red, y green, z blue)", "--")
         self._line("#555555", "orientation of the tip")
 
     def draw_loads(self) -> None:
@@ -229,16 +233,10 @@ class _Scene:
 
         self.handles.append(
             Line2D(
-                [],
-                [],
-                color=style.TARGET,
-                marker="X",
-                markersize=9,
-                markeredgecolor="white",
-                linestyle="none",
-                label=label,
+                [], [], color=style.TARGET, marker="X", markersize=9, markeredgecolor="white",
+                linestyle="none", label=label,
             )
-        )
+        )  # fmt: skip
 
     def finish(self) -> None:
         """One scale for all axes, a view across the arm's bend, labels and legend."""

@@ -1,4 +1,6 @@
-"""Stiffness along an arm (the paper's figure 6), and of its tip over two pressures."""
+"""Figures of maps: stiffness along an arm (the paper's figure 6), and of the tip over pressures."""
+
+from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
@@ -7,10 +9,16 @@ from numpy.typing import NDArray
 
 from stiffopt.directions import direction_name
 from stiffopt.experiments.arm_map import ArmMap, TipMap
-from stiffopt.plots.experiments import N_PER_CM
-from stiffopt.plots.figures import _literal, require_matplotlib
-from stiffopt.plots.scales import label_logarithmic, make_logarithmic, round_steps
-from stiffopt.plots.wording import BAR, MM
+from stiffopt.plots.style import (
+    ARM,
+    draw_head,
+    label_logarithmic,
+    make_logarithmic,
+    new_figure,
+    round_steps,
+    tidy,
+)
+from stiffopt.plots.wording import BAR, MM, N_PER_CM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,21 +26,13 @@ if TYPE_CHECKING:
 _COLOURS = "viridis"
 
 
-def plot_arm_map(found: ArmMap) -> "Figure":
+def plot_arm_map(found: ArmMap) -> Figure:
     """Draw stiffness along the arm, a row for each group of channels, a panel per direction.
 
     The first panel of a row shows the arm at the same pressures, from the side.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
     rows, columns = len(found.groups), len(found.directions)
-    figure = Figure(figsize=(3.6 + 4.0 * columns, 1.4 + 3.5 * rows))
+    figure = new_figure(3.6 + 4.0 * columns, 1.4 + 3.5 * rows)
     width, height = figure.get_figwidth(), figure.get_figheight()
     grid = figure.add_gridspec(
         rows, columns + 2, width_ratios=(0.8, *(1.0,) * columns, 0.04), left=0.75 / width,
@@ -48,17 +48,13 @@ def plot_arm_map(found: ArmMap) -> "Figure":
             axes = figure.add_subplot(grid[row, column + 1])
             _draw_along(axes, found, row, column, colours)
     _pressure_bar(figure, figure.add_subplot(grid[:, -1]), found.pressures)
-    _head(
+    of = "base" if found.frame == "base" else f"{found.frame} of each point"
+    draw_head(
         figure,
         f"{found.robot}: stiffness along the arm",
-        f"boundary {found.boundary}, axes of the {found.frame}{_point(found)}      "
-        "dotted: the middle of the arm",
+        f"boundary {found.boundary}, axes of the {of}      dotted: the middle of the arm",
     )
     return figure
-
-
-def _point(found: ArmMap) -> str:
-    return "" if found.frame == "base" else " of each point"
 
 
 def _draw_shapes(axes: Any, found: ArmMap, row: int, colours: list[Any]) -> None:
@@ -66,7 +62,7 @@ def _draw_shapes(axes: Any, found: ArmMap, row: int, colours: list[Any]) -> None
     flat = _bending_plane(shapes)
     for shape, colour in zip(shapes, colours, strict=True):
         axes.plot(shape[:, :2] @ flat, shape[:, 2], color=colour, linewidth=2.2)
-    axes.plot([-0.1 * found.length * MM, 0.1 * found.length * MM], [0, 0], color="#39424b", lw=3)
+    axes.plot([-0.1 * found.length * MM, 0.1 * found.length * MM], [0, 0], color=ARM, lw=3)
     across = "x" if abs(flat[0]) > 0.999 else "in the plane of bending"
     sign = "-" if flat[0] < -0.999 else ""
     axes.set_xlabel(f"{sign}{across} (mm)", fontsize=9)
@@ -74,7 +70,7 @@ def _draw_shapes(axes: Any, found: ArmMap, row: int, colours: list[Any]) -> None
     axes.set_aspect("equal", adjustable="datalim")
     if found.hangs:
         axes.invert_yaxis()
-    _plain(axes)
+    tidy(axes)
 
 
 def _bending_plane(shapes: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -91,7 +87,7 @@ def _draw_along(axes: Any, found: ArmMap, row: int, column: int, colours: list[A
     for level, colour in enumerate(colours):
         values = found.stiffness[row, level, :, column] * N_PER_CM
         axes.plot(found.at * MM, values, color=colour, linewidth=1.7)
-    axes.axvline(found.length / 2 * MM, color="#39424b", linewidth=0.9, linestyle=":")
+    axes.axvline(found.length / 2 * MM, color=ARM, linewidth=0.9, linestyle=":")
     name = direction_name(tuple(found.directions[column]))
     axes.set_title(f"along {name}", loc="left", fontsize=10.5)
     make_logarithmic(axes)
@@ -99,22 +95,13 @@ def _draw_along(axes: Any, found: ArmMap, row: int, column: int, colours: list[A
     axes.set_ylabel("stiffness (N/cm)", fontsize=9)
     axes.set_xlim(found.at[0] * MM, found.at[-1] * MM)
     axes.grid(alpha=0.25, which="both")
-    _plain(axes)
+    tidy(axes)
 
 
-def plot_tip_map(found: TipMap) -> "Figure":
-    """Draw the tip's stiffness over two pressures, a heat map for each direction.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
-    """
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
+def plot_tip_map(found: TipMap) -> Figure:
+    """Draw the tip's stiffness over two pressures, a heat map for each direction."""
     columns = len(found.directions)
-    figure = Figure(figsize=(1.3 + 4.6 * columns, 5.4))
+    figure = new_figure(1.3 + 4.6 * columns, 5.4)
     width, height = figure.get_figwidth(), figure.get_figheight()
     grid = figure.add_gridspec(
         1, columns, left=0.75 / width, right=1 - 0.7 / width, top=1 - 1.25 / height,
@@ -129,7 +116,7 @@ def plot_tip_map(found: TipMap) -> "Figure":
         if k + 1 not in found.channels
     ]
     others = f"      {', '.join(rest)}" if 0 < len(rest) <= 8 else ""
-    _head(
+    draw_head(
         figure,
         f"{found.robot}: stiffness of the tip over channels {a} and {b}",
         f"boundary {found.boundary}, axes of the {found.frame}{others}",
@@ -137,7 +124,7 @@ def plot_tip_map(found: TipMap) -> "Figure":
     return figure
 
 
-def _draw_heat(figure: "Figure", axes: Any, found: TipMap, column: int) -> None:
+def _draw_heat(figure: Figure, axes: Any, found: TipMap, column: int) -> None:
     from matplotlib.colors import LogNorm
 
     values = found.stiffness[:, :, column] * N_PER_CM
@@ -178,7 +165,7 @@ def _colours(count: int) -> list[Any]:
     return [colormaps[_COLOURS](k) for k in np.linspace(0, 0.92, count)]
 
 
-def _pressure_bar(figure: "Figure", axes: Any, pressures: NDArray[np.float64]) -> None:
+def _pressure_bar(figure: Figure, axes: Any, pressures: NDArray[np.float64]) -> None:
     """Show which colour is which pressure."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap
@@ -194,14 +181,3 @@ def _pressure_bar(figure: "Figure", axes: Any, pressures: NDArray[np.float64]) -
 def _named(group: tuple[int, ...]) -> str:
     numbers = ", ".join(map(str, group))
     return f"channel {numbers}" if len(group) == 1 else f"channels {numbers}"
-
-
-def _plain(axes: Any) -> None:
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.tick_params(labelsize=8.5)
-
-
-def _head(figure: "Figure", title: str, facts: str) -> None:
-    height = figure.get_figheight()
-    figure.text(0.025, 1 - 0.34 / height, _literal(title), fontsize=15, weight="bold", va="center")
-    figure.text(0.025, 1 - 0.68 / height, facts, fontsize=10, va="center")

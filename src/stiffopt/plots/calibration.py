@@ -2,22 +2,34 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.directions import direction_name
-from stiffopt.identify.choice import Candidate
-from stiffopt.identify.comparison import Comparison
-from stiffopt.identify.stiffness_comparison import StiffnessComparison
+from stiffopt.identify.results import Comparison
+from stiffopt.identify.structures import Candidate
+from stiffopt.identify.validation import StiffnessComparison
 from stiffopt.model.description import RobotDescription
-from stiffopt.plots.experiments import CHANNELS, MEASURED, MODEL, _head, _plain
-from stiffopt.plots.figures import _literal, require_matplotlib
-from stiffopt.plots.scales import label_logarithmic, make_logarithmic
-from stiffopt.plots.style import RANGE
+from stiffopt.plots.style import (
+    BEFORE,
+    MEASURED,
+    MODEL,
+    RANGE,
+    channel_colour,
+    draw_head,
+    label_logarithmic,
+    legend_beside,
+    legend_on_top,
+    literal,
+    make_logarithmic,
+    stacked_panels,
+    thinned,
+    tidy,
+)
 from stiffopt.plots.wording import BAR, MM, vector_text
 
 if TYPE_CHECKING:
@@ -38,18 +50,18 @@ _MOST = 8  # logs in a figure; of more, those with the largest errors
 _MOST_PATHS = 4  # where each takes much room
 _DRAWN = 3000  # points of a line
 _SCATTERED = 1200  # points of a log in a cloud
-_BEFORE = "#9aa3ab"
 _OUTSIDE = "#f2a541"
-_WIDE = 11.0  # inches
-_HEAD = 1.08
+_HEAD = 1.08  # inches
+_FOOT = 0.58
+_GAP = 0.45
 _ROW = 1.35
-_FEW = 30  # different pressures
-_ASIDE = 0.015  # of their range
-_GAP = 5.0  # median steps of time that are a pause in a recording, if they are ...
-_PAUSE = 1.0  # s
-_FLAT = 0.25  # an axis shows at least this share of what the widest of x, y and z does
-_LINE = 0.2  # inches, of a legend
+_LINE = 0.2  # of a legend
 _LEGEND = 75  # characters beside each other in a legend
+_FEW = 30  # different pressures
+_ASIDE = 0.015  # of their range: by how much logs of a few pressures stand side by side
+_PAUSE_STEPS = 5.0  # median steps of time that are a pause in a recording, if they are also ...
+_PAUSE = 1.0  # ... so many seconds
+_FLAT = 0.25  # an axis shows at least this share of what the widest of x, y and z does
 
 
 # -- over time ------------------------------------------------------------------------------------
@@ -64,22 +76,17 @@ def plot_errors_over_time(
     ----------
     found : sequence of Comparison
     before : sequence of Comparison
-        The same logs beside the robot as it was; may be empty.
+        The same logs, compared with the robot file as it was before; may be empty.
     title : str
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
     """
     shown = _worst(found)
-    figure, panels, height = _stacked(len(shown), 1, _ROW if len(shown) > 2 else 2 * _ROW)
+    figure, panels = _rows(len(shown), _ROW if len(shown) > 2 else 2 * _ROW)
     logarithmic = bool(before)
     for axes, i in zip(panels[:, 0], shown, strict=True):
         each = found[i]
         _shade_outside(axes, each)
         if before:
-            _line(axes, each.time, before[i].distance * MM, _BEFORE, 0.9, "robot file before")
+            _line(axes, each.time, before[i].distance * MM, BEFORE, 0.9, "robot file before")
         _line(axes, each.time, each.distance * MM, MEASURED, 1.0, "this robot file")
         _panel_title(axes, each)
         axes.set_xlim(each.time[0], each.time[-1])
@@ -91,25 +98,19 @@ def plot_errors_over_time(
             axes.set_ylim(bottom=0)
         axes.set_ylabel("error (mm)")
     panels[-1, 0].set_xlabel("time (s)")
-    _key(figure, panels[0, 0], height, found)
-    _head(figure, title, _facts("distance of the predicted from the measured tip", found, shown))
+    _key(figure, panels[0, 0], found)
+    draw_head(figure, title, _note("distance of the predicted from the measured tip", found, shown))
     return figure
 
 
 def plot_tip_over_time(
     found: Sequence[Comparison], *, title: str = "tip", frame: str = "the tracker's frame"
 ) -> Figure:
-    """Draw the measured and the predicted tip over time: x, y and z of each log.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
-    """
+    """Draw the measured and the predicted tip over time: x, y and z of each log."""
     shown = _worst(found)
     alone = len(shown) == 1
     rows, columns = (3, 1) if alone else (len(shown), 3)
-    figure, panels, height = _stacked(rows, columns, 1.7)
+    figure, panels = _rows(rows, 1.7, columns=columns)
     for row, i in enumerate(shown):
         each = found[i]
         both = np.concatenate([each.measured, each.predicted]) * MM
@@ -126,23 +127,17 @@ def plot_tip_over_time(
             _room(axes, both[:, axis], _FLAT * widest)
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
-    _key(figure, panels[0, 0], height, found)
-    _head(figure, title, _facts(f"position in {frame}", found, shown))
+    _key(figure, panels[0, 0], found)
+    draw_head(figure, title, _note(f"position in {frame}", found, shown))
     return figure
 
 
 def plot_paths(
     found: Sequence[Comparison], *, title: str = "paths", frame: str = "the tracker's frame"
 ) -> Figure:
-    """Draw the measured and the predicted path of the tip in three views, a row for each log.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
-    """
+    """Draw the measured and the predicted path of the tip in three views, a row for each log."""
     shown = _worst(found, _MOST_PATHS)
-    figure, panels, height = _stacked(len(shown), 3, 3.3 if len(shown) == 1 else 2.6)
+    figure, panels = _rows(len(shown), 3.3 if len(shown) == 1 else 2.6, columns=3)
     for row, i in enumerate(shown):
         each = found[i]
         rows = _evenly(len(each.time), _DRAWN)
@@ -162,8 +157,8 @@ def plot_paths(
             axes.set_aspect("equal", adjustable="datalim")
             axes.grid(alpha=0.2)
         _panel_title(panels[row, 0], each)
-    _key(figure, panels[0, 0], height, ())
-    _head(figure, title, _facts(f"path in {frame}", found, shown))
+    _key(figure, panels[0, 0], ())
+    draw_head(figure, title, _note(f"path in {frame}", found, shown))
     return figure
 
 
@@ -176,67 +171,98 @@ def plot_errors_over_pressure(
     """Draw the error of the tip over the pressure of each channel, a row for each segment.
 
     Last in a row is the norm of the segment's pressures; what the calibration has seen is shaded.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
     """
-    counts = [segment.n_channels for segment in robot.segments]
-    columns = max(counts) + 1
+    columns = max(segment.n_channels for segment in robot.segments) + 1
     shown = [found[i] for i in _worst(found)]
+    labels = [literal(each.name) for each in shown]
     known = robot.calibration is not None and len(robot.calibration.pressure_max) > 0
-    labels = [_literal(each.name) for each in shown] + ["what the calibration has seen"] * known
-    beside = max(1, min(len(labels), _LEGEND // (max(map(len, labels)) + 4)))
-    head = max(_HEAD, 0.35 + _LINE * -(-len(labels) // beside))
-    figure, panels, height = _stacked(len(counts), columns, 2.5, shared=True, head=head)
-    ends = np.cumsum([0, *counts])
-    beside_each_other = False
-    for s, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
-        for k in range(columns):
-            axes = panels[s, k]
-            if k < end - begin:
-                channel = begin + k
-                pressures = [each.pressures[:, channel] for each in shown]
-                label = f"{robot.channel_name(channel)} (bar)"
-            elif k == columns - 1:
-                channel = -1
-                pressures = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in shown]
-                label = f"norm of segment {s + 1} (bar)"
-            else:
-                axes.set_visible(False)
-                continue
-            aside = _side_by_side(pressures)
-            beside_each_other |= bool(aside.any())
-            _shade_seen(axes, robot, s, channel, margin=float(aside.max(initial=0.0)))
-            for number, (each, p) in enumerate(zip(shown, pressures, strict=True)):
-                rows = _evenly(len(p), _SCATTERED)
-                axes.plot(
-                    (p[rows] + aside[number]) * BAR, each.distance[rows] * MM, ".",
-                    markersize=3.0, alpha=0.5, markeredgewidth=0, label=each.name,
-                    color=CHANNELS[number % len(CHANNELS)],
-                )  # fmt: skip
-            axes.set_xlabel(label)
-            if k == 0:
-                axes.set_ylabel("error (mm)")
-            _plain(axes)
-    highest = max((float(np.nanmax(each.distance, initial=0.0)) for each in shown), default=1.0)
+    if known:
+        labels.append("what the calibration has seen")
+    in_a_line = max(1, min(len(labels), _LEGEND // (max(map(len, labels)) + 4)))
+    head = max(_HEAD, 0.35 + _LINE * -(-len(labels) // in_a_line))
+    figure, panels = _rows(
+        robot.n_segments, 2.5, columns=columns, head=head, between=0.08, sharey=True
+    )
     for axes in panels.flat:
-        axes.set_ylim(0, 1.05 * highest * MM)
-    handles, _ = panels[0, 0].get_legend_handles_labels()
+        axes.set_visible(False)
+    stands_aside = False
+    for each in _panels_of_pressure(robot, shown):
+        axes = panels[each.segment, each.column]
+        axes.set_visible(True)
+        aside = _side_by_side(each.pressures)
+        stands_aside |= bool(aside.any())
+        if each.seen is not None:
+            margin = float(aside.max(initial=0.0))
+            low, high = each.seen
+            axes.axvspan((low - margin) * BAR, (high + margin) * BAR, color=RANGE, zorder=0)
+        for number, (log, p) in enumerate(zip(shown, each.pressures, strict=True)):
+            rows = _evenly(len(p), _SCATTERED)
+            axes.plot(
+                (p[rows] + aside[number]) * BAR, log.distance[rows] * MM, ".", markersize=3.0,
+                alpha=0.5, markeredgewidth=0, color=channel_colour(number),
+            )  # fmt: skip
+        axes.set_xlabel(each.label)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("error (mm)")
+    highest = max((float(np.nanmax(each.distance, initial=0.0)) for each in shown), default=1.0)
+    panels[0, 0].set_ylim(0, 1.05 * highest * MM)
+    handles = list(panels[0, 0].lines)
     if known:
         from matplotlib.patches import Patch
 
         handles.append(Patch(color=RANGE))
-    figure.legend(
-        handles, labels, loc="upper right", bbox_to_anchor=(0.985, 1 - 0.1 / height), ncols=beside,
-        fontsize=8.5, frameon=False, markerscale=4, columnspacing=1.2, handletextpad=0.4,
+    legend_on_top(
+        figure, handles, labels, ncols=in_a_line, fontsize=8.5, markerscale=4, columnspacing=1.2,
+        handletextpad=0.4,
     )  # fmt: skip
     what = "error of the tip over pressure"
-    if beside_each_other:
+    if stands_aside:
         what += " (the logs, of a few pressures each, stand side by side)"
-    _head(figure, title, _facts(what, found, _worst(found)))
+    draw_head(figure, title, _note(what, found, _worst(found)))
     return figure
+
+
+@dataclass(frozen=True)
+class _PressurePanel:
+    """What one panel of errors over pressure shows, in Pa.
+
+    Attributes
+    ----------
+    segment, column : where it stands.
+    label : of its horizontal axis.
+    pressures : of each log, (N,).
+    seen : least and greatest that the calibration has seen; None where it is not known.
+    """
+
+    segment: int
+    column: int
+    label: str
+    pressures: list[Array]
+    seen: tuple[float, float] | None
+
+
+def _panels_of_pressure(
+    robot: RobotDescription, logs: Sequence[Comparison]
+) -> Iterator[_PressurePanel]:
+    """A panel for each channel of a segment, and one for the norm of the segment's pressures."""
+    calibration = robot.calibration
+    if calibration is not None and not calibration.pressure_max:
+        calibration = None
+    last = max(segment.n_channels for segment in robot.segments)
+    begin = 0
+    for s, segment in enumerate(robot.segments):
+        end = begin + segment.n_channels
+        for channel in range(begin, end):
+            seen = None
+            if calibration is not None:
+                seen = calibration.pressure_min[channel], calibration.pressure_max[channel]
+            pressures = [each.pressures[:, channel] for each in logs]
+            label = f"{robot.channel_name(channel)} (bar)"
+            yield _PressurePanel(s, channel - begin, label, pressures, seen)
+        norms = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in logs]
+        seen = None if calibration is None else (0.0, calibration.pressure_norm[s])
+        yield _PressurePanel(s, last, f"norm of segment {s + 1} (bar)", norms, seen)
+        begin = end
 
 
 def _side_by_side(pressures: Sequence[Array]) -> Array:
@@ -248,37 +274,15 @@ def _side_by_side(pressures: Sequence[Array]) -> Array:
     return places * _ASIDE * float(np.ptp(every))
 
 
-def _shade_seen(
-    axes: Any, robot: RobotDescription, segment: int, channel: int, margin: float
-) -> None:
-    """Shade what was recorded of a channel, or (-1) of the norm of a segment."""
-    calibration = robot.calibration
-    if calibration is None or not calibration.pressure_max:
-        return
-    if channel < 0:
-        low, high = 0.0, calibration.pressure_norm[segment]
-    else:
-        low, high = calibration.pressure_min[channel], calibration.pressure_max[channel]
-    axes.axvspan((low - margin) * BAR, (high + margin) * BAR, color=RANGE, zorder=0)
-
-
 # -- models and stiffness -------------------------------------------------------------------------
 
 
 def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "models") -> Figure:
-    """Draw the error of each model in what was held back.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
-    """
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
-    height = 1.75 + 0.5 * len(candidates)
-    figure = Figure(figsize=(_WIDE, height))
-    axes = figure.add_axes((0.16, 0.62 / height, 0.58, 1 - 1.75 / height))
+    """Draw the error of each model in what was held back."""
+    figure, panels = stacked_panels(
+        [0.5 * len(candidates)], left=1.76, right=2.86, head=1.13, foot=0.62
+    )
+    axes = panels[0, 0]
     folds = list(candidates[0].folds)
     for row, each in enumerate(candidates):
         is_chosen = each.structure.name == chosen
@@ -289,8 +293,8 @@ def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "m
         for number, fold in enumerate(folds):
             axes.plot(
                 each.folds[fold].mean * MM, row, "o", markersize=5,
-                color=CHANNELS[number % len(CHANNELS)], markeredgewidth=0,
-                label=_literal(fold) if row == 0 else None,
+                color=channel_colour(number), markeredgewidth=0,
+                label=literal(fold) if row == 0 else None,
             )  # fmt: skip
     axes.set_yticks(range(len(candidates)), [each.structure.name for each in candidates])
     for tick, each in zip(axes.get_yticklabels(), candidates, strict=True):
@@ -298,29 +302,16 @@ def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "m
     axes.invert_yaxis()
     axes.set_xlim(left=0)
     axes.set_xlabel("mean error of the tip (mm)")
-    axes.legend(
-        loc="upper left", bbox_to_anchor=(1.01, 1.05), fontsize=9, frameon=False, title="held back",
-        alignment="left",
-    )  # fmt: skip
-    _plain(axes)
-    _head(figure, title, f"bars: mean over what was held back      chosen: {chosen}")
+    legend_beside(axes, title="held back", alignment="left")
+    tidy(axes)
+    draw_head(figure, title, f"bars: mean over what was held back      chosen: {chosen}")
     return figure
 
 
 def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiffness") -> Figure:
-    """Draw measured stiffnesses with their 95 % intervals, and what the robot says of them.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
-    """
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
-    height = 1.75 + 0.27 * len(rows)
-    figure = Figure(figsize=(_WIDE, height))
-    axes = figure.add_axes((0.24, 0.62 / height, 0.56, 1 - 1.75 / height))
+    """Draw measured stiffnesses with their 95 % intervals, and what the robot says of them."""
+    figure, panels = stacked_panels([0.27 * len(rows)], left=2.64, right=2.2, head=1.13, foot=0.62)
+    axes = panels[0, 0]
     places = np.arange(len(rows))
     measured = np.array([row.measured for row in rows])
     axes.errorbar(
@@ -329,7 +320,7 @@ def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiff
     )  # fmt: skip
     shown = [measured]
     for values, colour, mark, label in (
-        ([row.before for row in rows], _BEFORE, "D", "robot file before"),
+        ([row.before for row in rows], BEFORE, "D", "robot file before"),
         ([row.after for row in rows], MODEL, "o", "this robot file"),
     ):
         x = np.array([np.nan if value is None else value for value in values])
@@ -349,9 +340,9 @@ def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiff
     else:
         axes.set_xlim(left=0)
     axes.grid(axis="x", alpha=0.25, which="both")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.02), fontsize=9, frameon=False)
-    _plain(axes)
-    _head(figure, title, "measured, and at the same pressures predicted")
+    legend_beside(axes)
+    tidy(axes)
+    draw_head(figure, title, "measured, and predicted at the same pressures")
     return figure
 
 
@@ -364,26 +355,11 @@ def _label(row: StiffnessComparison) -> str:
 # -- parts ----------------------------------------------------------------------------------------
 
 
-def _stacked(
-    rows: int, columns: int, row: float, *, shared: bool = False, head: float = _HEAD
-) -> tuple[Figure, Any, float]:
-    """Figure with rows of panels below a head, the panels (rows, columns), and its height."""
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
-    height = head + 0.45 + rows * (row + 0.42)
-    figure = Figure(figsize=(_WIDE, height))
-    panels = figure.subplots(
-        rows, columns, squeeze=False, sharey=shared,
-        gridspec_kw={
-            "left": 0.07, "right": 0.985, "top": 1 - head / height, "bottom": 0.58 / height,
-            "hspace": 0.45 / row * (1.0 if columns == 1 or shared else 1.25),
-            "wspace": 0.08 if shared else 0.24,
-        },
-    )  # fmt: skip
-    for axes in panels.flat:
-        _plain(axes)
-    return figure, panels, height
+def _rows(rows: int, height: float, *, columns: int = 1, **settings: Any) -> tuple[Figure, Any]:
+    """Figure with rows of panels of a height in inches, and the panels (rows, columns)."""
+    gap = _GAP * (1.25 if columns > 1 and "sharey" not in settings else 1.0)
+    settings = {"head": _HEAD, "foot": _FOOT, "gap": gap, **settings}
+    return stacked_panels([height] * rows, columns=columns, **settings)
 
 
 def _worst(found: Sequence[Comparison], most: int = _MOST) -> list[int]:
@@ -394,7 +370,7 @@ def _worst(found: Sequence[Comparison], most: int = _MOST) -> list[int]:
     return sorted(np.argsort(errors)[::-1][:most].tolist())
 
 
-def _facts(what: str, found: Sequence[Comparison], shown: Sequence[int]) -> str:
+def _note(what: str, found: Sequence[Comparison], shown: Sequence[int]) -> str:
     if len(shown) == len(found):
         return what
     return f"{what}      of {len(found)} logs the {len(shown)} with the largest errors"
@@ -405,13 +381,13 @@ def _panel_title(axes: Any, found: Comparison) -> None:
     text = f"{found.name}"
     if errors.n:
         text += f"   mean {errors.mean * MM:.2f} mm, 95 % below {errors.p95 * MM:.2f} mm"
-    axes.set_title(_literal(text), loc="left", fontsize=9.5, pad=3)
+    axes.set_title(literal(text), loc="left", fontsize=9.5, pad=3)
 
 
 def _line(axes: Any, time: Array, values: Array, colour: str, width: float, label: str) -> None:
     """Draw a line that breaks at pauses, and whose peaks stay however long it is."""
-    rows = _peaks(values, _DRAWN)
-    line = _path(time[rows], np.stack([time[rows], values[rows]], axis=1))
+    time, values = thinned(time, values, _DRAWN)
+    line = _path(time, np.stack([time, values], axis=1))
     axes.plot(line[:, 0], line[:, 1], color=colour, linewidth=width, label=label)
 
 
@@ -422,23 +398,8 @@ def _path(time: Array, values: Array) -> Array:
     if len(t) < 3:
         return points
     steps = np.diff(t)
-    pauses = np.flatnonzero(steps > max(_GAP * float(np.median(steps)), _PAUSE)) + 1
+    pauses = np.flatnonzero(steps > max(_PAUSE_STEPS * float(np.median(steps)), _PAUSE)) + 1
     return np.asarray(np.insert(points, pauses, np.nan, axis=0))
-
-
-def _peaks(values: Array, most: int) -> NDArray[np.intp]:
-    """Rows with the least and the greatest value of each of many stretches."""
-    count = len(values)
-    if count <= most:
-        return np.arange(count)
-    edges = np.linspace(0, count, most // 2 + 1).astype(int)
-    kept = []
-    for begin, end in itertools.pairwise(edges):
-        part = values[begin:end]
-        known = np.flatnonzero(np.isfinite(part))
-        if len(known):
-            kept += [begin + known[part[known].argmin()], begin + known[part[known].argmax()]]
-    return np.unique(np.array(kept, dtype=np.intp))
 
 
 def _evenly(count: int, most: int) -> NDArray[np.intp]:
@@ -471,7 +432,7 @@ def _room(axes: Any, values: Array, least: float) -> None:
         axes.set_ylim(middle - half, middle + half)
 
 
-def _key(figure: Figure, axes: Any, height: float, found: Sequence[Comparison]) -> None:
+def _key(figure: Figure, axes: Any, found: Sequence[Comparison]) -> None:
     """Legend of the lines, and of the shade where there is some, at the top."""
     handles, labels = axes.get_legend_handles_labels()
     if any(not each.inside.all() for each in found):
@@ -479,7 +440,4 @@ def _key(figure: Figure, axes: Any, height: float, found: Sequence[Comparison]) 
 
         handles.append(Patch(color=_OUTSIDE, alpha=0.3))
         labels.append("outside what the calibration has seen")
-    figure.legend(
-        handles, labels, loc="upper right", bbox_to_anchor=(0.985, 1 - 0.16 / height),
-        ncols=len(labels), fontsize=9, frameon=False, handlelength=1.6, columnspacing=1.4,
-    )  # fmt: skip
+    legend_on_top(figure, handles, labels, columnspacing=1.4)

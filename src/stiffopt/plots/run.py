@@ -1,4 +1,4 @@
-"""The page that a lab wants after a run: tip, error, pressures, stiffness, and what happened."""
+"""Figure of a closed-loop run: tip, error, pressures, stiffness, states, alarms and events."""
 
 from __future__ import annotations
 
@@ -9,13 +9,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.daemon.run_log import RecordedRun, RunEvent
+from stiffopt.daemon.run_log import RecordedRun, RunEvent, RunSpan
 from stiffopt.errors import printable
-from stiffopt.plots.experiments import AXES, CHANNELS, _head, _legend, _plain
-from stiffopt.plots.figures import _literal, require_matplotlib
-from stiffopt.plots.run_timeline import SHADES, draw_timeline, timeline_rows
-from stiffopt.plots.scales import make_logarithmic
-from stiffopt.plots.style import TARGET
+from stiffopt.plots.style import (
+    AXES,
+    DARK,
+    ELLIPSOID,
+    GREY,
+    TARGET,
+    channel_colour,
+    draw_head,
+    legend_beside,
+    literal,
+    make_logarithmic,
+    stacked_panels,
+    thinned,
+    tidy,
+)
 from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
@@ -30,10 +40,22 @@ _HEAD = 1.3
 _PANEL, _GAP, _ROW, _LINE = 1.35, 0.16, 0.24, 0.2
 _FOOT = 0.62
 _MOST_EVENTS = 14  # in the list
-_POINTS = 4000  # of a line; more would not be seen
 _FLOOR = 1e-5  # m; errors below are drawn there
 _SMALLEST_RANGE = 2.0  # mm, of an axis of the tip
-_GREY = "#8a8f96"
+_STATES = {
+    "unconfigured": "#c9cdd2",
+    "inactive": "#c9cdd2",
+    "active": "#7fb77e",
+    "holding": "#f2b134",
+    "fault": "#d9534f",
+}
+_SEVERITIES = {"info": "#4e79a7", "warning": "#e0a100", "error": "#b00020"}
+_ALARM = "#e07b39"
+_MOST_ALARMS = 6  # kinds that have a row
+_HALF = 0.36  # of a row, that a band fills to each side
+_LONGEST = 20  # letters of a name
+_LETTER_WIDTH = 0.0095  # of the panel's width
+_APART = 0.012  # of the panel's width, between two numbers of events
 
 
 def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
@@ -45,30 +67,17 @@ def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
         At least one tick.
     title :
         By default the name of the rig.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
     """
-    require_matplotlib()
-    from matplotlib.figure import Figure
-
     listed = _listed(run.events)
     stiff = bool(np.isfinite(run.stiffness).any())
     angles = bool(np.isfinite(run.angle_error).any())
-    heights = [_PANEL] * 3 + [_PANEL] * (1 + angles) + [_PANEL] * (len(run.channels) + stiff)
-    heights.append(_ROW * (timeline_rows(run) + 0.6))
+    heights = [_PANEL] * (4 + angles + len(run.channels) + stiff)
+    heights.append(_ROW * (1.6 + len(_alarm_kinds(run)) + bool(run.events)))
     below = _FOOT + _LINE * (len(listed) + 1.2) * bool(listed)
-    height = _HEAD + sum(heights) + _GAP * (len(heights) - 1) + below
-    figure = Figure(figsize=(_WIDE, height))
-    panels = figure.subplots(
-        len(heights), 1, sharex=True, height_ratios=heights,
-        gridspec_kw={
-            "left": 0.105, "right": 0.84, "top": 1 - _HEAD / height, "bottom": below / height,
-            "hspace": _GAP / np.mean(heights),
-        },
-    )  # fmt: skip
+    figure, grid = stacked_panels(
+        heights, wide=_WIDE, left=1.21, right=1.84, head=_HEAD, foot=below, gap=_GAP, sharex=True
+    )
+    panels = grid[:, 0]
     rest = iter(panels)
     for axis in range(3):
         _draw_tip(next(rest), run, axis)
@@ -81,15 +90,14 @@ def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
         first += count
     if stiff:
         _draw_stiffness(next(rest), run)
-    draw_timeline(panels[-1], run, listed)
+    _draw_timeline(panels[-1], run, listed)
     _shade(panels[:-1], run)
     panels[-1].set_xlabel("time (s)")
     panels[-1].set_xlim(run.time[0], max(run.time[-1], run.time[0] + 1e-3))
     for axes in panels[:-1]:
         axes.yaxis.set_label_coords(-0.062, 0.5)
     _list_events(figure, listed, below)
-    _head(figure, title or run.about.get("rig", "run"), _literal(_what(run)))
-    figure.text(0.025, 1 - 0.94 / height, _literal(_figures(run)), fontsize=10, va="center")
+    draw_head(figure, title or run.about.get("rig", "run"), _what(run), _figures(run))
     return figure
 
 
@@ -97,17 +105,17 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
     seen = run.seen_position[:, axis] * MM
     if np.isfinite(seen).any():
         axes.plot(
-            *_thinned(run.captured, seen), "o", color=AXES[axis], alpha=0.3, markersize=4.5,
+            *thinned(run.captured, seen), "o", color=AXES[axis], alpha=0.3, markersize=4.5,
             markeredgewidth=0, label="tracker",
         )  # fmt: skip
     axes.plot(
-        *_thinned(run.time, run.tip_position[:, axis] * MM), color=AXES[axis], linewidth=1.3,
+        *thinned(run.time, run.tip_position[:, axis] * MM), color=AXES[axis], linewidth=1.3,
         label="estimate",
     )  # fmt: skip
     target = run.target_position[:, axis] * MM
     if np.isfinite(target).any():
         axes.plot(
-            *_thinned(run.time, target), color=TARGET, linewidth=1.3, linestyle=(0, (4, 2)),
+            *thinned(run.time, target), color=TARGET, linewidth=1.3, linestyle=(0, (4, 2)),
             label="target",
         )  # fmt: skip
     low, high = axes.get_ylim()
@@ -115,92 +123,95 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
         middle = (low + high) / 2
         axes.set_ylim(middle - _SMALLEST_RANGE / 2, middle + _SMALLEST_RANGE / 2)
     axes.set_ylabel(f"tip {'xyz'[axis]} (mm)")
-    _legend(axes)
-    _plain(axes)
+    legend_beside(axes)
+    tidy(axes)
 
 
 def _draw_error(axes: Any, run: RecordedRun) -> None:
     error = np.maximum(run.position_error, _FLOOR) * MM
-    axes.plot(*_thinned(run.time, error), color="#333333", linewidth=1.2, label="position")
+    axes.plot(*thinned(run.time, error), color=DARK, linewidth=1.2, label="position")
     axes.set_ylabel("error (mm)")
     known = error[np.isfinite(error)]
     if len(known):
         axes.set_ylim(0.8 * known.min(), 1.3 * max(known.max(), 2 * known.min()))
         make_logarithmic(axes)
         axes.grid(alpha=0.25, axis="y")
-        _legend(axes)
+        legend_beside(axes)
     else:
         axes.set_yticks([])
-        axes.text(
-            0.5, 0.5, "nothing was asked for", transform=axes.transAxes, ha="center", color=_GREY
-        )
-    _plain(axes)
+        axes.text(0.5, 0.5, "no target was set", transform=axes.transAxes, ha="center", color=GREY)
+    tidy(axes)
 
 
 def _draw_angle(axes: Any, run: RecordedRun) -> None:
     axes.plot(
-        *_thinned(run.time, np.degrees(run.angle_error)), color="#333333", linewidth=1.2,
+        *thinned(run.time, np.degrees(run.angle_error)), color=DARK, linewidth=1.2,
         label="angle",
     )  # fmt: skip
     axes.set_ylabel("error (deg)")
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.25, axis="y")
-    _legend(axes)
-    _plain(axes)
+    legend_beside(axes)
+    tidy(axes)
 
 
 def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) -> None:
     from matplotlib.lines import Line2D
 
     for channel in channels:
-        colour = CHANNELS[(channel - channels[0]) % len(CHANNELS)]
+        colour = channel_colour(channel - channels[0])
         axes.plot(
-            *_thinned(run.time, run.measured[:, channel] * BAR), color=colour, linewidth=2.6,
+            *thinned(run.time, run.measured[:, channel] * BAR), color=colour, linewidth=2.6,
             alpha=0.3,
         )  # fmt: skip
         axes.plot(
-            *_thinned(run.time, run.commanded[:, channel] * BAR), color=colour, linewidth=1.1,
+            *thinned(run.time, run.commanded[:, channel] * BAR), color=colour, linewidth=1.1,
             label=f"p{channel + 1}",
         )  # fmt: skip
     limits = np.unique(np.stack([run.low, run.high])[:, :, list(channels)] * BAR)
     for limit in limits[np.isfinite(limits)]:
-        axes.axhline(limit, color=_GREY, linewidth=0.9, linestyle=(0, (1, 2)), zorder=1)
+        axes.axhline(limit, color=GREY, linewidth=0.9, linestyle=(0, (1, 2)), zorder=1)
     handles = [*axes.get_legend_handles_labels()[0]]
     if segment == 0:
         handles += [
-            Line2D([], [], color=_GREY, linewidth=2.6, alpha=0.5, label="measured"),
-            Line2D([], [], color=_GREY, linewidth=1.1, label="commanded"),
-            Line2D([], [], color=_GREY, linewidth=0.9, linestyle=(0, (1, 2)), label="limits"),
+            Line2D([], [], color=GREY, linewidth=2.6, alpha=0.5, label="measured"),
+            Line2D([], [], color=GREY, linewidth=1.1, label="commanded"),
+            Line2D([], [], color=GREY, linewidth=0.9, linestyle=(0, (1, 2)), label="limits"),
         ]
     axes.set_ylabel(f"segment {segment + 1}\n(bar)")
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, -0.03), high + 0.02 * (high - low))
-    _legend(axes, handles=handles)
-    _plain(axes)
+    legend_beside(axes, handles=handles)
+    tidy(axes)
 
 
 def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
     if np.isfinite(run.best_stiffness).any():
         axes.plot(
-            *_thinned(run.time, run.best_stiffness), color=TARGET, linewidth=1.3,
+            *thinned(run.time, run.best_stiffness), color=TARGET, linewidth=1.3,
             linestyle=(0, (4, 2)), label="of the plan",
         )  # fmt: skip
     axes.plot(
-        *_thinned(run.time, run.stiffness), color="#6a3d9a", linewidth=1.3, label="of the arm,\nnow"
+        *thinned(run.time, run.stiffness), color=ELLIPSOID, linewidth=1.3, label="of the arm,\nnow"
     )  # fmt: skip
     axes.set_ylabel("stiffness\n(N/m, N m/rad)")
     axes.grid(alpha=0.25, axis="y")
-    _legend(axes)
-    _plain(axes)
+    legend_beside(axes)
+    tidy(axes)
 
 
 def _shade(panels: Any, run: RecordedRun) -> None:
-    """Let the states in which it did not steer show behind everything."""
+    """Shade the times at which the loop was not active, in the colours of its states."""
     for span in run.states:
-        if span.kind in SHADES and span.kind != "active":
+        if span.kind in _STATES and span.kind != "active":
             for axes in panels:
                 axes.axvspan(
-                    span.begin, span.end, color=SHADES[span.kind], alpha=0.22, linewidth=0, zorder=0
+                    span.begin,
+                    span.end,
+                    color=_STATES[span.kind],
+                    alpha=0.22,
+                    linewidth=0,
+                    zorder=0,
                 )
 
 
@@ -211,12 +222,12 @@ def _list_events(figure: Any, listed: list[RunEvent], below: float) -> None:
         y = (below - _FOOT - _LINE * (line + 0.6)) / height
         figure.text(0.04, y, f"{line + 1}", fontsize=8.5, weight="bold", va="center", ha="right")
         figure.text(0.105, y, f"{event.time:.2f} s", fontsize=8.5, va="center", ha="right")
-        figure.text(0.12, y, _literal(event.kind), fontsize=8.5, va="center", weight="bold")
-        figure.text(0.28, y, _literal(text), fontsize=8.5, va="center")
+        figure.text(0.12, y, literal(event.kind), fontsize=8.5, va="center", weight="bold")
+        figure.text(0.28, y, literal(text), fontsize=8.5, va="center")
 
 
 def _listed(events: tuple[RunEvent, ...]) -> list[RunEvent]:
-    """Return the events that are told in words: the gravest where there are too many."""
+    """The events that are listed in words: the gravest where there are too many."""
 
     def rank(index: int) -> tuple[int, int]:
         event = events[index]
@@ -238,33 +249,77 @@ def _what(run: RecordedRun) -> str:
 
 
 def _figures(run: RecordedRun) -> str:
-    """Say how well it went while it steered."""
-    steered = np.zeros(len(run), dtype=bool)
+    """Median errors and stiffness while the loop was active."""
+    active = np.zeros(len(run), dtype=bool)
     for span in run.states:
         if span.kind == "active":
-            steered |= (run.time >= span.begin) & (run.time < span.end)
+            active |= (run.time >= span.begin) & (run.time < span.end)
     parts = []
-    error = run.position_error[steered & np.isfinite(run.position_error)] * MM
+    error = run.position_error[active & np.isfinite(run.position_error)] * MM
     if len(error):
         low, middle, high = np.quantile(error, (0.05, 0.5, 0.95))
         parts.append(f"error: median {middle:.3g} mm, 90 % within {low:.3g} to {high:.3g} mm")
-    share = (run.stiffness / run.best_stiffness)[steered]
+    share = (run.stiffness / run.best_stiffness)[active]
     if np.isfinite(share).any():
         parts.append(f"stiffness: median {100 * np.nanmedian(share):.0f} % of the plan's")
-    return f"while active:   {'      '.join(parts)}" if parts else "nothing was asked for"
+    return f"while active:   {'      '.join(parts)}" if parts else "no target was set"
 
 
-def _thinned(moments: Array, values: Array) -> tuple[Array, Array]:
-    """Return a line with at most some thousand points that shows the same extremes."""
-    count = len(moments)
-    size = -(-2 * count // _POINTS)
-    if size <= 2:
-        return moments, values
-    bins = count // size
-    shaped = values[: bins * size].reshape(bins, size)
-    filled_low = np.where(np.isfinite(shaped), shaped, np.inf)
-    filled_high = np.where(np.isfinite(shaped), shaped, -np.inf)
-    pair = np.sort(np.stack([filled_low.argmin(axis=1), filled_high.argmax(axis=1)]), axis=0)
-    rows = np.unique((pair + np.arange(bins) * size).ravel(order="F"))
-    rows = np.append(rows, count - 1) if rows[-1] != count - 1 else rows
-    return moments[rows], values[rows]
+# -- states, alarms and events over time ----------------------------------------------------------
+
+
+def _draw_timeline(axes: Any, run: RecordedRun, listed: list[RunEvent]) -> None:
+    """Draw bands for states and alarms, and marks for events; those that are listed by number."""
+    kinds = _alarm_kinds(run)
+    labels = ["state", *kinds, *(["events"] if run.events else [])]
+    width = max(float(run.time[-1] - run.time[0]), 1e-3)
+    for span in run.states:
+        _band(axes, span, 0, _STATES[span.kind])
+        if (span.end - span.begin) / width > _LETTER_WIDTH * (len(span.kind) + 1):
+            middle = (span.begin + span.end) / 2
+            axes.text(middle, 0, span.kind, ha="center", va="center", fontsize=8, clip_on=True)
+    for span in run.alarms:
+        if span.kind in kinds:
+            _band(axes, span, 1 + kinds.index(span.kind), _ALARM)
+    if run.events:
+        _draw_events(axes, run, listed, len(labels) - 1, width)
+    names = [literal(_short(label)) for label in labels]
+    axes.set_yticks(range(len(labels)), names)
+    axes.set_ylim(len(labels) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0, labelsize=8)
+    axes.tick_params(axis="x", labelsize=9)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+
+
+def _band(axes: Any, span: RunSpan, row: int, colour: str) -> None:
+    axes.fill_between([span.begin, span.end], row - _HALF, row + _HALF, color=colour, linewidth=0.6)
+
+
+def _draw_events(
+    axes: Any, run: RecordedRun, listed: list[RunEvent], row: int, width: float
+) -> None:
+    numbers = {id(event): number for number, event in enumerate(listed, start=1)}
+    last = -float("inf")
+    for event in run.events:
+        colour = _SEVERITIES.get(event.severity, _SEVERITIES["info"])
+        axes.vlines(event.time, row - _HALF, row + _HALF, color=colour, linewidth=1.6)
+        number = numbers.get(id(event))
+        if number is not None and event.time - last > _APART * width:
+            last = event.time
+            axes.annotate(
+                str(number), (event.time, row), xytext=(2, 0), textcoords="offset points",
+                va="center", fontsize=8, color=colour, weight="bold",
+            )  # fmt: skip
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 3]}..."
+
+
+def _alarm_kinds(run: RecordedRun) -> list[str]:
+    """The kinds of alarms that have a row: those that stood longest."""
+    stood: dict[str, float] = {}
+    for span in run.alarms:
+        stood[span.kind] = stood.get(span.kind, 0.0) + span.end - span.begin
+    kept = sorted(stood, key=lambda kind: -stood[kind])[:_MOST_ALARMS]
+    return [kind for kind in stood if kind in kept]

@@ -1,23 +1,245 @@
-"""Colours and lengths that the pictures share."""
+"""What all figures share: colours, panels, titles, legends, logarithmic scales, and saving.
 
-SEGMENTS = ("#7fa8c9", "#a9c47f", "#c9a27f", "#a58fc4", "#7fc4b8")
-"""Of the segments in turn."""
+matplotlib is imported when something is drawn, not before.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.documents import write_whole
+from stiffopt.errors import FileError, printable, require_package
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+# -- colours --------------------------------------------------------------------------------------
+
+MEASURED = "#2f6db3"
+MODEL = "#d62728"
 TARGET = "#d62728"
+BEFORE = "#9aa3ab"
+"""Of a robot file before it was calibrated."""
+AXES = ("#2f6db3", "#2a8a57", "#c99a0b")
+"""Of x, y and z."""
+CHANNELS = ("#2f6db3", "#c2571a", "#2a8a57", "#8e5bb5", "#c99a0b", "#4aa7b5", "#b5547a", "#6b7a3a",
+            "#7d5a4a")  # fmt: skip
+"""Of channels, or logs, in turn."""
+SEGMENTS = ("#7fa8c9", "#a9c47f", "#c9a27f", "#a58fc4", "#7fc4b8")
+"""Of segments in turn."""
 DIRECTIONS = ("#c2571a", "#8c2d04", "#e0a100", "#b5547a")
 """Of the stiffnesses that a task names, in turn."""
 ELLIPSOID = "#6a3d9a"
-LIMIT = "#f28e2b"
-INSIDE = "#4e79a7"
+AT_LIMIT = "#f28e2b"
+WITHIN_LIMITS = "#4e79a7"
 RANGE = "#e9ecef"
+"""Of what is allowed, or was recorded."""
+BOUND = "#9aa3ab"
 LOAD = "#111111"
+ARM = "#39424b"
+"""Of the arm in outline."""
+GREY = "#8a8f96"
+DARK = "#333333"
 
 
-def colour(segment: int) -> str:
+def segment_colour(segment: int) -> str:
     """Return the colour of a segment, counted from 0."""
     return SEGMENTS[segment % len(SEGMENTS)]
 
 
-def edge(segment: int) -> str:
-    """Return a segment's colour, dark enough for text."""
-    red, green, blue = (int(colour(segment)[i : i + 2], 16) for i in (1, 3, 5))
+def segment_text_colour(segment: int) -> str:
+    """Return a segment's colour, dark enough for text and thin lines."""
+    red, green, blue = (int(segment_colour(segment)[i : i + 2], 16) for i in (1, 3, 5))
     return f"#{red * 6 // 10:02x}{green * 6 // 10:02x}{blue * 6 // 10:02x}"
+
+
+def channel_colour(channel: int) -> str:
+    """Return the colour of a channel, or of a log, counted from 0."""
+    return CHANNELS[channel % len(CHANNELS)]
+
+
+# -- figures --------------------------------------------------------------------------------------
+
+_WIDE = 11.0  # inches
+_DPI = 130
+
+
+def require_matplotlib() -> None:
+    """Say how to get matplotlib if it is missing.
+
+    Raises
+    ------
+    MissingExtraError
+        If it is not installed.
+    """
+    require_package("matplotlib", "plot")
+
+
+def new_figure(width: float, height: float, **settings: Any) -> Figure:
+    """Return an empty figure of a size in inches.
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), **settings)
+
+
+def stacked_panels(
+    heights: Sequence[float], *, columns: int = 1, wide: float = _WIDE, left: float = 0.8,
+    right: float = 0.17, head: float = 1.1, foot: float = 0.6, gap: float = 0.4,
+    between: float = 0.24, **shared: Any,
+) -> tuple[Figure, Any]:  # fmt: skip
+    """Return a figure with rows of panels, and the panels (rows, columns).
+
+    Parameters
+    ----------
+    heights : of the rows.
+    columns : how many panels stand in a row.
+    wide, left, right, head, foot, gap : width of the figure, its margins on the four sides, and
+        the space between two rows; like `heights` in inches.
+    between : space between two columns, as a share of a panel's width.
+    shared : ``sharex`` and ``sharey``, as matplotlib's ``subplots`` takes them.
+    """
+    rows = len(heights)
+    height = head + sum(heights) + gap * (rows - 1) + foot
+    figure = new_figure(wide, height)
+    panels = figure.subplots(
+        rows, columns, squeeze=False, height_ratios=list(heights), **shared,
+        gridspec_kw={
+            "left": left / wide, "right": 1 - right / wide, "top": 1 - head / height,
+            "bottom": foot / height, "hspace": gap * rows / sum(heights), "wspace": between,
+        },
+    )  # fmt: skip
+    for axes in panels.flat:
+        tidy(axes)
+    return figure, panels
+
+
+def save_figure(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a figure in the format that the path's ending names; whole or not at all.
+
+    Raises
+    ------
+    FileError
+        If it cannot be written.
+    """
+    buffer = BytesIO()
+    try:
+        figure.savefig(buffer, format=Path(path).suffix[1:].lower() or "png", dpi=_DPI)
+    except ValueError as error:  # a format that matplotlib does not know
+        raise FileError(path, f"cannot be drawn: {error}") from None
+    write_whole(path, buffer.getvalue())
+
+
+# -- words ----------------------------------------------------------------------------------------
+
+
+def literal(text: str) -> str:
+    """Return text that matplotlib does not take for mathematics."""
+    return printable(text).replace("$", r"\$")
+
+
+def draw_head(figure: Figure, title: str, *lines: str) -> None:
+    """Write a title at the top of a figure, and lines with the numbers that matter below it."""
+    height = figure.get_figheight()
+    figure.text(0.025, 1 - 0.34 / height, literal(title), fontsize=15, weight="bold", va="center")
+    for number, line in enumerate(lines):
+        y = 1 - (0.68 + 0.26 * number) / height
+        figure.text(0.025, y, literal(line), fontsize=10, va="center")
+
+
+def legend_beside(axes: Any, **settings: Any) -> None:
+    """Put a legend to the right of a panel."""
+    axes.legend(
+        loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=9, frameon=False, borderaxespad=0.0,
+        handlelength=1.6, **settings,
+    )  # fmt: skip
+
+
+def legend_on_top(
+    figure: Figure, handles: Sequence[Any], labels: Sequence[str], **settings: Any
+) -> None:
+    """Put a legend into the upper right corner of a figure."""
+    figure.legend(
+        handles, labels, loc="upper right", frameon=False,
+        bbox_to_anchor=(0.985, 1 - 0.14 / figure.get_figheight()),
+        **{"fontsize": 9, "ncols": len(labels), "handlelength": 1.6, **settings},
+    )  # fmt: skip
+
+
+def tidy(axes: Any) -> None:
+    """Leave out the frame's upper and right side; small numbers."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=9)
+
+
+# -- scales and lines -----------------------------------------------------------------------------
+
+
+_STEPS = (
+    (1.0,),
+    (1.0, 3.0),
+    (1.0, 2.0, 5.0),
+    (1.0, 1.5, 2.0, 3.0, 5.0, 7.0),
+    (1.0, 1.2, 1.4, 1.6, 1.8, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0),
+    tuple(step / 10 for step in range(10, 100)),
+)
+"""Ticks of a decade, from few to many."""
+
+
+def round_steps(low: float, high: float, most: int = 8) -> Array:
+    """Round numbers between two positive ones, evenly spread on a logarithmic scale."""
+    decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
+    found: list[float] = []
+    for steps in _STEPS:
+        ticks = [float(step) * 10.0**decade for decade in decades for step in steps]
+        ticks = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
+        if len(found) >= 2 and len(ticks) > most:
+            break
+        found = ticks
+    return np.array(found)
+
+
+def make_logarithmic(axes: Any) -> None:
+    """Give the vertical axis of a panel, whose limits are set, a logarithmic scale."""
+    axes.set_yscale("log")
+    label_logarithmic(axes.yaxis, *axes.get_ylim())
+
+
+def label_logarithmic(axis: Any, low: float, high: float, most: int = 8) -> None:
+    """Put plain round numbers on a logarithmic axis."""
+    from matplotlib.ticker import FixedLocator, NullLocator
+
+    axis.set_major_locator(FixedLocator(list(round_steps(low, high, most))))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(lambda value, _: f"{value:.3g}")
+
+
+def thinned(time: Array, values: Array, most: int = 4000) -> tuple[Array, Array]:
+    """Return a line with at most about so many points that shows the same extremes."""
+    count = len(time)
+    size = -(-2 * count // most)
+    if size <= 2:
+        return time, values
+    bins = count // size
+    shaped = values[: bins * size].reshape(bins, size)
+    filled_low = np.where(np.isfinite(shaped), shaped, np.inf)
+    filled_high = np.where(np.isfinite(shaped), shaped, -np.inf)
+    pair = np.sort(np.stack([filled_low.argmin(axis=1), filled_high.argmax(axis=1)]), axis=0)
+    rows = np.unique((pair + np.arange(bins) * size).ravel(order="F"))
+    rows = np.append(rows, count - 1) if rows[-1] != count - 1 else rows
+    return time[rows], values[rows]

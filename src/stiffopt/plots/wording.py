@@ -1,4 +1,4 @@
-"""What numbers and stiffness measures are called, in pictures and in tables alike."""
+"""Numbers, units and stiffness measures in words, the same in figures and in tables."""
 
 from collections.abc import Iterable
 
@@ -10,6 +10,8 @@ MM = 1e3
 """Millimetres per metre."""
 BAR = 1e-5
 """Bar per pascal."""
+N_PER_CM = 0.01
+"""N/cm per N/m."""
 
 
 def least_maximised(solution: PressureSolution) -> float | None:

@@ -1,4 +1,6 @@
-"""Sections through a workspace: how stiff the tip can be made, and how much can be chosen."""
+"""Figure of a workspace: sections that show how stiff the tip can be made at each place."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -7,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
-from stiffopt.plots.figures import _literal, require_matplotlib
+from stiffopt.plots.style import ARM, draw_head, label_logarithmic, new_figure, tidy
 from stiffopt.plots.wording import MM, unit_text
 from stiffopt.workspace import WorkspaceMap
 
@@ -17,20 +19,19 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 
 ENOUGH = 10
-"""Samples without which a cell's range of stiffness is not shown: fewer tell little of it."""
+"""Samples that a cell needs for its ratio of stiffnesses to be shown; fewer tell little of it."""
 
 _UNKNOWN = "#d5d9dd"
-_ARM = "#39424b"
 _BEST, _CHOICE = "viridis", "YlOrRd"
-_ROW, _HEAD, _FOOT = 2.75, 1.45, 0.95  # inches: a direction, above and below all
+_ROW, _HEAD, _FOOT = 2.75, 1.55, 0.95  # inches: a direction, above and below all
 
 
-def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> "Figure":
+def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> Figure:
     """Draw sections through a workspace, a row for each direction.
 
-    On the left the greatest stiffness that a place can be given, on the right how many times it
-    is the least: what can be chosen there.  The upright section holds the arm at rest, the level
-    one is where the workspace is widest.
+    On the left the greatest stiffness that the tip can have at a place, on the right the ratio of
+    the greatest to the least: how much pressures can change it there. The upright section holds the
+    arm at rest, the level one is where the workspace is widest.
 
     Parameters
     ----------
@@ -46,18 +47,13 @@ def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> "Figure"
     ------
     InputError
         If no tip was found anywhere.
-    MissingExtraError
-        If matplotlib is not installed.
     """
-    require_matplotlib()
     if not len(found.table):
         raise InputError("there is nothing to draw: no sample has a stable equilibrium")
-    from matplotlib.figure import Figure
-
     sections = (_Section.upright(found), _Section.level(found))
     rows = len(found.plan.measures)
     height = _HEAD + _FOOT + _ROW * rows
-    figure = Figure(figsize=(15.5, height))
+    figure = new_figure(15.5, height)
     grid = figure.add_gridspec(
         rows, 7, width_ratios=(1, 1, 0.05, 0.2, 1, 1, 0.05), left=0.055, right=0.945,
         top=1 - _HEAD / height, bottom=_FOOT / height, wspace=0.36, hspace=0.32,
@@ -70,8 +66,10 @@ def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> "Figure"
         ):
             panels = [figure.add_subplot(grid[row, first + k]) for k in range(2)]
             drawn = _draw_sections(panels, sections, values, colours)
-            bar = figure.colorbar(drawn, cax=figure.add_subplot(grid[row, first + 2]))
-            _label_bar(bar, label)
+            bar: Any = figure.colorbar(drawn, cax=figure.add_subplot(grid[row, first + 2]))
+            label_logarithmic(bar.ax.yaxis, bar.vmin, bar.vmax)
+            bar.ax.tick_params(labelsize=8)
+            bar.set_label(label, fontsize=9)
             panels[0].set_title(
                 f"{_way(found, row)} {name}", loc="left", fontsize=11, weight="bold"
             )
@@ -98,13 +96,13 @@ class _Section:
         self.radius = found.plan.robot.description.segments[0].outer_radius
 
     @classmethod
-    def upright(cls, found: WorkspaceMap) -> "_Section":
-        """The plane y = 0, or the fullest beside it."""
+    def upright(cls, found: WorkspaceMap) -> _Section:
+        """The plane y = 0, or if nothing was reached there the plane with the most cells."""
         layers = found.cells[:, 1]
         return cls(found, 1, 0 if (layers == 0).any() else _fullest(layers))
 
     @classmethod
-    def level(cls, found: WorkspaceMap) -> "_Section":
+    def level(cls, found: WorkspaceMap) -> _Section:
         """The height at which most cells are reached."""
         return cls(found, 2, _fullest(found.cells[:, 2]))
 
@@ -169,12 +167,12 @@ def _frame(axes: Any, section: _Section, other: _Section) -> None:
         side = section.radius * MM
         axes.fill(
             [-side, side, side, -side], [0, 0, section.length * MM, section.length * MM],
-            facecolor="none", edgecolor=_ARM, linewidth=1.1, linestyle="--", zorder=4,
+            facecolor="none", edgecolor=ARM, linewidth=1.1, linestyle="--", zorder=4,
         )  # fmt: skip
-        axes.plot([-2.2 * side, 2.2 * side], [0, 0], color=_ARM, linewidth=3.0, zorder=4)
+        axes.plot([-2.2 * side, 2.2 * side], [0, 0], color=ARM, linewidth=3.0, zorder=4)
     else:
-        axes.plot(0, 0, marker="+", color=_ARM, markersize=9, markeredgewidth=1.4, zorder=4)
-    line = axes.axhline(other.place * MM, color=_ARM, linewidth=0.9, linestyle=":", zorder=3)
+        axes.plot(0, 0, marker="+", color=ARM, markersize=9, markeredgewidth=1.4, zorder=4)
+    line = axes.axhline(other.place * MM, color=ARM, linewidth=0.9, linestyle=":", zorder=3)
     line.set_dash_capstyle("round")
     room = 0.04 * max(right - left, top - bottom)
     axes.set_xlim(left - room, right + room)
@@ -185,28 +183,7 @@ def _frame(axes: Any, section: _Section, other: _Section) -> None:
     across, up = ("xyz"[axis] for axis in section.axes)
     axes.set_xlabel(f"{across} (mm)   {section.name}", fontsize=9, labelpad=1)
     axes.set_ylabel(f"{up} (mm)", fontsize=9, labelpad=1)
-    axes.tick_params(labelsize=8)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _label_bar(bar: Any, label: str) -> None:
-    """Plain numbers, few of them, on a logarithmic scale."""
-    from matplotlib.ticker import FixedLocator, NullLocator
-
-    low, high = bar.vmin, bar.vmax
-    steps: tuple[float, ...] = (1, 2, 5) if high / low > 4 else (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 7)
-    if high / low < 1.6:
-        steps = tuple(step / 10 for step in (*range(10, 20), *range(20, 50, 2), *range(50, 100, 5)))
-    decades = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-    ticks = [step * 10.0**decade for decade in decades for step in steps]
-    ticks = [tick for tick in ticks if low * 0.999 <= tick <= high * 1.001]
-    if len(ticks) < 2:
-        ticks = [low, high]
-    bar.ax.yaxis.set_major_locator(FixedLocator(ticks))
-    bar.ax.yaxis.set_minor_locator(NullLocator())
-    bar.ax.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
-    bar.ax.tick_params(labelsize=8)
-    bar.set_label(label, fontsize=9)
+    tidy(axes)
 
 
 def _way(found: WorkspaceMap, row: int) -> str:
@@ -215,39 +192,35 @@ def _way(found: WorkspaceMap, row: int) -> str:
     return f"{way} {'' if measure.frame == 'base' else 'the tip’s '}".rstrip()
 
 
-def _write_head(figure: "Figure", found: WorkspaceMap, title: str, height: float) -> None:
+def _write_head(figure: Figure, found: WorkspaceMap, title: str, height: float) -> None:
     plan, first = found.plan, found.plan.measures[0]
-    figure.text(
-        0.03, 1 - 0.3 / height, _literal(f"{title}: the workspace of the tip"), fontsize=15,
-        weight="bold", va="center",
-    )  # fmt: skip
-    parts = [
-        f"{found.volume * 1e6:,.0f} cm³ reached",
+    draw_head(
+        figure,
+        f"{title}: the workspace of the tip",
+        f"{found.volume * 1e6:,.0f} cm³ reached      "
         f"{found.samples:,} samples, {np.median(found.count):g} in the median cell of "
-        f"{plan.cell * MM:g} mm",
-        f"stiffness of {first.kind}, {first.boundary}",
-    ]
-    figure.text(0.03, 1 - 0.62 / height, "      ".join(parts), fontsize=10.5, va="center")
+        f"{plan.cell * MM:g} mm      stiffness of {first.kind}, {first.boundary}",
+    )
     for x, text in (
         (0.055, "How stiff can the tip be made at a place?"),
-        (0.52, "How much of it can be chosen there? (1: nothing, the place decides)"),
+        (0.52, "How much can the stiffness be changed there? (1: not at all)"),
     ):
-        figure.text(x, 1 - 0.95 / height, text, fontsize=11.5, va="center", color="#20394f")
+        figure.text(x, 1 - 1.03 / height, text, fontsize=11.5, va="center", color="#20394f")
 
 
-def _write_foot(figure: "Figure") -> None:
+def _write_foot(figure: Figure) -> None:
     """Explain what lines and colours mean."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles = [
-        Line2D([], [], color=_ARM, linestyle="--", linewidth=1.1, label="the arm at rest"),
-        Line2D([], [], color=_ARM, linewidth=3, label="its base"),
+        Line2D([], [], color=ARM, linestyle="--", linewidth=1.1, label="the arm at rest"),
+        Line2D([], [], color=ARM, linewidth=3, label="its base"),
         Line2D(
-            [], [], color=_ARM, linestyle=":", linewidth=1,
+            [], [], color=ARM, linestyle=":", linewidth=1,
             label="where the other section is",
         ),
-        Patch(facecolor=_UNKNOWN, label=f"reached by fewer than {ENOUGH} samples: choice unknown"),
+        Patch(facecolor=_UNKNOWN, label=f"reached by fewer than {ENOUGH} samples: ratio unknown"),
     ]  # fmt: skip
     figure.legend(
         handles=handles, loc="lower left", bbox_to_anchor=(0.03, 0.0), ncols=4, fontsize=9.5,

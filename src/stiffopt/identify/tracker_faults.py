@@ -1,14 +1,17 @@
-"""Orientations of tracked bodies whose markers look alike after quarter turns.
+"""Readings of a tracker that cannot be right: gaps, repeats, jumps and flipped orientations.
 
-A tracker that mistakes the markers of a body reports it turned by one of the 24 proper rotations of
-the cube about the body's own axes: ``R_reported = R g``. Rotations of the arm are continuous, so
-that these jumps can be undone along a recording, all but one such rotation of the whole of it.
+A tracker may lose a body for some rows, repeat its last reading, or report a body elsewhere for a
+moment. Where the markers of a body look alike after quarter turns, it may also report the body
+turned by one of the 24 proper rotations of the cube about the body's own axes,
+``R_reported = R g``. Rotations of an arm are continuous, so that such flips can be undone along a
+recording, but for one of these rotations that all of it may share.
 
 Quaternions are w first.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 
@@ -16,16 +19,153 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.identify.screening import norms, whole
+from stiffopt.identify.settings import TRACKER
 
-__all__ = ["Unflipped", "aligned", "mean_rotation", "rotations", "unflipped", "unit_quaternions"]
+__all__ = [
+    "MEDIAN_NORM", "Unflipped", "aligned", "dropouts", "jumps", "mean_rotation", "norms", "repeats",
+    "rotations", "roughness", "unflipped", "unit_quaternions", "whole",
+]  # fmt: skip
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
 
-_AGREE = np.radians(20.0)  # by which rows that follow each other may differ at one place
-_TURN = 4.0  # rad that a body may turn while it moves by the length of the arm
-_LONG = 5  # rows in a row that are no chance
-_CHUNK = 1 << 16  # rows at a time
+MEDIAN_NORM = 1.538
+"""Median of the length of a standard normal vector in space."""
+_CHUNK = 1 << 16  # rows whose flips are looked for at a time, to save memory
+
+
+def whole(values: Array) -> Rows:
+    """Say in which rows (N,) of (N, m) no number is missing; fast where there are few columns."""
+    return np.asarray(np.isfinite(np.einsum("ij->i", values)))
+
+
+def norms(values: Array) -> Array:
+    """Lengths (N,) of rows (N, m); faster than ``numpy.linalg.norm``, with the same result."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", values, values)))
+
+
+def repeats(tracked: Sequence[Array]) -> Rows:
+    """Say in which rows (N,) all arrays (N, m) repeat the row before, number for number."""
+    same = np.ones(len(tracked[0]) - 1, dtype=bool)
+    known = np.zeros_like(same)
+    for values in tracked:
+        before, now = values[:-1], values[1:]
+        finite = np.isfinite(now)
+        same &= np.all((before == now) | ~(finite | np.isfinite(before)), axis=1)
+        known |= finite.any(axis=1)
+    return np.concatenate(([False], same & known))
+
+
+def dropouts(position: Array, length: float) -> Rows:
+    """Say which positions (N, 3) are zeros that stand for none, or farther than any arm gets.
+
+    Parameters
+    ----------
+    position :
+        In m; NaN where it is missing.
+    length :
+        Of the arm, in m.
+    """
+    zero = np.all(position == 0, axis=1)
+    seen = whole(position) & ~zero
+    if not seen.any():
+        return np.zeros(len(position), dtype=bool)
+    if np.sum(norms(position[seen]) < TRACKER.origin * length) >= TRACKER.origin_rows:
+        zero[:] = False
+    off = norms(position - np.median(position[seen], axis=0))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(zero | (off > TRACKER.farthest * length))
+
+
+def roughness(time: Array, position: Array) -> Array:
+    """Distance (N - 2,) of each position (N, 3) from the straight line between its neighbours."""
+    share = ((time[1:-1] - time[:-2]) / (time[2:] - time[:-2]))[:, None]
+    line = (1 - share) * position[:-2] + share * position[2:]
+    return np.asarray(norms(position[1:-1] - line))
+
+
+def jumps(time: Array, position: Array, reach: Array, length: float) -> Rows:
+    """Say in which rows (N,) a position is away for a moment from where the body was.
+
+    It must be away from the straight lines that the rows before, the rows after and both of them
+    together lay through it, by several ordinary steps of that time of the recording, and by more
+    than the pressures may have moved it. So the answer to a step of pressure is none, and the
+    first and the last row never are.
+
+    Parameters
+    ----------
+    time :
+        (N,), in s.
+    position :
+        (N, 3), in m; NaN where it is not to be used.
+    reach :
+        (N,), how far changes of pressure until then may have moved the tip altogether, in m.
+    length :
+        Of the arm, in m.
+    """
+    bad = np.zeros(len(time), dtype=bool)
+    seen = np.flatnonzero(whole(position))
+    if len(seen) < 3:
+        return bad
+    usual = (
+        TRACKER.jump_sigmas * float(np.median(roughness(time[seen], position[seen]))) / MEDIAN_NORM
+    )
+    least = max(usual, TRACKER.jump_least * length)
+    pause = TRACKER.jump_pause * float(np.median(np.diff(time[seen])))
+    for count in 2 * (
+        *range(1, TRACKER.jump_rows + 1),
+    ):  # twice, as one jump may hide another near it
+        rows = np.flatnonzero(whole(position) & ~bad)
+        if len(rows) < count + 2:
+            break
+        found = _away(time[rows], position[rows], reach[rows], count, least, pause)
+        for k in range(count):
+            bad[rows[found + k]] = True
+    return bad
+
+
+def _away(
+    time: Array, position: Array, reach: Array, count: int, least: float, pause: float
+) -> NDArray[np.int_]:
+    """Return the first row of each run of `count` rows that is away from both its neighbours."""
+    last = len(time) - 1
+    step = norms(np.diff(position, axis=0))
+    some = 1 - 1 / TRACKER.jump_factor  # of `least`: no run that is found starts or ends with less
+    large = step > some * least
+    before = np.flatnonzero(large[: len(step) - count] & large[count:])
+    after = before + count + 1
+    soon = time[after] - time[before] <= pause * (count + 1)
+    before, after = before[soon], after[soon]
+    around = np.concatenate([before + k for k in (-3, -2, -1)] + [after + k for k in (0, 1, 2)])
+    there = (around >= 0) & (around < len(step))
+    steps = np.where(there, step[np.clip(around, 0, len(step) - 1)], 0.0).reshape(6, -1)
+    across = norms(position[after] - position[before])
+    ordinary = np.maximum(np.median(steps, axis=0), across)
+    moved = reach[after - 1] - reach[np.maximum(before - 1, 0)]
+    limit = np.maximum(least, TRACKER.jump_factor * ordinary) + moved
+
+    earlier, later = np.maximum(before - 1, 0), np.minimum(after + 1, last)
+    lines = (
+        (before, _slope(time, position, earlier, before)),
+        (before, _slope(time, position, before, after)),
+        (after, _slope(time, position, after, later)),
+    )
+    away = np.ones(len(before), dtype=bool)
+    for k in range(1, count + 1):
+        for origin, slope in lines:
+            expected = position[origin] + slope * (time[before + k] - time[origin])[:, None]
+            away &= norms(position[before + k] - expected) > limit
+    return np.asarray(before[away] + 1)
+
+
+def _slope(time: Array, position: Array, a: NDArray[np.int_], b: NDArray[np.int_]) -> Array:
+    """Velocities (K, 3) between rows; none where they are the same row."""
+    between = time[b] - time[a]
+    safe = np.where(between > 0, between, 1.0)
+    return np.asarray((position[b] - position[a]) / safe[:, None])
+
+
+# orientations -------------------------------------------------------------------------------------
 
 
 def _cube() -> Array:
@@ -151,7 +291,7 @@ def mean_rotation(rotation: Array) -> Array:
 def _allowance(before: Array, after: Array, length: float) -> Array:
     """Angle (N,) in rad by which bodies may have turned that have moved from here to there."""
     way = norms(after - before)
-    return np.asarray(_AGREE + _TURN * np.nan_to_num(way) / length)
+    return np.asarray(TRACKER.turn_agrees + TRACKER.turn_moving * np.nan_to_num(way) / length)
 
 
 def _links(
@@ -215,7 +355,7 @@ def _join(
             known = _turned(q[[last, near]], version[[last, near]])
             allowed = _allowance(p[[last]], p[[near]], length)
             turn, off = _links(known[:1], known[1:], allowed)
-            if off[0] and end - start < _LONG:
+            if off[0] and end - start < TRACKER.turn_rows:
                 lost[start:end] = True
                 continue
             # q g_version g_turn for all rows of the piece

@@ -1,0 +1,237 @@
+"""What calibration and validation return: errors of the tip, and fitted numbers with remarks."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.identify.fit import Fit
+from stiffopt.identify.settings import REPORT
+from stiffopt.identify.unknowns import BASE, SENSOR
+from stiffopt.model.parameters import Parameter
+
+__all__ = [
+    "TIED", "Comparison", "Errors", "FittedEstimate", "doubts", "estimates", "outliers", "together",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+
+TIED = "hardly told apart"
+"""How the remark on two numbers begins that these data do not tell apart."""
+_NORMAL = 1.959963984540054  # 97.5 % quantile
+_PLACED = {
+    BASE: "the base tracked too, or touched with a pointer",
+    SENSOR: "the tip's orientation recorded while it bends in all directions",
+}
+"""What recordings would tell where these are."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the tip over some rows.
+
+    Attributes
+    ----------
+    n : number of rows that were compared.
+    mean, median, p95, max : of the distance between measured and predicted position, in m; NaN
+        where there is no row.
+    angle : mean angle between measured and predicted axis of the tip, in rad, or None where no
+        orientation was recorded.
+    """
+
+    n: int
+    mean: float
+    median: float
+    p95: float
+    max: float
+    angle: float | None
+
+    @classmethod
+    def of(cls, distances: Array, angles: Array | None) -> Errors:
+        """Summarise distances (N,) in m and angles (N,) in rad; what is NaN is left out."""
+        known = distances[np.isfinite(distances)]
+        turned = None if angles is None else angles[np.isfinite(angles)]
+        angle = float(turned.mean()) if turned is not None and len(turned) else None
+        if not len(known):
+            return cls(0, np.nan, np.nan, np.nan, np.nan, angle)
+        return cls(
+            len(known),
+            float(known.mean()),
+            float(np.median(known)),
+            float(np.quantile(known, 0.95)),
+            float(known.max()),
+            angle,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A log and the model's prediction of it, in the frame of the recording.
+
+    Attributes
+    ----------
+    name : of the log.
+    time : (N,), in s.
+    pressures : (N, n), commanded, in Pa.
+    effective : (N, n), for which the model's equilibrium was taken, in Pa.
+    measured, predicted : (N, 3), positions of the tip's sensor, in m; NaN where not measured.
+    angle : (N,), between the measured and the predicted axis of the tip, in rad; None where no
+        orientation was recorded.
+    inside : (N,), whether the calibration had seen such pressures; all true without one.
+    remarks : what was found in the log, one sentence each.
+    """
+
+    name: str
+    time: Array
+    pressures: Array
+    effective: Array
+    measured: Array
+    predicted: Array
+    angle: Array | None
+    inside: NDArray[np.bool_]
+    remarks: tuple[str, ...]
+
+    @property
+    def distance(self) -> Array:
+        """Error (N,) of the position in m; NaN where it was not measured."""
+        return np.asarray(np.linalg.norm(self.measured - self.predicted, axis=1))
+
+    @property
+    def errors(self) -> Errors:
+        """Errors of all rows."""
+        return Errors.of(self.distance, self.angle)
+
+    @property
+    def outside(self) -> Errors:
+        """Errors of the rows whose pressures the calibration had not seen."""
+        return self.rows(~self.inside).errors
+
+    def rows(self, wanted: NDArray[np.bool_]) -> Comparison:
+        """Some rows (N,) of it."""
+        return replace(
+            self,
+            time=self.time[wanted],
+            pressures=self.pressures[wanted],
+            effective=self.effective[wanted],
+            measured=self.measured[wanted],
+            predicted=self.predicted[wanted],
+            angle=None if self.angle is None else self.angle[wanted],
+            inside=self.inside[wanted],
+        )
+
+
+def together(comparisons: Sequence[Comparison]) -> Errors:
+    """Errors of the rows of all logs together."""
+    distances = np.concatenate([np.zeros(0), *(each.distance for each in comparisons)])
+    angles = [each.angle for each in comparisons if each.angle is not None]
+    return Errors.of(distances, np.concatenate(angles) if angles else None)
+
+
+@dataclass(frozen=True)
+class FittedEstimate:
+    """A fitted number with its interval.
+
+    Attributes
+    ----------
+    name : what people call it.
+    key : its key in the robot file, or empty.
+    unit : SI unit; empty for a plain number.
+    before, value : before and after the fit, in SI; the motion of a frame is zero before.
+    low, high : ends of the 95 % interval.
+    learnt : share of the prior's variance that the data removed, from 0 to 1.
+    far : distance from the robot file, in prior deviations.
+    """
+
+    name: str
+    key: str
+    unit: str
+    before: float
+    value: float
+    low: float
+    high: float
+    learnt: float
+    far: float
+
+
+def estimates(found: Fit) -> tuple[FittedEstimate, ...]:
+    """Return every number of a fit with its interval."""
+    variance = np.diag(found.covariance)
+    listed = []
+    for unknown, x, v in zip(found.problem.unknowns.all, found.x, variance, strict=True):
+        middle, half = x * unknown.deviation, _NORMAL * math.sqrt(v) * unknown.deviation
+        ends = [max(middle - half, unknown.low), middle, min(middle + half, unknown.high)]
+        before, unit, key = 0.0, unknown.unit, ""
+        if unknown.parameter is not None:
+            key, unit = unknown.parameter.key, unknown.parameter.unit
+            before = unknown.parameter.value(found.problem.description)
+            ends = [float(unknown.parameter.at(before, end)) for end in ends]
+        listed.append(
+            FittedEstimate(
+                unknown.name,
+                key,
+                unit,
+                before,
+                ends[1],
+                ends[0],
+                ends[2],
+                learnt=float(np.clip(1 - v, 0, 1)),
+                far=float(x),
+            )
+        )
+    return tuple(listed)
+
+
+def doubts(found: Fit, listed: Sequence[FittedEstimate]) -> list[str]:
+    """Return a remark on each number that was not learnt, not told apart, or is far off."""
+    remarks = []
+    unlearnt: dict[str, list[str]] = {}
+    for estimate in listed:
+        if estimate.learnt < REPORT.learnt:
+            unlearnt.setdefault(_experiment(estimate), []).append(estimate.name)
+    for experiment, names in unlearnt.items():
+        tell = f"; what would tell: {experiment}" if experiment else ""
+        remarks.append(f"not learnt from these data: {'; '.join(names)}{tell}")
+    deviation = np.sqrt(np.diag(found.covariance))
+    correlation = found.covariance / np.outer(deviation, deviation)
+    for i, one in enumerate(listed):
+        for j in range(i):
+            if abs(correlation[i, j]) > REPORT.tied:
+                remarks.append(
+                    f"{TIED}: {listed[j].name} and {one.name} (correlation {correlation[i, j]:.2f})"
+                )
+    for estimate in listed:
+        turned = estimate.unit == "rad" and not estimate.key and not estimate.name.endswith("z")
+        if abs(estimate.far) > REPORT.far or (turned and abs(estimate.value) > REPORT.tilt):
+            remarks.append(
+                f"far from the robot file: {estimate.name}, by {abs(estimate.far):.1f} of its "
+                "tolerances; look for a reason before you trust it"
+            )
+    return remarks
+
+
+def _experiment(estimate: FittedEstimate) -> str:
+    if estimate.key:
+        return Parameter(estimate.key).number.experiment
+    return next((text for name, text in _PLACED.items() if estimate.name.startswith(name)), "")
+
+
+def outliers(found: Fit) -> list[str]:
+    """Return a remark on each recording that has rows far from the model, which count less."""
+    remarks = []
+    starts = found.problem.starts
+    error = np.linalg.norm(found.predicted.errors[0], axis=1) if starts[-1] else np.zeros(0)
+    far = error > REPORT.outlier * np.sqrt(3) * found.problem.noise.position
+    for sample, (a, b) in zip(found.problem.samples, itertools.pairwise(starts), strict=True):
+        if far[a:b].any():
+            times = sample.recording.time[sample.rows][far[a:b]]
+            remarks.append(
+                f"{sample.recording.name}: {far[a:b].sum()} of {b - a} rows are more than "
+                f"{REPORT.outlier:g} deviations from the model, first at {times[0]:.4g} s, "
+                f"last at {times[-1]:.4g} s; they count less"
+            )
+    return remarks

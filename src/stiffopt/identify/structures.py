@@ -1,0 +1,317 @@
+"""Models that calibration may choose from, and the choice of the one that predicts best.
+
+Models are compared by their errors in logs, or parts of logs, to which they were not fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import InputError
+from stiffopt.identify.fit import Fit, fit
+from stiffopt.identify.problem import CalibrationProblem
+from stiffopt.identify.recording import Recording
+from stiffopt.identify.results import Errors
+from stiffopt.identify.settings import CHOICE, START
+from stiffopt.model.actuation import StrainLaw
+from stiffopt.model.description import Compensation, Corrections, RobotDescription, Segment
+from stiffopt.model.history import Creep, History, Play
+from stiffopt.model.laws import law_class, strain_laws
+
+__all__ = [
+    "STRUCTURES", "Candidate", "ModelStructure", "best", "held_back_errors", "other_laws",
+]  # fmt: skip
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ModelStructure:
+    """A model that calibration may choose: what is fitted, and which history the segments have.
+
+    Attributes
+    ----------
+    name : for reports and the command line.
+    words : what the model has, in words.
+    shape : keys of a segment that are fitted to its equilibria, without indices.
+    lag, falling, play, memory, creep : whether the history has them; a lag comes with a dead time
+        where the logs are fine enough to tell the two apart.
+    strain_law : of all segments; empty for that of the robot file.
+    as_given : whether the history is that of the robot file.
+    after : names of simpler models; this one is tried only if one of them is the best so far.
+    """
+
+    name: str
+    words: str
+    shape: tuple[str, ...]
+    lag: bool = False
+    falling: bool = False
+    play: bool = False
+    memory: bool = False
+    creep: bool = False
+    strain_law: str = ""
+    as_given: bool = False
+    after: tuple[str, ...] = ()
+
+    def applied(
+        self, description: RobotDescription, seen: float, fine: bool = True
+    ) -> RobotDescription:
+        """Return the robot from which the fit of this structure begins.
+
+        Parameters
+        ----------
+        description : RobotDescription
+            What it already has of the structure is where the fit begins.
+        seen : float
+            Highest recorded pressure, in Pa.
+        fine : bool
+            Whether the logs can tell a dead time from a lag.
+        """
+        segments = tuple(self._segment(segment, seen, fine) for segment in description.segments)
+        return description.model_copy(update={"segments": segments, "calibration": None})
+
+    def is_possible(self, description: RobotDescription) -> bool:
+        """Whether the robot can have this structure: a dead band is for positive pressures."""
+        return "corrections.dead_band" not in self.shape or min(description.pressure_min) >= 0
+
+    def can_be_told(self, recordings: Sequence[Recording]) -> bool:
+        """Whether recordings can tell what the structure has, whatever its error on them.
+
+        Where pressures move evenly all the time, creep is taken for amplitude, and then predicts
+        other logs worse than no creep would.
+        """
+        return not self.creep or _held(recordings) > CHOICE.held
+
+    def _segment(self, segment: Segment, seen: float, fine: bool) -> Segment:
+        update: dict[str, object] = {"history": self._history(segment, seen, fine)}
+        if self.strain_law and self.strain_law != segment.strain_law:
+            keys = law_class(self.strain_law).Keys
+            update |= {"strain_law": self.strain_law, "law": keys() if keys is not None else None}
+        given = segment.compensation or Compensation()
+        if not given.modulus_per_pressure:  # a robot file that softens says how
+            given = given.model_copy(update={"modulus_law": "exponential"})
+        if "compensation.bending_radius" in self.shape:
+            radius = given.bending_radius or START.bending_radius * segment.length
+            given = given.model_copy(update={"bending_radius": radius})
+        update["compensation"] = given
+        corrections = segment.corrections or Corrections()
+        if "corrections.dead_band" in self.shape:
+            band = corrections.dead_band or START.dead_band * seen
+            corrections = corrections.model_copy(update={"dead_band": band})
+        update["corrections"] = corrections
+        return segment.model_copy(update=update)
+
+    def _history(self, segment: Segment, seen: float, fine: bool) -> History | None:
+        if self.as_given:
+            return segment.history
+        given = segment.history or History()
+        if not (self.lag or self.play):
+            return None
+        plays = given.play or tuple(
+            Play(width=w * seen, share=START.play_share) for w in START.play_widths
+        )
+        creeps = given.creep or tuple(
+            Creep(time=time, share=START.creep_share) for time in START.creep_times
+        )
+        return History(
+            dead_time=(given.dead_time or START.dead_time) if self.lag and fine else 0.0,
+            lag=(given.lag or START.lag) if self.lag else 0.0,
+            lag_falling=(given.lag_falling or given.lag or START.lag) if self.falling else 0.0,
+            memory=(given.memory or (1.0,) * segment.n_channels) if self.memory else (),
+            play=plays if self.play else (),
+            creep=creeps if self.creep else (),
+        )
+
+
+_BASIC = (
+    "length",
+    "material.youngs_modulus",
+    "compensation.area",
+    "compensation.stiffness",
+    "corrections.gain",
+    "corrections.offset",
+    "corrections.azimuth",
+    "compensation.modulus_per_pressure",
+)
+_PROGRESSIVE = (
+    *_BASIC,
+    "corrections.dead_band",
+    "compensation.bending_radius",
+    "compensation.lengthening",
+)
+
+STRUCTURES = (
+    ModelStructure("static", "no history", _BASIC),
+    ModelStructure("lag", "a first-order lag", _BASIC, lag=True),
+    ModelStructure("hysteresis", "lag and play", _BASIC, lag=True, play=True),
+    ModelStructure("creep", "lag, play and creep", _BASIC, lag=True, play=True, creep=True),
+    ModelStructure(
+        "progressive",
+        "lag and play; a dead band, and bending that stiffens and lengthens",
+        _PROGRESSIVE,
+        lag=True,
+        play=True,
+    ),
+    ModelStructure(
+        "progressive-creep",
+        "lag, play and creep; a dead band, and bending that stiffens and lengthens",
+        _PROGRESSIVE,
+        lag=True,
+        play=True,
+        after=("creep", "progressive"),
+        creep=True,
+    ),
+    ModelStructure(
+        "channel-hysteresis",
+        "lags when rising and falling, and play of each channel's own",
+        _BASIC,
+        lag=True,
+        falling=True,
+        play=True,
+        memory=True,
+    ),
+)
+"""Those with the fewest numbers first."""
+
+
+def other_laws(description: RobotDescription) -> list[type[StrainLaw]]:
+    """Strain laws that all segments of a robot could have instead of their own, simplest first."""
+    own = {segment.strain_law for segment in description.segments}
+    if len(own) != 1:
+        return []
+    found = []
+    for name, law in strain_laws().items():
+        try:
+            for segment in description.segments:
+                Segment(**segment.model_dump() | {"strain_law": name, "law": None})
+        except InputError:  # the law cannot describe such a segment
+            continue
+        if name not in own:
+            found.append(law)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A model that was fitted, and its errors in what was held back.
+
+    Attributes
+    ----------
+    structure : ModelStructure
+    fit : Fit
+        To all rows of the trial.
+    folds : dict of str to Errors
+        Errors of what was held back, by what that was.
+    """
+
+    structure: ModelStructure
+    fit: Fit
+    folds: dict[str, Errors] = field(default_factory=dict)
+
+    @property
+    def score(self) -> float:
+        """Mean error over what was held back, in m."""
+        return float(np.mean([errors.mean for errors in self.folds.values()]))
+
+
+def held_back_errors(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, Errors]:
+    """Errors in logs or parts of logs when the others are fitted.
+
+    Parameters
+    ----------
+    found : Fit
+        To all of them; the other fits begin there.
+    settle : float
+        Of a log that begins in an unknown state this many s at its beginning still count, as they
+        would if it were predicted.
+    """
+    problem = found.problem
+    errors = {}
+    for name, away in _folds(problem).items():
+        kept = [_without_beginning(each, problem, i, settle) for i, each in enumerate(away)]
+        if not any(each.any() for each in kept):
+            continue  # a log that ends before its beginning does
+        x = fit(problem.without(kept), [found.x], tell, rounds=0, most=CHOICE.evaluations).x
+        distances = np.linalg.norm(problem.predict(x).errors[0], axis=1)
+        found_there = Errors.of(distances[np.concatenate(kept)], None)
+        if found_there.n:
+            errors[name] = found_there
+    if not errors:
+        raise InputError(
+            "there is nothing left to compare models with; expected longer logs, or name a model"
+        )
+    return errors
+
+
+def best(candidates: Sequence[Candidate]) -> Candidate:
+    """Return the simplest model of those that predict about as well as the best.
+
+    About as well means within one standard error of the difference over what was held back, or
+    within the share `ChoiceSettings.no_worse`.
+
+    Parameters
+    ----------
+    candidates : sequence of Candidate
+        The simplest first.
+    """
+    leader = min(candidates, key=lambda candidate: candidate.score)
+    reference = _means(leader)
+    for candidate in candidates:  # the simplest first
+        worse = _means(candidate) - reference
+        error = float(np.std(worse, ddof=1) / np.sqrt(len(worse))) if len(worse) > 1 else 0.0
+        if worse.mean() <= max(error, CHOICE.no_worse * reference.mean()):
+            return candidate
+    return leader
+
+
+def _means(candidate: Candidate) -> Array:
+    return np.array([errors.mean for errors in candidate.folds.values()])
+
+
+def _folds(problem: CalibrationProblem) -> dict[str, list[Rows]]:
+    """Rows of each sample that are held back together, by a name of them."""
+    samples = problem.samples
+    none = [np.zeros(len(each.rows), dtype=bool) for each in samples]
+    folds: dict[str, list[Rows]] = {}
+    if len(samples) >= CHOICE.logs:
+        for i, each in enumerate(samples):
+            folds[each.recording.name] = [*none[:i], ~none[i], *none[i + 1 :]]
+        return folds
+    for part in range(CHOICE.parts):
+        folds[f"part {part + 1} of {CHOICE.parts}"] = [
+            np.arange(len(rows)) * CHOICE.parts // len(rows) == part for rows in none
+        ]
+    norms = [np.linalg.norm(each.recording.pressures[each.rows], axis=1) for each in samples]
+    high = np.quantile(np.concatenate(norms), 1 - CHOICE.top)
+    folds["highest pressures"] = [norm > high for norm in norms]
+    return folds
+
+
+def _without_beginning(away: Rows, problem: CalibrationProblem, i: int, settle: float) -> Rows:
+    sample = problem.samples[i]
+    estimated = sample.begin == "unknown" or problem.unknowns.zeros[i]
+    if not (estimated and away.all()):
+        return away
+    time = sample.recording.time[sample.rows]
+    return np.asarray(away & (time > time[0] + settle))
+
+
+def _held(recordings: Sequence[Recording]) -> float:
+    """Share of the time in which no pressure had changed for a while."""
+    held = total = 0.0
+    for recording in recordings:
+        range_of = np.ptp(recording.pressures, axis=0).max() or 1.0
+        change = (
+            np.abs(np.diff(recording.pressures, axis=0)).max(axis=1) > CHOICE.held_still * range_of
+        )
+        moves = np.concatenate([[recording.time[0]], recording.time[1:][change]])
+        last = moves[np.searchsorted(moves, recording.time, side="right") - 1]
+        steps = np.diff(recording.time, append=recording.time[-1])
+        held += float(steps[recording.time - last > CHOICE.held_for].sum())
+        total += float(steps.sum())
+    return held / total if total else 0.0

@@ -1,0 +1,267 @@
+"""Figures of a solution: the arm with its pressures, and the trade-off against tip error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import degrees
+from textwrap import shorten
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stiffopt.errors import InputError, printable
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.plots import style
+from stiffopt.plots.arm import draw_arm
+from stiffopt.plots.style import literal, new_figure, tidy
+from stiffopt.plots.wording import (
+    BAR,
+    MM,
+    direction_text,
+    figures,
+    gain_text,
+    least_maximised,
+    unit_text,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_LONGEST_NOTE = 120  # characters of the message that fit
+_MOST_LABELS = 15  # pressures with a number on their bar
+_STATUS = {"solved": "#2a7f3f", "unreachable": "#b35c00", "failed": "#b00020"}
+
+
+def plot_solution(
+    robot: Manipulator,
+    solution: PressureSolution,
+    *,
+    front: Sequence[PressureSolution] | None = None,
+    plain: float | None = None,
+    title: str | None = None,
+) -> Figure:
+    """Draw an answer: the arm in space, and its pressures against their limits.
+
+    Parameters
+    ----------
+    robot : Manipulator
+        The arm; the load of the solution's task is put on it.
+    solution : PressureSolution
+    front : sequence of PressureSolution, optional
+        A trade-off to draw beside it, as `stiffopt.pareto_front` returns it.
+    plain : float, optional
+        First stiffness of a stiffness-blind solution, to compare with.
+    title : str, optional
+        By default the name of the task's file.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    InputError
+        If the solution has no pressures, as the solver failed.
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    style.require_matplotlib()
+    if solution.pressures is None:
+        raise InputError("there is nothing to draw: the solution has no pressures")
+    load = solution.task.load
+    arm = robot.with_load(load.force, load.moment, load.frame) if load else robot
+    figure = new_figure(13, 6.6 if front is None else 7.8)
+    grid = figure.add_gridspec(
+        1 if front is None else 2, 3, width_ratios=(0.42, 1.15, 1), left=0.03, right=0.975,
+        top=0.825, bottom=0.09, wspace=0.2, hspace=0.42,
+    )  # fmt: skip
+    draw_arm(figure, grid[:, 1], arm, solution)
+    _draw_pressures(figure.add_subplot(grid[0, 2]), arm, solution)
+    if front is not None:
+        _draw_pareto(figure.add_subplot(grid[1, 2]), front, plain)
+    _head(figure, solution, title or _name(solution), plain)
+    return figure
+
+
+def plot_pareto(
+    front: Sequence[PressureSolution], *, plain: float | None = None, title: str | None = None
+) -> Figure:
+    """Draw a trade-off: stiffness against tip error.
+
+    Parameters
+    ----------
+    front : sequence of PressureSolution
+        As `stiffopt.pareto_front` returns it.
+    plain : float, optional
+        First stiffness of a stiffness-blind solution, to compare with.
+    title : str, optional
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    figure = new_figure(6.4, 4.4, layout="constrained")
+    axes = figure.add_subplot()
+    _draw_pareto(axes, front, plain)
+    if title:
+        axes.set_title(literal(title))
+    return figure
+
+
+def _name(solution: PressureSolution) -> str:
+    source = solution.task.source
+    return solution.task.robot if source is None else source.stem
+
+
+def _head(figure: Figure, solution: PressureSolution, title: str, plain: float | None) -> None:
+    """Title, and below it the numbers that matter."""
+    figure.text(0.03, 0.945, literal(title), fontsize=15, weight="bold", va="center")
+    figure.text(
+        0.975, 0.945, solution.status, fontsize=13, weight="bold", va="center", ha="right",
+        color=_STATUS[solution.status],
+    )  # fmt: skip
+    figure.text(0.03, 0.895, _key_numbers(solution, plain), fontsize=10.5, va="center")
+    if solution.message:
+        message = shorten(printable(solution.message), _LONGEST_NOTE, placeholder=" ...")
+        figure.text(0.03, 0.858, literal(message), fontsize=9.5, va="center", style="italic")
+
+
+def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
+    tolerance = solution.task.target.tolerance
+    parts = []
+    if solution.position_error is not None:
+        parts.append(
+            f"tip error {solution.position_error * MM:.3g} mm "
+            f"(tolerance {tolerance.position * MM:g} mm)"
+        )
+    if solution.angle_error is not None:
+        parts.append(
+            f"{degrees(solution.angle_error):.3g} deg "
+            f"(tolerance {degrees(tolerance.angle):.4g} deg)"
+        )
+    if solution.stiffness is not None:
+        measure = solution.task.measures[0]
+        compared = (
+            ""
+            if plain is None
+            else f" (plain: {figures(plain)}, {gain_text(solution.stiffness, plain)})"
+        )
+        parts.append(
+            f"stiffness {figures(solution.stiffness)} {unit_text(measure.unit)}{compared} "
+            f"{direction_text(measure)}"
+        )
+    if solution.matrix_distance is not None:
+        parts.append(f"{solution.matrix_distance:.3g} from the matrix to match")
+    return "      ".join(parts)
+
+
+def _draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -> None:
+    """Bars of the pressures in bar against the limits that hold; those at a limit stand out."""
+    description = robot.description
+    lower, upper = (bound * BAR for bound in solution.task.pressure_bounds(description))
+    values = np.asarray(solution.pressures) * BAR
+    at_limit = [_active_side(solution, description.channel_name(k)) for k in range(len(values))]
+    places = _places(robot)
+    axes.bar(places, upper - lower, bottom=lower, width=0.8, color=style.RANGE, zorder=1)
+    for side, bounds in (("min", lower), ("max", upper)):
+        for place, bound, at in zip(places, bounds, at_limit, strict=True):
+            held = at == side
+            axes.hlines(
+                bound, place - 0.4, place + 0.4, zorder=5 if held else 2, clip_on=False,
+                color=style.AT_LIMIT if held else style.BOUND, linewidth=3.5 if held else 1.2,
+            )  # fmt: skip
+    colours = [style.AT_LIMIT if at else style.WITHIN_LIMITS for at in at_limit]
+    axes.bar(places, values, width=0.62, color=colours, zorder=3)
+    top = max(upper.max(), 0.0) - min(lower.min(), 0.0)
+    if len(values) <= _MOST_LABELS:
+        for place, value, colour in zip(places, values, colours, strict=True):
+            axes.text(
+                place, max(value, 0.0) + 0.012 * top, f"{value + 0.0:.2f}", ha="center",
+                va="bottom", fontsize=9, color=colour if colour == style.AT_LIMIT else "#20394f",
+                weight="bold", zorder=4,
+            )  # fmt: skip
+    _label_channels(axes, robot, places)
+    axes.set_ylabel("pressure (bar)")
+    axes.set_ylim(min(lower.min(), 0.0), max(upper.max(), 0.0) + 0.2 * top)
+    _pressure_legend(axes, any(at_limit))
+    tidy(axes)
+
+
+def _draw_pareto(axes: Any, front: Sequence[PressureSolution], plain: float | None) -> None:
+    """Stiffness against tip error, each point the stiffest at its error."""
+    axes.set_title("stiffness gained by a larger tip error", fontsize=11, loc="left")
+    tidy(axes)
+    if not front:
+        axes.text(
+            0.5, 0.5, "out of reach at every tolerance tried", ha="center", transform=axes.transAxes
+        )
+        return
+    by_position = front[0].position_error is not None
+    errors = [
+        (point.position_error or 0.0) * MM if by_position else degrees(point.angle_error or 0.0)
+        for point in front
+    ]
+    values = [least_maximised(point) or 0.0 for point in front]
+    axes.plot(errors, values, "o-", color=style.WITHIN_LIMITS, markersize=5, label="stiffest found")
+    axes.plot(errors[:1], values[:1], "o", color=style.TARGET, markersize=8, label="this task")
+    if plain is not None:
+        axes.axhline(plain, color=style.GREY, linestyle="--", linewidth=1.2, label="plain solution")
+    if min(errors) > 0:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.set_xlabel(f"tip error ({'mm' if by_position else 'deg'})")
+    axes.set_ylabel(f"stiffness ({unit_text(front[0].stiffness_unit)})")
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper left", fontsize=9, frameon=False)
+
+
+def _active_side(solution: PressureSolution, channel: str) -> str:
+    """At which limit a channel is: ``min``, ``max`` or neither."""
+    sides = (s for s in ("min", "max") if f"{channel} {s}" in solution.active_bounds)
+    return next(sides, "")
+
+
+def _places(robot: Manipulator) -> Any:
+    """Where the bars stand: a gap between segments."""
+    places, place = [], 0.0
+    for segment in robot.description.segments:
+        for _ in range(segment.n_channels):
+            places.append(place)
+            place += 1.0
+        place += 0.6
+    return np.array(places)
+
+
+def _label_channels(axes: Any, robot: Manipulator, places: Any) -> None:
+    counts = [segment.n_channels for segment in robot.description.segments]
+    axes.set_xticks(places, [str(k + 1) for n in counts for k in range(n)])
+    axes.tick_params(axis="x", length=0)
+    axes.set_xlabel("channel")
+    start = 0
+    for number, count in enumerate(counts):
+        middle = places[start : start + count].mean()
+        axes.text(
+            middle, 1.0, f"segment {number + 1}", transform=axes.get_xaxis_transform(),
+            ha="center", va="top", fontsize=10, weight="bold",
+            color=style.segment_text_colour(number),
+        )  # fmt: skip
+        start += count
+
+
+def _pressure_legend(axes: Any, any_active: bool) -> None:
+    from matplotlib.patches import Patch
+
+    handles = [Patch(color=style.WITHIN_LIMITS, label="pressure")]
+    if any_active:
+        handles.append(Patch(color=style.AT_LIMIT, label="at a limit"))
+    handles.append(Patch(facecolor=style.RANGE, edgecolor=style.BOUND, label="allowed"))
+    axes.legend(
+        handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, fontsize=9,
+        frameon=False, columnspacing=1.2, handlelength=1.2,
+    )  # fmt: skip
