@@ -266,9 +266,9 @@ def opened(
 
     `robot` is what the simulated arm is made from, so it is always the file as it was.
     """
-    from stiffopt.rig.assembly import make_rig
+    from stiffopt.safety.rigs import rig_for_programs
 
-    rig: Any = make_rig(description, robot)
+    rig: Any = rig_for_programs(description, robot)
     with rig:
         if file is not None:
             rig.tracker.registration = rig.tracker.registration.then(file.registration)
@@ -367,14 +367,14 @@ def along_a_log(
 ) -> None:
     """Error in % of length along a log of pressures (N, n) that are held one after the other."""
     from stiffopt import CalibrationSettings, read_log, validate
-    from stiffopt.experiments.conductor import GENTLE, Conductor
+    from stiffopt.experiments.conductor import CONDUCTOR, Conductor
     from stiffopt.experiments.coverage import Coverage, round_name
 
     n = pressures.shape[1]
     with opened(description, robots["nominal"]) as rig:
         conductor = Conductor(rig, description.rate)
         conductor.start()
-        coverage = Coverage(np.zeros(n), pressures, np.full(n, GENTLE), 7.0)
+        coverage = Coverage(np.zeros(n), pressures, np.full(n, CONDUCTOR.gentle), 7.0)
         names = [round_name(k + 1) for k in range(len(coverage.rounds))]
         for number in range(1, len(names) + 1):
             coverage.record(conductor, folder, number, {}, lambda done, text: None)
@@ -525,7 +525,7 @@ def steered(
     loop : its gain may be 0, for none.
     """
     from stiffopt import PressureSolver, Target, Task
-    from stiffopt.experiments.conductor import Conductor, Row
+    from stiffopt.experiments.conductor import Conductor, TrackedFrame
 
     first = Target(position=tuple(wanted[0][1].tolist()))
     solver = PressureSolver(known.model, Task(robot=robot.name, target=first))
@@ -548,7 +548,10 @@ def steered(
             begins = conductor.clock.now() + loop.wait
 
             def correct(
-                row: Row, here: Array = here, inverse: Array = inverse, begins: float = begins
+                row: TrackedFrame,
+                here: Array = here,
+                inverse: Array = inverse,
+                begins: float = begins,
             ) -> None:
                 nonlocal p
                 if row.visible and row.time >= begins:
@@ -557,7 +560,7 @@ def steered(
             conductor.sink = correct if loop.gain else None
             distance = np.empty(count)
             for tick in range(count):
-                conductor.tick(p, loop.slew)
+                conductor.approach(p, loop.slew)
                 tip = rig.world.plant.tip_pose()[:3, 3]
                 distance[tick] = np.linalg.norm(tip - true)
             errors.append(distance)

@@ -24,6 +24,8 @@ from stiffopt.rig.interface import (
     RawPose,
     Rig,
 )
+from stiffopt.rig.settings import Safety
+from stiffopt.safety.rigs import gated_rig
 
 Array = NDArray[np.float64]
 
@@ -32,6 +34,7 @@ FRAME = 0.025  # s
 LATENCY = 0.03  # s
 CLEARANCE = 0.001  # m
 CONTACT = 5000.0  # N/m
+PERIOD = 0.02  # s between commands, for which the gate is made
 
 
 class FakeWorld(Clock):
@@ -100,6 +103,9 @@ class FakeWorld(Clock):
 
 
 class FakeSupply(PressureSupply):
+    endpoints = ()
+    is_simulated = True
+
     def __init__(self, world: FakeWorld, limits: PressureLimits) -> None:
         super().__init__(limits, world)
         self.world = world
@@ -169,7 +175,7 @@ class FakeProbe(ForceProbe):
         begin, start = self.world.stage, self.world.t
         duration = abs(position - begin) / speed
         while self.world.t < start + duration - 1e-12:
-            self.world.sleep_until(min(self.world.t + 0.01, start + duration))
+            self.clock.sleep_until(min(self.world.t + 0.01, start + duration))
             share = (self.world.t - start) / duration
             self.world.stage = begin + share * (position - begin)
         self.world.stage = position
@@ -193,20 +199,21 @@ def fake_rig(
     *,
     robot: str = "stiff-flop-1",
     slew: float | None = 1e5,
-    low: float = 0.0,
-    high: float = 1.5e5,
+    low: ArrayLike = 0.0,
+    high: ArrayLike = 1.5e5,
     probe: bool = True,
     tracker: bool = True,
     noise: float = 0.0,
     force_noise: float = 0.0,
     seed: int = 0,
+    safety: Safety | None = None,
 ) -> Rig:
-    """Return a rig; its world is `rig.clock`."""
+    """Return a rig with the safety gate in front of its supply; `world_of` has its world."""
     description = load_description(robot)
     n = description.n_pressures
     world = FakeWorld(n, tip, stiffness, noise, seed)
     limits = PressureLimits(np.full(n, low), np.full(n, high))
-    return Rig(
+    rig = Rig(
         description,
         FakeSupply(world, limits),
         FakeTracker(world) if tracker else None,
@@ -214,3 +221,9 @@ def fake_rig(
         clock=world,
         slew=slew,
     )
+    rig.bare = rig.supply  # type: ignore[attr-defined]
+    return gated_rig(rig, safety or Safety(), PERIOD)
+
+
+def world_of(rig: Rig) -> FakeWorld:
+    return rig.bare.world  # type: ignore[attr-defined, no-any-return]

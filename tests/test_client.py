@@ -21,10 +21,10 @@ from websockets.sync.client import ClientConnection, connect
 from fake_loop import FakeLoop
 from stiffopt.control.state import Alarm, Severity, Snapshot, State, Timing
 from stiffopt.control.trajectory import Trajectory, Waypoint
-from stiffopt.daemon import connections, crowd
+from stiffopt.daemon import connections
 from stiffopt.daemon.client import Client
-from stiffopt.daemon.client_stream import ClientStream
-from stiffopt.daemon.crowd import MAX_CONNECTIONS, MAX_STREAMS, Crowd, Member
+from stiffopt.daemon.client_wire import ClientStream
+from stiffopt.daemon.connections import MAX_CONNECTIONS, MAX_STREAMS, Crowd, Member
 from stiffopt.daemon.messages import MAX_MESSAGE
 from stiffopt.daemon.reports import record_of
 from stiffopt.daemon.service import create_app
@@ -122,7 +122,7 @@ def test_a_connection_on_which_nothing_is_answered_is_closed(
 def test_where_all_with_the_token_are_being_answered_the_newest_has_to_go(
     loop: FakeLoop, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(crowd, "MAX_CONNECTIONS", 2)
+    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 2)
     free = threading.Event()
     waiting: list[str] = []
 

@@ -18,6 +18,7 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -32,13 +33,10 @@ from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon import secret as secret_module
 from stiffopt.daemon.client import Client
-from stiffopt.daemon.crowd import MAX_CONNECTIONS
-from stiffopt.daemon.daemon import STOP_TIME, Daemon
-from stiffopt.daemon.exposure import check_exposure, is_loopback
-from stiffopt.daemon.keeper import Keeper
-from stiffopt.daemon.logged import LogEvents
-from stiffopt.daemon.notify import ServiceManager
-from stiffopt.daemon.secret import Secret
+from stiffopt.daemon.connections import MAX_CONNECTIONS
+from stiffopt.daemon.daemon import TIMES, Daemon
+from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
+from stiffopt.daemon.secret import Secret, check_exposure, is_loopback
 from stiffopt.errors import CommandError, DeviceError, FileError, InputError
 from stiffopt.rig.settings import Safety, ServiceSettings
 
@@ -127,7 +125,7 @@ def test_the_example_for_planners_streams_a_circle(
         exec(compile(code.replace(address[0], str(made.url)), "daemon.md", "exec"), {})
     finally:
         made.loop._listeners.clear()
-        made.loop.listen(made._ticked)
+        made.loop.listen(made._control.ticked)
         client.take_control()
     xy = {tuple(p[:2].round(4)) for p in seen if p is not None}
     assert len(xy) > 40  # it went round
@@ -336,9 +334,9 @@ def test_the_unit_restarts_vented_and_lets_the_pressures_down() -> None:
     assert unit["KillMode"] == "process"  # the guard is neither signalled nor killed
     assert unit["ExecStopPost"] == "-/opt/stiffopt/bin/stiffopt vent /etc/stiffopt/rig.yaml"
     assert "15 s" in _page()
-    assert STOP_TIME == 15
+    assert TIMES.stop == 15
     longest = next(m.le for m in Safety.model_fields["ramp_time"].metadata if hasattr(m, "le"))
-    assert float(unit["TimeoutStopSec"]) > longest + STOP_TIME
+    assert float(unit["TimeoutStopSec"]) > longest + TIMES.stop
     assert unit["Restart"] == "on-failure"
     assert "5" not in unit["RestartPreventExitStatus"].split()
     assert "RestrictRealtime" not in unit
@@ -626,6 +624,7 @@ class Standstill:
         made._control = threading.Thread(
             target=lambda: (made._stopping.wait(60), control()), daemon=True
         )
+        made._control.failure = None  # type: ignore[attr-defined]
         made._control.start()
 
     def __call__(self, name: str) -> Any:
@@ -655,7 +654,7 @@ def stopped(made: Daemon, hangs: set[str]) -> list[str]:
         taken = time.monotonic() - begin
     finally:
         still.go_on.set()
-    assert taken < made.description.safety.ramp_time + STOP_TIME - 1, hangs
+    assert taken < made.description.safety.ramp_time + TIMES.stop - 1, hangs
     return still.calls
 
 
@@ -670,7 +669,7 @@ REST = {"planner", "tracker", "telemetry", "service"}
 def test_what_hangs_keeps_neither_the_supply_from_being_closed_nor_the_end(
     idle: Daemon, monkeypatch: pytest.MonkeyPatch, hangs: set[str]
 ) -> None:
-    monkeypatch.setattr(daemon_module, "_REST_TIME", 0.3)
+    monkeypatch.setattr(daemon_module, "TIMES", replace(TIMES, rest=0.3))
     calls = stopped(idle, hangs)
     assert calls[:2] == ["control", "supply"]  # vented first, and this waits for nothing
     assert set(calls[2:]) == REST
@@ -683,7 +682,7 @@ def test_what_hangs_keeps_neither_the_supply_from_being_closed_nor_the_end(
 def test_a_supply_that_hangs_is_told_and_the_rest_ends(
     idle: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(daemon_module, "CONTROL_TIME", 0.3)
+    monkeypatch.setattr(daemon_module, "TIMES", replace(TIMES, control=0.3))
     assert set(stopped(idle, {"supply"})) >= REST
     assert idle.hung == ("supply",)
     assert "whether the supply is vented is not known" in idle.trouble
@@ -714,7 +713,7 @@ def test_what_fails_at_the_end_keeps_nothing_from_ending(idle: Daemon) -> None:
 def test_telemetry_that_does_not_start_is_an_alarm_and_control_goes_on(
     idle: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(daemon_module, "_START", 0.2)
+    monkeypatch.setattr(daemon_module, "TIMES", replace(TIMES, telemetry=0.2))
     hangs = threading.Event()
     idle._telemetry = SimpleNamespace(start=lambda: hangs.wait(20), port=None)  # type: ignore[assignment]
     idle._start_telemetry()

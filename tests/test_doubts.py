@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stiffopt.experiments.doubts import doubts
+from stiffopt.experiments.kinematics_result import doubts
 from stiffopt.logs import Log
 
 TIME = np.arange(0, 20, 0.025)

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 from scipy import stats
 
 import stiffopt
-from fake_rig import CLEARANCE, LAG, FakeSupply, FakeWorld, fake_rig, straight
+from fake_rig import CLEARANCE, PERIOD, FakeSupply, FakeWorld, fake_rig, straight, world_of
 from stiffopt.cli import experiment_run
 from stiffopt.cli.main import main
 from stiffopt.cli.quantities import directions, pressures
-from stiffopt.errors import DeviceError, FileError, InputError
+from stiffopt.errors import DeviceError, FileError, InputError, StiffoptError
 from stiffopt.experiments import (
     KinematicsSettings,
     PressureSequence,
@@ -34,17 +34,19 @@ from stiffopt.experiments import (
     run_kinematics,
     run_stiffness,
 )
-from stiffopt.experiments.conductor import GENTLE, STEEPEST, Conductor, steepest
+from stiffopt.experiments.conductor import CONDUCTOR, Conductor
 from stiffopt.experiments.coverage import coverage_for, spread_pressures
-from stiffopt.experiments.coverage_result import read_rounds
 from stiffopt.experiments.folder import alone_in, create_folder
-from stiffopt.experiments.kinematics_result import read_recordings
-from stiffopt.experiments.points import PointsFile
-from stiffopt.experiments.slope import Line, combine, fit_line, fit_lines, student_t
+from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
+from stiffopt.experiments.probing import PointsFile
+from stiffopt.experiments.slope import LineFit, combine, fit_line, fit_lines, student_t
 from stiffopt.logs import Log, read_log, read_mcap_log, read_stiffness_table
-from stiffopt.rig.assembly import make_rig
 from stiffopt.rig.config import load_rig_description
-from stiffopt.rig.interface import PressureLimits, Rig
+from stiffopt.rig.interface import Rig
+from stiffopt.rig.settings import Safety
+from stiffopt.safety.gate import effective_slew
+from stiffopt.safety.rigs import rig_for_programs
+from stiffopt.safety.settings import COMMANDS
 
 GOLDEN = {  # bar: stiffness along x, y, z in N/m; reference/paper-notes.md
     0.0: (14.03, 14.03, 730.42),
@@ -55,11 +57,6 @@ GOLDEN = {  # bar: stiffness along x, y, z in N/m; reference/paper-notes.md
 
 
 SIM = Path(__file__).resolve().parent.parent / "rig" / "sim.yaml"
-
-
-def world_of(rig: Rig) -> FakeWorld:
-    assert isinstance(rig.clock, FakeWorld)
-    return rig.clock
 
 
 def golden(p: np.ndarray, direction: np.ndarray) -> float:
@@ -154,8 +151,7 @@ def test_commands_keep_slew_and_limits(tmp_path: Path) -> None:
 
 
 def test_channels_that_cannot_be_low_are_brought_up_and_down(tmp_path: Path) -> None:
-    rig = fake_rig(slew=1e5)
-    rig.supply.limits = PressureLimits(np.full(3, 0.1e5), np.full(3, 1e5))
+    rig = fake_rig(slew=1e5, low=0.1e5, high=1e5)
     with rig:
         run_kinematics(rig, tmp_path, short(repetitions=1), rate=50.0)
     log = read_log(tmp_path / "kinematics_1.csv")
@@ -204,9 +200,9 @@ def test_nothing_moves_beyond_the_limits(tmp_path: Path) -> None:
 def test_a_tracker_that_goes_blind_ends_the_experiment(tmp_path: Path) -> None:
     rig = fake_rig()
     world_of(rig).at.append((5.0, lambda: setattr(world_of(rig), "seen", False)))
-    with rig, pytest.raises(DeviceError, match="has not seen the tip for 2 s"):
+    with rig, pytest.raises(DeviceError, match=r"has not seen the tip for 0\.5 s"):
         run_kinematics(rig, tmp_path, short(period=4.0), rate=100.0)
-    assert world_of(rig).t < 100 + 5 + 2.2
+    assert world_of(rig).t < 100 + 5 + 0.7
     assert not world_of(rig).commanded.any()
     assert len(read_log(tmp_path / "kinematics_1.part.csv")) > 50
 
@@ -331,7 +327,7 @@ def test_every_combined_pose_is_held_and_gently_reached(
     with rig:
         assert run_kinematics(rig, tmp_path, settings, rate=50.0) == []
     most = high if highest is None else min(high, highest)
-    rate = GENTLE if slew is None else min(slew, GENTLE)
+    rate = CONDUCTOR.gentle if slew is None else min(slew, CONDUCTOR.gentle)
     assert_gentle(rig, rate, high)  # the teeth are slower than that
     logs = read_rounds(tmp_path, 2)
     assert len(logs) == 2
@@ -354,8 +350,7 @@ def test_every_combined_pose_is_held_and_gently_reached(
 
 
 def test_combined_poses_of_channels_that_cannot_be_low(tmp_path: Path) -> None:
-    rig = fake_rig(slew=1e5)
-    rig.supply._limits = PressureLimits(np.array([0.1e5, -0.5e5, 0.0]), np.array([1e5, 0.5e5, 1e5]))
+    rig = fake_rig(slew=1e5, low=[0.1e5, -0.5e5, 0.0], high=[1e5, 0.5e5, 1e5])
     with rig:
         run_kinematics(rig, tmp_path, short(repetitions=1, poses=3), rate=50.0)
         with pytest.raises(InputError, match=r"at most 0.05 bar: channel 1 has 0.1 to 1 bar"):
@@ -742,7 +737,7 @@ def test_what_bends_beyond_doubt_is_fitted_by_a_parabola() -> None:
 
 
 def test_repetitions_that_differ_are_believed_over_residuals_that_do_not() -> None:
-    lines = [Line(slope, 0.01, 7, 9) for slope in (13.0, 14.0, 15.0)]
+    lines = [LineFit(slope, 0.01, 7, 9) for slope in (13.0, 14.0, 15.0)]
     found = combine(lines)
     assert found is not None
     assert found.value == pytest.approx(14)
@@ -752,7 +747,7 @@ def test_repetitions_that_differ_are_believed_over_residuals_that_do_not() -> No
 
 
 def test_repetitions_that_agree_by_luck_do_not_hide_the_residuals() -> None:
-    found = combine([Line(14.0, 0.5, 7, 9)] * 2)
+    found = combine([LineFit(14.0, 0.5, 7, 9)] * 2)
     assert found is not None
     assert found.sigma == pytest.approx(0.5 / math.sqrt(2))
     assert found.half_width == pytest.approx(2.1448 * 0.5 / math.sqrt(2), rel=1e-4)
@@ -803,13 +798,12 @@ def test_the_figure_of_stiffness_shows_what_there_is(
     tmp_path: Path, levels: tuple[float, ...]
 ) -> None:
     """Also of an experiment that has hardly begun: only one series is there."""
-    from stiffopt.experiments.points import SeriesKey
-    from stiffopt.experiments.probing import Point
+    from stiffopt.experiments.probing import ProbePoint, SeriesKey
     from stiffopt.plots.experiments import plot_stiffness
 
     settings = quick(pressures=levels)
     points = [
-        Point(float(k), 0.3 * k, 0.01 * k, 0.01 * k, np.zeros(3), np.zeros(3), True, True)
+        ProbePoint(float(k), 0.3 * k, 0.01 * k, 0.01 * k, np.zeros(3), np.zeros(3), True, True)
         for k in (0, 1, 2, 1, 0)
     ]
     PointsFile(tmp_path, 3).append(SeriesKey(1, levels[0], (1.0, 0.0, 0.0)), points)
@@ -977,7 +971,7 @@ def test_ctrl_c_vents_and_keeps_and_can_be_resumed(
     use: Callable[[Rig], Rig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = use(fake_rig(slew=3e5))
-    world, supply = world_of(rig), rig.supply
+    world, supply = world_of(rig), rig.bare  # type: ignore[attr-defined]
     assert isinstance(supply, FakeSupply)
     pressed: list[float] = []
 
@@ -1014,7 +1008,7 @@ def test_a_fault_of_the_rig(
     world_of(rig).at.append((4.0, lambda: setattr(world_of(rig), "seen", False)))
     assert main([*KINEMATICS, "--out", "run"]) == 5
     said = capsys.readouterr().err
-    assert "has not seen the tip for 2 s; the arm is vented" in said
+    assert "has not seen the tip for 0.5 s; the arm is vented" in said
     assert "--resume run" in said
     assert not world_of(rig).commanded.any()
 
@@ -1023,7 +1017,7 @@ def test_a_supply_that_dies_is_said_to_be_dangerous(
     use: Callable[[Rig], Rig], capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = use(fake_rig())
-    world_of(rig).at.append((3.0, lambda: setattr(rig.supply, "dead", True)))
+    world_of(rig).at.append((3.0, lambda: setattr(rig.bare, "dead", True)))
     assert main([*KINEMATICS, "--out", "run"]) == 5
     assert "MAY STILL BE UNDER PRESSURE" in capsys.readouterr().err
 
@@ -1032,7 +1026,7 @@ def test_no_device_leaves_no_folder(
     use: Callable[[Rig], Rig], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = use(fake_rig())
-    rig.supply.dead = True  # type: ignore[attr-defined]
+    rig.bare.dead = True  # type: ignore[attr-defined]
     assert main([*KINEMATICS, "--out", "run"]) == 5
     assert "does not answer" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
@@ -1144,30 +1138,24 @@ def test_help_waits_for_no_numerics() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_an_alignment_that_takes_long_finds_the_pressure_again(tmp_path: Path) -> None:
-    """A device's own watchdog may vent while a person mounts the probe: no jump back up."""
+def test_an_alignment_that_takes_long_ends_with_a_vented_arm(tmp_path: Path) -> None:
+    """Nobody commands while this probe is aligned, so the arm is let down; no jump back up."""
     rig = fake_rig(stiffness=golden)
     world, probe = world_of(rig), rig.probe
     assert probe is not None
     align = probe.align
 
     def slowly(direction: tuple[float, ...]) -> None:
-        world.commanded = np.zeros(3)
-        world.sleep_until(world.t + 60)
+        stall(rig, 60)
         align(direction)
 
     probe.align = slowly  # type: ignore[method-assign, assignment]
     settings = quick(directions=((1.0, 0.0, 0.0),))
-    with rig:
+    with rig, pytest.raises(DeviceError, match=r"stood still for 60 s.*--resume"):
         run_stiffness(rig, tmp_path, settings, model(), rate=50.0)
-    values = np.array([value[0] for _, value in world.writes])
-    begin = int(np.argmax(np.array([time for time, _ in world.writes]) > 160))
-    assert values[begin - 1] == 0.4e5
-    assert values[begin] < 0.1e5
-    assert values[begin:-1].max() == 0.4e5
-    log = read_log(tmp_path / "stiffness_1.csv")
-    assert log.measured is not None
-    assert np.isnan(log.measured[:, 0]).sum() > 1000  # nobody read it then
+    late = [value for time, value in world.writes if time > 100 + 60]
+    assert late
+    assert not np.any(late)
 
 
 class _ByHand:
@@ -1232,7 +1220,8 @@ def began(rig: Rig, target: float, rate: float = RATE) -> Conductor:
 
 
 def stall(rig: Rig, seconds: float) -> None:
-    world_of(rig).sleep_until(world_of(rig).t + seconds)
+    """Let the experiment stand still; what guards the arm goes on."""
+    rig.clock.sleep(seconds)
 
 
 def hold(conductor: Conductor, target: float, seconds: float) -> None:
@@ -1243,44 +1232,75 @@ def written(rig: Rig, start: int = 0) -> np.ndarray:
     return np.array([value[0] for _, value in world_of(rig).writes[start:]])
 
 
-@pytest.mark.parametrize("sign", [1, -1], ids=["pressure", "vacuum"])
-@pytest.mark.parametrize("error", [0.0, 0.245e5, -0.245e5])
-@pytest.mark.parametrize("pause", [0.32, 0.36, 1.0])
-def test_after_the_watchdog_has_vented_pressure_comes_back_slowly(
-    sign: int, error: float, pause: float
-) -> None:
-    rig = fake_rig(slew=1e5, low=-1.5e5)
-    world = world_of(rig)
-    world.watchdog, world.gauge = 0.3, lambda p: p + error
-    with rig:
-        conductor = began(rig, sign * 1e5)
-        before = len(world.writes)
-        stall(rig, pause)
-        hold(conductor, sign * 1e5, 2.0)
-        after = sign * written(rig, before)
-    assert after[0] <= 2001
-    assert np.diff(np.concatenate([[0], after[:-1]])).max() <= 2001
-    assert after[-2] == 1e5  # and it does come back
+def test_an_experiment_needs_the_gate() -> None:
+    rig = fake_rig()
+    rig.supply = rig.bare  # type: ignore[attr-defined]
+    with rig, pytest.raises(InputError, match=r"open it by stiffopt\.open_rig"):
+        Conductor(rig, RATE)
 
 
-def test_a_supply_without_gauges_is_not_believed_to_hold_what_has_expired() -> None:
+@pytest.mark.parametrize("gauges", [True, False])
+def test_a_pause_shorter_than_a_command_holds_changes_nothing(gauges: bool) -> None:
     rig = fake_rig(slew=1e5)
-    world_of(rig).gauge = lambda p: np.full(3, np.nan)
+    world_of(rig).watchdog = 0.3  # of the device: it is spoken to all the time
+    if not gauges:
+        world_of(rig).gauge = lambda p: np.full(3, np.nan)
     with rig:
         conductor = began(rig, 1e5)
         before = len(world_of(rig).writes)
-        stall(rig, 0.4)
-        conductor.tick(np.full(3, 1e5))
-        assert written(rig, before).tolist() == [1e5]  # as a command holds for 0.5 s
-        stall(rig, 0.6)
-        conductor.tick(np.full(3, 1e5))
-        assert written(rig, before)[1] <= 2000
+        for pause in (0.32, 0.36, 0.49):
+            stall(rig, pause)
+            hold(conductor, 1e5, 0.3)
+        assert set(written(rig, before)) == {1e5}
+        assert world_of(rig).pressures == pytest.approx([1e5] * 3, rel=1e-3)
+
+
+@pytest.mark.parametrize("start", [1e5, -0.5e5], ids=["pressure", "vacuum"])
+def test_after_a_longer_pause_pressures_come_back_slowly(start: float) -> None:
+    """The command has expired: the arm is being let down, and goes on from there."""
+    rig = fake_rig(slew=1e5, low=-1.5e5)
+    with rig:
+        conductor = began(rig, start)
+        before = len(world_of(rig).writes)
+        stall(rig, 0.9)
+        low = abs(world_of(rig).commanded[0])
+        assert 0.5 * abs(start) < low < 0.7 * abs(start)
+        conductor.ramp(np.full(3, start))
+        assert np.diff(np.abs(written(rig, before))).max() <= 1001
+
+
+@pytest.mark.parametrize("pause", [1.6, 10.0])
+def test_after_a_long_pause_the_arm_is_vented_and_the_experiment_ends(pause: float) -> None:
+    rig = fake_rig(slew=1e5)
+    with rig:
+        conductor = began(rig, 1e5)
+        stall(rig, pause)
+        assert not world_of(rig).commanded.any()
+        before = len(world_of(rig).writes)
+        with pytest.raises(DeviceError, match=r"stood still for 1.* s.*--resume"):
+            conductor.tick(np.full(3, 1e5))
+        assert not written(rig, before).any()
+
+
+@pytest.mark.parametrize("pause", [0.6, 5.0])
+def test_after_everything_stood_still_nothing_is_commanded(pause: float) -> None:
+    """Not even what guards the arm has run meanwhile; the device has vented by itself."""
+    rig = fake_rig(slew=1e5)
+    world_of(rig).watchdog = 0.3
+    with rig:
+        conductor = began(rig, 1e5)
+        before = len(world_of(rig).writes)
+        world_of(rig).sleep_until(world_of(rig).t + pause)
+        with pytest.raises(StiffoptError, match=r"no command came|stood still"):
+            conductor.tick(np.full(3, 1e5))
+        assert not written(rig, before).any()
 
 
 @pytest.mark.parametrize("start", [1.5e5, -0.2e5])
-@pytest.mark.parametrize("error", [-0.245e5, 0.245e5, -0.15e5, 0.15e5])
+@pytest.mark.parametrize("error", [-0.07e5, 0.07e5, 0.145e5])
 @pytest.mark.parametrize("pause", [0.0, 0.4])
 def test_a_gauge_that_is_wrong_moves_nothing(start: float, error: float, pause: float) -> None:
+    """Too low by half of `Safety.max_pressure_error`, or too high by all of it."""
     rig = fake_rig(slew=1e5, low=-0.6e5)
     world_of(rig).gauge = lambda p: p + error
     with rig:
@@ -1289,11 +1309,12 @@ def test_a_gauge_that_is_wrong_moves_nothing(start: float, error: float, pause: 
         for target in (start, start / 2, start):
             stall(rig, pause)
             conductor.ramp(np.full(3, target))
+            hold(conductor, target, 1.0)
         moved = np.diff(written(rig, before - 1))
     assert np.abs(moved).max() <= 1001
 
 
-@pytest.mark.parametrize("shown", [0.0, 1.5e5, np.nan])
+@pytest.mark.parametrize("shown", [0.0, 1.5e5, 9e5, np.nan])
 @pytest.mark.parametrize("pause", [0.0, 0.4])
 def test_one_or_two_bad_readings_move_nothing(shown: float, pause: float) -> None:
     rig = fake_rig(slew=1e5)
@@ -1313,63 +1334,82 @@ def test_one_or_two_bad_readings_move_nothing(shown: float, pause: float) -> Non
     assert np.diff(written(rig, before)[:-1]).min() >= -1001
 
 
+@pytest.mark.parametrize("shown", [9e5, np.nan])
+def test_readings_that_stay_impossible_end_the_experiment(shown: float) -> None:
+    rig = fake_rig(slew=1e5)
+    with rig:
+        conductor = began(rig, 1e5)
+        world_of(rig).gauge = lambda p: np.array([p[0], shown, p[2]])
+        with pytest.raises(DeviceError, match=r"channel 2 reads .*, which cannot be"):
+            hold(conductor, 1e5, 1.0)
+    assert not world_of(rig).commanded.any()
+
+
 def test_slow_regulators_are_not_taken_for_lost_pressure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fake_rig.LAG", 2.0)
     rig = fake_rig(slew=1e5)
     with rig:
         conductor = began(rig, 1.5e5)
         hold(conductor, 1.5e5, 5.0)
-        conductor.ramp(np.full(3, 0.2e5), slew=1e5)
+        for _ in range(200):
+            conductor.tick(np.full(3, 0.2e5))
         before = len(world_of(rig).writes)
         for pause in (0.0, 0.2, 0.4, 0.4):
             stall(rig, pause)
             hold(conductor, 0.2e5, 3.0)
         assert set(written(rig, before)) == {0.2e5}
+        conductor.ramp(np.full(3, 1.5e5))
+        hold(conductor, 1.5e5, 3.0)
 
 
-def test_pressure_that_goes_while_the_loop_runs_comes_back_slowly() -> None:
-    """Somebody has shut the air and opens it again."""
-    rig = fake_rig(slew=1e5)
-    world, shut = world_of(rig), [False]
-    advance = world.sleep_until
-
-    def without_air(moment: float) -> None:
-        advance(moment)
-        if shut[0]:
-            world.pressures = np.zeros(3)
-
-    world.sleep_until = without_air  # type: ignore[method-assign]
+@pytest.mark.parametrize("start", [1e5, -0.5e5], ids=["pressure", "vacuum"])
+@pytest.mark.parametrize("left", [0.0, 0.3])
+def test_pressure_that_is_lost_ends_the_experiment(start: float, left: float) -> None:
+    """Somebody has shut the air, or a tube is off: what was measured then is worth nothing."""
+    rig = fake_rig(slew=1e5, low=-1e5)
+    world, lost = world_of(rig), [False]
+    world.gauge = lambda p: np.array([p[0] * left, p[1], p[2]]) if lost[0] else p
     with rig:
-        conductor = began(rig, 1e5)
-        shut[0] = True
-        hold(conductor, 1e5, 0.1)
-        shut[0] = False
-        before = len(world.writes)
-        hold(conductor, 1e5, 2.0)
-        after = written(rig, before)
-    assert after[0] < 0.1e5
-    assert after[-2] == 1e5
+        conductor = began(rig, start)
+        hold(conductor, start, 10.0)
+        lost[0] = True
+        before = world.t
+        with pytest.raises(DeviceError, match=r"channel 1 reads .* (leaks|is stuck)"):
+            hold(conductor, start, 5.0)
+        assert world.t - before < 1.0
+    assert not world.commanded.any()
+
+
+def test_pressure_that_nobody_commanded_ends_the_experiment() -> None:
+    rig = fake_rig(slew=1e5)
+    with rig:
+        conductor = Conductor(rig, RATE)
+        conductor.start()
+        world_of(rig).gauge = lambda p: p + np.array([0.0, 0.0, 0.5e5])
+        with pytest.raises(DeviceError, match=r"channel 3 reads 0\.5 bar.* is stuck"):
+            hold(conductor, 0.0, 1.0)
 
 
 def test_a_loop_that_was_held_up_does_not_jump_on_a_rig_without_slew(tmp_path: Path) -> None:
     rig = fake_rig(slew=None)
-    assert steepest(rig).tolist() == [STEEPEST] * 3
+    assert effective_slew(rig).tolist() == [COMMANDS.default_slew] * 3
     stalls = iter([False] * 400 + [True] + [False] * 10000)
 
     def check() -> None:
         if next(stalls):
-            stall(rig, 1.9)
+            stall(rig, 1.4)
 
     with rig:
         run_kinematics(rig, tmp_path, short(repetitions=1, period=4.0), rate=RATE, check=check)
     values = written(rig)
     assert values.max() > 0.45e5
-    assert np.abs(np.diff(values)).max() <= STEEPEST * 2 / RATE + 1e-6
-    quick_teeth = PressureSequence.sawtooth(np.zeros(3), [1.5e5], 0.1, steepest(rig))
-    assert quick_teeth.times[1] == pytest.approx(1.5e5 / STEEPEST)
+    most = COMMANDS.default_slew * COMMANDS.pause_periods * PERIOD
+    assert np.abs(np.diff(values)).max() <= most + 1e-6
+    quick_teeth = PressureSequence.sawtooth(np.zeros(3), [1.5e5], 0.1, effective_slew(rig))
+    assert quick_teeth.times[1] == pytest.approx(1.5e5 / COMMANDS.default_slew)
 
 
-@pytest.mark.parametrize(("low", "high"), [(-0.6e5, -0.1e5), (0.1e5, 0.6e5), (-0.6e5, 0.6e5)])
+@pytest.mark.parametrize(("low", "high"), [(0.1e5, 0.6e5), (-0.6e5, 0.6e5), (-0.6e5, 0.0)])
 def test_every_arm_can_be_ramped_down(low: float, high: float) -> None:
     rig = fake_rig(slew=1e5, low=low, high=high)
     target = 0.3e5 if high > 0 else -0.3e5
@@ -1383,37 +1423,36 @@ def test_every_arm_can_be_ramped_down(low: float, high: float) -> None:
 
 
 def test_a_ramp_that_gets_nowhere_ends() -> None:
-    rig = fake_rig(slew=1e5, high=0.2e5)
+    """Three channels together need more force than the rig allows."""
+    rig = fake_rig(slew=1e5, high=0.2e5, safety=Safety(max_force=0.5))
     with rig:
-        conductor = Conductor(rig, RATE, check=lambda: stall(rig, 0.31))
+        conductor = Conductor(rig, RATE)
         conductor.start()
-        world_of(rig).watchdog = 0.3
-        world_of(rig).gauge = lambda p: np.full(3, np.nan)
-        conductor._valid = 0.3
-        with pytest.raises(DeviceError, match="fall again and again"):
+        with pytest.raises(DeviceError, match="the gate limits them"):
             conductor.ramp(np.full(3, 0.2e5))
-    assert max(value.max() for _, value in world_of(rig).writes) <= 2001
+    force = max(rig.force(value) for _, value in world_of(rig).writes)
+    assert 0.4 < force <= 0.5
 
 
 def test_a_slew_of_nothing_is_refused() -> None:
-    with fake_rig(slew=0.0) as rig, pytest.raises(InputError, match="slew of this rig"):
-        Conductor(rig, RATE)
+    with pytest.raises(InputError, match="slew: expected values above 0"):
+        fake_rig(slew=0.0)
 
 
-LIMITS = [(0.0, 1.5e5), (-0.6e5, -0.1e5), (0.1e5, 1e5), (-0.6e5, 0.6e5), (-0.9e5, 0.0)]
+LIMITS = [(0.0, 1.5e5), (0.1e5, 1e5), (-0.6e5, 0.6e5), (-0.9e5, 0.0)]
 STEPS = st.tuples(
-    st.sampled_from(["tick", "ramp", "stall", "spike"]), st.floats(0, 1), st.booleans()
+    st.sampled_from(["tick", "ramp", "stall", "halt", "spike"]), st.floats(0, 1), st.booleans()
 )
 
 
-@examples(max_examples=120, deadline=None, derandomize=True)
+@examples(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @example(LIMITS[0], 0.3, 0.0, [("ramp", 0.7, True), ("stall", 1.0, True), ("tick", 0.7, True)], 0)
-@example(LIMITS[1], 0.3, 0.0, [("ramp", 0.2, True), ("stall", 1.0, True), ("ramp", 0.2, False)], 0)
-@example(LIMITS[4], math.inf, -0.15e5, [("ramp", 0.7, True)] * 3, 1)
+@example(LIMITS[1], 0.3, 0.0, [("ramp", 0.2, True), ("halt", 1.0, True), ("ramp", 0.2, False)], 0)
+@example(LIMITS[3], math.inf, -0.07e5, [("ramp", 0.7, True)] * 3, 1)
 @given(
     limits=st.sampled_from(LIMITS),
     watchdog=st.sampled_from([0.3, 0.5, math.inf]),
-    error=st.sampled_from([0.0, 0.245e5, -0.245e5]),
+    error=st.sampled_from([0.0, 0.145e5, -0.07e5]),
     steps=st.lists(STEPS, min_size=1, max_size=7),
     seed=st.integers(0, 99),
 )
@@ -1424,6 +1463,7 @@ def test_commands_keep_their_promises(
     steps: list[tuple[str, float, bool]],
     seed: int,
 ) -> None:
+    """Whatever happens: within limits and slew, or vented; and an end leaves the arm vented."""
     low, high = limits
     slew = [1e5, 0.3e5, None][seed % 3]
     rig = fake_rig(slew=slew, low=low, high=high)
@@ -1435,40 +1475,46 @@ def test_commands_keep_their_promises(
         return p + error if not bad[0] else np.full(3, 7e4 * (seed % 5 - 2))
 
     world.gauge = gauge
+    ended = False
     with rig:
         conductor = began(rig, min(max(0.0, low), high))
-        for what, share, long in steps:
-            target = np.array([share, 1 - share, 0.5]) * (high - low) + low
-            target = np.where([long, True, not long], target, 0.0)
-            if what == "stall":
-                stall(rig, (2.0 if long else 0.6) * share)
-            elif what == "spike":
-                bad[0] = 2  # the next reading but none after it
-            elif what == "ramp":
-                conductor.ramp(target)
-                assert world.commanded.tolist() == target.tolist()
-            for _ in range(20 if long else 3):
-                conductor.tick(target)
-        conductor.ramp(np.zeros(3))
-        assert not world.commanded.any()
-        ended = len(world.writes)
-    times = np.array([time for time, _ in world.writes[:ended]])
-    values = np.array([value for _, value in world.writes[:ended]])
-    chambers = np.array(world.chambers[:ended])
+        try:
+            for what, share, long in steps:
+                target = np.array([share, 1 - share, 0.5]) * (high - low) + low
+                target = np.where([long, True, not long], target, 0.0)
+                if what == "stall":
+                    stall(rig, (2.0 if long else 0.6) * share)
+                elif what == "halt":  # of all that runs here
+                    world.sleep_until(world.t + (2.0 if long else 0.6) * share)
+                elif what == "spike":
+                    bad[0] = 2  # the next reading but none after it
+                elif what == "ramp":
+                    conductor.ramp(target)
+                    assert world.commanded.tolist() == target.tolist()
+                for _ in range(20 if long else 3):
+                    conductor.tick(target)
+            conductor.ramp(np.zeros(3))
+            assert not world.commanded.any()
+        except StiffoptError:
+            ended = True
+            assert any(what in ("stall", "halt") for what, _, _ in steps)
+    assert not world.commanded.any()
+    times = np.array([time for time, _ in world.writes])
+    values = np.array([value for _, value in world.writes])
     assert ((values == 0) | ((values >= low) & (values <= high))).all()
     edge = min(max(0.0, low), high)  # what is nearest to nothing that can be held
-    rate = STEEPEST if slew is None else slew
-    for k in range(1, ended):
-        step = rate * min(times[k] - times[k - 1], 2 / RATE) + 1e-6
-        for old, new, chamber in zip(values[k - 1], values[k], chambers[k], strict=True):
+    rate = COMMANDS.default_slew if slew is None else slew
+    for k in range(1, len(values)):
+        passed = min(times[k] - times[k - 1], COMMANDS.pause_periods * PERIOD)
+        step = rate * passed + 1e-6
+        vented = not values[k].any()  # at once, when the arm is closed or a command has expired
+        for old, new in zip(values[k - 1], values[k], strict=True):
             smooth = abs(new - old) <= step
-            gap = (old, new) == (0, edge) or (new == 0 and 0 < abs(edge) >= abs(old) - step)
-            gone = abs(chamber) < abs(old) - 0.05e5 or times[k] - times[k - 1] > 0.5
-            restarted = gone and abs(new) <= max(step, abs(edge))
-            assert smooth or gap or restarted
-            if times[k] - times[k - 1] > 0.15 and watchdog < times[k] - times[k - 1]:
-                slack = 0.15e5 + rate * (LAG + 3 / RATE) + abs(error)
-                assert abs(new) <= abs(chamber) + max(slack, abs(edge) + step)
+            gap = (old, new) in ((0, edge), (edge, 0)) or (
+                new == 0 and abs(old) <= abs(edge) + step
+            )
+            assert smooth or gap or vented, (k, old, new)
+    assert ended or not values[-1].any()
 
 
 def test_two_processes_do_not_share_a_folder(
@@ -1497,7 +1543,7 @@ def test_a_probe_that_is_mounted_by_hand_needs_somebody(
 def test_readings_that_cannot_be_end_the_experiment(tmp_path: Path) -> None:
     description = load_rig_description(SIM)
     plant = description.plant.model_copy(update={"faults": True, "dynamics": "quasi-static"})
-    rig = make_rig(
+    rig = rig_for_programs(
         description.model_copy(update={"plant": plant}),
         stiffopt.load_robot("stiff-flop-1").description,
     )
@@ -1507,6 +1553,6 @@ def test_readings_that_cannot_be_end_the_experiment(tmp_path: Path) -> None:
         if world.time > 3 and world.faults["supply"] == "ok":
             world.inject("supply", "garbage", 1)
 
-    with rig, pytest.raises(DeviceError, match=r"channel 2, of which at most 1\.5 bar"):
+    with rig, pytest.raises(DeviceError, match=r"channel 2 reads .*, which cannot be"):
         run_kinematics(rig, tmp_path, short(), rate=50.0, progress=spoil)
     assert not world.set_point.any()

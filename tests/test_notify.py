@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from stiffopt.daemon.notify import ServiceManager
+from stiffopt.daemon.keeper import ServiceManager
 from stiffopt.errors import MissingExtraError
 
 VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")

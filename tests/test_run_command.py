@@ -44,7 +44,7 @@ from stiffopt.control.controller import Controller
 from stiffopt.control.state import Alarm, Event, Severity, State, Timing
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon.client import Client
-from stiffopt.daemon.daemon import STOP_TIME
+from stiffopt.daemon.daemon import TIMES
 
 ROOT = Path(__file__).resolve().parent.parent
 EDGES, COUNTS = (1e-4, 1e-3, 1e-2), (90, 8, 2, 0)
@@ -172,7 +172,15 @@ def test_two_segments_hold_a_task_without_the_extra_and_for_a_time(
     tmp_path: Path, compiled: Path
 ) -> None:
     (tmp_path / "two.yaml").write_text(TWO, encoding="utf-8")
-    missing = ("fastapi", "uvicorn", "websockets", "httpx", "foxglove", "prometheus_client")
+    missing = (
+        "fastapi",
+        "starlette",
+        "uvicorn",
+        "websockets",
+        "httpx",
+        "foxglove",
+        "prometheus_client",
+    )
     hidden = f"import sys; sys.modules.update(dict.fromkeys({missing})); "
     rig = str(patient_rig(tmp_path, "sim-two-segment"))
     task = str(tmp_path / "two.yaml")
@@ -284,7 +292,7 @@ def test_a_terminal_that_takes_nothing_does_not_keep_it_from_ending(
         wait_for(inactive, 60)
         time.sleep(0.5)
         run.send_signal(signal.SIGTERM)
-        assert run.wait(1 + STOP_TIME) == 0
+        assert run.wait(1 + TIMES.stop) == 0
     finally:
         run.kill()
         run.wait()
@@ -352,7 +360,7 @@ def test_what_hangs_when_all_is_over_is_left(
             tracker={"port": str(tmp_path / "no-aurora")},
         )
     )
-    monkeypatch.setattr(daemon_module, "_REST_TIME", 0.2)
+    monkeypatch.setattr(daemon_module, "TIMES", replace(TIMES, rest=0.2))
     hangs = threading.Event()
     end = Controller.close
 

@@ -14,7 +14,7 @@ import pytest
 
 from made_runs import BEGIN, FakeLoop, StillClock, event, snapshot, ticks
 from stiffopt.daemon import recording as recording_module
-from stiffopt.daemon.recording import MIN_FREE, Recording
+from stiffopt.daemon.recording import RecordingLimits, RunRecording
 from stiffopt.daemon.run_log import read_run
 from stiffopt.daemon.telemetry import about_run
 from stiffopt.model.robot_files import load_description
@@ -29,12 +29,12 @@ class Logger:
     """A recording and what is logged into it."""
 
     def __init__(self, folder: Path, name: str = "rig", **options: Any) -> None:
-        from stiffopt.daemon.channels import TelemetryChannels
+        from stiffopt.daemon.topics import TelemetryChannels
 
         context = foxglove.Context()
         self.channels = TelemetryChannels(context, round(WALL * 1e9), 0.03)
         about = about_run(ROBOT, name, snapshot(BEGIN), BEGIN, 0)
-        self.recording = Recording(
+        self.recording = RunRecording(
             folder, name, context, about, wall=lambda: WALL, **{"free": lambda _: 1e12, **options}
         )
         self.count = 0
@@ -133,7 +133,7 @@ def test_a_name_never_overwrites(tmp_path: Path) -> None:
 
 
 def test_a_large_recording_goes_on_in_another_file(tmp_path: Path) -> None:
-    logger = Logger(tmp_path, largest=20_000.0)
+    logger = Logger(tmp_path, limits=RecordingLimits(largest=20_000.0))
     logger.recording.commit(0.0)
     for _ in range(60):
         logger.log(10)
@@ -150,7 +150,7 @@ def test_the_disk_is_not_filled_to_its_last_byte(tmp_path: Path) -> None:
     logger = Logger(tmp_path, free=lambda _: free)
     logger.recording.commit(0.0)
     logger.log(10, 0.0)
-    free = MIN_FREE - 1
+    free = RecordingLimits().min_free - 1
     logger.log(10, 0.5)  # looked at once a second
     assert logger.recording.is_open
     logger.log(10, 1.1)
@@ -160,7 +160,7 @@ def test_the_disk_is_not_filled_to_its_last_byte(tmp_path: Path) -> None:
     run = read_run(path)
     assert run.complete
     assert len(run) == 30
-    free = MIN_FREE + 1  # not yet enough
+    free = RecordingLimits().min_free + 1  # not yet enough
     logger.log(10, 100.0)
     assert "MB are free" in logger.recording.trouble
     free = 1e12

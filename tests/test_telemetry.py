@@ -30,8 +30,7 @@ from made_runs import (
     tip_at,
 )
 from stiffopt.control.state import Alarm, Severity, State
-from stiffopt.daemon.run_export import log_of_run
-from stiffopt.daemon.run_log import read_run
+from stiffopt.daemon.run_log import log_of_run, read_run
 from stiffopt.daemon.telemetry import Telemetry
 from stiffopt.daemon.topics import topic_schemas
 from stiffopt.logs import read_log, write_log

@@ -16,7 +16,7 @@ from stiffopt.experiments import (
     KinematicsSettings,
     StiffnessResult,
 )
-from stiffopt.experiments.slope import Estimate
+from stiffopt.experiments.slope import SlopeEstimate
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.plots.wording import BAR, MM, figures
 
@@ -196,7 +196,7 @@ def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentR
     )
 
 
-def _estimate(estimate: Estimate | None) -> str:
+def _estimate(estimate: SlopeEstimate | None) -> str:
     if estimate is None:
         return "no contact"
     return f"{figures(estimate.value)} +- {estimate.half_width:.2g}"

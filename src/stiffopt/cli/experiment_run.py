@@ -34,7 +34,6 @@ from stiffopt.experiments import (
     run_stiffness,
 )
 from stiffopt.experiments.coverage import round_count
-from stiffopt.experiments.coverage_result import read_rounds
 from stiffopt.experiments.folder import (
     alone_in,
     check_same,
@@ -48,7 +47,7 @@ from stiffopt.experiments.kinematics import (
     poses_for,
     sequence_for,
 )
-from stiffopt.experiments.kinematics_result import read_recordings
+from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
 from stiffopt.logs import require_mcap, write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot

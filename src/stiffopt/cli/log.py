@@ -1,4 +1,4 @@
-"""The commands `stiffopt log ...`: what was recorded of a run, as a table and as a page."""
+"""The commands `stiffopt log export` and `stiffopt log plot`: their options and help."""
 
 from typing import Annotated
 

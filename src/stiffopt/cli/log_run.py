@@ -1,4 +1,4 @@
-"""What `stiffopt log ...` does: read a recording, write what it says in another form."""
+"""Exports the recording of a run as CSV, or plots it."""
 
 from __future__ import annotations
 
@@ -20,8 +20,7 @@ def export(recording: str, out: str | None, *, quiet: bool) -> int:
     """Write a recording as log v1; return the exit code."""
 
     def work() -> None:
-        from stiffopt.daemon.run_export import log_of_run
-        from stiffopt.daemon.run_log import is_of_experiment, read_run
+        from stiffopt.daemon.run_log import is_of_experiment, log_of_run, read_run
         from stiffopt.logs import Log, read_mcap_log, write_log
 
         path = _beside(recording, ".csv") if out is None else out

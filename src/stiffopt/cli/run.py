@@ -1,4 +1,4 @@
-"""The command `stiffopt run`: the closed loop of a rig, until it is ended."""
+"""The command `stiffopt run`: its options and help."""
 
 from typing import Annotated
 
@@ -59,10 +59,13 @@ def run(
     ] = False,
 ) -> None:
     """Run the daemon."""
-    from stiffopt.cli.run_daemon import Options, run  # here, so that --help waits for no numerics
+    from stiffopt.cli.run_daemon import (  # here, so that --help waits for no numerics
+        RunOptions,
+        run,
+    )
 
     style = "plain" if plain else "json" if json_lines else "auto"
     if plain and json_lines:
         raise typer.BadParameter("give --plain or --json-lines, not both")
-    options = Options(task, arm, duration, not no_service, log_folder, style)
+    options = RunOptions(task, arm, duration, not no_service, log_folder, style)
     raise typer.Exit(run(rig, options))

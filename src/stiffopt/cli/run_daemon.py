@@ -1,4 +1,4 @@
-"""What `stiffopt run` does: start the daemon, show it, end it in good order."""
+"""Runs the daemon in the foreground: starts it, shows its state, ends it on a signal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from stiffopt.cli.console import report_error
 from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED
 from stiffopt.cli.quantities import quantity
 from stiffopt.cli.run_ending import Backstop, Screen, leave
-from stiffopt.cli.run_lines import Display, Lines
+from stiffopt.cli.run_lines import Lines, RunDisplay
 from stiffopt.control.state import State
 from stiffopt.errors import InputError, SlowWarning, StiffoptError
 from stiffopt.rig.config import load_rig_description
@@ -27,7 +27,7 @@ from stiffopt.rig.config import load_rig_description
 if TYPE_CHECKING:
     from stiffopt.daemon.daemon import Daemon
 
-__all__ = ["Options", "run"]
+__all__ = ["RunOptions", "run"]
 
 _SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
@@ -38,8 +38,8 @@ _FAVOURED = -10  # niceness, where permitted: see `_favour`
 
 
 @dataclass(frozen=True)
-class Options:
-    """The options of the command.
+class RunOptions:
+    """The options of `stiffopt run`.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Options:
     style: str = "auto"
 
 
-def run(rig: str, options: Options) -> int:
+def run(rig: str, options: RunOptions) -> int:
     """Run the daemon of a rig until it is ended; return the exit code."""
     try:
         seconds = _checked(options)
@@ -71,7 +71,7 @@ def run(rig: str, options: Options) -> int:
         return BAD_INPUT
 
 
-def _checked(options: Options) -> float:
+def _checked(options: RunOptions) -> float:
     """Return the duration in s; raise `InputError` if the options contradict each other."""
     if options.task is not None and not options.arm:
         raise InputError("--task needs --arm: a task is pursued once the arm is armed")
@@ -90,9 +90,9 @@ def _checked(options: Options) -> float:
     return seconds
 
 
-def _run(rig: str, options: Options, seconds: float, signals: _Signals) -> int:
+def _run(rig: str, options: RunOptions, seconds: float, signals: _Signals) -> int:
     _favour()
-    from stiffopt.daemon.daemon import STOP_TIME, Daemon
+    from stiffopt.daemon.daemon import TIMES, Daemon
 
     style = _style(options.style)
     daemon = Daemon(
@@ -103,7 +103,7 @@ def _run(rig: str, options: Options, seconds: float, signals: _Signals) -> int:
     )
     screen = Screen()
     watch = _Watch(daemon, _display(style, daemon), signals, screen)
-    longest = daemon.description.safety.ramp_time + STOP_TIME
+    longest = daemon.description.safety.ramp_time + TIMES.stop
     with Backstop(longest, watch.is_ending), _warnings_shown(watch):
         state, refused = _steered(daemon, watch, options, seconds)
         code = _verdict(daemon, state, refused, watch.report)
@@ -112,7 +112,9 @@ def _run(rig: str, options: Options, seconds: float, signals: _Signals) -> int:
     return code
 
 
-def _steered(daemon: Daemon, watch: _Watch, options: Options, seconds: float) -> tuple[State, str]:
+def _steered(
+    daemon: Daemon, watch: _Watch, options: RunOptions, seconds: float
+) -> tuple[State, str]:
     """Run a daemon from its start to its end; return the last state, and why it was refused."""
     refused = ""
     try:
@@ -137,7 +139,7 @@ def _steered(daemon: Daemon, watch: _Watch, options: Options, seconds: float) ->
 
 
 def _verdict(daemon: Daemon, state: State, refused: str, report: Callable[[str], None]) -> int:
-    """Return the exit code, and say what must be known."""
+    """Return the exit code; report what went wrong."""
     if refused:
         report(refused)
     if daemon.trouble:
@@ -154,9 +156,11 @@ def _verdict(daemon: Daemon, state: State, refused: str, report: Callable[[str],
 
 
 class _Watch:
-    """Shows what a daemon does until it shall end, and while it ends."""
+    """Shows the state of a daemon while it runs and while it ends."""
 
-    def __init__(self, daemon: Daemon, display: Display, signals: _Signals, screen: Screen) -> None:
+    def __init__(
+        self, daemon: Daemon, display: RunDisplay, signals: _Signals, screen: Screen
+    ) -> None:
         self.signals = signals
         self._display, self._daemon, self._screen = display, daemon, screen
         self._next_event = 0
@@ -205,12 +209,12 @@ class _Watch:
 
     def wind_up(self) -> None:
         """Show how the pressures are let down; another signal lets them out at once."""
-        from stiffopt.daemon.daemon import CONTROL_TIME
+        from stiffopt.daemon.daemon import TIMES
 
         self._ending = True
         self._daemon.begin_stop()
         vented = False
-        end = time.monotonic() + self._daemon.description.safety.ramp_time + CONTROL_TIME
+        end = time.monotonic() + self._daemon.description.safety.ramp_time + TIMES.control
         while not self._daemon.ended and time.monotonic() < end:
             self.show()
             if self.signals.count > 1 and not vented:
@@ -220,7 +224,7 @@ class _Watch:
 
 
 class _Signals:
-    """Signals that end the program, counted; none of them interrupts what is being done.
+    """Counts the signals that are to end the program, without interrupting it.
 
     Attributes
     ----------
@@ -276,7 +280,7 @@ def _style(asked: str) -> str:
     return "live" if sys.stdout is not None and sys.stdout.isatty() else "json"
 
 
-def _display(style: str, daemon: Daemon) -> Display:
+def _display(style: str, daemon: Daemon) -> RunDisplay:
     if style == "live":
         from stiffopt.cli.run_status import LiveStatus
 
@@ -304,7 +308,7 @@ def _warnings_shown(watch: _Watch) -> Iterator[None]:
 
 
 def _favour() -> None:
-    """Let this process be preferred to others, where that is permitted.
+    """Raise the priority of this process, where that is permitted.
 
     The control thread is real-time, but must wait for whichever thread has the interpreter; that
     one should not in turn have to wait for other programs.

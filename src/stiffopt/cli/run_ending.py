@@ -1,4 +1,4 @@
-"""How `stiffopt run` ends in bounded time: nothing that is shown, or hangs, can keep it."""
+"""Makes `stiffopt run` end in bounded time, even if the terminal or a thread hangs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from queue import SimpleQueue
 from typing import Self
 
 from stiffopt.cli.exits import FAULT
-from stiffopt.daemon.parts import Part
+from stiffopt.daemon.calls import Part
 
 __all__ = ["Backstop", "Screen", "leave"]
 
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class Screen:
-    """Shows things one after the other in a thread of its own: a terminal may take nothing."""
+    """Prints from a thread of its own, since writing to a terminal may block."""
 
     def __init__(self) -> None:
         self._waiting: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
@@ -55,7 +55,7 @@ class Screen:
 
 
 class Backstop:
-    """Ends the process if it has not ended in time by itself, whatever it hangs in.
+    """A watchdog that ends the process if it does not end in time by itself.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def _flush() -> None:
 
 
 def _tell(line: bytes) -> None:
-    """Write to stderr if somebody takes it."""
+    """Write to stderr unless that would block."""
     with suppress(OSError, ValueError, AttributeError):
         ready = select.poll()
         ready.register(sys.stderr.fileno(), select.POLLOUT)

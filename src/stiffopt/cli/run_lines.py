@@ -1,4 +1,4 @@
-"""What `stiffopt run` tells as lines: JSON for programs, plain for people."""
+"""Shows a run as lines on stdout: JSON for programs, plain text for people."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import entries
@@ -17,40 +17,23 @@ from stiffopt.daemon.reports import plain
 from stiffopt.errors import printable
 from stiffopt.safety.messages import json_line
 
-__all__ = ["Display", "Facts", "Lines"]
+if TYPE_CHECKING:
+    from stiffopt.daemon.daemon import Daemon
+
+__all__ = ["Lines", "RunDisplay"]
 
 _LONGEST = 500  # characters of a text: a pipe takes 4096 bytes at once or not at all
 
 
-class Facts(Protocol):
-    """What does not change while a daemon runs."""
-
-    @property
-    def url(self) -> str | None:
-        """Of the control interface."""
-
-    @property
-    def token_file(self) -> object:
-        """Where the token is."""
-
-    @property
-    def recording(self) -> str | None:
-        """The file that is recorded to."""
-
-    @property
-    def foxglove_port(self) -> int | None:
-        """Where Foxglove can connect."""
-
-
-class Display(Protocol):
-    """Where a run is shown, anew after each `period`, in s."""
+class RunDisplay(Protocol):
+    """A way to show a run: as lines or as a live status; updated every `period`, in s."""
 
     period: float
 
     def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Show something that is no event of the loop."""
 
-    def begin(self, facts: Facts) -> None:
+    def begin(self, daemon: Daemon) -> None:
         """Show what was started."""
 
     def update(self, now: Snapshot, events: list[Event]) -> None:
@@ -61,7 +44,7 @@ class Display(Protocol):
 
 
 class Lines:
-    """One line for each event and each change of state, on stdout.
+    """Writes a line to stdout for each event and each change of state.
 
     Nothing here waits or fails: a line that nobody takes, because the reader has stopped or is
     gone, is left out, for the arm is more important.
@@ -84,13 +67,13 @@ class Lines:
         """Write a line about this moment."""
         self._line(self._now(), str(severity), kind, text)
 
-    def begin(self, facts: Facts) -> None:
+    def begin(self, daemon: Daemon) -> None:
         """Write where everything is."""
         found: dict[str, Any] = {
-            "url": facts.url,
-            "token_file": None if facts.token_file is None else str(facts.token_file),
-            "recording": facts.recording,
-            "foxglove_port": facts.foxglove_port,
+            "url": daemon.url,
+            "token_file": None if daemon.token_file is None else str(daemon.token_file),
+            "recording": daemon.recording,
+            "foxglove_port": daemon.foxglove_port,
         }
         told = {key: value for key, value in found.items() if value is not None}
         words = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in told.items())

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -15,10 +15,12 @@ from rich.table import Table
 from rich.text import Text
 
 from stiffopt.cli.console import console_on
-from stiffopt.cli.run_lines import Facts
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.errors import printable
+
+if TYPE_CHECKING:
+    from stiffopt.daemon.daemon import Daemon
 
 __all__ = ["LiveStatus", "status"]
 
@@ -37,7 +39,7 @@ _FACTORS = {"": (1.0, 3), "mm": (1e3, 1), "deg": (180 / math.pi, 1)}  # and deci
 
 
 class LiveStatus:
-    """Shows how things stand, in one place of the terminal.
+    """Shows the state of the loop in one place of the terminal.
 
     A terminal that is gone or fails is no reason to end: nothing is shown then.
 
@@ -68,7 +70,7 @@ class LiveStatus:
             console=console or console_on(), auto_refresh=False, vertical_overflow="crop"
         )
         self._events: deque[Event] = deque(maxlen=_EVENTS)
-        self._facts: Facts | None = None
+        self._daemon: Daemon | None = None
         self._rate = math.nan
         self._before: tuple[float, int] | None = None
         self._works = True
@@ -79,9 +81,9 @@ class LiveStatus:
         if not self._live.is_started:
             self._attempt(lambda: self._live.console.print(Text(text, _LEVELS[severity])))
 
-    def begin(self, facts: Facts) -> None:
+    def begin(self, daemon: Daemon) -> None:
         """Start to show."""
-        self._facts = facts
+        self._daemon = daemon
         self._attempt(self._live.start)
 
     def update(self, now: Snapshot, events: list[Event]) -> None:
@@ -92,7 +94,7 @@ class LiveStatus:
         if self._before is None or now.time > self._before[0] + 1:
             self._before = (now.time, now.timing.ticks)
         shown = status(
-            now, self._name, self._channels, self._rate, tuple(self._events), self._facts
+            now, self._name, self._channels, self._rate, tuple(self._events), self._daemon
         )
         self._attempt(lambda: self._live.update(shown, refresh=True))
 
@@ -117,9 +119,9 @@ def status(
     channels: Sequence[str],
     rate: float = math.nan,
     events: Sequence[Event] = (),
-    facts: Facts | None = None,
+    daemon: Daemon | None = None,
 ) -> RenderableType:
-    """Return how things stand as something that rich shows.
+    """Return the state of the loop as something that rich can print.
 
     Parameters
     ----------
@@ -131,7 +133,7 @@ def status(
         Of the loop, in Hz; NaN where unknown.
     events :
         The latest.
-    facts :
+    daemon :
         Where everything is.
     """
     armed = now.state in (State.ACTIVE, State.HOLDING)
@@ -140,8 +142,8 @@ def status(
     stiffness = _stiffness(now) if armed else []
     parts.append(_table([*stiffness, *_loop(now, rate), *_alarms(now)]))
     parts += [_event(event) for event in events]
-    if facts is not None:
-        parts.append(_table(_places(facts)))
+    if daemon is not None:
+        parts.append(_table(_places(daemon)))
     return Group(*parts)
 
 
@@ -200,7 +202,7 @@ def _pressures(now: Snapshot, channels: Sequence[str]) -> Table:
 
 
 def _bar(measured: float, commanded: float, high: float) -> Text:
-    """Return what is measured as a bar against the limit, with a mark where it should be."""
+    """Return the measured pressure as a bar up to its limit, with a mark at the command."""
     share = min(max(measured / high, 0.0), 1.0) if high > 0 else 0.0
     wanted = min(max(commanded / high, 0.0), 1.0) if high > 0 else 0.0
     filled, mark = round(share * _BAR), min(round(wanted * _BAR), _BAR - 1)
@@ -262,15 +264,15 @@ def _event(event: Event) -> Text:
     return Text(f"  {printable(event.text)} [{event.kind}]", _LEVELS[event.severity])
 
 
-def _places(facts: Facts) -> list[tuple[str, RenderableType]]:
+def _places(daemon: Daemon) -> list[tuple[str, RenderableType]]:
     rows: list[tuple[str, RenderableType]] = []
-    if facts.url is not None:
-        token = "" if facts.token_file is None else f", token in {facts.token_file}"
-        rows.append(("control", f"{facts.url}{token}"))
-    if facts.foxglove_port is not None:
-        rows.append(("Foxglove", f"ws port {facts.foxglove_port}"))
-    if facts.recording is not None:
-        rows.append(("recording", facts.recording))
+    if daemon.url is not None:
+        token = "" if daemon.token_file is None else f", token in {daemon.token_file}"
+        rows.append(("control", f"{daemon.url}{token}"))
+    if daemon.foxglove_port is not None:
+        rows.append(("Foxglove", f"ws port {daemon.foxglove_port}"))
+    if daemon.recording is not None:
+        rows.append(("recording", daemon.recording))
     rows.append(("", Text("Ctrl-C lets the pressures down and ends; twice vents at once", "dim")))
     return rows
 

@@ -95,7 +95,7 @@ class Timing:
     The histogram of how late ticks begin has k upper edges and k + 1 counts.
     """
 
-    ticks: Annotated[int, Shown("so far", topic="/timing", metric="ticks")] = 0
+    ticks: Annotated[int, Shown("ticks of the loop so far", topic="/timing", metric="ticks")] = 0
     overruns: Annotated[
         int,
         Shown("ticks that ended after the next one was due", topic="/timing", metric="overruns"),
@@ -120,7 +120,8 @@ class Timing:
         ),
     ] = ()
     lateness_counts: Annotated[
-        tuple[int, ...], Shown("its counts (k + 1,); the last are later still", topic="/timing")
+        tuple[int, ...],
+        Shown("counts (k + 1,) of that histogram; the last are later", topic="/timing"),
     ] = (0,)
 
     @property
@@ -174,7 +175,12 @@ class SteeringStatus:
     ] = field(default_factory=_nan3)
     seen_age: Annotated[
         float,
-        Shown("age of that sample", "s", topic="/tip", metric="tracker_age_seconds"),
+        Shown(
+            "age of the latest sample that was used",
+            "s",
+            topic="/tip",
+            metric="tracker_age_seconds",
+        ),
     ] = math.inf
     target_position: Annotated[
         Array | None,
@@ -277,11 +283,23 @@ class Snapshot(SteeringStatus):
     ]
     commanded: Annotated[
         Array,
-        Shown("set-points", "Pa", topic="/pressure", metric="pressure_pascals", label="commanded"),
+        Shown(
+            "set-points of the channels",
+            "Pa",
+            topic="/pressure",
+            metric="pressure_pascals",
+            label="commanded",
+        ),
     ]
     measured: Annotated[
         Array,
-        Shown("readings", "Pa", topic="/pressure", metric="pressure_pascals", label="measured"),
+        Shown(
+            "measured pressures",
+            "Pa",
+            topic="/pressure",
+            metric="pressure_pascals",
+            label="measured",
+        ),
     ]
     measured_time: Annotated[
         float, Shown("when the pressures were read, on the rig's clock", "s", topic="/pressure")

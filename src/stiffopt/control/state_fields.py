@@ -148,7 +148,7 @@ def _entry(name: str, hint: Any, shown: Shown) -> Entry:
         units=units if len(units) > 1 else (),
         json=json,
         key=shown.key or (json[0] if json else name),
-        decimals=_DECIMALS[units[0]] if shown.decimals is None else shown.decimals,
+        decimals=_DECIMALS.get(units[0], 7) if shown.decimals is None else shown.decimals,
     )
 
 

@@ -1,17 +1,20 @@
-"""Who may speak to the daemon at all: before any request is read."""
+"""Access control of the HTTP interface: the token and the allowed hosts.
+
+Requests that a stranger or a foreign web page may not make are refused before they are parsed.
+"""
 
 from __future__ import annotations
 
 import hmac
 from collections.abc import Iterable
-from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from stiffopt.daemon.refusals import RefusedError
+from stiffopt.daemon.reports import RefusalError
+from stiffopt.daemon.secret import is_address
 from stiffopt.errors import InputError
 
 __all__ = ["MAX_BODY", "Access", "Token"]
@@ -22,7 +25,7 @@ _READING = ("GET", "HEAD")
 
 
 class Token:
-    """The secret of those who may move the arm.
+    """The secret that a client shows to be allowed to move the arm.
 
     Raises
     ------
@@ -39,31 +42,31 @@ class Token:
         self._secret = text.encode()
 
     def check(self, given: str | None) -> None:
-        """Raise `RefusedError` unless this is the token; the time it takes tells nothing of it."""
+        """Raise `RefusalError` unless this is the token; the time it takes tells nothing of it."""
         if given is None:
-            raise RefusedError(
+            raise RefusalError(
                 401, "no-token", "this needs the token: 'Authorization: Bearer TOKEN'"
             )
         if not hmac.compare_digest(given.encode("utf-8", "replace"), self._secret):
-            raise RefusedError(403, "wrong-token", "that is not this daemon's token")
+            raise RefusalError(403, "wrong-token", "that is not this daemon's token")
 
     def is_shown(self, headers: Headers) -> bool:
         """Return whether the token stands in the header Authorization."""
         try:
             self.check_headers(headers)
-        except RefusedError:
+        except RefusalError:
             return False
         return True
 
     def check_headers(self, headers: Headers) -> None:
-        """Raise `RefusedError` unless the token stands in the header Authorization."""
+        """Raise `RefusalError` unless the token stands in the header Authorization."""
         given = headers.getlist("authorization")
         kind, _, secret = given[0].partition(" ") if len(given) == 1 else ("", "", "")
         self.check(secret.strip() if kind.lower() == "bearer" else None)
 
 
 class Access:
-    """Refuses, in front of the application, what a stranger or a web page may send.
+    """ASGI middleware that refuses requests of strangers and of foreign web pages.
 
     - A web page that someone on this machine looks at can send requests here. So the request must
       be addressed to this machine by a name that no stranger's name server can hand out, and if
@@ -100,7 +103,7 @@ class Access:
                 receive = await _collected(receive, headers)
             elif "authorization" in headers:
                 self._token.check_headers(headers)
-        except RefusedError as refusal:
+        except RefusalError as refusal:
             if scope["type"] == "websocket":
                 await send({"type": "websocket.close", "code": 1008})  # before accepting: a 403
                 return
@@ -112,8 +115,8 @@ class Access:
     def _check_place(self, headers: Headers) -> None:
         hosts = headers.getlist("host")
         name = _host_name(hosts[0]) if len(hosts) == 1 else ""
-        if name not in self._hosts and not _is_address(name):
-            raise RefusedError(
+        if name not in self._hosts and not is_address(name):
+            raise RefusalError(
                 403,
                 "host",
                 "the header Host names no address of this daemon; use its IP address, localhost, "
@@ -122,7 +125,7 @@ class Access:
         for origin in headers.getlist("origin"):
             scheme, _, place = origin.partition("://")
             if scheme not in ("http", "https") or place.lower() != hosts[0].lower():
-                raise RefusedError(
+                raise RefusalError(
                     403, "origin", "pages of other sites may not speak to this daemon"
                 )
 
@@ -134,17 +137,9 @@ def _host_name(host: str) -> str:
         return ""
 
 
-def _is_address(name: str) -> bool:
-    try:
-        ip_address(name)
-    except ValueError:
-        return False
-    return True
-
-
 async def _collected(receive: Receive, headers: Headers) -> Receive:
     """Read the body, if it is not too long, and return what hands it out again."""
-    too_long = RefusedError(413, "too-long", f"the body is longer than {MAX_BODY} bytes")
+    too_long = RefusalError(413, "too-long", f"the body is longer than {MAX_BODY} bytes")
     given = headers.get("content-length", "0")
     if given.isdecimal() and (len(given) > 12 or int(given) > MAX_BODY):
         raise too_long

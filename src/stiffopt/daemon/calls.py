@@ -1,4 +1,4 @@
-"""Calls to the control loop from the service, which must not wait for it."""
+"""Runs calls that may hang in threads of their own, and waits for them for a limited time."""
 
 from __future__ import annotations
 
@@ -6,69 +6,56 @@ import asyncio
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any
 
 from stiffopt.control.request_queue import Requester, requested_by
-from stiffopt.control.state import Event, Snapshot
-from stiffopt.control.trajectory import Trajectory
-from stiffopt.daemon.refusals import RefusedError
-from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Task
+from stiffopt.daemon.reports import RefusalError
 
-__all__ = ["Commanded", "EventLog", "LoopCalls"]
+__all__ = [
+    "LoopCalls",
+    "Part",
+]
+
+
+class Part:
+    """A call that runs in a daemon thread, so that the process can end even if it hangs.
+
+    Parameters
+    ----------
+    name :
+        Of the thread.
+    work :
+        Is begun at once.
+
+    Attributes
+    ----------
+    error : what the work has raised, if anything.
+    """
+
+    def __init__(self, name: str, work: Callable[[], Any]) -> None:
+        self.name = name
+        self.error: BaseException | None = None
+        self._work = work
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def ends_within(self, seconds: float) -> bool:
+        """Wait for some time at most; return whether the work has ended."""
+        self._thread.join(max(seconds, 0.0))
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        try:
+            self._work()
+        except BaseException as error:
+            self.error = error
+
 
 _WAITING = 8  # calls at once; more than a lively client needs
 
 
-class EventLog(Protocol):
-    """What has happened."""
-
-    def since(self, index: int, /) -> tuple[list[Event], int]:
-        """Return the events from an index on, and the index after the last one."""
-
-
-class Commanded(Protocol):
-    """What the service needs of a `ControlLoop`; see there.
-
-    The commands return when they are done, or raise `CommandError` or `InputError` and change
-    nothing; one that its `Requester` has given up is not begun any more. `snapshot` and `events`
-    return at once.
-    """
-
-    @property
-    def events(self) -> EventLog:
-        """What has happened."""
-
-    def arm(self) -> None:
-        """Check everything and steer."""
-
-    def disarm(self) -> None:
-        """Let the pressures down and vent."""
-
-    def set_task(self, task: Task) -> None:
-        """Pursue a task."""
-
-    def set_target(self, target: Target) -> None:
-        """Go to another target."""
-
-    def follow_trajectory(self, trajectory: Trajectory) -> None:
-        """Go through waypoints."""
-
-    def hold(self, reason: str = ...) -> None:
-        """Keep the pressures."""
-
-    def vent(self, reason: str = ...) -> None:
-        """Let all pressure out at once."""
-
-    def reset(self) -> None:
-        """Leave the state fault."""
-
-    def snapshot(self) -> Snapshot:
-        """Say how things stand."""
-
-
 class LoopCalls:
-    """Waits for the control loop in threads of their own, and not for ever.
+    """Calls the control loop from asyncio: in a thread per call, and with a time limit.
 
     Parameters
     ----------
@@ -100,19 +87,19 @@ class LoopCalls:
 
         Raises
         ------
-        RefusedError
+        RefusalError
             It does not return in time, or too many calls are waiting already.
         """
         if self._running >= _WAITING and not urgent:
-            raise RefusedError(503, "busy", "the control loop has too much to do; try again")
-        asker = Requester()
-        answer = start(function, *args, asker=None if lasting else asker)
+            raise RefusalError(503, "busy", "the control loop has too much to do; try again")
+        requester = Requester()
+        answer = start(function, *args, requester=None if lasting else requester)
         self._running += 1
         answer.add_done_callback(self._ended)
         try:
             await asyncio.wait([answer], timeout=self._patience)
         finally:  # also where the client has gone
-            never = not answer.done() and asker.give_up()
+            never = not answer.done() and requester.give_up()
         if answer.done():
             return answer.result()
         if lasting:
@@ -122,7 +109,7 @@ class LoopCalls:
         else:
             outcome = "whether it will still do this is not known: look at the state, or vent"
         late = f"the control loop did not answer within {self._patience:g} s"
-        raise RefusedError(503, "no-answer", f"{late}; {outcome}")
+        raise RefusalError(503, "no-answer", f"{late}; {outcome}")
 
     def _ended(self, answer: asyncio.Future[Any]) -> None:
         self._running -= 1
@@ -131,7 +118,7 @@ class LoopCalls:
 
 
 def start(
-    function: Callable[..., Any], *args: Any, asker: Requester | None = None
+    function: Callable[..., Any], *args: Any, requester: Requester | None = None
 ) -> asyncio.Future[Any]:
     """Call a function in a thread of its own, which does not keep the process from ending.
 
@@ -139,7 +126,7 @@ def start(
     ----------
     function, args :
         What to call.
-    asker :
+    requester :
         Who asks, and may give it up; None: it is done however late.
     """
     events = asyncio.get_running_loop()
@@ -156,7 +143,7 @@ def start(
     def work() -> None:
         result, error = None, None
         try:
-            with requested_by(asker or Requester()):
+            with requested_by(requester or Requester()):
                 result = function(*args)
         except Exception as raised:
             error = raised

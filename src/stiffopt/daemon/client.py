@@ -1,4 +1,4 @@
-"""The daemon's client: the control loop's commands, over the control interface."""
+"""The Python client of the daemon: its methods are the commands of the control loop."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike
 
 from stiffopt.control.state import Event, Snapshot, State
 from stiffopt.control.trajectory import Trajectory, Waypoint
-from stiffopt.daemon.client_stream import ClientStream
+from stiffopt.daemon.client_wire import ClientStream, Wire
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
 from stiffopt.daemon.reports import RobotReport, record_of
-from stiffopt.daemon.wire import Wire
 from stiffopt.errors import CommandError, InputError, ServiceError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task, load_task
@@ -32,7 +31,7 @@ _STEADY = 0.3  # s for which an arm that has settled stays near
 
 
 class Client:
-    """Speaks to a running daemon.
+    """A connection to a running daemon, to read the state of an arm and to command it.
 
     ::
 

@@ -1,4 +1,4 @@
-"""The daemon: the control loop of a rig, and everything around it, in one piece."""
+"""Starts and ends the daemon: guard, control loop, telemetry and network interface of a rig."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -18,18 +19,16 @@ from stiffopt.control.controller import Controller
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
-from stiffopt.daemon.exposure import bracketed, check_exposure
-from stiffopt.daemon.keeper import Keeper
-from stiffopt.daemon.logged import LogEvents
-from stiffopt.daemon.notify import ServiceManager
-from stiffopt.daemon.parts import Part
-from stiffopt.daemon.secret import Secret
+from stiffopt.daemon.calls import Part
+from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
+from stiffopt.daemon.secret import Secret, bracketed, check_exposure
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
 from stiffopt.files import file_text
-from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.manipulator import load_robot
 from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.rig.config import RigDescription, load_rig_description
+from stiffopt.safety.guard_client import GuardLink
 from stiffopt.safety.realtime import real_time, tidy
 from stiffopt.safety.rigs import guarded_rig
 
@@ -37,31 +36,47 @@ if TYPE_CHECKING:
     from stiffopt.daemon.serving import Server
     from stiffopt.daemon.telemetry import Telemetry
 
-__all__ = ["CONTROL_TIME", "STOP_TIME", "Daemon"]
+__all__ = ["TIMES", "ControlThread", "Daemon", "DaemonTimes"]
 
 Array = NDArray[np.float64]
 
 _FASTEST = 500.0  # Hz
-_SHAPE = 12  # poses along the arm that Foxglove draws
-_SHARE = 0.02  # of the time, which the control thread needs too
-_TIDY = 10.0  # s between collections of garbage
-_ARMING = 10.0  # s in which an arm that was just connected must become ready
-_AGAIN = 0.2  # s between attempts to arm, in which the tracker sees the tip some times
-_START = 5.0  # s in which telemetry must have started
 
-STOP_TIME = 15.0
-"""Seconds beyond `Safety.ramp_time` after which a daemon has ended, whatever hangs. What follows
-adds up to less, so that the command has some time left to say what became of it."""
-CONTROL_TIME = 6.0
-"""Seconds beyond the ramp in which the control thread must have ended."""
-_KEEPER_TIME = 0.5
-_VENT_TIME = 1.0
-_SUPPLY_TIME = 3.0
-_REST_TIME = 2.5
+
+@dataclass(frozen=True)
+class DaemonTimes:
+    """How long the parts of a daemon may take, in s.
+
+    Attributes
+    ----------
+    arming : in which an arm that was just connected must become ready to be armed.
+    arming_again : between attempts to arm, in which the tracker sees the tip some times.
+    telemetry : in which telemetry must have started.
+    tidy : between collections of garbage.
+    stop : beyond `Safety.ramp_time`, in which a daemon has ended, whatever hangs. The times below
+        add up to less, so that the command has some time left to report the outcome.
+    control : beyond the ramp, in which the control thread must have ended.
+    keeper, vent, supply, rest : in which the keeper, a direct command to vent, the supply and all
+        other parts must have ended.
+    """
+
+    arming: float = 10.0
+    arming_again: float = 0.2
+    telemetry: float = 5.0
+    tidy: float = 10.0
+    stop: float = 15.0
+    control: float = 6.0
+    keeper: float = 0.5
+    vent: float = 1.0
+    supply: float = 3.0
+    rest: float = 2.5
+
+
+TIMES = DaemonTimes()
 
 
 class Daemon:
-    """Runs the closed loop of a rig: guard, control, telemetry and the control interface.
+    """The daemon of a rig: guard, control loop, telemetry and the HTTP interface.
 
     Nothing is connected or started before `start`; it is vented and inactive then, until `arm` is
     called here or by a client. `stop`, or the end of a `with` block, lets the pressures down,
@@ -86,8 +101,6 @@ class Daemon:
         The model of the arm.
     loop : ControlLoop
         State, events and commands.
-    failure : BaseException or None
-        What ended the control thread, if it was not asked to end.
     trouble : str
         Why it is not certain that the arm is vented, after `stop`; empty if it is.
     hung : tuple of str
@@ -116,7 +129,6 @@ class Daemon:
                 rig, f"{description.rate:g} Hz is too fast; at most {_FASTEST:g} Hz", key="rate"
             )
         self.robot = load_robot(robot_path(description.robot, Path(rig).parent))
-        self.failure: BaseException | None = None
         self.trouble = ""
         self.hung: tuple[str, ...] = ()
         self._folder = os.fspath(log_folder or description.log.folder)
@@ -147,8 +159,8 @@ class Daemon:
             None if self._server is None else self._is_serving,
         )
         self._stopping = threading.Event()
-        self._control: threading.Thread | None = None
-        self._tidied = 0.0
+        self._control: ControlThread | None = None
+        self._hangs = False
         self._log = LogEvents(self.loop)
         self._started = self._stopped = self._recorded = False
         self._stop_begun = float("inf")
@@ -185,6 +197,13 @@ class Daemon:
         """Whether control has ended: asked to, or by `failure`."""
         return self._control is None or not self._control.is_alive()
 
+    @property
+    def failure(self) -> BaseException | None:
+        """What ended the control thread, if it was not asked to end."""
+        if self._hangs:
+            return TimeoutError("the control thread hangs")
+        return None if self._control is None else self._control.failure
+
     # life ----------------------------------------------------------------------------------------
 
     def start(self) -> None:
@@ -210,8 +229,9 @@ class Daemon:
             self._manager.status("connecting to the rig")
             self.loop.configure()
             self._start_telemetry()
-            self.loop.listen(self._ticked)
-            self._control = threading.Thread(target=self._run, name="control", daemon=True)
+            self._control = ControlThread(
+                self.loop, self.link, self._stopping, self._manager, self._telemetry
+            )
             self._control.start()
             self._keeper.start()
         except BaseException:
@@ -243,7 +263,7 @@ class Daemon:
         InputError
             It cannot be armed, or the task does not suit; it is inactive then.
         """
-        end = time.monotonic() + _ARMING
+        end = time.monotonic() + TIMES.arming
         while True:
             try:
                 self.loop.arm()
@@ -252,7 +272,7 @@ class Daemon:
                 last = self.loop.snapshot().state is State.FAULT or time.monotonic() > end
                 if last or self._stopping.is_set():
                     raise
-            self._stopping.wait(_AGAIN)
+            self._stopping.wait(TIMES.arming_again)
         if task is None:
             return
         try:
@@ -272,14 +292,14 @@ class Daemon:
     def vent(self, reason: str = "asked to", patience: float = 0.5) -> None:
         """Let all pressure out at once, also when the control thread does not answer."""
         if not Part("vent", lambda: self.loop.vent(reason)).ends_within(patience):
-            Part("vent-link", self.link.vent).ends_within(_VENT_TIME)
+            Part("vent-link", self.link.vent).ends_within(TIMES.vent)
 
     def stop(self) -> State:
         """End everything and return the last state.
 
         The pressures are let down and vented first, and the guard, which owns the supply, is ended;
         neither waits for anything else. Then all the rest ends. From `begin_stop` on, or from here
-        if that was not called, this takes `Safety.ramp_time` and less than `STOP_TIME`, whatever
+        if that was not called, this takes `Safety.ramp_time` and less than `TIMES.stop`, whatever
         hangs. To stop twice does nothing.
         """
         if self._stopped:
@@ -287,13 +307,13 @@ class Daemon:
         self._stopped = True
         self.begin_stop()
         self._end_control()
-        self._keeper.stop(_KEEPER_TIME)
+        self._keeper.stop(TIMES.keeper)
         state = self.loop.snapshot().state
         closing = Part("supply", self.link.close)
-        before = CONTROL_TIME + _KEEPER_TIME + _VENT_TIME
-        closing.ends_within(self._left(before + _SUPPLY_TIME, _SUPPLY_TIME))
+        before = TIMES.control + TIMES.keeper + TIMES.vent
+        closing.ends_within(self._left(before + TIMES.supply, TIMES.supply))
         self._end_the_rest()
-        if not closing.ends_within(self._left(before + _SUPPLY_TIME + _REST_TIME)):
+        if not closing.ends_within(self._left(before + TIMES.supply + TIMES.rest)):
             self.trouble = "the guard does not end; whether the supply is vented is not known"
             self.hung = ("supply", *self.hung)
         elif closing.error is not None:
@@ -311,9 +331,9 @@ class Daemon:
         """Wait for the control thread, which lets the pressures down; vent if it hangs."""
         if self._control is None:
             return
-        self._control.join(self._left(CONTROL_TIME))
+        self._control.join(self._left(TIMES.control))
         if self._control.is_alive():
-            self.failure = TimeoutError("the control thread hangs")
+            self._hangs = True
             self.hung = (*self.hung, "control")
             self.vent("the control thread hangs", patience=0.0)
 
@@ -327,7 +347,7 @@ class Daemon:
         if self._server is not None:
             works["service"] = self._end_service
         parts = [Part(name, work) for name, work in works.items()]
-        end = time.monotonic() + _REST_TIME
+        end = time.monotonic() + TIMES.rest
         for part in parts:
             if not part.ends_within(end - time.monotonic()):
                 self.hung = (*self.hung, part.name)
@@ -360,7 +380,7 @@ class Daemon:
         if not service:
             settings = settings.model_copy(update={"foxglove_port": None})
         try:
-            from stiffopt.daemon.telemetry import Telemetry
+            from stiffopt.daemon.telemetry import ArmShape, Telemetry
 
             return Telemetry(
                 self.robot.description,
@@ -369,7 +389,7 @@ class Daemon:
                 self._folder,
                 settings,
                 clock=self._clock,
-                backbone=_Shape(self.robot),
+                backbone=ArmShape(self.robot),
                 about={"rig_file": file_text("rig", self.description)},
             )
         except MissingExtraError as error:
@@ -401,8 +421,10 @@ class Daemon:
             return
         self._recorded = True
         starting = Part("telemetry", self._telemetry.start)
-        if not starting.ends_within(_START):
-            text = f"telemetry has not started within {_START:g} s; control goes on without"
+        if not starting.ends_within(TIMES.telemetry):
+            text = (
+                f"telemetry has not started within {TIMES.telemetry:g} s; control goes on without"
+            )
             self.loop.add_alarm("telemetry", text)
         elif starting.error is not None:
             raise starting.error
@@ -435,49 +457,65 @@ class Daemon:
             self._warn(kind, text)
         self._secret.write()
 
-    # the control thread --------------------------------------------------------------------------
 
-    def _run(self) -> None:
+class ControlThread(threading.Thread):
+    """Ticks the control loop in real time until it is told to stop, then lets the pressures down.
+
+    Parameters
+    ----------
+    loop, link :
+        The loop, and the link to its guard.
+    stopping :
+        Tells it to stop.
+    manager :
+        Is told in each tick that the loop lives.
+    telemetry :
+        Is handed the state after each tick.
+
+    Attributes
+    ----------
+    failure : BaseException or None
+        What ended it, if it was not told to stop; the loop has vented then.
+    """
+
+    def __init__(
+        self,
+        loop: ControlLoop,
+        link: GuardLink,
+        stopping: threading.Event,
+        manager: ServiceManager,
+        telemetry: Telemetry | None,
+    ) -> None:
+        super().__init__(name="control", daemon=True)
+        self.failure: BaseException | None = None
+        self._loop, self._link, self._stopping = loop, link, stopping
+        self._manager, self._telemetry = manager, telemetry
+        self._tidied = 0.0
+        loop.listen(self.ticked)
+
+    def run(self) -> None:
+        """Tick; see `ControlLoop.run`."""
         try:
             with real_time() as granted:
-                for who, notice, well in (
-                    ("control", granted.notice, not granted.denied),
-                    ("guard", self.link.real_time, not self.link.real_time.startswith("not")),
-                ):
-                    severity = Severity.INFO if well else Severity.WARNING
-                    self.loop.events.add(
-                        self._clock.now(), "real-time", f"{who}: {notice}", severity
-                    )
-                self.loop.run(self._stopping)
+                self._tell("control", granted.notice, well=not granted.denied)
+                notice = self._link.real_time
+                self._tell("guard", notice, well=not notice.startswith("not"))
+                self._loop.run(self._stopping)
         except BaseException as error:  # `run` has vented; whoever waits is told
             self.failure = error
 
-    def _ticked(self, now: Snapshot) -> None:
-        """Pass on what a tick has left; in the control thread."""
+    def ticked(self, now: Snapshot) -> None:
+        """Pass on the state that a tick has left; in this thread."""
         self._manager.watchdog()
         if self._telemetry is not None:
             self._telemetry.put(now)
-        if now.time - self._tidied > _TIDY:
+        if now.time - self._tidied > TIMES.tidy:
             self._tidied = now.time
             tidy(thoroughly=now.state not in ARMED)
 
-
-class _Shape:
-    """The arm's shape, for telemetry; as often as its share of the interpreter's time permits."""
-
-    def __init__(self, robot: Manipulator) -> None:
-        self._robot = robot
-        self._due = 0.0
-        self._last: Array | None = None
-
-    def __call__(self, pressures: Array) -> Array:
-        """Return poses (m, 4, 4) along the arm, now or a little while ago."""
-        now = time.monotonic()
-        if self._last is None or now >= self._due:
-            self._last = self._robot.backbone(pressures, _SHAPE)
-            ended = time.monotonic()
-            self._due = ended + (ended - now) / _SHARE
-        return self._last
+    def _tell(self, who: str, notice: str, *, well: bool) -> None:
+        severity = Severity.INFO if well else Severity.WARNING
+        self._loop.events.add(self._loop.rig.clock.now(), "real-time", f"{who}: {notice}", severity)
 
 
 def _vibrates(description: RigDescription) -> bool:

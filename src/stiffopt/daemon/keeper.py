@@ -1,40 +1,198 @@
-"""What must be seen to while a daemon runs, and by nobody who steers or serves."""
+"""Watches a running daemon: replaces a dead guard, tells systemd, makes events of log records."""
 
 from __future__ import annotations
 
+import logging
+import os
 import threading
 import time
+import traceback
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Protocol
+from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 from stiffopt.control.loop import ControlLoop
-from stiffopt.daemon.notify import ServiceManager
-from stiffopt.errors import StiffoptError
+from stiffopt.control.state import Severity
+from stiffopt.errors import MissingExtraError, StiffoptError
+from stiffopt.safety.guard_client import GuardLink
 
-__all__ = ["Guarded", "Keeper"]
+__all__ = [
+    "Keeper",
+    "LogEvents",
+    "ServiceManager",
+]
+
+
+class ServiceManager:
+    """Notifies systemd, if it started this process: ready, alive, state, stopping.
+
+    The environment tells: ``NOTIFY_SOCKET``, and ``WATCHDOG_USEC`` if it wants signs of life.
+    Nothing here waits: what the manager does not take at once is lost.
+
+    Parameters
+    ----------
+    clock :
+        Time in s.
+
+    Attributes
+    ----------
+    watchdog_interval : seconds after which the manager ends a process that has not called
+        `watchdog`; None: it does not look.
+
+    Raises
+    ------
+    MissingExtraError
+        There is a manager and sdnotify is not installed.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._notifier = _notifier() if os.environ.get("NOTIFY_SOCKET") else None
+        self.watchdog_interval = _interval() if self._notifier is not None else None
+        self._fed = float("-inf")
+
+    def ready(self) -> None:
+        """Say that the start is over."""
+        self._say("READY=1")
+
+    def status(self, text: str) -> None:
+        """Say how things stand, for people."""
+        self._say("STATUS=" + " ".join(text.split()))
+
+    def watchdog(self) -> None:
+        """Say that all is well; for the control loop itself, in every tick, and nobody else.
+
+        A timer or another thread would go on to say so after the loop hangs. It is passed on when
+        half of the interval is over.
+        """
+        if self.watchdog_interval is None:
+            return
+        now = self._clock()
+        if now - self._fed >= 0.5 * self.watchdog_interval:
+            self._fed = now
+            self._say("WATCHDOG=1")
+
+    def stopping(self) -> None:
+        """Say that the end has begun."""
+        self._say("STOPPING=1")
+
+    def close(self) -> None:
+        """Say no more."""
+        notifier, self._notifier = self._notifier, None
+        self.watchdog_interval = None
+        if notifier is not None and notifier.socket is not None:
+            notifier.socket.close()
+
+    def _say(self, text: str) -> None:
+        if self._notifier is not None:
+            # sdnotify sends Latin-1 and systemd reads UTF-8: the bytes must be those of the latter
+            self._notifier.notify(text.encode().decode("latin-1"))
+
+
+def _notifier() -> Any:
+    try:
+        notifier: Any = import_module("sdnotify").SystemdNotifier()
+    except ImportError:
+        raise MissingExtraError("sdnotify", "daemon") from None
+    if notifier.socket is not None:
+        notifier.socket.setblocking(False)
+    return notifier
+
+
+def _interval() -> float | None:
+    """Return the watchdog's interval in s, if it is meant for this process."""
+    try:
+        interval = float(os.environ["WATCHDOG_USEC"]) * 1e-6
+        meant_for = int(os.environ.get("WATCHDOG_PID", os.getpid()))
+    except (KeyError, ValueError):
+        return None
+    return interval if interval > 0 and meant_for == os.getpid() else None
+
+
+_OURS = "stiffopt"
+_LOGGERS = (_OURS, "uvicorn", "websockets", "foxglove", "asyncio")
+_QUIET = 1.0  # s in which the same place in the code is not heard again
+_LONGEST = 300  # characters of a text, part of which strangers may have written
+
+
+class LogEvents(logging.Handler):
+    """A logging handler that turns warnings and errors into events of the control loop.
+
+    What strangers can provoke must not push everything else out of the events: of each place in the
+    code one record a second is taken, and that of a library is never more than a warning.
+
+    Parameters
+    ----------
+    loop :
+        Whose events they become.
+    clock :
+        Time in s.
+    """
+
+    def __init__(self, loop: ControlLoop, clock: Callable[[], float] = time.monotonic) -> None:
+        super().__init__(logging.WARNING)
+        self._loop, self._clock = loop, clock
+        self._heard: dict[tuple[str, str, int], float] = {}
+
+    def attach(self) -> None:
+        """Hear from now on."""
+        for name in _LOGGERS:
+            logging.getLogger(name).addHandler(self)
+
+    def detach(self) -> None:
+        """Hear no more."""
+        for name in _LOGGERS:
+            logging.getLogger(name).removeHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Append an event; what is wrong with a record must not hurt whoever logs."""
+        with suppress(Exception):
+            self._tell(record)
+
+    def _tell(self, record: logging.LogRecord) -> None:
+        place, now = (record.name, record.pathname, record.lineno), self._clock()
+        if now - self._heard.get(place, -_QUIET) < _QUIET:
+            return
+        self._heard[place] = now
+        ours = record.name.partition(".")[0] == _OURS
+        bad = ours and record.levelno >= logging.ERROR
+        self._loop.events.add(
+            self._loop.rig.clock.now(),
+            "service",
+            _text(record),
+            Severity.ERROR if bad else Severity.WARNING,
+        )
+
+
+def _text(record: logging.LogRecord) -> str:
+    """Return the text of a record, even if its arguments do not fit its format."""
+    try:
+        lines = record.getMessage().splitlines() or [""]
+        return lines[0][:_LONGEST] + _where(record)
+    except Exception as error:
+        place = f"{Path(record.pathname).name}:{record.lineno}"
+        return f"what was logged in {place} cannot be shown ({type(error).__name__})"
+
+
+def _where(record: logging.LogRecord) -> str:
+    """Return the exception of a record, and the line that raised it."""
+    error = record.exc_info[1] if record.exc_info else None
+    if error is None:
+        return ""
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f", {Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else ""
+    return f" ({type(error).__name__}: {str(error)[:_LONGEST]}{where})"
+
 
 _LOOK = 0.1  # s
 _AGAIN = 2.0  # s from a failed attempt to start a guard to the next
 _GUARD, _SERVICE = "guard", "service"
 
 
-class Guarded(Protocol):
-    """The link to a guard."""
-
-    @property
-    def alive(self) -> bool:
-        """Whether the guard is there."""
-
-    def open(self) -> None:
-        """Start a guard, which connects to the supply and vents it."""
-
-    def close(self) -> None:
-        """End it."""
-
-
 class Keeper:
-    """Looks after a running daemon, in a thread of its own.
+    """A thread that watches the guard and the HTTP interface of a running daemon.
 
     - A guard process that has ended, which is a fault for the loop, is replaced. Its link has
       vented the supply by then, as far as that answers, and has ended a guard that hung.
@@ -59,7 +217,7 @@ class Keeper:
     def __init__(
         self,
         loop: ControlLoop,
-        link: Guarded,
+        link: GuardLink,
         manager: ServiceManager,
         serving: Callable[[], bool] | None = None,
         clock: Callable[[], float] = time.monotonic,

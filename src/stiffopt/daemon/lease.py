@@ -1,4 +1,4 @@
-"""Who has control: one client at a time, for as long as it is heard."""
+"""The control lease: one client at a time may command the arm, as long as it sends heartbeats."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["ControlLease", "Holder"]
 
 @dataclass(frozen=True)
 class Holder:
-    """Who has control.
+    """The client that has control.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class _Grant:
 
 
 class ControlLease:
-    """Control over the arm, lent to one client at a time.
+    """Control over the arm, granted to one client at a time.
 
     A client that is not heard for `heartbeat` seconds loses it. Nobody else gets it before what
     is due then has been done: `check` says that it is due, `settle` that it has been done. Any

@@ -1,4 +1,4 @@
-"""What clients send, derived key by key from the schemas of the files.
+"""JSON messages of clients (tasks, targets, trajectories), derived from the schemas of the files.
 
 A message is the JSON form of a `Schema`: the same keys, plain numbers in SI, and the unit of a
 quantity at the end of its name. Its fields are made from those of the schema, so a key that is
@@ -8,7 +8,7 @@ numbers, NaN and infinities are refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import UnionType
 from typing import (
     Annotated,
@@ -39,7 +39,6 @@ from pydantic.fields import FieldInfo
 
 from stiffopt.control.contents import listed
 from stiffopt.control.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
-from stiffopt.daemon.refusals import sentence
 from stiffopt.documents import document_of
 from stiffopt.errors import InputError, Loc, dotted, shown
 from stiffopt.files import from_document
@@ -60,6 +59,7 @@ __all__ = [
     "TaskText",
     "TrajectoryMessage",
     "message_of",
+    "sentence",
     "task_of",
     "trajectory_of",
 ]
@@ -68,6 +68,7 @@ MAX_MESSAGE = 16_384
 """Characters of the longest message to a stream."""
 _MAX_TEXT = 65_536  # characters of a task file; to read more would keep the control loop waiting
 _MAX_ITEMS = 50  # of a list of descriptions, such as stiffness measures
+_TOLD = 5  # mistakes told at once
 _MAX_NUMBERS = 200  # of a list with one number per channel
 
 _UNITS_IN_NAMES = {"orientation": "orientation_wxyz", "matrix": "matrix_n_per_m"}
@@ -87,7 +88,7 @@ def _example(**example: Any) -> ConfigDict:
 
 
 class ControlRequest(_Message):
-    """Who wants control: a name for the people who find it taken."""
+    """The name of the client that wants control, for others who find it taken."""
 
     model_config = _example(client="planner")
 
@@ -95,7 +96,7 @@ class ControlRequest(_Message):
 
 
 class HoldRequest(_Message):
-    """Why the pressures shall stay as they are."""
+    """The reason why the pressures are to be held."""
 
     reason: Annotated[str, Field(min_length=1, max_length=200)] = "a client asked for it"
 
@@ -106,6 +107,17 @@ def _valid(adapter: TypeAdapter[ModelT], given: Any, place: Loc) -> ModelT:
     except ValidationError as error:
         mistakes = [{**mistake, "loc": (*place, *mistake["loc"])} for mistake in error.errors()]
         raise InputError(sentence(mistakes)) from None
+
+
+def sentence(mistakes: Sequence[Any]) -> str:
+    """Return pydantic's list of mistakes as one sentence."""
+    told = []
+    for mistake in mistakes[:_TOLD]:
+        place = dotted([step for step in mistake["loc"] if not str(step).startswith("<")])
+        reason = str(mistake["msg"])
+        told.append(f"{place}: {reason}" if place else reason)
+    more = f"; and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""
+    return "; also ".join(told) + more
 
 
 # Messages from schemas ---------------------------------------------------------------------------
@@ -154,7 +166,7 @@ class SchemaMessage(_Message):
 
 
 def _json_of(value: Any, place: Loc, lost: list[Loc]) -> Any:
-    """Return a description as JSON; places of what no message has a key for are added to `lost`."""
+    """Return a description as JSON; keys that its message does not have are added to `lost`."""
     if isinstance(value, Schema):
         message = next(_MADE[each] for each in type(value).__mro__ if each in _MADE)
         found = {}
@@ -174,7 +186,7 @@ def _json_of(value: Any, place: Loc, lost: list[Loc]) -> Any:
 
 
 def _keys_of(value: Any) -> Any:
-    """Return what a message says, with the keys of its schema."""
+    """Return the contents of a message under the keys of its schema."""
     if isinstance(value, SchemaMessage):
         return {name: _keys_of(getattr(value, key)) for name, key in value.names.items()}
     if isinstance(value, list):
@@ -186,7 +198,7 @@ _MADE: dict[type[Schema], type[SchemaMessage]] = {}
 
 
 def message_of(schema: type[Schema], base: type[SchemaMessage] = SchemaMessage) -> Any:
-    """Return the class of messages that say what a schema says.
+    """Return the message class of a schema.
 
     Parameters
     ----------
@@ -217,12 +229,12 @@ def message_of(schema: type[Schema], base: type[SchemaMessage] = SchemaMessage) 
 
 
 def _says(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
-    """Decorate a message that says what a schema says: its fields are added."""
+    """Return a class decorator that adds the fields of a schema to a message."""
     return lambda base: message_of(schema, base)
 
 
 def _is_unsaid(info: FieldInfo) -> bool:
-    """Whether a field is no part of what is described: where it was read, or a constant."""
+    """Whether a field is left out of messages: the file that it was read from, or a constant."""
     is_constant = get_origin(info.annotation) is Literal and len(get_args(info.annotation)) == 1
     return bool(info.exclude) or is_constant
 
@@ -232,14 +244,14 @@ def _name(name: str, hint: Any) -> str:
 
 
 def _unit(hint: Any) -> str:
-    """Return the unit that the type of a field tells; empty if it has none."""
+    """Return the unit in the type of a field; empty if it has none."""
     args = get_args(hint)
     own = [part.unit for part in args[1:] if isinstance(part, QuantityKind)]
     return next(filter(None, [*own, *(_unit(part) for part in args)]), "")
 
 
 def _type(hint: Any) -> Any:
-    """Return the type in a message of what has a type in a schema: plain JSON, with its bounds."""
+    """Return the JSON type, with bounds, for the type of a field in a schema."""
     origin, args = get_origin(hint), get_args(hint)
     if isinstance(hint, type) and issubclass(hint, Schema):
         return message_of(hint)
@@ -258,7 +270,7 @@ def _type(hint: Any) -> Any:
 
 
 def _bounded(kind: Any, metadata: tuple[Any, ...]) -> Any:
-    """Return a type with those of a field's validators that hold for plain JSON as well."""
+    """Return a type with those of a field's validators that apply to plain JSON."""
     flat = [p for m in metadata for p in (m.metadata if isinstance(m, FieldInfo) else [m])]
     if kind is float:
         kept = [part for part in flat if isinstance(part, bounds.BaseMetadata | AfterValidator)]
@@ -298,7 +310,7 @@ class TrajectoryMessage(SchemaMessage):
 
 @_says(Task)
 class TaskMessage(SchemaMessage):
-    """What the arm shall do. A robot, if it is named, must be the daemon's."""
+    """A task for the arm. A robot, if it is named, must be the daemon's."""
 
     model_config = _example(
         target={"position_m": [0.0, 0.0, 0.18]},

@@ -1,4 +1,4 @@
-"""Metrics for Prometheus, made when they are asked for; the loop does nothing for them."""
+"""Metrics for Prometheus, computed when they are read; the control loop does nothing for them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 
 class Metrics:
-    """What Prometheus may know of a loop.
+    """The metrics of a control loop and its telemetry, as text for Prometheus.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def _sentence(text: str) -> str:
 
 
 class _Collector:
-    """What the registry asks."""
+    """Adapts `Metrics` to the registry of prometheus_client."""
 
     def __init__(self, metrics: Metrics) -> None:
         self._metrics = metrics

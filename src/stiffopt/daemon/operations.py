@@ -1,4 +1,4 @@
-"""What a client may ask of the control loop, and what becomes of it."""
+"""The operations behind the HTTP interface: check who has control, then call the control loop."""
 
 from __future__ import annotations
 
@@ -13,20 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import units
-from stiffopt.control.state import State
-from stiffopt.daemon.calls import Commanded, LoopCalls, start
+from stiffopt.control.loop import ControlLoop
+from stiffopt.control.state import Snapshot, State
+from stiffopt.daemon.calls import LoopCalls, start
 from stiffopt.daemon.lease import ControlLease
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, task_of
-from stiffopt.daemon.refusals import RefusedError, refusal_of
 from stiffopt.daemon.reports import (
+    LEASE_HEADER,
     DoneReport,
     GrantReport,
     LeaseReport,
+    RefusalError,
     RobotReport,
     TaskReport,
-    state_json,
+    json_of,
+    refusal_of,
 )
-from stiffopt.daemon.wire import LEASE_HEADER
 from stiffopt.errors import CommandError, StiffoptError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.interface import Clock
@@ -38,7 +40,9 @@ _log = logging.getLogger(__name__)
 
 
 class Operations:
-    """The interface without its wire. All methods are for one event loop.
+    """The daemon's interface without HTTP: reading, control and commands.
+
+    All methods are for one event loop.
 
     Parameters
     ----------
@@ -56,7 +60,7 @@ class Operations:
 
     def __init__(
         self,
-        loop: Commanded,
+        loop: ControlLoop,
         robot: RobotDescription,
         heartbeat: float,
         clock: Clock,
@@ -69,6 +73,7 @@ class Operations:
         self._clock = clock
         self._call = LoopCalls(patience)
         self._task: TaskMessage | None = None  # the last that was accepted, while it matters
+        self._told: tuple[Snapshot, dict[str, Any]] | None = None  # the last state as JSON
         self._settling: asyncio.Task[None] | None = None
 
     def state(self) -> dict[str, Any]:
@@ -77,7 +82,10 @@ class Operations:
         lease = None
         if holder is not None:
             lease = LeaseReport(client=holder.client, expires_in_s=holder.expires_in)
-        return state_json(self.loop.snapshot(), lease)
+        now = self.loop.snapshot()
+        if self._told is None or self._told[0] is not now:  # streams mostly want the same one
+            self._told = (now, json_of(now))
+        return {**self._told[1], "lease": None if lease is None else lease.model_dump()}
 
     def robot_report(self) -> RobotReport:
         """Return what arm this is."""
@@ -111,7 +119,7 @@ class Operations:
     # Control ----------------------------------------------------------------------------------
 
     async def take(self, client: str) -> GrantReport:
-        """Give a client control; raise `RefusedError` if another has it."""
+        """Give a client control; raise `RefusalError` if another has it."""
         await self.watch()  # who had it may be gone
         with _of_lease():
             identity = self.lease.take(client)
@@ -119,12 +127,12 @@ class Operations:
         return GrantReport(lease=identity, heartbeat_s=beat, renew_every_s=beat / 4)
 
     def renew(self, identity: str | None) -> None:
-        """Note that a client was heard; raise `RefusedError` if it does not have control."""
+        """Note that a client was heard; raise `RefusalError` if it does not have control."""
         with _of_lease():
             self.lease.renew(_shown(identity))
 
     def release(self, identity: str | None) -> None:
-        """Take control back; raise `RefusedError` if the client does not have it."""
+        """Take control back; raise `RefusalError` if the client does not have it."""
         with _of_lease():
             self.lease.release(_shown(identity))
 
@@ -190,16 +198,17 @@ class Operations:
     async def command(
         self, identity: str | None, function: Callable[[Any], None], what: Callable[[], Any]
     ) -> DoneReport:
-        """Let the loop do something with what `what` returns, or refuses with `InputError`.
+        """Call a command of the loop with the description that `what` returns.
 
-        That is made in another thread, as it may take long; the others must be heard meanwhile.
+        `what` may raise `InputError`. It is called in another thread, as it may take long, and
+        other clients must be answered meanwhile.
         """
         with self._control(identity):
             await self._asked(lambda: function(what()))
         return self._done()
 
     async def _forgetting(self, identity: str | None, function: Callable[[], None]) -> DoneReport:
-        """Let the loop do something after which there is no task."""
+        """Call a command of the loop after which there is no task."""
         with self._control(identity):
             await self._asked(function)
             self._task = None
@@ -235,12 +244,12 @@ def _of_lease() -> Iterator[None]:
     try:
         yield
     except CommandError as error:
-        raise RefusedError(409, "lease", str(error)) from None
+        raise RefusalError(409, "lease", str(error)) from None
 
 
 def _shown(identity: str | None) -> str:
     if identity is None:
-        raise RefusedError(
+        raise RefusalError(
             409, "lease", f"this needs control; take it, and show the lease in '{LEASE_HEADER}'"
         )
     return identity

@@ -1,4 +1,4 @@
-"""The page for people: every call of the interface, from its own schema, without any network."""
+"""The HTML page that documents the HTTP interface, made from its OpenAPI schema; works offline."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The recording of a run: an MCAP file that outlives a kill, and whose failure hurts nobody.
+"""Writes the recording of a run as MCAP: it survives a kill, and its failure stops nothing else.
 
 foxglove's writer gives up for good, without a word, when its file fails it; so the file that it is
 given is a piece of memory that cannot fail, and what is in there goes to the disk here. A commit
@@ -13,21 +13,37 @@ import re
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
-from stiffopt.daemon.private import make_private
+from stiffopt.daemon.secret import make_private
 from stiffopt.daemon.topics import METADATA
 
-__all__ = ["MIN_FREE", "Recording", "free_bytes"]
+__all__ = ["RecordingLimits", "RunRecording", "free_bytes"]
 
-MIN_FREE = 200e6
-"""Bytes that are left free on the disk; a recording that would need them ends."""
-_ENOUGH = 1.25  # times that must be free before a recording begins
-_LARGEST = 1e9  # bytes of a file; then another one follows
-_LOOK = 1.0  # s between two looks at what is free
-_RETRY = 10.0  # s until it is tried again
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-_CHUNK = 1 << 22  # bytes; a commit comes long before
+
+
+@dataclass(frozen=True)
+class RecordingLimits:
+    """How much is recorded, and how often the disk is looked at.
+
+    Attributes
+    ----------
+    min_free : bytes that are left free on the disk; a recording that would need them ends.
+    margin : factor on `min_free` of what must be free before a recording begins.
+    largest : bytes of a file, after which another one follows.
+    look : s between two looks at how much is free.
+    retry : s after a failure until recording is tried again.
+    chunk : bytes of a chunk of MCAP; a commit comes long before.
+    """
+
+    min_free: float = 200e6
+    margin: float = 1.25
+    largest: float = 1e9
+    look: float = 1.0
+    retry: float = 10.0
+    chunk: int = 1 << 22
 
 
 def free_bytes(folder: str) -> float:
@@ -36,8 +52,8 @@ def free_bytes(folder: str) -> float:
     return float(there.f_bavail * there.f_frsize)
 
 
-class Recording:
-    """Recording of everything that is logged in a context of foxglove, in one file after another.
+class RunRecording:
+    """Records everything that is logged in a context of foxglove, in one file after another.
 
     Nothing here raises after the beginning: `trouble` says what is wrong, and what can be done is
     tried again.
@@ -54,8 +70,8 @@ class Recording:
         Kept in each file as metadata.
     wall, free :
         Give the date in s since 1970 and the bytes that are free in a folder.
-    largest :
-        Bytes after which another file follows.
+    limits :
+        How much is recorded.
 
     Attributes
     ----------
@@ -73,14 +89,14 @@ class Recording:
         *,
         wall: Callable[[], float] = time.time,
         free: Callable[[str], float] = free_bytes,
-        largest: float = _LARGEST,
+        limits: RecordingLimits = RecordingLimits(),
     ) -> None:
         self.path: str | None = None
         self.trouble = ""
         self.written = 0
         self._folder, self._name = os.fspath(folder), _file_name(name)
         self._context, self._about = context, dict(about)
-        self._wall, self._free, self._largest = wall, free, largest
+        self._wall, self._free, self._limits = wall, free, limits
         self._writer: Any = None
         self._window = _Window()
         self._file = -1
@@ -96,16 +112,16 @@ class Recording:
         """See what was logged onto the disk, or try to begin; `now` in s on any steady clock."""
         if self._writer is None:
             if now >= self._retry_at:
-                self._retry_at = now + _RETRY
+                self._retry_at = now + self._limits.retry
                 self._begin()
             return
         try:
             self._writer.flush()
             self._write(self._window.take())
             if now >= self._look_at:
-                self._look_at = now + _LOOK
-                self._check_free(MIN_FREE)
-            if self._size >= self._largest:
+                self._look_at = now + self._limits.look
+                self._check_free(self._limits.min_free)
+            if self._size >= self._limits.largest:
                 self._finish()
                 self._begin()
         except _FailedError as failed:
@@ -127,7 +143,7 @@ class Recording:
 
         try:
             make_private(self._folder)
-            self._check_free(_ENOUGH * MIN_FREE)
+            self._check_free(self._limits.margin * self._limits.min_free)
             self._file, self.path = self._new_file()
             self._size = 0
             self._window = _Window()
@@ -138,7 +154,7 @@ class Recording:
                     compression=MCAPCompression.Zstd,
                     compression_level=1,  # twice as fast as the default, and as small
                     compression_threads=0,
-                    chunk_size=_CHUNK,
+                    chunk_size=self._limits.chunk,
                 ),
             )
             self._writer.write_metadata(METADATA, self._about)
@@ -169,9 +185,10 @@ class Recording:
         except OSError as error:
             raise _FailedError(f"{self._folder}: {_reason(error)}") from None
         if free < least:
+            needed = self._limits.margin * self._limits.min_free
             raise _FailedError(
                 f"nothing is recorded: {free / 1e6:.0f} MB are free in {self._folder}; "
-                f"make room for more than {_ENOUGH * MIN_FREE / 1e6:.0f} MB"
+                f"make room for more than {needed / 1e6:.0f} MB"
             )
 
     def _write(self, data: bytes) -> None:
@@ -209,7 +226,7 @@ class Recording:
         self._close_file()
         self.trouble = trouble
         if now is not None:
-            self._retry_at = now + _RETRY
+            self._retry_at = now + self._limits.retry
 
     def _close_file(self) -> None:
         if self._file >= 0:
@@ -225,7 +242,7 @@ class _FailedError(Exception):
 
 
 class _Window:
-    """What foxglove has written since the last commit, as the end of a file that it believes in.
+    """A file in memory that holds what foxglove has written since the last commit.
 
     It goes back within a chunk to fill in its length, never further: a commit ends the chunk.
     """

@@ -1,4 +1,4 @@
-"""What the daemon answers, as JSON: SI units in the names, null for what is not known.
+"""The daemon's answers as JSON: units end the names, null is what is not known.
 
 The reports of the loop's state and of its events follow from the definitions in
 `stiffopt.control.state`; the other answers are models of their own.
@@ -16,21 +16,28 @@ from pydantic import BaseModel, BeforeValidator, Field, create_model
 from stiffopt.control.state import Event, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.messages import TargetMessage, TaskMessage
-from stiffopt.errors import ServiceError, printable
+from stiffopt.errors import CommandError, InputError, ServiceError, StiffoptError, printable
+
+LEASE_HEADER = "Stiffopt-Lease"
+"""Header in which a client shows that it has control."""
+_LONGEST = 1000  # characters of a message
 
 __all__ = [
+    "LEASE_HEADER",
     "DoneReport",
     "ErrorReport",
     "EventsReport",
     "GrantReport",
     "LeaseReport",
+    "RefusalError",
     "RobotReport",
     "StateReport",
     "TaskReport",
+    "error_of",
     "json_of",
     "plain",
     "record_of",
-    "state_json",
+    "refusal_of",
 ]
 
 RecordT = TypeVar("RecordT")
@@ -43,21 +50,30 @@ Text = Annotated[str, BeforeValidator(printable)]  # a file's name, say, need no
 
 
 def json_of(record: Any) -> dict[str, Any]:
-    """Return a record of the state, such as a `Snapshot` or an `Event`, as JSON has it."""
+    """Return a record of the state, such as a `Snapshot` or an `Event`, as JSON."""
     found: dict[str, Any] = {}
     for entry in entries(type(record)):
+        names = entry.json
+        if not names:
+            continue
         value = plain(getattr(record, entry.name), entry)
-        found.update(zip(entry.json, _shares(record, entry, value), strict=True))
+        if len(names) == 1:
+            found[names[0]] = value
+        elif entry.units:
+            held = getattr(record, entry.shown.unit_field)
+            for unit, name in zip(entry.units, names, strict=True):
+                found[name] = value if unit == held else None
+        else:
+            size = len(value) // len(names)
+            for part, name in enumerate(names):
+                found[name] = value[part * size : (part + 1) * size]
     return found
 
 
-def state_json(now: Snapshot, lease: LeaseReport | None = None) -> dict[str, Any]:
-    """Return the state of the loop, and who has control, as `StateReport` describes it."""
-    return {**json_of(now), "lease": None if lease is None else lease.model_dump()}
-
-
 def record_of(record: type[RecordT], given: Mapping[str, Any]) -> RecordT:
-    """Return what `json_of` was given; what was not known is NaN. Further keys do no harm.
+    """Return the record from which `json_of` made some JSON; null becomes NaN.
+
+    Unknown keys, as of a newer daemon, are ignored.
 
     Raises
     ------
@@ -71,27 +87,16 @@ def record_of(record: type[RecordT], given: Mapping[str, Any]) -> RecordT:
         raise ServiceError(f"the daemon's {record.__name__.lower()} is none: {reason}") from None
 
 
-def _shares(record: Any, entry: Entry, value: Any) -> list[Any]:
-    """Return what goes under each of a field's names in JSON."""
-    if len(entry.json) < 2:
-        return [value] * len(entry.json)
-    if entry.units:
-        held = getattr(record, entry.shown.unit_field)
-        return [value if unit == held else None for unit in entry.units]
-    size = len(value) // len(entry.json)
-    return [value[k * size : (k + 1) * size] for k in range(len(entry.json))]
-
-
 def plain(value: Any, entry: Entry) -> Any:
-    """Return a value as JSON has it."""
+    """Return the value of a field as JSON."""
     if value is None:
         return None
     match entry.kind:
         case Kind.NUMBER:
             return float(value) if isfinite(value) else None
         case Kind.NUMBERS:
-            numbers = np.asarray(value, dtype=float).tolist()
-            return [x if isfinite(x) else None for x in numbers]
+            numbers = value.tolist() if entry.in_array else value
+            return [float(x) if isfinite(x) else None for x in numbers]
         case Kind.COUNTS | Kind.FLAGS:
             values: list[Any] = np.asarray(value).tolist()
             return values
@@ -137,7 +142,7 @@ def _value_of(value: Any, entry: Entry) -> Any:
 
 
 def _report_model(name: str, record: type, **more: Any) -> type[BaseModel]:
-    """Return the model of what `json_of` gives of a record."""
+    """Return the pydantic model of the JSON that `json_of` makes of a record."""
     fields: dict[str, Any] = {}
     for entry in entries(record):
         kind: Any = {
@@ -189,7 +194,7 @@ class RobotReport(BaseModel):
 
 
 class TaskReport(BaseModel):
-    """What is being done in a word, what is asked of the tip now, and the last task given here.
+    """What is being done in a word, the target now, and the last task given here.
 
     `task` is null where the arm is vented or no client gave one.
     """
@@ -200,7 +205,7 @@ class TaskReport(BaseModel):
 
 
 class GrantReport(BaseModel):
-    """Control: what to show with each command, and how often to be heard."""
+    """Control is granted: the lease to send with each command, and how often to renew it."""
 
     lease: str
     heartbeat_s: Annotated[float, Field(description="control is lost after this time of silence")]
@@ -222,6 +227,55 @@ class Mistake(BaseModel):
 
 
 class ErrorReport(BaseModel):
-    """Why a request was not done."""
+    """Why a request was refused."""
 
     error: Mistake
+
+
+# Refusals ---------------------------------------------------------------------------------------
+
+
+class RefusalError(StiffoptError):
+    """A request is refused.
+
+    Parameters
+    ----------
+    status :
+        The HTTP status.
+    code :
+        A word for programs.
+    message :
+        A sentence for people.
+    """
+
+    def __init__(self, status: int, code: str, message: str) -> None:
+        super().__init__(status, code, message)
+        self.status = status
+        self.code = code
+        self.message = printable(message)[:_LONGEST]
+
+    def __str__(self) -> str:
+        return self.message
+
+    @property
+    def body(self) -> dict[str, Any]:
+        """What the client is sent."""
+        return {"error": {"code": self.code, "message": self.message}}
+
+
+def refusal_of(error: StiffoptError) -> RefusalError:
+    """Return the refusal that a client is sent for an error of the control loop."""
+    if isinstance(error, RefusalError):
+        return error
+    if isinstance(error, InputError) and not isinstance(error, CommandError):
+        return RefusalError(422, "input", str(error))
+    return RefusalError(409, "refused", str(error))
+
+
+def error_of(status: int, message: str) -> StiffoptError:
+    """Return the exception that a client raises for a status of the daemon."""
+    if status in (401, 403, 404, 405, 409):
+        return CommandError(message)
+    if status in (413, 422):
+        return InputError(message)
+    return ServiceError(message)

@@ -1,4 +1,4 @@
-"""A run of the daemon, read back from its recording: whatever is whole, also after a kill."""
+"""Reads the recording of a run, and converts it to a log (log v1) for calibration."""
 
 from __future__ import annotations
 
@@ -14,10 +14,18 @@ from stiffopt.control.state import SeenPose, Snapshot
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.topics import FORMAT, METADATA, STATES
 from stiffopt.errors import FileError
+from stiffopt.logs.log import Log
 from stiffopt.logs.mcap_log import LOG_METADATA
 from stiffopt.logs.mcap_reading import McapContents, read_mcap
 
-__all__ = ["RecordedRun", "RunEvent", "RunSpan", "is_of_experiment", "read_run"]
+__all__ = [
+    "RecordedRun",
+    "RunEvent",
+    "RunSpan",
+    "is_of_experiment",
+    "log_of_run",
+    "read_run",
+]
 
 Array = NDArray[np.float64]
 
@@ -37,7 +45,7 @@ class RunEvent:
 
 @dataclass(frozen=True)
 class RunSpan:
-    """A time in which something was so: a state with its reason, an alarm with its text."""
+    """An interval of time in which a state, with its reason, or an alarm, with its text, held."""
 
     begin: float
     end: float
@@ -264,3 +272,87 @@ def _alarms(messages: Sequence[Mapping[str, Any]], begin: float, end: float) -> 
             open_since.setdefault(kind, (_number(alarm.get("since_s", now)) - begin, alarm["text"]))
     spans += [RunSpan(since, end, kind, text) for kind, (since, text) in open_since.items()]
     return tuple(sorted(spans, key=lambda span: span.begin))
+
+
+_GAP = 0.1  # s without a frame, which rows without a tip fill ...
+_STEP = 0.05  # ... s apart
+_NEAR = 0.1  # s between a frame and a reading that belongs to it
+_DIGITS = 6  # of a time in s, as log v1 writes it
+
+
+def log_of_run(run: RecordedRun) -> Log:
+    """Return the log of a run. Time 0 is when the recording began; N rows may be none.
+
+    A frame that no arm could have moved to, or in which the tip was not seen, gives a row without
+    a tip. Two frames of the same time give one row; of frames that were captured before the first
+    command it is not known what the pressures were, and they are left out.
+    """
+    within = (run.captured >= run.time[0]) & (run.captured <= run.time[-1] + _NEAR)
+    captured = np.round(run.captured[within], _DIGITS)
+    position = run.seen_position[within].copy()
+    quaternion = run.seen_quaternion[within].copy()
+    unknown = run.doubted[within] | ~np.isfinite(position).all(axis=1)
+    position[unknown] = quaternion[unknown] = np.nan
+
+    order = np.lexsort((unknown, captured))  # of the same time, those that saw something first
+    captured, first = np.unique(captured[order], return_index=True)
+    position, quaternion = position[order][first], quaternion[order][first]
+
+    between = _fillers(run.time, captured)
+    time = np.concatenate([captured, between])
+    nothing = np.full((len(between), 1), np.nan)
+    order = np.argsort(time, kind="stable")
+    time = time[order]
+    position = np.concatenate([position, nothing.repeat(3, axis=1)])[order]
+    quaternion = np.concatenate([quaternion, nothing.repeat(4, axis=1)])[order]
+    turns = bool(np.isfinite(quaternion).any())
+    measured = _between(run, time)
+    return Log(
+        time=time,
+        commanded=_commands_at(run, time),
+        measured=measured if np.isfinite(measured).any() else None,
+        tip_position=position,
+        tip_quaternion=quaternion if turns else None,
+    )
+
+
+def _fillers(ticks: Array, captured: Array) -> Array:
+    """Return times of ticks, some way apart, in which no frame was captured."""
+    after = np.searchsorted(captured, ticks, side="right")
+    edges = np.concatenate([[-np.inf], captured, [np.inf]])
+    before, next_one = edges[after], edges[after + 1]
+    alone = (next_one - before > _GAP) & (ticks - before >= _STEP) & (next_one - ticks >= _STEP)
+    chosen: list[float] = []
+    for tick in np.round(ticks[alone], _DIGITS):
+        if not chosen or tick >= chosen[-1] + _STEP - 1e-9:
+            chosen.append(float(tick))
+    return np.array(chosen)
+
+
+def _commands_at(run: RecordedRun, time: Array) -> Array:
+    """Return the commands (N, n) that held at times (N,); NaN where ticks are missing."""
+    slack = 10.0**-_DIGITS  # times were rounded
+    tick = np.maximum(np.searchsorted(run.time, time + slack, side="right") - 1, 0)
+    period = float(np.median(np.diff(run.time))) if len(run) > 1 else 0.0
+    commanded = run.commanded[tick]
+    commanded[time - run.time[tick] > max(_NEAR, 3 * period)] = np.nan
+    return commanded
+
+
+def _between(run: RecordedRun, time: Array) -> Array:
+    """Return measured pressures (N, n) at times (N,), NaN where no reading is near."""
+    read = np.where(np.isfinite(run.measured_time), run.measured_time, run.time)
+    read, first = np.unique(read, return_index=True)
+    values = run.measured[first]
+    measured = np.full((len(time), run.n), np.nan)
+    for channel in range(run.n):
+        known = np.isfinite(values[:, channel])
+        if known.any():
+            at = read[known]
+            line = np.interp(time, at, values[known, channel])
+            after = np.searchsorted(at, time).clip(1, max(len(at) - 1, 1))
+            nearest = np.minimum(
+                np.abs(time - at[after - 1]), np.abs(time - at[np.minimum(after, len(at) - 1)])
+            )
+            measured[:, channel] = np.where(nearest <= _NEAR, line, np.nan)
+    return measured

@@ -1,18 +1,113 @@
-"""The token of those who may move the arm: from the environment, or drawn and kept in a file."""
+"""The token of those who may move the arm, kept in a file that is this user's alone.
+
+The token is that of the environment, or it is drawn and written to the file. Other users may be
+able to write to the folder, so files and links that they put in its place are found out. A token
+that is too short is refused where other machines can reach the interface.
+"""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import secrets
+import socket
+import stat
 from contextlib import suppress
+from ipaddress import ip_address
 from pathlib import Path
 
-from stiffopt.daemon.private import check_folder, check_mine, make_private, read_mine
-from stiffopt.errors import FileError
+from stiffopt.errors import FileError, InputError
 from stiffopt.rig.settings import ServiceSettings
 
-__all__ = ["Secret"]
+__all__ = [
+    "MIN_TOKEN",
+    "Secret",
+    "bracketed",
+    "check_exposure",
+    "check_folder",
+    "check_mine",
+    "is_address",
+    "is_loopback",
+    "make_private",
+    "read_mine",
+]
+
+MIN_TOKEN = 16
+"""Characters of a token that is not easily guessed."""
+_LONGEST = 4096  # bytes of a file that is read whole
+_READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+
+
+def make_private(folder: str | os.PathLike[str]) -> None:
+    """Make a folder, and what is missing above it, for this user alone; `OSError` if it fails."""
+    last = Path(folder)
+    missing = [path for path in (last, *last.parents) if not path.exists()]
+    for path in reversed(missing):
+        path.mkdir(mode=0o700, exist_ok=True)
+    if not last.is_dir():
+        raise NotADirectoryError(20, "not a folder")
+
+
+def check_folder(folder: Path, advice: str) -> None:
+    """Raise `FileError` where another user could exchange files in a folder.
+
+    Parameters
+    ----------
+    folder :
+        What must belong to this user or to root, and be writable for all only if it is sticky.
+    advice :
+        What to do otherwise, as the end of a sentence.
+    """
+    found = folder.stat()
+    if found.st_uid not in (0, os.geteuid()):
+        raise FileError(folder, f"belongs to another user, who can exchange files there; {advice}")
+    if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
+        raise FileError(
+            folder,
+            f"is writable for all, so that anyone can exchange files there; take that right away "
+            f"(chmod o-w), or {advice}",
+        )
+
+
+def check_mine(path: Path, advice: str, opened: int | None = None) -> None:
+    """Raise `FileError` unless a file is a regular one of this user, or is not there.
+
+    Parameters
+    ----------
+    path :
+        The file; a symbolic link is none.
+    advice :
+        What to do otherwise, as the end of a sentence.
+    opened :
+        Its descriptor if it is open; else what has the name now is looked at.
+    """
+    try:
+        found = os.lstat(path) if opened is None else os.fstat(opened)
+    except FileNotFoundError:
+        return
+    if stat.S_ISLNK(found.st_mode):
+        problem = "is a symbolic link, which is not followed here; remove it"
+    elif not stat.S_ISREG(found.st_mode):
+        problem = "is no regular file; remove it"
+    elif found.st_uid != os.geteuid():
+        problem = (
+            "belongs to another user, whose daemon may be running; if it is not, remove this file"
+        )
+    else:
+        return
+    raise FileError(path, f"{problem}, or {advice}")
+
+
+def read_mine(path: Path) -> str:
+    """Return the text of a short file, without following a link or waiting for a pipe."""
+    descriptor = os.open(path, _READ)
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError("no regular file")
+        return os.read(descriptor, _LONGEST).decode("ascii")
+    finally:
+        os.close(descriptor)
+
 
 _LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _OTHERWISE = "give another log.folder or service.token_file"
@@ -126,3 +221,74 @@ class Secret:
         if self._lock is not None:
             os.close(self._lock)
             self._lock = None
+
+
+# Who can reach the interface, and whether the token is good enough for that
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine can reach what listens on a host.
+
+    A name is on loopback if all its addresses are; one that has no address is not.
+    """
+    try:
+        found = {host} if is_address(host) else _addresses(host)
+    except OSError:
+        return False
+    return bool(found) and all(ip_address(address).is_loopback for address in found)
+
+
+def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
+    """Return the warnings due before the control interface listens: kinds and texts of events.
+
+    Parameters
+    ----------
+    host :
+        Where it will listen.
+    token :
+        Of those who may move the arm.
+    given :
+        Whether a person chose the token; else it was drawn.
+
+    Raises
+    ------
+    InputError
+        The token is too short for a host that other machines can reach.
+    """
+    beyond, short = not is_loopback(host), given and len(token) < MIN_TOKEN
+    if beyond and short:
+        raise InputError(
+            f"the token has {len(token)} characters, too few for the host {host}, which other "
+            f"machines can reach; give one of at least {MIN_TOKEN}, leave the environment variable "
+            "empty so that one is drawn, or listen on 127.0.0.1 (service.token, service.host in "
+            "the rig file)"
+        )
+    if beyond:
+        text = (
+            f"the control interface listens on {host}, beyond this machine and unencrypted: "
+            "whoever can listen in on the network can read the token and move the arm"
+        )
+        return [("exposed", text)]
+    if short:
+        text = f"the token is shorter than {MIN_TOKEN} characters; others here may guess it"
+        return [("token", text)]
+    return []
+
+
+def bracketed(host: str) -> str:
+    """Return a host as it is written in a URL."""
+    return f"[{host}]" if ":" in host else host
+
+
+def _addresses(host: str) -> set[str]:
+    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+    return {str(address[0]) for *_, address in found}
+
+
+def is_address(name: str) -> bool:
+    """Return whether a host is given as an IP address, and not by name."""
+    try:
+        ip_address(name)
+    except ValueError:
+        return False
+    return True

@@ -1,7 +1,7 @@
-"""The control interface: HTTP and WebSocket over a control loop.
+"""The HTTP and WebSocket interface of a control loop, as a FastAPI application.
 
-Anyone may read; with the token one may stop the arm; with the token and control one may move it. A
-request that is refused changes nothing.
+Anyone may read; a client with the token may stop the arm; a client with the token and control may
+move it. A request that is refused changes nothing.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Annotated, Any
 
 from pydantic import WrapValidator
 
+from stiffopt.control.loop import ControlLoop
 from stiffopt.daemon.messages import (
     ControlRequest,
     HoldRequest,
@@ -47,14 +48,13 @@ except ModuleNotFoundError as error:
     raise MissingExtraError("fastapi", "daemon") from error
 
 from stiffopt.daemon.access import Access, Token
-from stiffopt.daemon.calls import Commanded
-from stiffopt.daemon.crowd import MEMBER, Crowd, Member
+from stiffopt.daemon.connections import MEMBER, Crowd, Member
+from stiffopt.daemon.messages import sentence
 from stiffopt.daemon.metrics import CONTENT_TYPE
 from stiffopt.daemon.operations import Operations
 from stiffopt.daemon.page import POLICY, page_of
-from stiffopt.daemon.refusals import RefusedError, sentence
+from stiffopt.daemon.reports import LEASE_HEADER, RefusalError
 from stiffopt.daemon.stream import Stream
-from stiffopt.daemon.wire import LEASE_HEADER
 
 __all__ = ["create_app"]
 
@@ -84,7 +84,7 @@ LeaseHeader = Annotated[
 
 
 def create_app(
-    loop: Commanded,
+    loop: ControlLoop,
     *,
     robot: RobotDescription,
     token: str,
@@ -317,29 +317,29 @@ def _add_pages(app: FastAPI, metrics: Callable[[], bytes] | None) -> None:
 def _add_refusals(app: FastAPI) -> None:
     """Say in one way why a request was not done."""
 
-    @app.exception_handler(RefusedError)
-    async def refused(request: Request, error: RefusedError) -> JSONResponse:
+    @app.exception_handler(RefusalError)
+    async def refused(request: Request, error: RefusalError) -> JSONResponse:
         return _answered(error)
 
     @app.exception_handler(RequestValidationError)
     async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
         mistakes = [{**m, "loc": [s for s in m["loc"] if s != "body"]} for m in error.errors()]
-        return _answered(RefusedError(422, "input", sentence(mistakes)))
+        return _answered(RefusalError(422, "input", sentence(mistakes)))
 
     @app.exception_handler(HTTPException)
     async def other(request: Request, error: HTTPException) -> JSONResponse:
         if error.status_code == 400:  # a body that cannot be parsed at all
-            return _answered(RefusedError(422, "input", "the body is not JSON that can be read"))
-        answer = _answered(RefusedError(error.status_code, "http", f"{error.detail}".lower()))
+            return _answered(RefusalError(422, "input", "the body is not JSON that can be read"))
+        answer = _answered(RefusalError(error.status_code, "http", f"{error.detail}".lower()))
         answer.headers.update(error.headers or {})
         return answer
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         return _answered(
-            RefusedError(500, "internal", "the daemon failed at this; its log says more")
+            RefusalError(500, "internal", "the daemon failed at this; its log says more")
         )
 
 
-def _answered(refusal: RefusedError) -> JSONResponse:
+def _answered(refusal: RefusalError) -> JSONResponse:
     return JSONResponse(refusal.body, refusal.status)

@@ -1,4 +1,4 @@
-"""The server of the control interface, in a thread of its own."""
+"""Runs the HTTP interface in uvicorn, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import threading
 import time
 from typing import Any
 
-from stiffopt.daemon.exposure import bracketed
 from stiffopt.daemon.messages import MAX_MESSAGE
+from stiffopt.daemon.secret import bracketed
 from stiffopt.errors import InputError, MissingExtraError, ServiceError
 
 __all__ = ["Server"]
@@ -73,8 +73,7 @@ class Server:
             import websockets  # noqa: F401  # which uvicorn needs for the stream
         except ModuleNotFoundError as error:
             raise MissingExtraError(error.name or "uvicorn", "daemon") from error
-        from stiffopt.daemon.connections import protocols_of
-        from stiffopt.daemon.crowd import Crowd
+        from stiffopt.daemon.connections import Crowd, protocols_of
 
         crowd = getattr(getattr(self._app, "state", None), "crowd", None) or Crowd()
         connection, stream = protocols_of(crowd)

@@ -1,4 +1,4 @@
-"""The WebSocket: states go out at a steady rate, targets come in and are answered."""
+"""The WebSocket of the daemon: sends states at a steady rate, receives targets and answers them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from stiffopt.daemon.access import Token
-from stiffopt.daemon.crowd import GRACE, MAX_STREAMS, Crowd, Member
-from stiffopt.daemon.messages import MAX_MESSAGE, TargetMessage
+from stiffopt.daemon.connections import GRACE, MAX_STREAMS, Crowd, Member
+from stiffopt.daemon.messages import MAX_MESSAGE, TargetMessage, sentence
 from stiffopt.daemon.operations import Operations
-from stiffopt.daemon.refusals import RefusedError, sentence
-from stiffopt.daemon.wire import LEASE_HEADER
+from stiffopt.daemon.reports import LEASE_HEADER, RefusalError
 
 __all__ = ["DEFAULT_RATE", "MAX_RATE", "Stream"]
 
@@ -28,7 +27,7 @@ MAX_RATE = 100.0
 
 
 class AccessMessage(BaseModel):
-    """What lets a stream move the arm; what is left out stays as it was."""
+    """The token and the lease that let a stream move the arm; a missing one stays as it was."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -46,7 +45,7 @@ class StreamedTarget(BaseModel):
 
 
 class Stream:
-    """One connection.
+    """One WebSocket connection.
 
     Of targets that come faster than the control loop takes them, only the newest is passed on:
     a stale one would move the arm to where the client no longer wants it.
@@ -87,7 +86,7 @@ class Stream:
         with suppress(WebSocketDisconnect):
             try:
                 await self._serve(_rate(self._socket.query_params.get("rate")))
-            except RefusedError as refusal:
+            except RefusalError as refusal:
                 await self._send({"type": "error", "seq": None, **refusal.body})
                 await self._socket.close(1008)
 
@@ -117,7 +116,7 @@ class Stream:
             if receiving.done() or self._crowd.seat(self._member):
                 return
         kind = "with" if self._member.trusted else "without"
-        raise RefusedError(503, "busy", f"there are {MAX_STREAMS} streams {kind} the token already")
+        raise RefusalError(503, "busy", f"there are {MAX_STREAMS} streams {kind} the token already")
 
     async def _report(self, period: float) -> None:
         clock = asyncio.get_running_loop()
@@ -137,7 +136,7 @@ class Stream:
                 given = _parsed(message.get("text"))
                 seq = _seq(given)
                 await self._take(given)
-            except RefusedError as refusal:
+            except RefusalError as refusal:
                 await self._send({"type": "error", "seq": seq, **refusal.body})
 
     async def _take(self, given: Any) -> None:
@@ -154,19 +153,19 @@ class Stream:
         replaced, self._next = self._next, target
         self._arrived.set()
         if replaced is not None:
-            newer = RefusedError(409, "superseded", "a newer target came before this one was taken")
+            newer = RefusalError(409, "superseded", "a newer target came before this one was taken")
             await self._answer(replaced.seq, newer)
 
     def _show(self, token: str) -> None:
         """Trust the client from now on, or no longer, by what it shows."""
         try:
             self._token.check(token)
-        except RefusedError:
+        except RefusalError:
             self._crowd.distrust(self._member)
             raise
         if not self._crowd.trust(self._member):
             text = f"there are {MAX_STREAMS} streams with the token already"
-            raise RefusedError(503, "busy", text)
+            raise RefusalError(503, "busy", text)
         self._shown.set()
 
     async def _work(self) -> None:
@@ -179,12 +178,12 @@ class Stream:
                 continue
             try:
                 await self._operations.command(self._lease, loop.set_target, streamed.target.read)
-            except RefusedError as refusal:
+            except RefusalError as refusal:
                 await self._answer(streamed.seq, refusal)
             else:
                 await self._answer(streamed.seq)
 
-    async def _answer(self, seq: int, refusal: RefusedError | None = None) -> None:
+    async def _answer(self, seq: int, refusal: RefusalError | None = None) -> None:
         told = {} if refusal is None else refusal.body
         await self._send({"type": "answer", "seq": seq, "accepted": refusal is None, **told})
 
@@ -202,23 +201,23 @@ def _rate(text: str | None) -> float:
     except ValueError:
         rate = math.nan
     if not rate >= 0:
-        raise RefusedError(422, "input", f"rate: expected 0 to {MAX_RATE:g}, in Hz")
+        raise RefusalError(422, "input", f"rate: expected 0 to {MAX_RATE:g}, in Hz")
     return min(rate, MAX_RATE)
 
 
 def _parsed(text: str | None) -> Any:
     if text is None:
-        raise RefusedError(422, "input", "expected text, not bytes")
+        raise RefusalError(422, "input", "expected text, not bytes")
     if len(text) > MAX_MESSAGE:
-        raise RefusedError(413, "too-long", f"the message is longer than {MAX_MESSAGE} characters")
+        raise RefusalError(413, "too-long", f"the message is longer than {MAX_MESSAGE} characters")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise RefusedError(422, "input", f"this is not JSON: {error}") from None
+        raise RefusalError(422, "input", f"this is not JSON: {error}") from None
 
 
 def _seq(given: Any) -> int | None:
-    """Return the number of a message, if it has one, be it ever so wrong otherwise."""
+    """Return the number of a message, if it has one, even if the rest of it is wrong."""
     seq = given.get("seq") if isinstance(given, dict) else None
     return seq if type(seq) is int and 0 <= seq <= 2**53 else None
 
@@ -227,4 +226,4 @@ def _valid(model: type[ModelT], given: Any) -> ModelT:
     try:
         return model.model_validate(given)
     except ValidationError as error:
-        raise RefusedError(422, "input", sentence(error.errors())) from None
+        raise RefusalError(422, "input", sentence(error.errors())) from None

@@ -1,7 +1,7 @@
-"""Telemetry: everything a loop says of itself, live for Foxglove and recorded as MCAP.
+"""Telemetry: sends the state of the loop to Foxglove and records it, in a thread of its own.
 
-The loop hands over a snapshot in each tick, which costs it a microsecond; all the rest is done by
-a thread of its own. Whatever fails here is an alarm and never more.
+The loop hands over a snapshot in each tick, which costs it a microsecond. Whatever fails here
+raises an alarm and does nothing else.
 """
 
 from __future__ import annotations
@@ -11,56 +11,58 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any, Protocol
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.state import Alarm, Event, Snapshot
-from stiffopt.daemon.channels import TelemetryChannels
-from stiffopt.daemon.recording import Recording
-from stiffopt.daemon.topics import FORMAT
+from stiffopt.control.loop import ControlLoop
+from stiffopt.control.state import Alarm, Snapshot
+from stiffopt.daemon.recording import RunRecording
+from stiffopt.daemon.topics import FORMAT, TelemetryChannels
 from stiffopt.errors import MissingExtraError, StiffoptError
 from stiffopt.files import file_text
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.device import Clock
 from stiffopt.rig.settings import ServiceSettings
 
-__all__ = ["EventSource", "Telemetry", "Watched", "about_run"]
+__all__ = ["ArmShape", "Telemetry", "TelemetryRates", "about_run"]
 
 Array = NDArray[np.float64]
 
-_WAKE = 0.02  # s between two looks at what has come
-_COMMIT = 0.1  # s: what a killed process loses
-_KEPT = 4096  # snapshots that wait; the oldest go first
-_FINEST = 0.01  # s between two ticks that are logged; a faster loop would pay with its punctuality
-_SMOOTH, _OFTEN, _SELDOM = 0.04, 0.1, 1.0  # s between what is not logged in each tick: frames,
-# the arm's shape and the timing, the state
-_CALM = 10.0  # s after which a loss or a failure is forgotten
+
+@dataclass(frozen=True)
+class TelemetryRates:
+    """How often what is logged, and how much waits; times in s.
+
+    Attributes
+    ----------
+    wake : between two looks at what the loop has handed over.
+    commit : between two writes to the disk: what a killed process loses.
+    queue : snapshots that may wait; the oldest are dropped first.
+    tick : between two snapshots that are logged; to log more would cost the loop its punctuality.
+    frames, shape, state : between messages of the frames, of the arm's shape and the timing, and
+        of the state while it does not change.
+    calm : after which a loss or a failure is forgotten.
+    shape_poses : along the arm that Foxglove draws.
+    shape_share : of the interpreter's time, which the control thread needs too, for the shape.
+    """
+
+    wake: float = 0.02
+    commit: float = 0.1
+    queue: int = 4096
+    tick: float = 0.01
+    frames: float = 0.04
+    shape: float = 0.1
+    state: float = 1.0
+    calm: float = 10.0
+    shape_poses: int = 12
+    shape_share: float = 0.02
 
 
-class EventSource(Protocol):
-    """The events of a loop."""
-
-    def since(self, index: int) -> tuple[list[Event], int]:
-        """Return the events from an index on, and the next index."""
-
-
-class Watched(Protocol):
-    """What telemetry needs of a loop."""
-
-    @property
-    def events(self) -> EventSource:
-        """What has happened."""
-
-    def snapshot(self) -> Snapshot:
-        """How things stand."""
-
-    def add_alarm(self, kind: str, text: str) -> None:
-        """Say what is wrong."""
-
-    def clear_alarm(self, kind: str) -> None:
-        """Say that it is well again."""
+RATES = TelemetryRates()
 
 
 class Telemetry:
@@ -97,7 +99,7 @@ class Telemetry:
         self,
         robot: RobotDescription,
         name: str,
-        loop: Watched,
+        loop: ControlLoop,
         folder: str | None,
         settings: ServiceSettings,
         *,
@@ -114,7 +116,7 @@ class Telemetry:
         self.dropped = 0
         self._loop, self._name, self._settings = loop, name, settings
         self._backbone = backbone
-        self._queue: deque[Snapshot] = deque(maxlen=_KEPT)
+        self._queue: deque[Snapshot] = deque(maxlen=RATES.queue)
         self._context = Context()
         begin = clock.now()
         self._offset = wall() - round(begin * 1e9)
@@ -124,7 +126,7 @@ class Telemetry:
         self._recording = (
             None
             if folder is None
-            else Recording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
+            else RunRecording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
         )
         self._server: Any = None
         self._thread: threading.Thread | None = None
@@ -162,7 +164,7 @@ class Telemetry:
 
     def put(self, snapshot: Snapshot) -> None:
         """Hand over a snapshot; called by the control thread in each tick, and never waits."""
-        if len(self._queue) == _KEPT:
+        if len(self._queue) == RATES.queue:
             self.dropped += 1
         self._queue.append(snapshot)
 
@@ -216,7 +218,7 @@ class Telemetry:
             self._attempt(self._channels.log_event, event)
         now = time.monotonic()
         if last or now >= self._due_commit:
-            self._due_commit = now + _COMMIT
+            self._due_commit = now + RATES.commit
             self._commit(now)
         self._look_back(now)
 
@@ -229,7 +231,7 @@ class Telemetry:
             self._tell("telemetry", f"something could not be logged: {error}")
 
     def _run(self) -> None:
-        while not self._stop.wait(_WAKE):
+        while not self._stop.wait(RATES.wake):
             self.work()
 
     def _listen(self) -> None:
@@ -251,22 +253,22 @@ class Telemetry:
 
     def _log(self, now: Snapshot) -> None:
         self._logged = now.time
-        due = on_time = now.time >= self._due_tick - _FINEST / 2
+        due = on_time = now.time >= self._due_tick - RATES.tick / 2
         state = (now.state, now.reason, now.task, _kinds(now.alarms))
         if state != self._last_state or now.time >= self._due_state:
             self._channels.log_state(now)
-            self._last_state, self._due_state = state, now.time + _SELDOM
+            self._last_state, self._due_state = state, now.time + RATES.state
             due = True
         if due:
-            regular = on_time and now.time <= self._due_tick + _FINEST
-            self._due_tick = (self._due_tick if regular else now.time) + _FINEST
+            regular = on_time and now.time <= self._due_tick + RATES.tick
+            self._due_tick = (self._due_tick if regular else now.time) + RATES.tick
             self._channels.log_tick(now)
         self._channels.log_samples(now)  # each of them
         if now.time >= self._due_smooth:
-            self._due_smooth = now.time + _SMOOTH
+            self._due_smooth = now.time + RATES.frames
             self._channels.log_frames(now)
         if now.time >= self._due_often:
-            self._due_often = now.time + _OFTEN
+            self._due_often = now.time + RATES.shape
             self._channels.log_timing(now, self.dropped)
             self._log_arm(now)
 
@@ -285,13 +287,13 @@ class Telemetry:
 
     def _look_back(self, now: float) -> None:
         """Say what was lost, and that all is well when nothing has gone wrong for a while."""
-        if now > self._failed_at + _CALM:
+        if now > self._failed_at + RATES.calm:
             self._tell("telemetry", "")
         if self.dropped > self._dropped_told:
             self._dropped_told, self._dropped_at = self.dropped, now
             text = f"telemetry is too slow; {self.dropped} snapshots were never logged"
             self._tell("telemetry-lost", text)
-        elif now > self._dropped_at + _CALM:
+        elif now > self._dropped_at + RATES.calm:
             self._tell("telemetry-lost", "")
 
     def _tell(self, kind: str, text: str) -> None:
@@ -305,10 +307,28 @@ class Telemetry:
             self._loop.clear_alarm(kind)
 
 
+class ArmShape:
+    """Computes the arm's shape as often as its share of the interpreter's time permits."""
+
+    def __init__(self, robot: Manipulator) -> None:
+        self._robot = robot
+        self._due = 0.0
+        self._last: Array | None = None
+
+    def __call__(self, pressures: Array) -> Array:
+        """Return poses (m, 4, 4) along the arm, now or a little while ago."""
+        now = time.monotonic()
+        if self._last is None or now >= self._due:
+            self._last = self._robot.backbone(pressures, RATES.shape_poses)
+            ended = time.monotonic()
+            self._due = ended + (ended - now) / RATES.shape_share
+        return self._last
+
+
 def about_run(
     robot: RobotDescription, name: str, first: Snapshot, begin: float, offset: int
 ) -> dict[str, str]:
-    """Return what a recording says of itself, so that whoever reads it needs nothing else."""
+    """Return the metadata of a recording: all that a reader needs beside the messages."""
     from stiffopt import __version__
 
     return {

@@ -1,22 +1,35 @@
-"""Topics of telemetry, live and recorded: the fields of the loop's state as JSON messages.
+"""Topics of telemetry, live and recorded: the fields of the loop's state as messages.
 
-Which field is in which topic stands in its definition in `stiffopt.control.state`. Foxglove reads
-no union types in a schema (``["number", "null"]`` makes it refuse the topic), so a schema says what
-a field is when it is there: of what is missing a scalar is left out, and an item of an array is
-null.
+Which field is in which topic stands in its definition in `stiffopt.control.state`. Where Foxglove
+has a message of its own it is used too, so that its panels show it without set-up: frames, the arm
+as a line, events as a log. Everything else is JSON. Foxglove reads no union types in a schema
+(``["number", "null"]`` makes it refuse the topic), so a schema says what a field is when it is
+there: of what is missing a scalar is left out, and an item of an array is null.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import Any
 
-from stiffopt.control.state import Event, SeenPose, Snapshot, State, Timing
-from stiffopt.control.state_fields import Entry, Kind, entries
+import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["FORMAT", "METADATA", "STATES", "encoded", "state_topics", "topic_schemas"]
+from stiffopt.control.state import Event, SeenPose, Severity, Snapshot, State, Timing
+from stiffopt.control.state_fields import Entry, Kind, entries
+from stiffopt.rig.interface import PoseSample
+
+__all__ = [
+    "FORMAT",
+    "METADATA",
+    "STATES",
+    "TelemetryChannels",
+    "encoded",
+    "state_topics",
+    "topic_schemas",
+]
 
 METADATA = "stiffopt-run"
 """Name of the metadata record of a run."""
@@ -70,7 +83,7 @@ def topic_schemas() -> dict[str, dict[str, Any]]:
 
 
 def encoded(topic: str, time: float, record: Any, **further: Any) -> bytes:
-    """Return the message of a topic that a record of the state gives at a time, in s."""
+    """Return the message of a topic for a record of the state, at a time in s."""
     message: dict[str, Any] = {"time_s": round(time, _TIME_DECIMALS)}
     for entry in _logged(type(record), topic):
         value = _rounded(getattr(record, entry.name), entry)
@@ -94,7 +107,7 @@ def _schema(entry: Entry) -> dict[str, Any]:
 
 
 def _rounded(value: Any, entry: Entry) -> Any:
-    """Return a value as it is logged; None if it is missing."""
+    """Return the value of a field, rounded, as it is logged; None if it is missing."""
     if value is None:
         return None
     match entry.kind:
@@ -115,3 +128,202 @@ def _rounded(value: Any, entry: Entry) -> Any:
                 for item in value
             ]
     return value
+
+
+Array = NDArray[np.float64]
+
+BASE, TIP, TARGET, SEEN = "base", "tip", "target", "tip_seen"
+"""Names of the frames; all are children of the base."""
+
+_SELDOM = ("/state", "/limits")
+_TARGET_SIZE = 0.004  # m
+_ARM_COLOUR, _TARGET_COLOUR = (0.31, 0.47, 0.65, 0.7), (0.84, 0.15, 0.16, 0.8)
+
+
+class TelemetryChannels:
+    """Writes snapshots, events and the shape of the arm to the topics of telemetry.
+
+    Parameters
+    ----------
+    context :
+        Of foxglove; whoever listens there gets all that is logged.
+    offset :
+        Nanoseconds since 1970 at the time 0 of the rig's clock. It stays, whatever becomes of the
+        wall clock.
+    thickness :
+        Of the arm as it is drawn, in m.
+    """
+
+    def __init__(self, context: Any, offset: int, thickness: float) -> None:
+        from foxglove import Channel
+        from foxglove.channels import FrameTransformsChannel, LogChannel, SceneUpdateChannel
+
+        self._offset, self._thickness = offset, thickness
+        self._seen: PoseSample | None = None
+        self._json = {
+            topic: Channel(topic, schema=schema, context=context)
+            for topic, schema in topic_schemas().items()
+        }
+        self._each_tick = [topic for topic in state_topics() if topic not in _SELDOM]
+        self._frames = FrameTransformsChannel("/tf", context=context)
+        self._scene = SceneUpdateChannel("/scene", context=context)
+        self._log = LogChannel("/log", context=context)
+
+    def close(self) -> None:
+        """Withdraw the topics."""
+        channels: list[Any] = [*self._json.values(), self._frames, self._scene, self._log]
+        for channel in channels:
+            channel.close()
+
+    def nanoseconds(self, time: float) -> int:
+        """Return the date, in ns since 1970, of a time on the rig's clock."""
+        return self._offset + round(time * 1e9)
+
+    def log_tick(self, now: Snapshot) -> None:
+        """Log what every tick has: pressures, the tip, and all else that does not change seldom."""
+        for topic in self._each_tick:
+            self._say(topic, now.time, now)
+
+    def log_samples(self, now: Snapshot) -> None:
+        """Log what the tracker has seen; times are those of capture."""
+        for sample in now.samples:
+            if sample.visible and not now.rejected:
+                self._seen = sample
+            seen = SeenPose(
+                sample.time,
+                sample.received,
+                sample.frame,
+                sample.position,
+                sample.quaternion,
+                doubted=now.rejected > 0,
+            )
+            self._say("/tracker", sample.time, seen, at=now.time)
+
+    def log_state(self, now: Snapshot) -> None:
+        """Log what changes seldom: state, alarms and limits."""
+        self._say("/state", now.time, now, state_number=STATES.index(now.state))
+        self._say("/limits", now.time, now)
+
+    def log_timing(self, now: Snapshot, dropped: int) -> None:
+        """Log how punctual the loop is, and how many snapshots never got here."""
+        self._say("/timing", now.time, now.timing, dropped=dropped)
+
+    def log_event(self, event: Event) -> None:
+        """Log something that happened, for people and for programs."""
+        from foxglove.messages import Log, LogLevel
+
+        moment = self.nanoseconds(event.time)
+        level = {
+            Severity.INFO: LogLevel.Info,
+            Severity.WARNING: LogLevel.Warning,
+            Severity.ERROR: LogLevel.Error,
+        }[event.severity]
+        message = Log(
+            timestamp=_timestamp(moment), level=level, message=event.text, name=event.kind
+        )
+        self._log.log(message, log_time=moment)
+        self._say("/event", event.time, event)
+
+    def log_arm(self, now: Snapshot, poses: Array) -> None:
+        """Log the arm's shape from poses (m, 4, 4) along it, and the target."""
+        from foxglove.messages import LinePrimitive, Point3, SceneUpdate
+
+        moment = self.nanoseconds(now.time)
+        points = [Point3(x=x, y=y, z=z) for x, y, z in poses[:, :3, 3].tolist()]
+        line = LinePrimitive(points=points, thickness=self._thickness, color=_colour(_ARM_COLOUR))
+        entities = [_entity(moment, "arm", lines=[line])]
+        where = _target_place(now)
+        if where is not None:
+            entities.append(_ball(moment, where))
+        self._scene.log(SceneUpdate(entities=entities), log_time=moment)
+
+    def log_frames(self, now: Snapshot) -> None:
+        """Log where tip and target are, and where the tip was last seen."""
+        from foxglove.messages import FrameTransforms
+
+        moment = self.nanoseconds(now.time)
+        frames = [_frame(moment, TIP, now.tip_position, now.tip_quaternion)]
+        where = _target_place(now)
+        if where is not None:
+            frames.append(_frame(moment, TARGET, where, _target_turn(now)))
+        if self._seen is not None:
+            captured = self.nanoseconds(self._seen.time)
+            frames.append(_frame(captured, SEEN, self._seen.position, self._seen.quaternion))
+        known = [frame for frame in frames if frame is not None]
+        if known:
+            self._frames.log(FrameTransforms(transforms=known), log_time=moment)
+
+    def _say(
+        self, topic: str, time: float, record: Any, *, at: float | None = None, **more: Any
+    ) -> None:
+        """Log what a topic says of a record at a time; it comes in the tick at `at`."""
+        moment = self.nanoseconds(time if at is None else at)
+        self._json[topic].log(encoded(topic, time, record, **more), log_time=moment)
+
+
+def _timestamp(moment: int) -> Any:
+    from foxglove.messages import Timestamp
+
+    return Timestamp(moment // 10**9, moment % 10**9)
+
+
+def _colour(parts: Sequence[float]) -> Any:
+    from foxglove.messages import Color
+
+    red, green, blue, opacity = parts
+    return Color(r=red, g=green, b=blue, a=opacity)
+
+
+def _frame(moment: int, name: str, position: Array, quaternion: Array | None) -> Any:
+    """Return a frame in the base, or None while it is not known where it is."""
+    from foxglove.messages import FrameTransform, Quaternion, Vector3
+
+    w, x, y, z = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion.tolist()
+    if not np.isfinite([*position.tolist(), w, x, y, z]).all():
+        return None
+    a, b, c = position.tolist()
+    return FrameTransform(
+        timestamp=_timestamp(moment),
+        parent_frame_id=BASE,
+        child_frame_id=name,
+        translation=Vector3(x=a, y=b, z=c),
+        rotation=Quaternion(x=x, y=y, z=z, w=w),
+    )
+
+
+def _ball(moment: int, where: Array) -> Any:
+    from foxglove.messages import Pose, Quaternion, SpherePrimitive, Vector3
+
+    x, y, z = where.tolist()
+    place = Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=0, y=0, z=0, w=1))
+    size = Vector3(x=_TARGET_SIZE, y=_TARGET_SIZE, z=_TARGET_SIZE)
+    ball = SpherePrimitive(pose=place, size=size, color=_colour(_TARGET_COLOUR))
+    return _entity(moment, TARGET, spheres=[ball])
+
+
+def _entity(moment: int, name: str, **shapes: Any) -> Any:
+    """Return an entity of the base frame; it disappears unless it is drawn again within 1 s."""
+    from foxglove.messages import Duration, SceneEntity
+
+    stamp, soon = _timestamp(moment), Duration(1)
+    return SceneEntity(timestamp=stamp, frame_id=BASE, id=name, lifetime=soon, **shapes)
+
+
+def _target_place(now: Snapshot) -> Array | None:
+    """Return where the target is (3,), with the tip's coordinate along free axes."""
+    if now.target_position is None:
+        return None
+    where: Array = np.where(np.isfinite(now.target_position), now.target_position, now.tip_position)
+    return where if np.isfinite(where).all() else None
+
+
+def _target_turn(now: Snapshot) -> Array | None:
+    """Return the target's orientation (4,), or the smallest rotation to its direction."""
+    if now.target_quaternion is not None:
+        return now.target_quaternion
+    if now.target_pointing is None:
+        return None
+    x, y, z = (now.target_pointing / np.linalg.norm(now.target_pointing)).tolist()
+    half = np.array([1 + z, -y, x, 0.0])  # turns the z axis there
+    length = float(np.linalg.norm(half))
+    return half / length if length > 1e-9 else np.array([0.0, 1.0, 0.0, 0.0])

@@ -1,13 +1,22 @@
-"""The paper's experiments: protocols that run on any rig, and what they find."""
+"""The paper's experiments: protocols that run on any rig, and the evaluation of their data.
+
+`kinematics` and `coverage` record the tip while pressures change, `stiffness` and `probing` push on
+it; the `conductor` commands the rig for all of them, `folder` keeps their files. The modules with
+`result` in their names compare the data with a model. `arm_map` needs no rig.
+"""
 
 from stiffopt.experiments.arm_map import ArmMap, TipMap, map_arm, map_tip
-from stiffopt.experiments.coverage_result import CoverageResult, evaluate_coverage
 from stiffopt.experiments.kinematics import (
     KinematicsSettings,
     PressureSequence,
     run_kinematics,
 )
-from stiffopt.experiments.kinematics_result import KinematicsResult, evaluate_kinematics
+from stiffopt.experiments.kinematics_result import (
+    CoverageResult,
+    KinematicsResult,
+    evaluate_coverage,
+    evaluate_kinematics,
+)
 from stiffopt.experiments.stiffness import StiffnessSettings, run_stiffness
 from stiffopt.experiments.stiffness_result import StiffnessResult, evaluate_stiffness
 

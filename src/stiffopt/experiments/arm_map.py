@@ -1,4 +1,4 @@
-"""Stiffness along an arm, and of its tip over two pressures: figure 6 of the paper."""
+"""Maps of a model's stiffness: along the arm (figure 6 of the paper), and over two pressures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Conductor: commands the pressures of a rig open loop and collects what its devices say."""
+"""The conductor runs an experiment on a rig: it commands pressures and records what is seen.
+
+Commands are goals of the supply of `stiffopt.open_rig`: the safety gate limits them, and lets the
+arm down when the experiment stops commanding. The pressure monitor judges every reading.
+"""
 
 from __future__ import annotations
 
@@ -12,40 +16,68 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import DeviceError, InputError
-from stiffopt.experiments.gauges import AGREE, Gauges
 from stiffopt.logs import LogRow
-from stiffopt.rig.interface import PoseSample, PressureCommand, Rig
+from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig
+from stiffopt.rig.settings import ControlSettings, Safety
+from stiffopt.safety.expected_pressure import Regulation
+from stiffopt.safety.goal import GoalSupply
+from stiffopt.safety.monitors import PressureMonitor
 
-__all__ = ["Conductor", "Row", "at_rest", "check_pressures", "steepest"]
+__all__ = [
+    "CONDUCTOR",
+    "Conductor",
+    "ConductorTuning",
+    "TrackedFrame",
+    "at_rest",
+    "check_pressures",
+]
 
 Array = NDArray[np.float64]
 
-LOST = 2.0
-"""Seconds without sight of the tip after which an experiment is given up, if no rig file says."""
-VALID = 0.5
-"""Seconds for which a command holds, if no rig file says."""
-GENTLE = 5e4
-"""Rate in Pa/s at which pressures are brought to where an experiment wants them."""
-STEEPEST = 5e5
-"""Rate in Pa/s of a channel for which neither robot nor rig file has a limit."""
-_FIRST = 5.0  # s that a tracker may take to see the tip for the first time
-_MOST_PERIODS = 2.0  # that count in one step: a loop that was held up does not catch up with a jump
-_PAUSE = 0.15  # s without a command after which a device may have vented by itself
-_GLANCE = 0.01  # s between two readings after a pause
-_MOST_LOOKS = 20  # after a pause, at pressures that change all the time
-_FAR = 0.1e5  # Pa by which a pressure must have fallen, for noise and lag
-_LOOK = 0.1  # s between two looks at whether something has settled
-_KEPT = 4096  # rows and moments
-_RECENT = 200  # moments among which that of a frame is looked for
-_NEAR = 0.1  # s between a frame and readings that belong to it
-_PATIENCE = 10  # times the steps that a ramp over the whole range takes
+_KEPT = 4096  # frames and ticks that are kept
+_RECENT = 200  # ticks among which that of a frame is looked for
 
 
 @dataclass(frozen=True)
-class Row:
-    """What was so when the tracker looked: tip, pressures, and the probe if it is in use.
+class ConductorTuning:
+    """How the conductor moves the arm and judges what it sees.
 
-    Times are those of the rig's clock; positions are those of the tip in the base frame.
+    Attributes
+    ----------
+    gentle : rate at which pressures are brought to a new pose, in Pa/s.
+    first_sight : time in which a tracker must see the tip for the first time, in s.
+    near : greatest time between a frame and the readings that belong to it, in s.
+    settle_look : time between two looks at whether something has settled, in s.
+    slowest_lag : time constant, in s, up to which regulators count as healthy. The arm of an
+        experiment need not be identified yet, so this is far above a usual `regulator_lag`.
+    bad_readings : impossible readings in a row that end an experiment; fewer are ignored.
+    ramp_patience : a ramp ends in an error if it takes so many times the expected number of ticks.
+    """
+
+    gentle: float = 5e4
+    first_sight: float = 5.0
+    near: float = 0.1
+    settle_look: float = 0.1
+    slowest_lag: float = 2.0
+    bad_readings: int = 3
+    ramp_patience: int = 10
+
+
+CONDUCTOR = ConductorTuning()
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """A frame of the tracker with the pressures and probe readings of that moment.
+
+    Attributes
+    ----------
+    time : when the frame was captured, on the rig's clock, in s.
+    position : of the tip in the base frame (3,), in m; NaN if it was not seen.
+    quaternion : of the tip in the base frame (w, x, y, z); None if it is not tracked.
+    commanded : set-points (n,) that held then, in Pa.
+    measured : pressures (n,) that were measured nearest to then, in Pa; NaN if not near.
+    force, stage : force in N and position in m of the probe; NaN while it is not in use.
     """
 
     time: float
@@ -75,7 +107,9 @@ class Row:
 
 
 @dataclass(frozen=True)
-class _Moment:
+class _TickRecord:
+    """Set-points and readings of one tick; units as in `TrackedFrame`."""
+
     time: float
     commanded: Array
     measured: Array
@@ -84,54 +118,57 @@ class _Moment:
 
 
 class Conductor:
-    """Steps a rig at a fixed rate: a command, a look at all devices, a wait for the next moment.
+    """Steps a rig at a fixed rate: command, read all devices, wait for the next tick.
 
-    Commands are within the rig's limits and never change faster than its slew (`steepest`). A loop
-    that was held up goes on from where it was. Where the pressure has gone meanwhile, because a
-    device's own watchdog has vented, the channel is vented and comes up again under the slew. No
-    reading of a gauge is ever commanded.
+    The safety gate limits every command; a loop that was held up makes no jump. The experiment ends
+    with `DeviceError` where the pressure monitor finds a fault, and where the arm was let down
+    because the loop had stood still; the caller then closes the rig, which vents it.
 
     Parameters
     ----------
     rig : Rig
-        Open, with a tracker.
+        Open, with a tracker, from `stiffopt.open_rig`.
     rate : float
-        Steps a second.
+        Ticks a second.
     check : callable, optional
-        Called at each step; raises to stop the experiment.
+        Called in each tick; raises to stop the experiment.
 
     Attributes
     ----------
-    rows : deque of Row
-        The latest of what was seen, one for each frame of the tracker.
+    rows : deque of TrackedFrame
+        The latest frames of the tracker.
     sink : callable or None
-        Is given every new row.
+        Called with every new frame.
     probing : bool
-        Whether the probe is read at each step.
+        Whether the probe is read in each tick.
     """
 
     def __init__(self, rig: Rig, rate: float, check: Callable[[], None] = lambda: None) -> None:
         if rig.tracker is None:
             raise InputError("this rig has no tracker; the experiment needs one")
-        if not np.all(rig.slew > 0):
-            raise InputError("the slew of this rig must be above 0 for each channel")
+        if not isinstance(rig.supply, GoalSupply):
+            raise InputError("this rig's supply has no safety gate; open it by stiffopt.open_rig")
         self.rig = rig
         self.tracker = rig.tracker
         self.clock = rig.clock
-        self.rows: deque[Row] = deque(maxlen=_KEPT)
-        self.sink: Callable[[Row], None] | None = None
+        self.rows: deque[TrackedFrame] = deque(maxlen=_KEPT)
+        self.sink: Callable[[TrackedFrame], None] | None = None
         self.probing = False
         self._period = 1.0 / rate
         self._check = check
-        self._slew = steepest(rig)
-        self._setpoint = np.array(rig.supply.commanded, dtype=float)
-        self._gauges = Gauges(self.n)
-        self._moments: deque[_Moment] = deque(maxlen=_KEPT)
+        safety = Safety() if rig.settings is None else rig.settings.safety
+        control = ControlSettings() if rig.settings is None else rig.settings.control
+        lag = max(control.regulator_lag, CONDUCTOR.slowest_lag)
+        regulation = Regulation.slowest(
+            rig.robot, control.model_copy(update={"regulator_lag": lag}), self.n
+        )
+        self._monitor = PressureMonitor(rig.supply.limits, safety, regulation, rig.slew)
+        self._impossible = 0  # readings in a row
+        self._valid, self._lost = safety.command_timeout, safety.tracker_timeout
+        self._target = self._commanded = np.array(rig.supply.commanded, dtype=float)
+        self._ticks: deque[_TickRecord] = deque(maxlen=_KEPT)
         self._last = self._deadline = self.clock.now()
-        safety = None if rig.settings is None else rig.settings.safety
-        self._valid = VALID if safety is None else safety.command_timeout
-        self._lost = LOST if safety is None else safety.tracker_timeout
-        self._hidden = False  # somebody may stand before the tracker
+        self._hidden = False  # somebody may stand in front of the tracker
 
     @property
     def n(self) -> int:
@@ -139,7 +176,7 @@ class Conductor:
         return self.rig.supply.n
 
     def start(self) -> None:
-        """Let commands have an effect, and wait for the tracker.
+        """Arm the supply and wait for the tracker.
 
         Raises
         ------
@@ -147,43 +184,45 @@ class Conductor:
             The tracker does not see the tip.
         """
         self.rig.supply.arm()
+        self._monitor.clear()
+        self._target = self._commanded = np.zeros(self.n)
         self._last = begin = self.clock.now()
         while not any(row.visible for row in self.rows):
-            if self.clock.now() - begin > _FIRST:
+            if self.clock.now() - begin > CONDUCTOR.first_sight:
                 raise DeviceError(
-                    f"the tracker has not seen the tip for {_FIRST:g} s; "
+                    f"the tracker has not seen the tip for {CONDUCTOR.first_sight:g} s; "
                     "is it connected, is the sensor in its field?"
                 )
-            self.tick(self._setpoint)
+            self.tick(self._target)
 
-    def tick(self, target: ArrayLike, slew: float | None = None) -> None:
-        """Command pressures (n,), as far as the slew lets them go, and wait for the next step.
+    def tick(self, target: ArrayLike) -> None:
+        """Command pressures (n,), in Pa, which the gate approaches, and wait for the next tick.
 
         Raises
         ------
+        CommandError
+            The pressures are outside the limits.
         DeviceError
-            A device fails, or the tracker has lost the tip.
+            A device fails, the tracker has lost the tip, or the arm was let down meanwhile.
         """
         self._check()
-        gone = self._gone()
         now = self.clock.now()
-        reach = self._slew if slew is None else np.minimum(self._slew, slew)
-        reach = reach * min(max(now - self._last, 0.0), _MOST_PERIODS * self._period)
-        limits, target = self.rig.supply.limits, np.asarray(target, dtype=float)
-        before, start = self._setpoint, np.where(gone, 0.0, self._setpoint)
-        wanted = np.clip(target, start - reach, start + reach)
-        outside = (wanted < limits.low) | (wanted > limits.high)
-        self._setpoint = limits.clamp(np.where((target == 0) & outside, 0.0, wanted))
+        pause = now - self._last
+        if pause > self._valid and not self.rig.supply.armed:
+            raise DeviceError(
+                f"the experiment stood still for {pause:.3g} s, so that the arm was let down and "
+                "vented; go on with --resume"
+            )
         self._last = now
-        reading = self.rig.supply.exchange(PressureCommand(self._setpoint, now, self._valid))
-        self._setpoint = self.rig.supply.commanded  # as far as the gate has let it go
-        self._gauges.note(now, before, self._setpoint, reading.pressures)
-        self._gauges.refuse_nonsense(limits)
+        self._target = np.array(target, dtype=float)
+        reading = self.rig.supply.exchange(PressureCommand(self._target, now, self._valid))
+        self._commanded = self.rig.supply.commanded  # as far as the gate has let it go
+        self._judge(now, reading)
         force, stage = np.nan, np.nan
         if self.probing and self.rig.probe is not None:
             felt = self.rig.probe.sample()
             force, stage = felt.force, felt.position
-        self._moments.append(_Moment(now, self._setpoint, reading.pressures, force, stage))
+        self._ticks.append(_TickRecord(now, self._commanded, reading.pressures, force, stage))
         for sample in self.tracker.read():
             self._take(sample)
         if self._lost < self.tracker.age() < np.inf and not self._hidden:
@@ -193,38 +232,23 @@ class Conductor:
             self._deadline = self.clock.now() + self._period
         self.clock.sleep_until(self._deadline)
 
-    def _gone(self) -> NDArray[np.bool_]:
-        """Say in which channels (n,) the pressure is no longer what it was commanded to be.
-
-        After a pause nothing is commanded before that is known. Where the command has expired and
-        no gauge shows that it still holds, it is taken for gone: to vent is always allowed.
-        """
-        half = 0.5 * np.abs(self._setpoint)
-        pause = self.clock.now() - self._last
-        if pause <= max(_PAUSE, 3 * self._period):
-            return self._gauges.fallen(self._setpoint, np.maximum(half, _FAR))
-        if not self.rig.supply.armed:  # nobody may be there any more: do not begin by itself
-            raise DeviceError(
-                f"the experiment stood still for {pause:.3g} s, so that the arm was let down and "
-                "vented; go on with --resume"
-            )
-        for count in range(_MOST_LOOKS):
-            if count >= AGREE and self._gauges.steady():
-                break
-            if count:
-                self.clock.sleep(_GLANCE)
-            self._gauges.look(self.rig.supply.read().pressures)
-        gone = self._gauges.fallen(self._setpoint, _FAR)
-        if pause > self._valid:
-            gone |= ~(self._gauges.shown(self._setpoint) >= half)
-        return gone
+    def _judge(self, now: float, reading: PressureReading) -> None:
+        """Raise `DeviceError` if the readings show a fault of the supply."""
+        self._monitor.tell(now, self._commanded)
+        trouble = self._monitor.update(self.clock.now(), reading)
+        impossible = trouble is not None and trouble.kind == "pressure-reading"
+        self._impossible = self._impossible + 1 if impossible else 0
+        if trouble is None or 0 < self._impossible < CONDUCTOR.bad_readings:
+            return
+        hint = "" if impossible else " (if its gauge is wrong, allow for it: max_pressure_error)"
+        raise DeviceError(trouble.text + hint)
 
     def _take(self, sample: PoseSample) -> None:
-        """Put a frame together with what held when it was captured."""
+        """Combine a frame with the set-points and readings of the moment of its capture."""
         if self.rows and sample.time <= self.rows[-1].time:
             return  # a frame that came twice
-        held, nearest = self._moments_at(sample.time)
-        row = Row(
+        held, nearest = self._ticks_at(sample.time)
+        row = TrackedFrame(
             time=sample.time,
             position=sample.position,
             quaternion=sample.quaternion,
@@ -237,14 +261,14 @@ class Conductor:
         if self.sink is not None:
             self.sink(row)
 
-    def _moments_at(self, time: float) -> tuple[_Moment, _Moment]:
-        """Return the moment whose command held at a time, and that with the nearest readings."""
-        recent = [self._moments[-k] for k in range(min(len(self._moments), _RECENT), 0, -1)]
-        after = bisect_right(recent, time, key=lambda moment: moment.time)
+    def _ticks_at(self, time: float) -> tuple[_TickRecord, _TickRecord]:
+        """Return the tick whose command held at a time, and the one with the nearest readings."""
+        recent = [self._ticks[-k] for k in range(min(len(self._ticks), _RECENT), 0, -1)]
+        after = bisect_right(recent, time, key=lambda tick: tick.time)
         around = recent[max(after - 1, 0) : after + 1]
-        nearest = min(around, key=lambda moment: abs(moment.time - time))
-        if abs(nearest.time - time) > _NEAR:
-            nearest = _Moment(time, nearest.commanded, np.full(self.n, np.nan), np.nan, np.nan)
+        nearest = min(around, key=lambda tick: abs(tick.time - time))
+        if abs(nearest.time - time) > CONDUCTOR.near:
+            nearest = _TickRecord(time, nearest.commanded, np.full(self.n, np.nan), np.nan, np.nan)
         return around[0], nearest
 
     # -- longer manoeuvres ------------------------------------------------------------------
@@ -252,15 +276,15 @@ class Conductor:
     def meanwhile(self, task: Callable[[], None]) -> None:
         """Hold the pressures while a task, in a thread of its own, waits for a person.
 
-        The supply is spoken to all the time, for its watchdog; that the tip is hidden is no fault.
-        Whatever the task raises is raised here.
+        Commands go on, so that they do not expire; a hidden tip is no fault meanwhile. Whatever the
+        task raises is raised here.
         """
         failures: list[BaseException] = []
 
         def work() -> None:
             try:
                 task()
-            except BaseException as error:  # told by who waits
+            except BaseException as error:  # raised by the thread that waits
                 failures.append(error)
 
         thread = threading.Thread(target=work, name="person", daemon=True)
@@ -268,51 +292,60 @@ class Conductor:
         try:
             thread.start()
             while thread.is_alive():
-                self.tick(self._setpoint)
+                self.tick(self._target)
             done = self.clock.now()
-            while self.tracker.age() > _NEAR and self.clock.now() - done < _FIRST and not failures:
-                self.tick(self._setpoint)  # whoever stood before the tracker steps aside
+            while (
+                self.tracker.age() > CONDUCTOR.near
+                and self.clock.now() - done < CONDUCTOR.first_sight
+                and not failures
+            ):
+                self.tick(self._target)  # until the person has left the tracker's view
         finally:
             self._hidden = False
         if failures:
             raise failures[0]
 
-    def ramp(self, target: ArrayLike, slew: float = GENTLE) -> None:
-        """Bring the pressures (n,) somewhere.
+    def approach(self, target: ArrayLike, rate: ArrayLike = CONDUCTOR.gentle) -> None:
+        """Tick once, towards pressures (n,), in Pa, and no faster than a rate, in Pa/s."""
+        limits, target = self.rig.supply.limits, np.asarray(target, dtype=float)
+        reach = np.asarray(rate) * min(max(self.clock.now() - self._last, 0.0), 2 * self._period)
+        near = np.clip(target, self._commanded - reach, self._commanded + reach)
+        outside = (near < limits.low) | (near > limits.high)  # on the way from or to 0
+        self.tick(limits.clamp(np.where((target == 0) & outside, 0.0, near)))
+
+    def ramp(self, target: ArrayLike) -> None:
+        """Bring the pressures (n,), in Pa, to a target gently, see `ConductorTuning`.
 
         Raises
         ------
         DeviceError
-            They do not get there, for the supply vents by itself again and again.
+            The set-points do not get there.
         """
         limits = self.rig.supply.limits
         target = limits.clamp(np.asarray(target, dtype=float))
         span = np.maximum(limits.high, 0.0) - np.minimum(limits.low, 0.0)
-        steps = float(np.max(span / np.minimum(self._slew, slew))) / self._period
-        for _ in range(_PATIENCE * (int(steps) + 10)):
-            self.tick(target, slew)  # at least one: they may have fallen
-            if np.array_equal(self._setpoint, target):
+        ticks = int(np.max(span / np.minimum(self.rig.slew, CONDUCTOR.gentle)) / self._period)
+        for _ in range(CONDUCTOR.ramp_patience * (ticks + 10)):
+            self.approach(target)
+            if np.array_equal(self._commanded, target):
                 return
-        raise DeviceError(
-            "the pressures do not get to where they shall be: they fall again and again; "
-            "is there air, does the supply's watchdog wait long enough?"
-        )
+        raise DeviceError("the pressures do not get to where they shall be: the gate limits them")
 
     def settle(
-        self, target: ArrayLike, settled: Callable[[Sequence[Row]], bool], timeout: float
+        self, target: ArrayLike, settled: Callable[[Sequence[TrackedFrame]], bool], timeout: float
     ) -> bool:
-        """Hold pressures (n,) until rows seen since then satisfy a condition; say if they did."""
+        """Hold pressures (n,) until new frames satisfy a condition; return whether they did."""
         begin = looked = self.clock.now()
         while (now := self.clock.now()) - begin < timeout:
             self.tick(target)
-            if now - looked >= _LOOK:
+            if now - looked >= CONDUCTOR.settle_look:
                 looked = now
                 if settled(self.since(begin)):
                     return True
         return False
 
-    def since(self, begin: float) -> list[Row]:
-        """Rows whose time is not before `begin`, in order."""
+    def since(self, begin: float) -> list[TrackedFrame]:
+        """Return the frames from the time `begin` on, in order."""
         found = []
         for row in reversed(self.rows):
             if row.time < begin:
@@ -321,17 +354,12 @@ class Conductor:
         return found[::-1]
 
 
-def steepest(rig: Rig) -> Array:
-    """Return the rates (n,) in Pa/s that no command exceeds: the rig's slew, or `STEEPEST`."""
-    return np.where(np.isfinite(rig.slew), rig.slew, STEEPEST)
-
-
 def at_rest(
-    rows: Sequence[Row], window: float = 1.0, tolerance: float = 5e-5, parts: int = 4
+    rows: Sequence[TrackedFrame], window: float = 1.0, tolerance: float = 5e-5, parts: int = 4
 ) -> bool:
-    """Whether the tip has come to rest: the means of the parts of a window agree.
+    """Return whether the tip has come to rest: the means of the parts of a window agree.
 
-    Means, since a tracker's noise is of the size of the tolerance; four of them, so that a slow
+    Means, since the tracker's noise is of the size of the tolerance; four of them, so that a slow
     swing shows.
     """
     groups = split_window([row for row in rows if row.visible], window, parts)
@@ -341,12 +369,14 @@ def at_rest(
     return float(np.linalg.norm(np.ptp(means, axis=0))) <= tolerance
 
 
-def split_window(rows: Sequence[Row], window: float, parts: int) -> list[list[Row]] | None:
-    """Rows of the last `window` s in equal parts, or None while there are too few."""
+def split_window(
+    rows: Sequence[TrackedFrame], window: float, parts: int
+) -> list[list[TrackedFrame]] | None:
+    """Split the frames of the last `window` s into equal parts; None while there are too few."""
     if not rows or rows[-1].time - rows[0].time < 0.95 * window:
         return None
     begin = rows[-1].time - window
-    groups: list[list[Row]] = [[] for _ in range(parts)]
+    groups: list[list[TrackedFrame]] = [[] for _ in range(parts)]
     for row in reversed(rows):
         if row.time < begin:
             break

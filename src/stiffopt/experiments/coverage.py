@@ -1,7 +1,7 @@
-"""Combined poses: all channels at once, spread over everything that a rig may be commanded.
+"""Combined poses: all channels pressurised at once, spread evenly over the rig's limits.
 
-The paper's sequence moves one channel at a time. What it cannot show, a model that is fitted to it
-has to guess: how channels act together, and what happens above its peaks.
+The paper's sequence moves one channel at a time. It does not show how channels act together, nor
+what happens above its peaks; a model fitted to it alone would have to extrapolate.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import GENTLE, Array, Conductor, Row, at_rest, steepest
-from stiffopt.experiments.folder import Recording
-from stiffopt.logs import LogLayout
+from stiffopt.experiments.conductor import CONDUCTOR, Array, Conductor, at_rest
+from stiffopt.experiments.folder import recorded
 from stiffopt.rig.interface import Rig
+from stiffopt.safety.gate import effective_slew
 
 __all__ = ["Coverage", "coverage_for", "round_count", "round_name", "spread_pressures"]
 
 ROUND = 6
-"""Poses after which the arm goes back to nothing, at most."""
+"""Poses, at most, after which the arm returns to no pressure."""
 _BEFORE = 3.0  # s that the arm usually takes to come to rest before a round
-_SKIPPED = 12  # of the sequence: what begins it rises together in all large bases
+_SKIPPED = 12  # first Halton points, which rise together in all large bases
 
 
 def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
@@ -56,7 +56,7 @@ def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
 
 
 def _mirrored(number: int, base: int) -> float:
-    """The digits of a number behind the point, in reverse order."""
+    """Return the radical inverse of a number: its digits mirrored at the point."""
     value, digit = 0.0, 1.0
     while number:
         digit /= base
@@ -77,14 +77,14 @@ def _primes() -> Iterator[int]:
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Combined poses as a rig can take them.
+    """Combined poses within the limits of a rig.
 
     Attributes
     ----------
-    base : pressures (n,) between rounds, in Pa: nothing, or what is nearest to it.
+    base : pressures (n,) between rounds, in Pa: the allowed ones nearest to 0.
     poses : pressures (N, n), in Pa.
     speed : rates (n,) at which pressures change, in Pa/s.
-    settle : seconds that the arm may take to come to rest in a pose.
+    settle : time that the arm may take to come to rest in a pose, in s.
     """
 
     base: Array
@@ -94,16 +94,16 @@ class Coverage:
 
     @property
     def rounds(self) -> list[Array]:
-        """The poses (m, n) between two returns to `base`, of about equal number."""
+        """The poses (m, n) of each round between two returns to `base`, of about equal number."""
         count = round_count(len(self.poses))
         return np.array_split(self.poses, count) if count else []
 
     def duration(self, number: int) -> float:
-        """Seconds that a round, counted from 1, takes at most."""
+        """Return the longest duration of a round, counted from 1, in s."""
         return _BEFORE + sum(self._durations(self.rounds[number - 1]))
 
     def _durations(self, poses: Array) -> list[float]:
-        """Of each way to a pose of a round and the time there; the last is the way back."""
+        """Return the longest durations, in s, of moving to each pose and resting there."""
         knots = np.vstack([self.base, poses, self.base])
         ways = np.abs(np.diff(knots, axis=0)) / self.speed
         return [float(way) + self.settle for way in ways.max(axis=1)]
@@ -136,37 +136,24 @@ class Coverage:
         int
             In how many poses the arm was not at rest in time.
         """
-        turns = any(row.quaternion is not None for row in conductor.rows)
-        layout = LogLayout(n=conductor.n, measured=True, tip_quaternion=turns)
         poses, before = self.rounds[number - 1], sum(map(len, self.rounds[: number - 1]))
         durations = self._durations(poses)
         restless = 0
-        begin = conductor.clock.now()
-        with Recording(folder, round_name(number), layout, begin, about) as recording:
-
-            def keep(row: Row) -> None:
-                if row.time >= begin:
-                    recording.append(row.logged(begin))
-
-            conductor.sink = keep
-            try:
-                for index, pose in enumerate([*poses, self.base]):
-                    count = min(before + index + 1, before + len(poses))
-                    tell(
-                        _BEFORE + sum(durations[:index]),
-                        f"combined pose {count} of {len(self.poses)}",
-                    )
-                    conductor.ramp(pose)
-                    rested = conductor.settle(pose, at_rest, self.settle)
-                    restless += not rested and index < len(poses)
-            finally:
-                conductor.sink = None
-            recording.complete()
+        with recorded(conductor, folder, round_name(number), about):
+            for index, pose in enumerate([*poses, self.base]):
+                count = min(before + index + 1, before + len(poses))
+                tell(
+                    _BEFORE + sum(durations[:index]),
+                    f"combined pose {count} of {len(self.poses)}",
+                )
+                conductor.ramp(pose)
+                rested = conductor.settle(pose, at_rest, self.settle)
+                restless += not rested and index < len(poses)
         return restless
 
 
 def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = None) -> Coverage:
-    """Return combined poses over all that a rig may be commanded.
+    """Return combined poses that cover the limits of a rig.
 
     Parameters
     ----------
@@ -174,7 +161,7 @@ def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = No
     count : int
         How many poses.
     settle : float
-        Seconds that the arm may take to come to rest in each.
+        Time that the arm may take to come to rest in each, in s.
     highest : float, optional
         No channel goes higher, in Pa.
 
@@ -194,13 +181,13 @@ def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = No
     return Coverage(
         base=limits.clamp(np.clip(0.0, limits.low, limits.high)),
         poses=np.array([_shortened(rig, pose) for pose in poses]).reshape(poses.shape),
-        speed=np.minimum(steepest(rig), GENTLE),
+        speed=np.minimum(effective_slew(rig), CONDUCTOR.gentle),
         settle=settle,
     )
 
 
 def _shortened(rig: Rig, pose: Array) -> Array:
-    """Return pressures (n,) with no more total force than the rig allows, in the same proportion.
+    """Scale pressures (n,) down to the total force that the rig allows.
 
     Raises
     ------
@@ -220,7 +207,7 @@ def _shortened(rig: Rig, pose: Array) -> Array:
 
 
 def round_count(poses: int) -> int:
-    """Return in how many rounds so many poses are taken."""
+    """Return the number of rounds for a number of poses."""
     return -(-poses // ROUND)
 
 

@@ -1,24 +1,60 @@
-"""Folder of an experiment: its settings, its recordings, and which of them are complete."""
+"""The folder of an experiment: its settings, its recordings, and which of them are complete."""
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Self, TypeVar
+from typing import Annotated, Self, TypeVar
+
+from pydantic import Field
 
 from stiffopt.errors import FileError, InputError
+from stiffopt.experiments.conductor import Conductor, TrackedFrame
 from stiffopt.files import read_file, save_file
 from stiffopt.logs import LogLayout, LogRow, LogWriter, McapLogWriter
 from stiffopt.schema import Schema
 
-__all__ = ["SETTINGS", "Recording", "alone_in", "create_folder", "open_folder"]
+__all__ = [
+    "SETTINGS",
+    "ExperimentRecording",
+    "ExperimentSettings",
+    "Progress",
+    "RawRecording",
+    "alone_in",
+    "check_same",
+    "create_folder",
+    "open_folder",
+    "recorded",
+    "remove_folder",
+]
 
 SETTINGS = "experiment.yaml"
 
 SchemaT = TypeVar("SchemaT", bound=Schema)
+_PAUSE = 1.0  # s between the times of two runs that share a file
+
+Progress = Callable[[float, float, str], None]
+"""Called with the amount done, the total amount, and what goes on in words."""
+
+
+class ExperimentSettings(Schema):
+    """Settings that all experiments have.
+
+    Attributes
+    ----------
+    rig, robot : their names, for people.
+    channels : number of channels.
+    repetitions : of the whole protocol.
+    """
+
+    rig: str = "rig"
+    robot: str = "robot"
+    channels: Annotated[int, Field(ge=1)]
+    repetitions: Annotated[int, Field(ge=1, le=1000)] = 5
 
 
 def create_folder(path: Path, settings: Schema) -> None:
@@ -55,12 +91,12 @@ def open_folder(path: Path, schema: type[SchemaT]) -> SchemaT:
 
 @contextmanager
 def alone_in(path: Path) -> Iterator[None]:
-    """Context in which no other process works in the folder of an experiment.
+    """Context in which no other process may work in the folder of an experiment.
 
     Raises
     ------
     InputError
-        One does.
+        Another process does.
     """
     try:
         import fcntl
@@ -83,19 +119,19 @@ def remove_folder(path: Path) -> None:
             path.rmdir()
 
 
-class Recording:
-    """One recording as CSV and MCAP, under other names until it is complete.
+class ExperimentRecording:
+    """A recording as CSV and MCAP, with ``.part`` in the names until it is complete.
 
     Parameters
     ----------
     folder, name :
-        Where, and under which name without ending.
+        Folder, and name of the files without ending.
     layout :
-        What is recorded.
+        Columns of the table.
     begin :
-        Time 0, on the rig's clock.
+        Time 0 of the recording on the rig's clock, in s.
     about :
-        Kept in the MCAP file.
+        Metadata for the MCAP file.
     """
 
     def __init__(
@@ -104,11 +140,11 @@ class Recording:
         self._begin = begin
         self._paths = [
             (folder / f"{name}.part.{ending}", folder / f"{name}.{ending}")
-            for ending in ("mcap", "csv")  # the CSV file last: it says that all is complete
+            for ending in ("mcap", "csv")  # the CSV file last: its name shows completeness
         ]
         (part_mcap, _), (part_csv, _) = self._paths
         for part in (part_mcap, part_csv):
-            part.unlink(missing_ok=True)  # of a run that was interrupted: it is repeated
+            part.unlink(missing_ok=True)  # of an interrupted run, which is repeated
         with ExitStack() as opened:
             csv = opened.enter_context(LogWriter(part_csv, layout))
             mcap = opened.enter_context(McapLogWriter(part_mcap, layout, about))
@@ -116,12 +152,12 @@ class Recording:
         self._writers: tuple[LogWriter | McapLogWriter, ...] = (csv, mcap)
 
     def append(self, row: LogRow) -> None:
-        """Write a row."""
+        """Append a row to both files."""
         for writer in self._writers:
             writer.append(row)
 
     def complete(self) -> None:
-        """Close the files and give them their names."""
+        """Close the files and give them their final names."""
         self._open.close()
         for part, whole in self._paths:
             os.replace(part, whole)
@@ -139,7 +175,7 @@ class Recording:
 
 
 def check_same(name: str, now: object, then: object) -> None:
-    """Refuse to resume with something that has changed.
+    """Refuse to resume an experiment with something that has changed.
 
     Raises
     ------
@@ -148,3 +184,93 @@ def check_same(name: str, now: object, then: object) -> None:
     """
     if now != then:
         raise InputError(f"the experiment was begun with {name} {then}, not {now}")
+
+
+@contextmanager
+def recorded(
+    conductor: Conductor,
+    folder: Path,
+    name: str,
+    about: Mapping[str, str],
+    longest: float = math.inf,
+) -> Iterator[float]:
+    """Context in which all frames go to a recording, which is complete if nothing is raised.
+
+    Parameters
+    ----------
+    conductor : Conductor
+        Whose frames are recorded; it has seen the tip.
+    folder, name, about :
+        As for `ExperimentRecording`.
+    longest :
+        Frames later than this are left out, in s.
+
+    Yields
+    ------
+    float
+        Time 0 of the recording, on the rig's clock, in s.
+    """
+    turns = any(row.quaternion is not None for row in conductor.rows)
+    layout = LogLayout(n=conductor.n, measured=True, tip_quaternion=turns)
+    begin = conductor.clock.now()
+    with ExperimentRecording(folder, name, layout, begin, about) as recording:
+
+        def keep(row: TrackedFrame) -> None:
+            if 0 <= row.time - begin <= longest:
+                recording.append(row.logged(begin))
+
+        conductor.sink = keep
+        try:
+            yield begin
+        finally:
+            conductor.sink = None
+        recording.complete()
+
+
+class RawRecording:
+    """ExperimentRecording of all rows from now on; a run that is resumed continues the CSV file.
+
+    Parameters
+    ----------
+    folder : Path
+    repetition : int
+        Counted from 1; part of the file names.
+    conductor : Conductor
+        Whose frames are recorded; it has seen the tip.
+    rig : str
+        Name of the rig, for the MCAP file.
+    """
+
+    def __init__(self, folder: Path, repetition: int, conductor: Conductor, rig: str) -> None:
+        self.repetition = repetition
+        self._conductor = conductor
+        turns = any(row.quaternion is not None for row in conductor.rows)
+        layout = LogLayout(
+            n=conductor.n, measured=True, tip_quaternion=turns, force=True, stage=True
+        )
+        name = f"stiffness_{repetition}"
+        self._csv = LogWriter(folder / f"{name}.csv", layout)
+        part, mcap = 1, folder / f"{name}.mcap"
+        while mcap.exists():
+            part += 1
+            mcap = folder / f"{name}_{part}.mcap"
+        about = {"experiment": "stiffness", "repetition": str(repetition), "rig": rig}
+        self._mcap = McapLogWriter(mcap, layout, about)
+        last = self._csv.last_time
+        now = conductor.clock.now()
+        begin = now if last is None else now - last - _PAUSE
+
+        def keep(row: TrackedFrame) -> None:
+            if row.time >= now:
+                self._csv.append(row.logged(begin))
+                self._mcap.append(row.logged(begin))
+
+        conductor.sink = keep
+
+    def close(self) -> None:
+        """Close both files."""
+        self._conductor.sink = None
+        try:
+            self._csv.close()
+        finally:
+            self._mcap.close()

@@ -20,10 +20,8 @@ from stiffopt.errors import FileError
 from stiffopt.experiments.conductor import (
     Array,
     Conductor,
-    Row,
     at_rest,
     check_pressures,
-    steepest,
 )
 from stiffopt.experiments.coverage import (
     Coverage,
@@ -31,32 +29,32 @@ from stiffopt.experiments.coverage import (
     round_count,
     round_name,
 )
-from stiffopt.experiments.folder import Recording
-from stiffopt.experiments.settings import ExperimentSettings, Progress
-from stiffopt.logs import LogLayout, read_log
+from stiffopt.experiments.folder import ExperimentSettings, Progress, recorded
+from stiffopt.logs import read_log
 from stiffopt.rig.interface import Rig
+from stiffopt.safety.gate import effective_slew
 from stiffopt.schema import Items
 from stiffopt.units import Duration, Pressure
 
 __all__ = ["KinematicsSettings", "PressureSequence", "recording_name", "run_kinematics"]
 
 SETTLE = 20.0
-"""Seconds for which the arm may take to come to rest before a repetition."""
+"""Time, in s, that the arm may take to come to rest before a repetition."""
 _TAIL = 1.0  # s that the last frames may take to arrive
 _AFTER = 0.2  # s that are recorded after the last tooth
 
 
 class KinematicsSettings(ExperimentSettings):
-    """What is done.
+    """Settings of the kinematics experiment.
 
     Attributes
     ----------
-    experiment : says which.
+    experiment : its kind.
     pressures : peaks of the teeth of each channel, in Pa.
-    period : of a tooth, up and down, in s.
-    poses : combined ones that follow; 0 for the paper's sequence alone.
-    settle : how long the arm may take to come to rest in each of them, in s.
-    max : pressure that no channel exceeds in them, in Pa, beside the limits of the rig.
+    period : duration of a tooth, up and down, in s.
+    poses : number of combined poses that follow; 0 for the paper's sequence alone.
+    settle : time that the arm may take to come to rest in each of these, in s.
+    max : pressure that no channel exceeds in these, in Pa, in addition to the rig's limits.
     """
 
     experiment: Literal["kinematics"] = "kinematics"
@@ -128,7 +126,7 @@ class PressureSequence:
 
 
 def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
-    """Return the sequence as this rig can follow it.
+    """Return the sequence within the limits and slew of a rig.
 
     Raises
     ------
@@ -138,11 +136,11 @@ def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
     limits = rig.supply.limits
     check_pressures(rig, settings.pressures, range(limits.n))
     base = limits.clamp(np.clip(0.0, limits.low, limits.high))
-    return PressureSequence.sawtooth(base, settings.pressures, settings.period, steepest(rig))
+    return PressureSequence.sawtooth(base, settings.pressures, settings.period, effective_slew(rig))
 
 
 def poses_for(rig: Rig, settings: KinematicsSettings) -> Coverage:
-    """Return the combined poses as this rig can take them.
+    """Return the combined poses within the limits of a rig.
 
     Raises
     ------
@@ -158,19 +156,19 @@ def recording_name(repetition: int) -> str:
 
 
 def missing_repetitions(folder: Path, settings: KinematicsSettings) -> list[int]:
-    """Repetitions that are not complete in a folder, counted from 1."""
+    """Return the repetitions, counted from 1, that are missing in a folder."""
     numbers = range(1, settings.repetitions + 1)
     return [k for k in numbers if not _is_whole(folder, recording_name(k))]
 
 
 def missing_rounds(folder: Path, settings: KinematicsSettings) -> list[int]:
-    """Rounds of combined poses that are not complete in a folder, counted from 1."""
+    """Return the rounds of combined poses, counted from 1, that are missing in a folder."""
     numbers = range(1, round_count(settings.poses) + 1)
     return [k for k in numbers if not _is_whole(folder, round_name(k))]
 
 
 def _is_whole(folder: Path, name: str) -> bool:
-    """Whether both files of a recording are there and the table can be read."""
+    """Return whether both files of a recording exist and the table can be read."""
     try:
         return (folder / f"{name}.mcap").exists() and len(read_log(folder / f"{name}.csv").time) > 1
     except FileError:  # damaged or not there: it is done again
@@ -186,7 +184,7 @@ def run_kinematics(
     progress: Progress = lambda done, total, text: None,
     check: Callable[[], None] = lambda: None,
 ) -> list[str]:
-    """Record the repetitions and the rounds of combined poses that a folder lacks.
+    """Record the repetitions and the rounds of combined poses that are missing in a folder.
 
     Parameters
     ----------
@@ -198,16 +196,16 @@ def run_kinematics(
         ``kinematics_1.part.csv``.
     settings : KinematicsSettings
     rate : float
-        Of the commands, in Hz.
+        Rate of the commands, in Hz.
     progress : callable
-        Is told seconds done, seconds in all and what goes on.
+        Called with the seconds done, all seconds, and what goes on.
     check : callable
         Called often; raises to stop.
 
     Returns
     -------
     list of str
-        What a user should know.
+        Notes for the user.
 
     Raises
     ------
@@ -268,23 +266,10 @@ def _record(
     tell: Callable[[float], None],
 ) -> None:
     clock = conductor.clock
-    turns = any(row.quaternion is not None for row in conductor.rows)
-    layout = LogLayout(n=conductor.n, measured=True, tip_quaternion=turns)
     end = sequence.duration + _AFTER
-    begin = clock.now()
-    with Recording(folder, name, layout, begin, about) as recording:
-
-        def keep(row: Row) -> None:
-            if 0 <= row.time - begin <= end:
-                recording.append(row.logged(begin))
-
-        conductor.sink = keep
-        try:
-            while (t := clock.now() - begin) < end + _TAIL:
-                conductor.tick(sequence.at(t))
-                tell(min(t, sequence.duration))
-                if t > end and conductor.rows[-1].time - begin > end:
-                    break  # all frames have arrived
-        finally:
-            conductor.sink = None
-        recording.complete()
+    with recorded(conductor, folder, name, about, end) as begin:
+        while (t := clock.now() - begin) < end + _TAIL:
+            conductor.tick(sequence.at(t))
+            tell(min(t, sequence.duration))
+            if t > end and conductor.rows[-1].time - begin > end:
+                break  # all frames have arrived

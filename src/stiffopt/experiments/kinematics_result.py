@@ -1,8 +1,12 @@
-"""What a kinematics experiment has found: how far the model's tip is from the measured one."""
+"""Results of the kinematics experiment: errors of the model's tip, and doubts about recordings.
+
+`evaluate_kinematics` compares the paper's sequence with a model, `evaluate_coverage` the combined
+poses; `doubts` finds what is suspicious in a complete recording.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,21 +14,57 @@ import numpy as np
 
 from stiffopt.errors import InputError
 from stiffopt.experiments.conductor import Array
-from stiffopt.experiments.doubts import doubts
+from stiffopt.experiments.coverage import round_name
 from stiffopt.experiments.kinematics import KinematicsSettings, recording_name
 from stiffopt.logs import Log, read_log
 from stiffopt.model.manipulator import Manipulator
 
-__all__ = ["KinematicsResult", "evaluate_kinematics"]
+__all__ = [
+    "CoverageResult",
+    "KinematicsResult",
+    "doubts",
+    "evaluate_coverage",
+    "evaluate_kinematics",
+    "read_recordings",
+    "read_rounds",
+]
 
 _GRID = 0.05  # s
-_GAP = 0.3  # s; nothing is drawn across a gap that is longer
 _EVERY = 2  # points of the grid at which a loaded arm is evaluated
+
+
+@dataclass(frozen=True)
+class EvaluationRules:
+    """What counts as a pose, a gap and a doubt when recordings are evaluated.
+
+    Attributes
+    ----------
+    gap : longest time between two samples, in s, across which the tip is interpolated.
+    held : time for which a command must not change to be a pose, in s.
+    window : time at the end of a pose over which tip and pressures are averaged, in s.
+    regulator_time : time in which a regulator should have followed a command, in s.
+    pressure_error : error of the pressure after that time that gives rise to a doubt, in Pa.
+    worse_share : share of the samples that may have a greater error.
+    hidden : longest time for which the tip may be out of sight, in s.
+    lost_share : share of the tracker's frames that may be missing.
+    """
+
+    gap: float = 0.3
+    held: float = 0.9
+    window: float = 1.0
+    regulator_time: float = 0.5
+    pressure_error: float = 5e3
+    worse_share: float = 0.01
+    hidden: float = 0.5
+    lost_share: float = 0.1
+
+
+RULES = EvaluationRules()
 
 
 @dataclass(frozen=True, eq=False)
 class KinematicsResult:
-    """Recordings against the model, on a common grid of times (K,).
+    """Comparison of recordings with the model, on a common grid of times (K,).
 
     Attributes
     ----------
@@ -37,7 +77,7 @@ class KinematicsResult:
     component_error : the mean of modelled less measured tip over the repetitions (K, 3), in m.
     errors : distances at all samples of all recordings (M,), in m.
     length : of the arm at rest, in m.
-    doubts : sentences on what makes one doubt the recordings.
+    doubts : what is suspicious in the recordings, in sentences.
     """
 
     repetitions: int
@@ -69,12 +109,12 @@ class KinematicsResult:
 
     @property
     def repeatability(self) -> float:
-        """Width of the band that the repetitions fill, its mean over time, in m."""
+        """Mean over time of the width of the band of all repetitions, in m."""
         return float(np.nanmean(np.linalg.norm(self.high - self.low, axis=1)))
 
 
 def read_recordings(folder: Path, settings: KinematicsSettings) -> list[Log]:
-    """Return the complete recordings of a folder."""
+    """Return the complete recordings of the paper's sequence in a folder."""
     paths = [folder / f"{recording_name(k + 1)}.csv" for k in range(settings.repetitions)]
     return [read_log(path) for path in paths if path.exists()]
 
@@ -82,9 +122,9 @@ def read_recordings(folder: Path, settings: KinematicsSettings) -> list[Log]:
 def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsResult:
     """Compare recordings of the same pressures with a model.
 
-    The model is given the measured pressures, where they were measured: what is judged is the
-    arm's model and not the regulators. An arm under gravity is given their mean over the
-    repetitions.
+    The model is evaluated at the measured pressures, where there are any, so that errors are those
+    of the arm's model and not of the regulators; for an arm under gravity at their mean over the
+    repetitions, since each pose takes milliseconds.
 
     Raises
     ------
@@ -124,7 +164,7 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """One recording: on the grid, and the errors at its own samples."""
+    """One recording on the grid, with the errors at its own samples."""
 
     tip: Array
     model: Array
@@ -139,14 +179,14 @@ def _compared(log: Log, model: Manipulator, grid: Array, of_all: Array | None) -
     else:
         expected = _on_grid(time, grid, of_all, np.inf)
     return _Compared(
-        tip=_on_grid(grid, time, tip, _GAP),
+        tip=_on_grid(grid, time, tip, RULES.gap),
         model=_on_grid(grid, time, expected, np.inf),
         errors=np.linalg.norm(expected - tip, axis=1),
     )
 
 
 def _tip_of_all(model: Manipulator, grid: Array, pressures: Array) -> Array:
-    """The model's tip (K, 3) for all repetitions: each pose of a loaded arm takes milliseconds."""
+    """Return the model's tip (K, 3) at the mean pressures of all repetitions."""
     at = np.unique(np.append(np.arange(0, len(grid), _EVERY), len(grid) - 1))
     return _on_grid(grid, grid[at], model.tip_pose(pressures[at])[:, :3, 3], np.inf)
 
@@ -166,3 +206,170 @@ def _mean_of_known(values: Array) -> Array:
     total = np.where(known, values, 0.0).sum(axis=0)
     count = known.sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+# combined poses ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class CoverageResult:
+    """Comparison of M combined poses with the model, by means over the last second of each.
+
+    Attributes
+    ----------
+    pressures : (M, n), in Pa; measured, or commanded where not.
+    tip : measured tip (M, 3), in m.
+    model : tip of the model (M, 3), in m.
+    speed : speed at which the tip still moved (M,), in m/s, including noise.
+    length : of the arm at rest, in m.
+    doubts : what is suspicious in the recordings, in sentences.
+    """
+
+    pressures: Array
+    tip: Array
+    model: Array
+    speed: Array
+    length: float
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def errors(self) -> Array:
+        """Distances (M,) between measured and modelled tip, in m."""
+        found: Array = np.linalg.norm(self.model - self.tip, axis=1)
+        return found
+
+    @property
+    def mean(self) -> float:
+        """Mean error, in m."""
+        return float(self.errors.mean())
+
+    @property
+    def p95(self) -> float:
+        """Error that 95 % of the poses do not exceed, in m."""
+        return float(np.quantile(self.errors, 0.95))
+
+    @property
+    def worst(self) -> float:
+        """Largest error, in m."""
+        return float(self.errors.max())
+
+
+def read_rounds(folder: Path, count: int) -> list[Log]:
+    """Return the complete recordings among the first `count` rounds of a folder."""
+    paths = [folder / f"{round_name(k + 1)}.csv" for k in range(count)]
+    return [read_log(path) for path in paths if path.exists()]
+
+
+def evaluate_coverage(logs: Sequence[Log], model: Manipulator) -> CoverageResult | None:
+    """Compare the poses in which the arm was held with a model, at the measured pressures.
+
+    Returns
+    -------
+    CoverageResult or None
+        None if the tip was seen in none of them.
+
+    Raises
+    ------
+    InputError
+        The model has another number of channels.
+    """
+    if any(log.n != model.n_pressures for log in logs):
+        raise InputError(
+            f"the model has {model.n_pressures} channels, the recordings have {logs[0].n}"
+        )
+    held = [pose for log in logs for pose in _held(log)]
+    if not held:
+        return None
+    pressures, tips, speed = (np.array(values) for values in zip(*held, strict=True))
+    return CoverageResult(
+        pressures=pressures,
+        tip=tips,
+        model=model.tip_pose(pressures)[:, :3, 3],
+        speed=speed,
+        length=model.length,
+        doubts=doubts(logs),
+    )
+
+
+def _held(log: Log) -> Iterator[tuple[Array, Array, float]]:
+    """Yield pressures (n,), tip (3,) and its speed in each pose except the last of a round."""
+    steps = np.any(log.commanded[1:] != log.commanded[:-1], axis=1)
+    seen = np.asarray(np.isfinite(log.tip_position).all(axis=1))
+    for rows in np.split(np.arange(len(log)), np.flatnonzero(steps) + 1):
+        if not len(rows) or np.array_equal(log.commanded[rows[0]], log.commanded[-1]):
+            continue
+        time = log.time[rows]
+        last = rows[(time > time[-1] - RULES.window) & seen[rows]]
+        if time[-1] - time[0] >= RULES.held and len(last) > 1:
+            tip = log.tip_position[last]
+            yield log.pressures[last].mean(axis=0), tip.mean(axis=0), _speed(log.time[last], tip)
+
+
+def _speed(time: Array, tip: Array) -> float:
+    """Return the speed of a straight motion fitted to positions (N, 3), in m/s."""
+    t = time - time.mean()
+    return float(np.linalg.norm(t @ tip) / (t @ t))
+
+
+# doubts ------------------------------------------------------------------------------------------
+
+
+def doubts(logs: Sequence[Log]) -> tuple[str, ...]:
+    """Return sentences on pressures that did not follow commands and on missing frames."""
+    found = [*_disobedient(logs)]
+    gap = max((_longest_gap(log) for log in logs), default=0.0)
+    if gap > RULES.hidden:
+        found.append(f"the tip was out of sight for up to {gap:.1f} s")
+    lost = max((_lost(log) for log in logs), default=0.0)
+    if lost > RULES.lost_share:
+        found.append(f"up to {100 * lost:.0f} % of a recording's frames are missing or without tip")
+    return tuple(found)
+
+
+def _disobedient(logs: Sequence[Log]) -> list[str]:
+    """Return a sentence for each channel whose pressure did not follow its commands."""
+    worst: dict[int, float] = {}
+    for log in logs:
+        if log.measured is None or len(log.time) < 2:
+            continue
+        low, high = _recent_extremes(log.time, log.commanded)
+        with np.errstate(invalid="ignore"):
+            off = np.fmax(np.fmax(log.measured - high, low - log.measured), 0.0)  # (N, n)
+        for channel in range(log.n):
+            known = off[np.isfinite(off[:, channel]), channel]
+            if len(known) and np.mean(known > RULES.pressure_error) > RULES.worse_share:
+                worst[channel] = max(worst.get(channel, 0.0), float(known.max()))
+    return [
+        f"the measured pressure of channel {channel + 1} was up to {off * 1e-5:.2f} bar away from "
+        f"what had been commanded in the {RULES.regulator_time:g} s before"
+        for channel, off in sorted(worst.items())
+    ]
+
+
+def _recent_extremes(time: Array, commanded: Array) -> tuple[Array, Array]:
+    """Return the least and greatest command (N, n) in the time that a regulator may take."""
+    low, high = commanded.copy(), commanded.copy()
+    rows = int(np.ceil(RULES.regulator_time / max(float(np.median(np.diff(time))), 1e-3)))
+    for back in range(1, min(rows, len(time) - 1) + 1):
+        low[back:] = np.minimum(low[back:], commanded[:-back])
+        high[back:] = np.maximum(high[back:], commanded[:-back])
+    return low, high
+
+
+def _seen(log: Log) -> Array:
+    return log.time[np.isfinite(log.tip_position).all(axis=1)]
+
+
+def _longest_gap(log: Log) -> float:
+    seen = _seen(log)
+    ends = np.concatenate(([log.time[0]], seen, [log.time[-1]])) if len(log.time) else np.zeros(1)
+    return float(np.diff(ends).max()) if len(ends) > 1 else 0.0
+
+
+def _lost(log: Log) -> float:
+    """Return the share of frames without tip, from the median time between frames."""
+    if len(log.time) < 3:
+        return 0.0
+    usual = float(np.median(np.diff(log.time)))
+    expected = float(log.time[-1] - log.time[0]) / usual + 1
+    return max(0.0, 1 - len(_seen(log)) / expected)

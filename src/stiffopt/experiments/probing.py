@@ -1,32 +1,74 @@
-"""One series of the stiffness experiment: the probe touches the tip and displaces it in steps."""
+"""A series of the stiffness experiment: the probe touches the tip and displaces it in steps.
+
+`Probing` does a series on the rig, `PointsFile` stores the points of all series.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stiffopt.errors import DeviceError, InputError
-from stiffopt.experiments.conductor import Array, Conductor, Row, split_window
+from stiffopt.errors import DeviceError, FileError, InputError
+from stiffopt.experiments.conductor import Array, Conductor, TrackedFrame, split_window
+from stiffopt.logs.table import cut_torn_end, read_table
 from stiffopt.rig.interface import ForceProbe
 
-__all__ = ["Point", "Probing", "Series"]
+__all__ = [
+    "PointsFile",
+    "ProbePoint",
+    "ProbeTuning",
+    "Probing",
+    "Series",
+    "SeriesKey",
+    "SeriesPoints",
+]
 
-SPEED = 0.002  # m/s of the stage
-_PIECE = 0.1  # s that one movement takes at most: the supply is spoken to in between
-_APPROACH = 1e-4  # m by which the stage looks for the tip
-_TARE = 1.0  # s for which the force is read before there is contact
-_STEP_WINDOW = 1.0  # s over which a force must not change; its second half is what is sampled
-_STEP_CHANGE = 0.01  # by which it may change nevertheless
-_STEP_TIMEOUT = 6.0  # s
-_TOUCH = 5.0  # noise levels that are contact
-_LEAST_TOUCH = 1e-3  # N
+NAME = "points.csv"
+_DIRECTION = ("direction_x", "direction_y", "direction_z")
+_KEY = ("repetition", "pressure_pa", *_DIRECTION)
+_VALUES = ("time_s", "force_n", "displacement_m", "stage_m", "tip_x_m", "tip_y_m", "tip_z_m")
+_FLAGS = ("touching", "settled")
+
+
+@dataclass(frozen=True)
+class ProbeTuning:
+    """How the probe approaches the tip, and when a force counts as settled.
+
+    Attributes
+    ----------
+    speed : of the stage, in m/s.
+    piece : duration of one movement at most, in s; the supply is commanded in between.
+    approach : steps in which the stage looks for the tip, in m.
+    tare : time over which the force without contact is read, in s.
+    window : time over which a force must not change at a step, in s; its second half is averaged.
+    change : share by which it may change nevertheless.
+    timeout : longest time at a step, in s.
+    touch : force, in standard deviations of its noise, that is contact.
+    least_touch : force that is contact, at least, in N.
+    """
+
+    speed: float = 0.002
+    piece: float = 0.1
+    approach: float = 1e-4
+    tare: float = 1.0
+    window: float = 1.0
+    change: float = 0.01
+    timeout: float = 6.0
+    touch: float = 5.0
+    least_touch: float = 1e-3
+
+
+PROBE = ProbeTuning()
 
 
 @dataclass(frozen=True)
 class Series:
-    """What one series shall do.
+    """Parameters of a series.
 
     Attributes
     ----------
@@ -45,15 +87,15 @@ class Series:
 
 
 @dataclass(frozen=True)
-class Point:
-    """One step: means over a time in which the force did not change.
+class ProbePoint:
+    """A step of a series: means over a time in which the force did not change.
 
     Attributes
     ----------
-    time : of its middle, on the rig's clock, in s.
-    force : with which the probe pushes, less what it felt without contact, in N.
-    displacement : of the tip along the direction, from where it was free, in m.
-    stage : beyond the first contact, in m.
+    time : middle of that time on the rig's clock, in s.
+    force : force of the probe, less its reading without contact, in N.
+    displacement : of the tip along the direction, from its free position, in m.
+    stage : travel of the stage beyond the first contact, in m.
     position : of the tip (3,), in m.
     measured : pressures (n,), in Pa.
     touching : whether the force is more than noise.
@@ -71,12 +113,12 @@ class Point:
 
 
 class Probing:
-    """Does series with the probe of a rig while pressures are held.
+    """Does series with the probe of a rig while the pressures are held.
 
     Parameters
     ----------
     conductor : Conductor
-        Of a rig that has a probe.
+        Conductor of a rig that has a probe.
     """
 
     def __init__(self, conductor: Conductor) -> None:
@@ -86,11 +128,11 @@ class Probing:
         self.probe: ForceProbe = conductor.rig.probe
         self._at = 0.0
 
-    def run(self, pressures: Array, series: Series) -> list[Point]:
-        """Touch, displace in steps, go back in the same, retreat; pressures (n,) are held.
+    def run(self, pressures: Array, series: Series) -> list[ProbePoint]:
+        """Touch, displace in steps, return in the same steps, retreat; pressures (n,) are held.
 
-        There and back, so that the creep of the arm, which goes on all the time, can be told from
-        the effect of the displacement.
+        The way back lets the creep of the arm, which never stops, be told from the effect of the
+        displacement.
 
         Raises
         ------
@@ -106,10 +148,10 @@ class Probing:
         finally:
             self._conductor.probing = False
 
-    def _pushed(self, pressures: Array, series: Series) -> list[Point]:
+    def _pushed(self, pressures: Array, series: Series) -> list[ProbePoint]:
         self._at = self.probe.sample().position
         free = self._tared(pressures)
-        points: list[Point] = []
+        points: list[ProbePoint] = []
         contact = self._touch(pressures, series, free)
         places = [contact + series.displacement * k / series.steps for k in range(series.steps + 1)]
         reached = 0
@@ -125,9 +167,9 @@ class Probing:
         return points
 
     def _tared(self, pressures: Array) -> _Free:
-        """What is felt and seen without contact."""
+        """Measure force, noise and tip position without contact."""
         begin = self._conductor.clock.now()
-        self._conductor.settle(pressures, lambda rows: False, _TARE)
+        self._conductor.settle(pressures, lambda rows: False, PROBE.tare)
         rows = [row for row in self._conductor.since(begin) if np.isfinite(row.force)]
         seen = [row.position for row in rows if row.visible]
         if len(rows) < 3 or not seen:
@@ -137,10 +179,10 @@ class Probing:
         return _Free(float(forces.mean()), noise, np.mean(seen, axis=0))
 
     def _touch(self, pressures: Array, series: Series, free: _Free) -> float:
-        """Go ahead until a force is felt; return where."""
+        """Move on until a force is felt; return the position of the stage."""
         begin = self._at
-        least = max(_TOUCH * free.noise, _LEAST_TOUCH)
-        step = min(_APPROACH, series.displacement / 4)
+        least = max(PROBE.touch * free.noise, PROBE.least_touch)
+        step = min(PROBE.approach, series.displacement / 4)
         while self._at - begin < series.reach:
             self._move(pressures, self._at + step, free.force + series.most_force)
             if self._felt() - free.force > least and self._felt() - free.force > least:
@@ -156,45 +198,46 @@ class Probing:
             raise DeviceError("the force of the probe cannot be read")
         return force
 
-    def _point(self, pressures: Array, series: Series, free: _Free, contact: float) -> Point:
+    def _point(self, pressures: Array, series: Series, free: _Free, contact: float) -> ProbePoint:
         conductor = self._conductor
         begin = conductor.clock.now()
 
-        def steady(rows: Sequence[Row]) -> bool:
-            halves = split_window(rows, _STEP_WINDOW, 2)
+        def steady(rows: Sequence[TrackedFrame]) -> bool:
+            halves = split_window(rows, PROBE.window, 2)
             if halves is None:
                 return False
             first, second = (np.mean([row.force for row in half]) for half in halves)
             slack = 4 * free.noise / np.sqrt(min(map(len, halves)))
-            return bool(abs(second - first) <= max(_STEP_CHANGE * abs(second - free.force), slack))
+            return bool(abs(second - first) <= max(PROBE.change * abs(second - free.force), slack))
 
-        settled = conductor.settle(pressures, steady, _STEP_TIMEOUT)
+        settled = conductor.settle(pressures, steady, PROBE.timeout)
         rows = conductor.since(begin)
-        last = [row for row in rows if row.time > rows[-1].time - _STEP_WINDOW / 2]
+        last = [row for row in rows if row.time > rows[-1].time - PROBE.window / 2]
         seen = [row for row in last if row.visible]
         if not seen:
             raise DeviceError("the tracker did not see the tip at a step of the probe")
         force = float(np.mean([row.force for row in last])) - free.force
         position = np.mean([row.position for row in seen], axis=0)
-        return Point(
+        return ProbePoint(
             time=float(np.mean([row.time for row in last])),
             force=force,
             displacement=float((position - free.position) @ series.direction),
             stage=float(np.mean([row.stage for row in last])) - contact,
             position=position,
             measured=np.mean([row.measured for row in last], axis=0),
-            touching=force > max(_TOUCH * free.noise / np.sqrt(len(last)), _LEAST_TOUCH / 2),
+            touching=force
+            > max(PROBE.touch * free.noise / np.sqrt(len(last)), PROBE.least_touch / 2),
             settled=settled,
         )
 
     def _move(self, pressures: Array, place: float, most_force: float) -> bool:
-        """Move in short pieces; say whether the place was reached before the force was."""
+        """Move in short pieces; return False if `most_force` came first."""
         while self._at != place:
-            far = SPEED * _PIECE
+            far = PROBE.speed * PROBE.piece
             self._at += float(np.clip(place - self._at, -far, far))
             if abs(self._at - place) < 1e-9:
                 self._at = place
-            self.probe.move_to(self._at, SPEED)
+            self.probe.move_to(self._at, PROBE.speed)
             self._conductor.tick(pressures)
             if self._felt() > most_force:
                 return False
@@ -203,8 +246,124 @@ class Probing:
 
 @dataclass(frozen=True)
 class _Free:
-    """Force without contact, its noise, and where the tip is then."""
+    """Force without contact, its noise, and the free position of the tip."""
 
     force: float
     noise: float
     position: Array
+
+
+@dataclass(frozen=True)
+class SeriesKey:
+    """Identifies a series: repetition (from 1), pressure in Pa, direction (unit vector)."""
+
+    repetition: int
+    pressure: float
+    direction: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesPoints:
+    """The N points of a series as arrays; see `ProbePoint`."""
+
+    key: SeriesKey
+    time: Array
+    force: Array
+    displacement: Array
+    stage: Array
+    touching: NDArray[np.bool_]
+    settled: NDArray[np.bool_]
+    measured: Array
+
+
+class PointsFile:
+    """The file with the points of all series; a series is appended as a whole.
+
+    Parameters
+    ----------
+    folder : Path
+    n : int
+        Number of channels.
+    """
+
+    def __init__(self, folder: Path, n: int) -> None:
+        self.path = folder / NAME
+        self.n = n
+
+    @property
+    def _columns(self) -> tuple[str, ...]:
+        measured = tuple(f"pm{k + 1}_pa" for k in range(self.n))
+        return (*_KEY, "point", "points", *_VALUES, *measured, *_FLAGS)
+
+    def read(self) -> list[SeriesPoints]:
+        """Return the complete series, in order.
+
+        Raises
+        ------
+        FileError
+            The file cannot be read, or is of another experiment.
+        """
+        if not self.path.exists():
+            return []
+        cut_torn_end(os.fspath(self.path))
+        if not self.path.stat().st_size:
+            return []
+        table = read_table(self.path)
+        if table.columns != self._columns:
+            raise FileError(self.path, "has other columns than this experiment", line=1)
+        series = []
+        start = 0
+        while start < len(table.values):
+            count = int(table["points"][start])
+            rows = table.values[start : start + count]
+            place = table.columns.index("point")
+            if count < 1 or rows[:, place].tolist() != list(range(1, count + 1)):
+                later = np.flatnonzero(table["point"][start + 1 :] == 1)
+                start = start + 1 + int(later[0]) if len(later) else len(table.values)
+                continue  # the end of a run that was killed
+            series.append(self._series(dict(zip(table.columns, rows.T, strict=True))))
+            start += count
+        return series
+
+    def _series(self, columns: dict[str, Array]) -> SeriesPoints:
+        x, y, z = (float(columns[name][0]) for name in _DIRECTION)
+        key = SeriesKey(int(columns["repetition"][0]), float(columns["pressure_pa"][0]), (x, y, z))
+        return SeriesPoints(
+            key=key,
+            time=columns["time_s"],
+            force=columns["force_n"],
+            displacement=columns["displacement_m"],
+            stage=columns["stage_m"],
+            touching=columns["touching"] > 0,
+            settled=columns["settled"] > 0,
+            measured=np.stack([columns[f"pm{k + 1}_pa"] for k in range(self.n)], axis=1),
+        )
+
+    def append(self, key: SeriesKey, points: Sequence[ProbePoint]) -> None:
+        """Append a series and flush it to disk.
+
+        Raises
+        ------
+        FileError
+            It cannot be written.
+        """
+        lines = []
+        for number, point in enumerate(points, start=1):
+            values = [
+                key.repetition, key.pressure, *key.direction, number, len(points),
+                point.time - points[0].time, point.force, point.displacement, point.stage,
+                *point.position, *point.measured, point.touching, point.settled,
+            ]  # fmt: skip
+            fields = [f"{value:.9g}" if np.isfinite(value) else "" for value in map(float, values)]
+            lines.append(",".join(fields))
+        try:
+            fresh = not self.path.exists() or not self.path.stat().st_size
+            header = [",".join(self._columns)] if fresh else []
+            with open(self.path, "ab") as stream:
+                stream.write("".join(f"{line}\n" for line in [*header, *lines]).encode())
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            raise FileError(
+                self.path, f"cannot be written: {(error.strerror or '').lower()}"
+            ) from None

@@ -1,10 +1,10 @@
-"""Slopes with their uncertainty: of one series by least squares, of repetitions by their scatter.
+"""Slopes with confidence intervals: least squares for a series, scatter for repetitions.
 
-What a user asks is how much the stiffness would differ if the whole measurement were done again:
-probe aligned anew, arm pressurised anew. Only the scatter between repetitions tells that; the
-residuals of one series know nothing of it. So the repetitions are what is counted, each with its
-own slope. With few of them their scatter may be small by luck, so the uncertainty is never taken
-to be less than what the residuals alone imply.
+The uncertainty of interest is by how much the stiffness would differ if the whole measurement were
+repeated, with the probe aligned and the arm pressurised anew. Only the scatter between repetitions
+shows that, not the residuals of one series. So each repetition counts as one measurement of the
+slope. As a few repetitions may agree by chance, the uncertainty is never less than the residuals
+imply.
 """
 
 from __future__ import annotations
@@ -16,19 +16,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Estimate", "Line", "combine", "fit_line", "fit_lines", "student_t"]
+__all__ = ["LineFit", "SlopeEstimate", "combine", "fit_line", "fit_lines", "student_t"]
 
 Array = NDArray[np.float64]
 
-FEWEST = 3
-"""Points without which a line is not fitted: two have no residual."""
-_DOUBT = 3.0  # standard errors by which a curvature must differ from none
-_ALIKE = 0.9  # correlation of a trend with x from which on it is left out
+_FEWEST = 3  # points; a line through two has no residual
+_BEND = 3.0  # standard errors by which a curvature must differ from 0 for a parabola to be fitted
+_ALIKE = 0.9  # correlation of a trend with x from which on the trend is left out
 
 
 @dataclass(frozen=True)
-class Line:
-    """A line by least squares.
+class LineFit:
+    """A line fitted by least squares.
 
     Attributes
     ----------
@@ -47,14 +46,14 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """What several slopes say together.
+class SlopeEstimate:
+    """Mean of the slopes of several repetitions, with its uncertainty.
 
     Attributes
     ----------
-    value : their mean.
+    value : mean of the slopes.
     sigma : standard error of the mean.
-    half_width : of its confidence interval.
+    half_width : half the width of its confidence interval.
     spread : standard deviation of the slopes; NaN for one.
     count : number of slopes.
     """
@@ -68,16 +67,16 @@ class Estimate:
 
 def fit_line(
     x: ArrayLike, y: ArrayLike, trend: ArrayLike | None = None, *, curved: bool = False
-) -> Line | None:
-    """Fit y by a line in x, all (N,); None for too few points or all at one x.
+) -> LineFit | None:
+    """Fit a line y(x) to N points; return None for too few points, or all at one x.
 
     Parameters
     ----------
-    x, y :
-        What is not finite is left out.
-    trend :
-        Such as time, in which y may also be linear: the slope is then that at a constant trend.
-        One that can hardly be told from x is left out.
+    x, y : (N,)
+        Points; those that are not finite are left out.
+    trend : (N,), optional
+        Another regressor, such as time; the slope is that at a constant trend. A trend that
+        correlates with x too much is left out.
     curved :
         Fit a parabola, whose slope at x = 0 is the result.
     """
@@ -85,7 +84,7 @@ def fit_line(
     w = np.zeros_like(u) if trend is None else np.asarray(trend, dtype=float)
     known = np.isfinite(u) & np.isfinite(v) & np.isfinite(w)
     u, v, w = u[known], v[known], w[known]
-    size = float(np.ptp(u)) if len(u) >= FEWEST else 0.0
+    size = float(np.ptp(u)) if len(u) >= _FEWEST else 0.0
     if size <= 0:
         return None
     columns = [np.ones_like(u), u / size]
@@ -103,11 +102,11 @@ def fit_line(
     bend = 0.0
     if curved and len(columns) > 2 and spread[2, 2] > 0:
         bend = float(found[2]) / math.sqrt(spread[2, 2])
-    return Line(float(found[1]) / size, math.sqrt(spread[1, 1]) / size, freedom, len(u), bend)
+    return LineFit(float(found[1]) / size, math.sqrt(spread[1, 1]) / size, freedom, len(u), bend)
 
 
 def _can_be_told(x: Array, trend: Array) -> bool:
-    """Whether a trend differs from x by so much that both can be fitted."""
+    """Return whether a trend differs enough from x for both to be fitted."""
     dx, dt = x - x.mean(), trend - trend.mean()
     size = math.sqrt(float(dx @ dx) * float(dt @ dt))
     return size > 0 and abs(float(dx @ dt)) < _ALIKE * size
@@ -115,20 +114,20 @@ def _can_be_told(x: Array, trend: Array) -> bool:
 
 def fit_lines(
     series: Sequence[tuple[ArrayLike, ArrayLike, ArrayLike]],
-) -> list[Line]:
+) -> list[LineFit]:
     """Fit the slopes at x = 0 of repetitions, each (x, y, trend).
 
-    They are straight lines, unless all repetitions together show beyond doubt that they bend:
-    then all are parabolas.
+    Straight lines are fitted, unless all repetitions together show a significant curvature; then
+    all are parabolas.
     """
     bent = [fit_line(x, y, trend, curved=True) for x, y, trend in series]
     bends = [line.bend for line in bent if line is not None]
-    curved = bool(bends) and abs(math.fsum(bends)) > _DOUBT * math.sqrt(len(bends))
+    curved = bool(bends) and abs(math.fsum(bends)) > _BEND * math.sqrt(len(bends))
     lines = bent if curved else [fit_line(x, y, trend) for x, y, trend in series]
     return [line for line in lines if line is not None]
 
 
-def combine(lines: Sequence[Line], confidence: float = 0.95) -> Estimate | None:
+def combine(lines: Sequence[LineFit], confidence: float = 0.95) -> SlopeEstimate | None:
     """Combine the slopes of repetitions; None if there are none."""
     if not lines:
         return None
@@ -137,37 +136,15 @@ def combine(lines: Sequence[Line], confidence: float = 0.95) -> Estimate | None:
     within = math.sqrt(math.fsum(line.sigma**2 for line in lines)) / count
     within_width = within * student_t(confidence, sum(line.freedom for line in lines))
     if count == 1:
-        return Estimate(value, within, within_width, math.nan, 1)
+        return SlopeEstimate(value, within, within_width, math.nan, 1)
     spread = math.sqrt(math.fsum((line.slope - value) ** 2 for line in lines) / (count - 1))
     between = spread / math.sqrt(count)
     width = max(between * student_t(confidence, count - 1), within_width)
-    return Estimate(value, max(between, within), width, spread, count)
+    return SlopeEstimate(value, max(between, within), width, spread, count)
 
 
 def student_t(confidence: float, freedom: int) -> float:
-    """Return the t that |T| of Student's distribution exceeds with chance 1 - confidence."""
-    low, high = 0.0, 1.0
-    while _within(high, freedom) < confidence:
-        high *= 2
-    for _ in range(200):
-        middle = (low + high) / 2
-        if _within(middle, freedom) < confidence:
-            low = middle
-        else:
-            high = middle
-    return (low + high) / 2
+    """Return the t that |T| of Student's distribution exceeds with probability 1 - confidence."""
+    from scipy.special import stdtrit
 
-
-def _within(t: float, freedom: int) -> float:
-    """Chance of |T| < t, in closed form (Abramowitz and Stegun 26.7.3 and 26.7.4)."""
-    angle = math.atan2(t, math.sqrt(freedom))
-    cosine, sine = math.cos(angle), math.sin(angle)
-    term = total = 1.0 if freedom % 2 == 0 else cosine
-    for k in range(2 if freedom % 2 == 0 else 3, freedom, 2):
-        term *= (k - 1) / k * cosine**2
-        total += term
-    if freedom % 2 == 0:
-        return sine * total
-    if freedom == 1:
-        total = 0.0
-    return 2 / math.pi * (angle + sine * total)
+    return float(stdtrit(freedom, 0.5 * (1 + confidence)))

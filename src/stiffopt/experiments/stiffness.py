@@ -1,8 +1,8 @@
 """Experiment 2 of the paper: a probe displaces the tip at several pressures of one channel.
 
-At each pressure the arm settles; then the probe is aligned with each direction in turn, touches
-the tip, displaces it in steps, there and back, and waits at each until the force has come to rest.
-All of it is repeated. The slope of force over displacement is the stiffness.
+At each pressure the arm settles. Then the probe is aligned with each direction in turn, touches the
+tip, displaces it in steps, there and back, and waits at each step until the force has come to rest.
+All of it is repeated. The stiffness is the slope of force over displacement.
 """
 
 from __future__ import annotations
@@ -18,11 +18,9 @@ from pydantic import Field
 
 from stiffopt.directions import Direction, direction_name
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import Array, Conductor, Row, at_rest, check_pressures
-from stiffopt.experiments.points import PointsFile, SeriesKey
-from stiffopt.experiments.probing import Probing, Series
-from stiffopt.experiments.raw import RawRecording
-from stiffopt.experiments.settings import ExperimentSettings, Progress
+from stiffopt.experiments.conductor import Array, Conductor, TrackedFrame, at_rest, check_pressures
+from stiffopt.experiments.folder import ExperimentSettings, Progress, RawRecording
+from stiffopt.experiments.probing import PointsFile, Probing, Series, SeriesKey
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.interface import Rig
 from stiffopt.schema import Items
@@ -31,24 +29,24 @@ from stiffopt.units import Duration, Force, Length, Pressure
 __all__ = ["StiffnessSettings", "run_stiffness"]
 
 HARD_STOP = 5.0
-"""Times the force that is meant not to be exceeded, at which a series ends."""
-_REST_WINDOW = 4.0  # s
+"""Multiple of `StiffnessSettings.force` at which a series ends."""
+_REST_WINDOW = 4.0  # s over which the tip must not move before a series
 
 
 class StiffnessSettings(ExperimentSettings):
-    """What is done.
+    """Settings of the stiffness experiment.
 
     Attributes
     ----------
-    experiment : says which.
-    channel : which of them is pressurised, counted from 1.
-    pressures : of that channel, in Pa.
-    directions : along which the probe pushes, in the base frame.
-    displacement : of the stage beyond the first contact, in m.
-    force : that steps are kept small for, where the model expects more, in N.
-    steps : of a series, each way.
-    settle : seconds for which the arm may take to come to rest.
-    reach : how far the stage looks for the tip, in m.
+    experiment : its kind.
+    channel : channel that is pressurised, counted from 1.
+    pressures : pressures of that channel, in Pa.
+    directions : unit vectors along which the probe pushes, in the base frame.
+    displacement : travel of the stage beyond the first contact, in m.
+    force : force, in N, that the model must not expect; else the displacement is made smaller.
+    steps : number of steps of a series, each way.
+    settle : time that the arm may take to come to rest, in s.
+    reach : travel within which the stage looks for the tip, in m.
     """
 
     experiment: Literal["stiffness"] = "stiffness"
@@ -74,7 +72,7 @@ class StiffnessSettings(ExperimentSettings):
     reach: Annotated[Length, Field(gt=0, le=0.1)] = 0.01
 
     def pressures_at(self, pressure: float) -> Array:
-        """Pressures (n,) of all channels when that of the one is `pressure`."""
+        """Return the pressures (n,) with `pressure` in the one channel and 0 in all others."""
         p = np.zeros(self.channels)
         p[self.channel - 1] = pressure
         return p
@@ -86,7 +84,7 @@ def check_stiffness(rig: Rig, settings: StiffnessSettings) -> None:
     Raises
     ------
     InputError
-        It says what.
+        The rig cannot do the experiment; the message says why.
     """
     if rig.probe is None:
         raise InputError("this rig has no probe; the stiffness experiment needs one")
@@ -100,7 +98,7 @@ def check_stiffness(rig: Rig, settings: StiffnessSettings) -> None:
 
 
 def all_series(settings: StiffnessSettings) -> list[SeriesKey]:
-    """Every series in the order in which they are done."""
+    """Return every series, in the order in which they are done."""
     return [
         SeriesKey(repetition, pressure, direction)
         for repetition in range(1, settings.repetitions + 1)
@@ -110,7 +108,7 @@ def all_series(settings: StiffnessSettings) -> list[SeriesKey]:
 
 
 def missing_series(folder: Path, settings: StiffnessSettings) -> list[SeriesKey]:
-    """Series that a folder lacks."""
+    """Return the series that are missing in a folder."""
     done = {_rounded(series.key) for series in PointsFile(folder, settings.channels).read()}
     return [key for key in all_series(settings) if _rounded(key) not in done]
 
@@ -126,22 +124,22 @@ def run_stiffness(
     check: Callable[[], None] = lambda: None,
     aside: Callable[[], AbstractContextManager[None]] = nullcontext,
 ) -> list[str]:
-    """Do the series that a folder lacks.
+    """Do the series that are missing in a folder.
 
     Parameters
     ----------
     rig : Rig
         Open, with a tracker and a probe.
     folder : Path
-        Gets ``points.csv``, the steps of all series, and of each repetition everything that was
-        seen, as ``stiffness_1.csv`` (log v1) and ``stiffness_1.mcap``.
+        Gets ``points.csv``, with the steps of all series, and a recording of each repetition, as
+        ``stiffness_1.csv`` (log v1) and ``stiffness_1.mcap``.
     settings : StiffnessSettings
     model : Manipulator
-        Says how large steps may be; nothing of it is in the data.
+        Decides on the size of the steps alone; the data are independent of it.
     rate : float
-        Of the commands, in Hz.
+        Rate of the commands, in Hz.
     progress : callable
-        Is told series done, series in all and what goes on.
+        Called with the number of series done, of all series, and what goes on.
     check : callable
         Called often; raises to stop.
     aside : callable
@@ -150,7 +148,7 @@ def run_stiffness(
     Returns
     -------
     list of str
-        What a user should know.
+        Notes for the user.
 
     Raises
     ------
@@ -163,7 +161,7 @@ def run_stiffness(
     todo = missing_series(folder, settings)
     if not todo:
         return []
-    run = _Run(folder, settings, model, Conductor(rig, rate, check), aside)
+    run = _StiffnessRun(folder, settings, model, Conductor(rig, rate, check), aside)
     total = len(all_series(settings))
     for number, key in enumerate(todo, start=total - len(todo)):
         text = (
@@ -177,13 +175,13 @@ def run_stiffness(
     return run.notes()
 
 
-def _still(rows: Sequence[Row]) -> bool:
-    """Whether the tip creeps so slowly that it hardly moves by itself during a series."""
+def _still(rows: Sequence[TrackedFrame]) -> bool:
+    """Return whether the tip creeps so slowly that it hardly moves during a series."""
     return at_rest(rows, window=_REST_WINDOW)
 
 
-class _Run:
-    """The state between two series: which pressure is on, which recording is open."""
+class _StiffnessRun:
+    """A run of the experiment, with its state between two series."""
 
     def __init__(
         self,
@@ -204,7 +202,7 @@ class _Run:
         conductor.start()
 
     def do(self, key: SeriesKey) -> None:
-        """Pressurise, settle, align, push, note."""
+        """Do one series and store its points."""
         try:
             self._series(key)
         except BaseException:
@@ -236,7 +234,7 @@ class _Run:
         self._by_hand(self._probing.probe.withdraw)
 
     def _by_hand(self, task: Callable[[], None]) -> None:
-        """Let the probe do what a person may have to help with."""
+        """Run a task of the probe for which a person may be needed."""
         with self._aside():
             if self._probing.probe.needs_a_person:
                 self._conductor.meanwhile(task)
@@ -244,7 +242,7 @@ class _Run:
                 task()
 
     def wind_down(self) -> None:
-        """Take the probe away, let the pressure down, close the recording."""
+        """Withdraw the probe, let the pressure down, close the recording."""
         try:
             self._withdraw()
             self._conductor.ramp(np.zeros(self._settings.channels))
@@ -256,7 +254,7 @@ class _Run:
         return self._conductor.settle(p, _still, self._settings.settle)
 
     def _planned(self, p: Array, key: SeriesKey) -> Series:
-        """Steps so small that a stiff direction does not ask for too much force."""
+        """Return a series whose steps are so small that the model expects no more than `force`."""
         settings = self._settings
         expected = float(self._model.stiffness(p, key.direction))
         return Series(
@@ -268,7 +266,7 @@ class _Run:
         )
 
     def notes(self) -> list[str]:
-        """What a user should know."""
+        """Return notes for the user."""
         found = []
         if self._restless:
             found.append(
@@ -287,6 +285,6 @@ class _Run:
 
 
 def _rounded(key: SeriesKey) -> tuple[int, float, tuple[float, ...]]:
-    """Return what tells series apart, as a file keeps it."""
+    """Return the key of a series rounded as in the file."""
     direction = tuple(round(component, 6) + 0.0 for component in key.direction)
     return key.repetition, round(key.pressure, 1), direction

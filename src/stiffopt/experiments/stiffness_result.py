@@ -1,4 +1,4 @@
-"""What a stiffness experiment has found, and how the model compares."""
+"""Results of the stiffness experiment: the measured stiffness of each series, and the model's."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from stiffopt.experiments.conductor import Array
-from stiffopt.experiments.points import PointsFile, SeriesPoints
-from stiffopt.experiments.slope import Estimate, Line, combine, fit_lines
+from stiffopt.experiments.probing import PointsFile, SeriesPoints
+from stiffopt.experiments.slope import LineFit, SlopeEstimate, combine, fit_lines
 from stiffopt.experiments.stiffness import StiffnessSettings
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.manipulator import Manipulator
@@ -27,16 +27,16 @@ class StiffnessCell:
     pressure : of the channel, in Pa.
     direction : unit vector in the base frame.
     estimate : from the displacement of the tip, in N/m; None if no repetition gave a slope.
-    by_stage : the same from the place of the stage: less by what contact and sensor give way.
+    by_stage : the same from the position of the stage; less, since contact and sensor yield too.
     slopes : of the repetitions, in N/m.
-    points : in contact, in all repetitions.
-    model : what the model says, in N/m.
+    points : number of points in contact, in all repetitions.
+    model : stiffness of the model, in N/m.
     """
 
     pressure: float
     direction: tuple[float, float, float]
-    estimate: Estimate | None
-    by_stage: Estimate | None
+    estimate: SlopeEstimate | None
+    by_stage: SlopeEstimate | None
     slopes: tuple[float, ...]
     points: int
     model: float
@@ -44,14 +44,14 @@ class StiffnessCell:
 
 @dataclass(frozen=True, eq=False)
 class StiffnessResult:
-    """All that was found.
+    """Measured and modelled stiffness of an experiment.
 
     Attributes
     ----------
     settings : of the experiment.
     cells : one for each pressure and direction.
-    curve_pressures : of the channel (K,), in Pa, at which the model's curves are known.
-    curves : model's stiffness (K, d) along the d directions, in N/m.
+    curve_pressures : pressures of the channel (K,), in Pa, of the model's curves.
+    curves : stiffness of the model (K, d) along the d directions, in N/m.
     """
 
     settings: StiffnessSettings
@@ -60,7 +60,7 @@ class StiffnessResult:
     curves: Array
 
     def along(self, direction: Sequence[float]) -> list[StiffnessCell]:
-        """Cells of one direction, in order of pressure."""
+        """Return the cells of one direction, in order of pressure."""
         found = [cell for cell in self.cells if cell.direction == tuple(direction)]
         return sorted(found, key=lambda cell: cell.pressure)
 
@@ -149,8 +149,8 @@ def _cell(
     )
 
 
-def _lines(series: Sequence[SeriesPoints], displacements: Sequence[Array]) -> list[Line]:
-    """Force over displacement, of the points in contact, with a steady creep taken off."""
+def _lines(series: Sequence[SeriesPoints], displacements: Sequence[Array]) -> list[LineFit]:
+    """Fit force over displacement for points in contact, with time as a trend for creep."""
     return fit_lines(
         [
             (displacement[one.touching], one.force[one.touching], one.time[one.touching])

@@ -1,16 +1,15 @@
-"""Recordings: log v1 (CSV), the same as MCAP, and tables of measured stiffness."""
+"""Logs of an arm over time (CSV "log v1" and MCAP), and tables of measured stiffness (CSV)."""
 
+from stiffopt.logs.csv_log import LogWriter, read_log, write_log
 from stiffopt.logs.layout import LogLayout
 from stiffopt.logs.log import Body, Log, LogRow
 from stiffopt.logs.mcap_log import McapLogWriter, read_mcap_log
 from stiffopt.logs.mcap_reading import require_mcap
-from stiffopt.logs.reading import read_log
 from stiffopt.logs.stiffness import (
     StiffnessTable,
     read_stiffness_table,
     write_stiffness_table,
 )
-from stiffopt.logs.writing import LogWriter, write_log
 
 __all__ = [
     "Body",

@@ -1,4 +1,4 @@
-"""Which columns a recording has: names of log v1."""
+"""The column names of a log (log v1)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _BODY = re.compile(r"([a-z][a-z0-9]*(?:_[a-z0-9]+)*)_(?:[xyz]_m|q[wxyz])")
 
 @dataclass(frozen=True)
 class LogLayout:
-    """Which columns there are.
+    """Which columns a log has.
 
     Attributes
     ----------
@@ -38,16 +38,29 @@ class LogLayout:
     stage: bool = False
 
     @property
+    def parts(self) -> dict[str, list[str]]:
+        """Columns of each quantity, in the order in which they are written.
+
+        The keys are ``time``, ``commanded``, ``measured``, ``BODY position``, ``BODY quaternion``
+        (the tip is a body), ``force`` and ``stage``.
+        """
+        parts = {"time": [_TIME], "commanded": _pressures("p", self.n)}
+        if self.measured:
+            parts["measured"] = _pressures("pm", self.n)
+        for name, turns in {"tip": self.tip_quaternion, **self.bodies}.items():
+            parts[f"{name} position"] = [f"{name}_{axis}_m" for axis in _AXES]
+            if turns:
+                parts[f"{name} quaternion"] = [f"{name}_{part}" for part in _PARTS]
+        if self.force:
+            parts["force"] = ["force_n"]
+        if self.stage:
+            parts["stage"] = ["stage_m"]
+        return parts
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Names of the columns in the order in which they are written."""
-        names = [_TIME, *_pressures("p", self.n)]
-        if self.measured:
-            names += _pressures("pm", self.n)
-        names += _body("tip", self.tip_quaternion)
-        for name, turns in self.bodies.items():
-            names += _body(name, turns)
-        names += ["force_n"] * self.force + ["stage_m"] * self.stage
-        return tuple(names)
+        return tuple(name for names in self.parts.values() for name in names)
 
     @classmethod
     def of_columns(cls, path: str, columns: Sequence[str]) -> LogLayout:
@@ -88,12 +101,6 @@ class LogLayout:
 
 def _pressures(prefix: str, n: int) -> list[str]:
     return [f"{prefix}{k + 1}_pa" for k in range(n)]
-
-
-def _body(name: str, turns: bool) -> list[str]:
-    return [f"{name}_{axis}_m" for axis in _AXES] + (
-        [f"{name}_{part}" for part in _PARTS] if turns else []
-    )
 
 
 def _count(names: set[str], prefix: str) -> int:

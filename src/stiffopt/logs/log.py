@@ -1,4 +1,4 @@
-"""What a recording is in code."""
+"""A log in memory: pressures and poses of an arm over time."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import InputError
 from stiffopt.logs.layout import LogLayout
 
-__all__ = ["Array", "Body", "Log", "LogRow"]
+__all__ = ["Array", "Body", "Log", "LogRow", "log_of_values"]
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Where a tracked body was.
+    """The poses of a tracked body over time.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A recording, in SI units; what is missing is NaN.
+    """A log: pressures and poses over time, in SI units; NaN where a value is missing.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Log:
 
 @dataclass(frozen=True)
 class LogRow:
-    """One row of a recording; see `Log`. What is missing is None or NaN."""
+    """One row of a `Log`; a missing value is None or NaN."""
 
     time: float
     commanded: ArrayLike
@@ -151,25 +151,39 @@ class LogRow:
         InputError
             It does not fit the layout.
         """
-        parts: list[tuple[str, ArrayLike | None, int]] = [
-            ("time", self.time, 1),
-            ("commanded", self.commanded, layout.n),
-        ]
-        if layout.measured:
-            parts.append(("measured", self.measured, layout.n))
-        parts.append(("position", self.position, 3))
-        if layout.tip_quaternion:
-            parts.append(("quaternion", self.quaternion, 4))
-        for name, turns in layout.bodies.items():
-            position, quaternion = self.bodies.get(name, (None, None))
-            parts.append((f"{name}: position", position, 3))
-            if turns:
-                parts.append((f"{name}: quaternion", quaternion, 4))
-        if layout.force:
-            parts.append(("force", self.force, 1))
-        if layout.stage:
-            parts.append(("stage", self.stage, 1))
-        return np.concatenate([_numbers(*part) for part in parts])
+        given: dict[str, ArrayLike | None] = {
+            "time": self.time,
+            "commanded": self.commanded,
+            "measured": self.measured,
+            "force": self.force,
+            "stage": self.stage,
+        }
+        for name, pose in {"tip": (self.position, self.quaternion), **self.bodies}.items():
+            given[f"{name} position"], given[f"{name} quaternion"] = pose
+        return np.concatenate(
+            [_numbers(name, given.get(name), len(c)) for name, c in layout.parts.items()]
+        )
+
+
+def log_of_values(values: Array, layout: LogLayout) -> Log:
+    """Return the log whose columns (N, m) are in the order of a layout."""
+    parts, end = {}, 0
+    for name, columns in layout.parts.items():
+        parts[name] = np.ascontiguousarray(values[:, end : end + len(columns)])
+        end += len(columns)
+    return Log(
+        time=parts["time"][:, 0],
+        commanded=parts["commanded"],
+        measured=parts.get("measured"),
+        tip_position=parts["tip position"],
+        tip_quaternion=parts.get("tip quaternion"),
+        bodies={
+            name: Body(parts[f"{name} position"], parts.get(f"{name} quaternion"))
+            for name in layout.bodies
+        },
+        force=parts["force"][:, 0] if layout.force else None,
+        stage=parts["stage"][:, 0] if layout.stage else None,
+    )
 
 
 def _row(values: Array | None, i: int) -> Array | None:

@@ -1,8 +1,8 @@
-"""The same recording as MCAP, which Foxglove and other viewers open.
+"""A log as MCAP, the format of Foxglove and other viewers: written by experiments, and read back.
 
-Without chunks, each row is with the system when `append` returns, as in a `LogWriter`. A row is
-the messages of one time; that of ``/pressure`` is written last, so that a row which has it is
-whole.
+A row of the log is one message per topic, all with the same time. The message of ``/pressure`` is
+written last, so a row that has it is whole. There are no chunks: each row has been handed to the
+system when `append` returns, as in `LogWriter`.
 
 | topic | is |
 | --- | --- |
@@ -25,9 +25,8 @@ import numpy as np
 
 from stiffopt.errors import FileError, InputError
 from stiffopt.logs.layout import LogLayout
-from stiffopt.logs.log import Array, Log, LogRow
+from stiffopt.logs.log import Array, Log, LogRow, log_of_values
 from stiffopt.logs.mcap_reading import McapContents, read_mcap, require_mcap
-from stiffopt.logs.reading import log_of_values
 
 __all__ = ["LOG_METADATA", "McapLogWriter", "read_mcap_log"]
 
@@ -43,7 +42,7 @@ _SCHEMAS: dict[str, dict[str, Any]] = {
 
 
 class McapLogWriter:
-    """Writes rows to a recording in MCAP, in the place of what is there.
+    """Writes the rows of a log to an MCAP file, which replaces what is there.
 
     Parameters
     ----------
@@ -258,7 +257,7 @@ def _pose(position: Any, quaternion: Any) -> dict[str, Any]:
 
 
 def _plain(values: Any) -> Any:
-    """Return numbers as JSON has them: null for what is not finite."""
+    """Return numbers for JSON: None for those that are not finite."""
     if values is None:
         return None
     numbers = np.asarray(values, dtype=float)

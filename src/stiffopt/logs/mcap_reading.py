@@ -1,4 +1,4 @@
-"""What is in an MCAP recording of stiffopt, whole or cut short: metadata and JSON messages."""
+"""Reads the metadata and JSON messages of an MCAP file, also of one that was cut short."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["McapContents", "read_mcap", "require_mcap"]
 
 @dataclass
 class McapContents:
-    """What was found in a recording.
+    """The metadata and messages of an MCAP file.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class McapContents:
 
 
 def require_mcap() -> None:
-    """Say how to get mcap if it is missing.
+    """Check that the library mcap is installed.
 
     Raises
     ------

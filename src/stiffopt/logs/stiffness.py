@@ -1,4 +1,4 @@
-"""Tables of measured stiffness: what the stiffness experiment finds, and calibration fits."""
+"""Tables of measured stiffness (CSV): results of the stiffness experiment, input of calibration."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _VALUES = ("stiffness_n_per_m", "sigma_n_per_m")
 
 @dataclass(frozen=True, eq=False)
 class StiffnessTable:
-    """Stiffnesses of the tip along directions, as measured.
+    """Measured stiffnesses of the tip, each along a direction.
 
     Attributes
     ----------

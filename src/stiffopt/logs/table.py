@@ -1,4 +1,4 @@
-"""Tables of numbers in CSV, read strictly and fast: a million rows take a few seconds."""
+"""Reads tables of numbers from CSV, strictly and fast: a million rows in a few seconds."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ _NUMBER = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\s*")
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """Columns of numbers, by name; an empty field is NaN. Row i is line i + 2 of the file."""
+    """A table of numbers with named columns; an empty field is NaN.
+
+    Row i is line i + 2 of the file.
+    """
 
     path: str
     columns: tuple[str, ...]
@@ -81,7 +84,7 @@ def read_bytes(path: str) -> bytes:
 
 
 def cut_torn_end(path: str) -> bool:
-    """Remove a last line that has no end, as one leaves that is killed while writing; say if so.
+    """Remove an unfinished last line, as a killed writer leaves it; return whether there was one.
 
     Raises
     ------

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stiffopt.directions import direction_name
-from stiffopt.experiments.coverage_result import CoverageResult
-from stiffopt.experiments.kinematics_result import KinematicsResult
+from stiffopt.experiments.kinematics_result import CoverageResult, KinematicsResult
 from stiffopt.experiments.stiffness_result import StiffnessResult
 from stiffopt.plots.style import (
     AXES,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import threading
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +27,10 @@ from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import Applied, SafetyGate, let_down
 from stiffopt.safety.settings import COMMANDS
 
-__all__ = ["GoalFollower", "GoalOutlet", "GoalSupply", "TickingClock", "check_goal"]
+if TYPE_CHECKING:
+    from stiffopt.safety.guard_client import GuardLink
+
+__all__ = ["GoalFollower", "GoalSupply", "TickingClock", "check_goal"]
 
 Array = NDArray[np.float64]
 
@@ -35,45 +38,6 @@ _EXPIRED = (
     "no command came for as long as the last one was valid, so the pressures were let down and "
     "vented; arm the supply again, and give commands a longer valid_for"
 )
-
-
-class GoalOutlet(Protocol):
-    """Interface that takes goals to a supply, in this process or through a guard."""
-
-    limits: PressureLimits
-
-    @property
-    def armed(self) -> bool:
-        """Whether commands are taken."""
-
-    @property
-    def commanded(self) -> Array:
-        """Set-points (n,) of the supply, in Pa."""
-
-    @property
-    def has_dump_valve(self) -> bool:
-        """Whether venting also opens a valve."""
-
-    def check_arming(self) -> None:
-        """Raise `CommandError` if this supply may never be armed."""
-
-    def open(self) -> None:
-        """Connect to the supply, which vents it."""
-
-    def close(self) -> None:
-        """Vent and disconnect."""
-
-    def arm_for_goals(self) -> None:
-        """Take goals from now on."""
-
-    def vent(self) -> None:
-        """Let all pressure out at once; no goal is taken until the supply is armed."""
-
-    def pursue(self, goal: PressureCommand) -> Applied:
-        """Take a goal and make the first step towards it."""
-
-    def read(self) -> PressureReading:
-        """Return the newest measured pressures."""
 
 
 def check_goal(goal: PressureCommand, now: float, limits: PressureLimits) -> Array:
@@ -288,9 +252,16 @@ class GoalSupply(Supply):
     expires: a `PressureCommand` says when, plain pressures are valid for 0.5 s. Then the pressures
     are let down within `Safety.ramp_time` and vented. In real time the guard process does all this,
     and vents at once when this process ends; a simulated rig does it on its own clock.
+
+    Parameters
+    ----------
+    outlet :
+        Takes the goals: a follower in this process, or the link to a guard that has one.
+    clock :
+        Clock of the rig.
     """
 
-    def __init__(self, outlet: GoalOutlet, clock: Clock) -> None:
+    def __init__(self, outlet: GoalFollower | GuardLink, clock: Clock) -> None:
         super().__init__(clock)
         self.limits = outlet.limits
         self._outlet = outlet

@@ -321,10 +321,10 @@ class Exchange:
 class GuardLink:
     """Commands a supply through the guard process that owns it; see `stiffopt.safety.guard`.
 
-    It is both an `Outlet` (streams) and a `GoalOutlet` (goals) on the clock `time.monotonic`. Any
-    thread may call any method. When the guard has vented by itself, `apply`, `pursue` and `arm`
-    raise `GuardTripped` once; after that, or after `vent`, `arm` works again. When the guard is
-    gone, or hangs, the supply is vented directly, see `GuardWatch`.
+    It takes streams, as an `Outlet`, and goals, as a `GoalFollower` does. Times are those of
+    `time.monotonic`. Any thread may call any method. When the guard has vented by itself, `apply`,
+    `pursue` and `arm` raise `GuardTripped` once; after that, or after `vent`, `arm` works again.
+    When the guard is gone, or hangs, the supply is vented directly, see `GuardWatch`.
 
     Parameters
     ----------

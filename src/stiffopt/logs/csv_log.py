@@ -1,4 +1,4 @@
-"""Log v1, written row by row: whatever happens, at most the last row is lost."""
+"""Logs as CSV (log v1): written row by row, so that a crash loses the last row only, and read."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 
 from stiffopt.errors import FileError, InputError
 from stiffopt.logs.layout import LogLayout
-from stiffopt.logs.log import Array, Log, LogRow
-from stiffopt.logs.table import cut_torn_end, read_bytes
+from stiffopt.logs.log import Array, Log, LogRow, log_of_values
+from stiffopt.logs.table import cut_torn_end, read_bytes, read_table
 
-__all__ = ["LogWriter", "write_log"]
+__all__ = ["LogWriter", "read_log", "write_log"]
 
 
 class LogWriter:
-    """Appends rows to a recording (log v1). Each row is with the system when `append` returns.
+    """Appends rows to a log (log v1); each is handed to the system when `append` returns.
 
     A file that is there and has the same columns is continued; `last_time` then says where.
 
@@ -155,6 +155,37 @@ def write_log(path: str | os.PathLike[str], log: Log) -> None:
     finally:
         if os.path.exists(part):
             os.remove(part)
+
+
+def read_log(path: str | os.PathLike[str]) -> Log:
+    """Read a log from CSV (log v1).
+
+    Parameters
+    ----------
+    path :
+        CSV in SI units with the columns ``time_s``, ``p1_pa`` ..., ``tip_x_m``, ``tip_y_m``,
+        ``tip_z_m``, and if they were recorded ``pm1_pa`` ..., ``tip_qw`` ... ``tip_qz``, the same
+        of other bodies, ``force_n`` and ``stage_m``. An empty field is a missing value.
+
+    Raises
+    ------
+    FileError
+        It cannot be read, a column is missing or unknown, a row has too few or too many fields, a
+        field is no finite number, or time does not increase. It names the line.
+    """
+    table = read_table(path)
+    layout = LogLayout.of_columns(table.path, table.columns)
+    time = table["time_s"]
+    for index in np.flatnonzero(np.isnan(time)):
+        raise FileError(table.path, "time_s is missing", line=int(index) + 2)
+    for index in np.flatnonzero(np.diff(time) <= 0):
+        raise FileError(
+            table.path,
+            f"time_s is {time[index + 1]:g} after {time[index]:g}; it must increase",
+            line=int(index) + 3,
+        )
+    order = [table.columns.index(name) for name in layout.columns]
+    return log_of_values(table.values[:, order], layout)
 
 
 def _format(column: str) -> str:
