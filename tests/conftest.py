@@ -16,6 +16,7 @@ LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 os.environ["MPLBACKEND"] = "Agg"
 os.environ["STIFFOPT_COMPILER"] = "none"  # but for tests that ask for `compiled`
+os.environ["STIFFOPT_COMPILE"] = "wait"  # but for tests of code that is made in the background
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

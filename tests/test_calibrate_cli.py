@@ -443,7 +443,7 @@ _CALIBRATE = ("calibrate", "--robot", "stiff-flop-1", "--out", "{tmp}/new.yaml")
     [
         (_CALIBRATE, "nothing to fit to; expected a LOG or a table of stiffness"),
         ((*_CALIBRATE, "{tmp}/no.csv"), "no.csv: there is no such file"),
-        ((*_CALIBRATE, "{tmp}/no.mcap"), "no.mcap: cannot be read"),
+        ((*_CALIBRATE, "{tmp}/no.mcap"), "no.mcap: there is no such file"),
         ((*_CALIBRATE, "{tmp}/bad.csv"), "the column 'p1_pa' is missing"),
         ((*_CALIBRATE, "{tmp}/k.csv"), "is a table of stiffness, not a log; give it as --stiff"),
         ((*_CALIBRATE, "{tmp}/six.csv"), "has 6 pressures.* --channels 1,2,3"),

@@ -16,6 +16,12 @@ import pytest
 
 from commanding import DRIVERS, LIMITS, PERIOD, WAYS, Bench, N, Way
 from stiffopt.errors import DeviceError, StiffoptError
+from stiffopt.rig.registry import driver_names
+
+
+def test_every_driver_of_a_supply_is_held_to_the_contract() -> None:
+    tested = {name.partition("-")[0] for name in DRIVERS}
+    assert tested >= set(driver_names("supply")) - {"line"}  # which is the third party
 
 
 @pytest.fixture(params=DRIVERS)

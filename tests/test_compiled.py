@@ -18,10 +18,11 @@ import pytest
 
 import stiffopt as so
 from stiffopt.errors import SlowWarning
-from stiffopt.model import compiled, native_build, native_robot
+from stiffopt.model import compiled, tip_functions
+from stiffopt.model import compiler as build
+from stiffopt.model.batch import in_parallel
+from stiffopt.model.codegen import c_code
 from stiffopt.model.compiled import interpreted, library
-from stiffopt.model.native_calls import in_parallel
-from stiffopt.model.native_source import c_code
 
 pytestmark = pytest.mark.skipif(
     all(shutil.which(name) is None for name in ("cc", "gcc", "clang")), reason="no C compiler"
@@ -41,7 +42,7 @@ def cache(tmp_path, monkeypatch):
 
 def as_a_new_process(monkeypatch):
     monkeypatch.setattr(compiled, "_loaded", {})
-    monkeypatch.setattr(compiled, "_notified", False)
+    monkeypatch.setattr(compiled, "_notified", set())
 
 
 def functions():
@@ -226,7 +227,7 @@ def test_what_makes_another_library(cache, monkeypatch, tmp_path):
     monkeypatch.setenv("STIFFOPT_COMPILER", fake_compiler(tmp_path / "mycc", 'exec $CC_REAL "$@"'))
     assert library("f", unexpected, build_missing=False) is None
     library("f", functions)
-    monkeypatch.setattr(native_build, "FLAGS", (*native_build.FLAGS, "-DX"))
+    monkeypatch.setattr(build, "FLAGS", (*build.FLAGS, "-DX"))
     library("f", functions)
     monkeypatch.setattr(compiled, "_own_code", lambda: "another version")
     library("f", functions)
@@ -235,7 +236,7 @@ def test_what_makes_another_library(cache, monkeypatch, tmp_path):
 
 def test_the_key_of_own_sources(tmp_path):
     source, beside = tmp_path / "a.c", tmp_path / "a.h"
-    compiler = native_build.find_compiler(tmp_path)
+    compiler = build.find_compiler(tmp_path)
     source.write_text("int a;")
     keys = [compiled._key("f", compiler, [str(source)], False)]
     beside.write_text("#define A 1\n")
@@ -288,8 +289,8 @@ def read_only(directory, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(native_build, "write_atomically", refuse)
-    monkeypatch.setattr(native_build.tempfile, "mkdtemp", refuse)
+    monkeypatch.setattr(build, "write_atomically", refuse)
+    monkeypatch.setattr(build.tempfile, "mkdtemp", refuse)
 
 
 def test_a_cache_whose_place_is_taken(tmp_path, monkeypatch):
@@ -300,13 +301,13 @@ def test_a_cache_whose_place_is_taken(tmp_path, monkeypatch):
 
 
 def test_where_the_cache_is(monkeypatch, tmp_path):
-    assert native_build.cache_directory() == Path(os.environ["STIFFOPT_CACHE_DIR"])
+    assert build.cache_directory() == Path(os.environ["STIFFOPT_CACHE_DIR"])
     monkeypatch.delenv("STIFFOPT_CACHE_DIR")
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert native_build.cache_directory() == tmp_path / "stiffopt"
+    assert build.cache_directory() == tmp_path / "stiffopt"
     monkeypatch.delenv("XDG_CACHE_HOME")
-    assert native_build.cache_directory() == Path.home() / ".cache" / "stiffopt"
+    assert build.cache_directory() == Path.home() / ".cache" / "stiffopt"
 
 
 def test_what_killed_builds_left_is_removed_after_a_day(cache):
@@ -365,7 +366,7 @@ def test_a_command_that_cannot_be_read(monkeypatch):
 )
 def test_a_compiler_that_fails(monkeypatch, tmp_path, cache, body, reason):
     monkeypatch.setenv("STIFFOPT_COMPILER", fake_compiler(tmp_path / "cc", body))
-    monkeypatch.setattr(native_build._run, "__defaults__", (0.3,))
+    monkeypatch.setattr(build._run, "__defaults__", (0.3,))
     start = time.monotonic()
     with pytest.warns(SlowWarning, match=reason) as notices:
         assert [library(content, functions) for content in ("f", "f")] == [None] * 2
@@ -442,9 +443,9 @@ def test_killed_in_the_middle(cache, tmp_path):
 
 
 def test_a_lock_is_waited_for_only_so_long(tmp_path):
-    with native_build.turn(tmp_path / "lock"):
+    with build.turn(tmp_path / "lock"):
         start = time.monotonic()
-        with native_build.turn(tmp_path / "lock", longest=0.1):
+        with build.turn(tmp_path / "lock", longest=0.1):
             assert 0.1 <= time.monotonic() - start < 5
 
 
@@ -467,7 +468,7 @@ def test_compiled_maps_are_those_of_the_vm(name, cache, monkeypatch):
     ps = np.random.default_rng(0).uniform(0, 1.2e5, (2000, reference.n_pressures))
     expected = {key: call(reference, ps) for key, call in CALLS.items()}
     assert not code_files(cache)  # too few rows to compile for
-    monkeypatch.setattr(native_robot, "COMPILED_FROM", 1500)
+    monkeypatch.setattr(tip_functions, "COMPILED_FROM", 1500)
     arm = so.load_robot(name)
     for key, call in CALLS.items():
         found = call(arm, ps)
@@ -477,7 +478,7 @@ def test_compiled_maps_are_those_of_the_vm(name, cache, monkeypatch):
         assert call(arm, ps[:0]).shape == expected[key][:0].shape
     assert len(code_files(cache)) == 1
     # from now on small batches use it too, without making anything
-    monkeypatch.setattr(native_robot._Formulas, "functions", unexpected)
+    monkeypatch.setattr(tip_functions, "_tip_functions", unexpected)
     as_a_new_process(monkeypatch)
     arm = so.load_robot(name)
     assert np.array_equal(arm.tip_pose(ps[:64]), expected["tip_pose"][:64])
@@ -485,7 +486,7 @@ def test_compiled_maps_are_those_of_the_vm(name, cache, monkeypatch):
 
 
 def test_bad_rows_of_a_large_batch(monkeypatch):
-    monkeypatch.setattr(native_robot, "COMPILED_FROM", 100)
+    monkeypatch.setattr(tip_functions, "COMPILED_FROM", 100)
     arm = so.load_robot("stiff-flop-1")
     ps = np.full((200, 3), 1e4)
     assert arm.tip_pose(ps).shape == (200, 4, 4)
@@ -501,6 +502,7 @@ def test_bad_rows_of_a_large_batch(monkeypatch):
 @pytest.mark.parametrize(("n", "most"), [(1, 8_000), (2, 16_500), (3, 25_000)])
 def test_how_much_is_compiled(n, most):
     """Instructions of the VM, which the time to compile goes by: 3 s for three segments."""
-    formulas = so.load_robot(f"stiff-flop-{n}")._tip._formulas.functions()
+    layout = so.load_robot(f"stiff-flop-{n}").layout
+    formulas = tip_functions._tip_functions(layout)
     assert sum(function.n_instructions() for function in formulas) < most
     assert all("int main" not in c_code(function) for function in formulas)

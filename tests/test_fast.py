@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from stiffopt.model import native_build
+from stiffopt.model import compiler as build
 from stiffopt.optimise import prepared as preparation
 
 KINDS = {
@@ -180,7 +180,7 @@ def test_one_structure_is_compiled_once(robot, task, monkeypatch):
     def refuse(*_):
         raise AssertionError("compiled again")
 
-    monkeypatch.setattr(native_build, "compile_library", refuse)
+    monkeypatch.setattr(build, "compile_library", refuse)
     rng = np.random.default_rng(1)
     for _ in range(3):
         assert so.solve_pressure(robot, random_task(robot, rng)).found
@@ -296,7 +296,7 @@ def test_threads_may_share_a_robot(robot, task):
 
 def test_without_a_compiler_there_is_one_notice(task, monkeypatch, tmp_path):
     monkeypatch.setenv("STIFFOPT_COMPILER", str(tmp_path / "missing"))
-    monkeypatch.setattr("stiffopt.model.compiled._notified", False)
+    monkeypatch.setattr("stiffopt.model.compiled._notified", set())
     robot = so.load_robot("stiff-flop-2")
     blind = task.model_copy(update={"stiffness": None})
     with pytest.warns(so.SlowWarning, match="was not found") as notices:

@@ -80,7 +80,7 @@ def compiled_point(solver, program, pressures):
     rows, terms, floors = setup.rows, setup.terms, setup.floors
     values = np.zeros(n + (rows + terms + floors) * (1 + n))
     radii = np.array([constraint.radius for constraint in program.constraints(1.0)])
-    parameters = np.array(program.parameters)
+    parameters = np.concatenate([solver._numbers, program.parameters])
     assert point(
         ctypes.addressof(setup), parameters.ctypes.data, radii.ctypes.data,
         pressures.ctypes.data, values.ctypes.data,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from stiffopt.cli.solve_records import json_line, result_record
+from stiffopt.cli.solve_records import json_record, result_record
 from stiffopt.cli.solve_report import block
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.optimise.goal import StiffnessGoal
@@ -133,6 +133,6 @@ def test_a_measure_outside_of_the_package_is_maximised_and_told():
     plain = 3 / np.trace(robot.tip_compliance(other.pressures)[:3, :3])
     assert solution.stiffness > plain
     solved = SolvedTask("a.yaml", robot, solution)
-    assert json.loads(json_line(solved))["stiffness"] == solution.stiffness
+    assert json_record(solved)["stiffness"] == solution.stiffness
     assert result_record(solved)["stiffness"][0]["mean"] == "translation"
     assert block(solved) is not None

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 import stiffopt as so
-from stiffopt.cli.solve_records import json_line, result_record
+from stiffopt.cli.solve_records import json_record, result_record
 from stiffopt.cli.solve_report import block
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.optimise.problem import PressureProblem
@@ -209,7 +209,7 @@ def test_is_met_by_both_solvers_and_told(kind, compiled, monkeypatch, tmp_path):
         assert term.holds(solution.errors[term.name])
     assert fast.stiffness == pytest.approx(slow.stiffness, rel=2e-3)
     solved = SolvedTask("a.yaml", arm, fast)
-    said = json.loads(json_line(solved))
+    said = json_record(solved)
     assert said[f"{term.result_name}_{term.unit}"] == fast.errors[term.name]
     assert term.result_name in result_record(solved)
     console = Console(width=100)

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.native_calls import Buffer
+from stiffopt.model.batch import Buffer
 
 __all__ = ["Formula"]
 

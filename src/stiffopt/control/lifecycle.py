@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from contextlib import ExitStack
 
 from stiffopt.control.state import Alarm, Event, Severity, State
 from stiffopt.errors import CommandError
+from stiffopt.model.compiler import held_off
 
 __all__ = ["ARMED", "Alarms", "EventBuffer", "Lifecycle"]
 
@@ -44,6 +46,11 @@ _ADVICE = {
 class Lifecycle:
     """The state of a control loop.
 
+    Parameters
+    ----------
+    in_real_time :
+        Whether ticks have deadlines: then no code is compiled in the background while it is armed.
+
     Attributes
     ----------
     state : State
@@ -52,9 +59,11 @@ class Lifecycle:
         Why, where nobody requested it.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, in_real_time: bool = False) -> None:
+        self._in_real_time = in_real_time
         self.state = State.UNCONFIGURED
         self.reason = ""
+        self._no_compiler = ExitStack()  # begins in the background while the arm is armed
 
     @property
     def armed(self) -> bool:
@@ -71,7 +80,12 @@ class Lifecycle:
         """
         if state not in _TRANSITIONS[self.state]:
             raise CommandError(f"{state} cannot follow {self.state}")
+        was_armed = self.armed
         self.state, self.reason = state, reason
+        if self.armed and not was_armed and self._in_real_time:
+            self._no_compiler.enter_context(held_off())
+        elif not self.armed:
+            self._no_compiler.close()
 
     def permit(self, request: str) -> None:
         """Refuse a request that the state does not permit.

@@ -38,6 +38,7 @@ __all__ = ["InlinePlanner", "Planner", "PlannerEnd", "PlanningEnd", "ProcessPlan
 _RESTART_AFTER = 1.0  # s between two starts of the process
 _PREPARATION = 0.5  # s; a new task that takes longer is reported
 _NICE = 5  # of the process: the control loop comes first
+_IDLE = 1.0  # s without a request, after which compiled code is asked for
 _ARRAYS = ("offset", "pressure_offset")  # of a request: compared and sent by value, every time
 _OBJECTS = ("serial", "task", "target", "search")  # immutable: compared by identity
 
@@ -286,6 +287,10 @@ class PlanningEnd:
         robot: Manipulator = self._connection.recv()
         return robot
 
+    def has_request(self, patience: float) -> bool:
+        """Whether a request comes within so many seconds."""
+        return self._connection.poll(patience)
+
     def request(self) -> PlanRequest:
         """Receive a request."""
         self._fields.update(self._connection.recv())
@@ -322,6 +327,8 @@ def main(end: PlanningEnd) -> None:
     planning = Planning(robot)
     end.answer(None)
     while True:
+        while not end.has_request(_IDLE):
+            planning.ask_for_code()
         request = end.request()
         try:
             end.answer(planning.plan(request))

@@ -92,10 +92,15 @@ class Planning:
     def __init__(self, robot: Manipulator, tuning: PlanningTuning | None = None) -> None:
         self._robot, self._tuning = robot, tuning or PlanningTuning()
         self._search = NearestSearch(TipModel(robot), FeedbackTuning().lever)
-        self._serial = -1
+        self._serial, self._is_compiled = -1, False
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
         self._advantage, self._refused = self._tuning.advantage, 0
+
+    def ask_for_code(self) -> None:
+        """Have compiled code for the last task made, which was not while the arm was armed."""
+        if self._serial >= 0 and not self._is_compiled:
+            self._is_compiled = self._solver.is_compiled
 
     def plan(self, request: PlanRequest) -> Plan:
         """Return the plan for a request.
@@ -110,7 +115,7 @@ class Planning:
             self._solver = PressureSolver(
                 self._robot, request.task.model_copy(update={"target": exact})
             )
-            self._is_compiled = self._solver.is_compiled
+            self._is_compiled = self._solver.compile()
             self._serial, self._last = request.serial, None
         target = model_target(request.target, request.offset, self._tuning)
         self._limits = self._effective_limits(request.pressure_offset)
@@ -181,6 +186,7 @@ class Planning:
 
     def _solve(self, target: Target, guess: Array | None) -> PressureSolution | None:
         """The optimiser's solution; None where it has none that holds, soon enough."""
+        self._is_compiled = self._is_compiled or self._solver.is_compiled
         if self._is_compiled:
             return self._solver.solve_at_once(target, guess, self._limits)
         solution = self._solver.solve(target, guess)

@@ -21,7 +21,7 @@ from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.errors import CommandError, DeviceError, GuardTripped, InputError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
-from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig
+from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig, SystemClock
 from stiffopt.rig.settings import ControlSettings, Safety
 from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.gate import Outlet, let_down
@@ -82,7 +82,7 @@ class Supervisor:
         self.rig, self.steering, self.outlet = rig, steering, outlet
         self._tuning = tuning
         self._clock, self._safety = rig.clock, safety
-        self.lifecycle = Lifecycle()
+        self.lifecycle = Lifecycle(in_real_time=isinstance(rig.clock, SystemClock))
         self.events = EventBuffer()
         self.alarms = Alarms(self.events)
         control = ControlSettings() if rig.settings is None else rig.settings.control

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.identify.settings import FIT
-from stiffopt.model.compiled import library
+from stiffopt.model.batch import CompiledFunction
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import compiling_at_once, library
 from stiffopt.model.history import NO_HISTORY, History
-from stiffopt.model.native_calls import CompiledFunction
-from stiffopt.model.native_source import dense
 
 __all__ = ["Effective", "Past", "Start"]
 
@@ -254,7 +254,8 @@ class _HistoryRun:
             def make() -> list[ca.Function]:
                 return [dense(self._step.mapaccum("past_run", _CHUNKS[-1]))]
 
-            code = library(self._content, make)
+            with compiling_at_once():
+                code = library(self._content, make)
             self._compiled = code.function("past_run") if code else None
         return self._compiled
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.model.native_calls import InterpretedFunction
-from stiffopt.model.native_source import dense
+from stiffopt.model.batch import InterpretedFunction
+from stiffopt.model.codegen import dense
 
 __all__ = ["Readings", "readings", "turned_by"]
 

@@ -9,7 +9,7 @@ need not know.  The laws themselves stand in `stiffopt.model.laws`, one file eac
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -57,13 +57,34 @@ class SectionGeometry:
         Chamber area of each channel (c,), in m^2: axial force per unit pressure.
     channel_moment : ndarray
         ``int r dA`` over each channel's chambers (c, 2), in m^3.
+
+    All may be symbols too, see `stiffopt.model.layout`.
     """
 
-    area: float
-    centroid: NDArray[np.float64]
-    second_moment: NDArray[np.float64]
-    channel_force: NDArray[np.float64]
-    channel_moment: NDArray[np.float64]
+    area: Any
+    centroid: Any
+    second_moment: Any
+    channel_force: Any
+    channel_moment: Any
+
+    @property
+    def is_eccentric(self) -> bool:
+        """Whether the centroid may lie beside the axis."""
+        return not ca.SX(self.centroid).is_zero()
+
+    def turned(self, azimuth: NDArray[np.float64]) -> SectionGeometry:
+        """The same section with the lever arms of its channels turned about the axis.
+
+        Parameters
+        ----------
+        azimuth :
+            Of each channel (c,), from x towards y, in rad; empty for none.
+        """
+        if not azimuth.any():
+            return self
+        c, s = np.cos(azimuth), np.sin(azimuth)
+        x, y = self.channel_moment.T
+        return replace(self, channel_moment=np.stack([c * x - s * y, s * x + c * y], axis=1))
 
     @classmethod
     def of(cls, segment: Segment) -> SectionGeometry:
@@ -187,9 +208,9 @@ class StrainLaw(ABC):
                     raise TypeError(f"the strain laws {cls.name!r} and {other.name!r} share {key}")
         cls.registered[cls.name] = cls
 
-    def __init__(self, segment: Segment) -> None:
+    def __init__(self, segment: Segment, geometry: SectionGeometry | None = None) -> None:
         self.segment = segment
-        self.geometry = SectionGeometry.of(segment)
+        self.geometry = geometry or SectionGeometry.of(segment)
         self.compensation = segment.compensation or Compensation()
         self.keys: Any = segment.law or (self.Keys() if self.Keys is not None else None)
 
@@ -277,18 +298,18 @@ class StrainLaw(ABC):
 
     def _axial_force(self, acting: ca.SX) -> ca.SX:
         """Force of the acting pressures on the section, ``f_z = sum P A_c``, in N."""
-        return ca.dot(ca.DM(self.geometry.channel_force), acting)
+        return ca.dot(ca.SX(self.geometry.channel_force), acting)
 
     def _moment_about_centroid(self, acting: ca.SX) -> ca.SX:
         """Moment (M_x, M_y) of the acting pressures about the section's centroid, in N m."""
         geometry, corrections = self.geometry, self.segment.corrections
-        lever = ca.SX(ca.sparsify(ca.DM(geometry.channel_moment.T)))  # (2, c): int r dA
+        lever = ca.sparsify(ca.SX(geometry.channel_moment.T))  # (2, c): int r dA
         if corrections is not None and len(corrections.azimuth):
             turn = ca.vertcat(*corrections.azimuth).T
             c, s = ca.cos(turn), ca.sin(turn)
             lever = ca.vertcat(c * lever[0, :] - s * lever[1, :], s * lever[0, :] + c * lever[1, :])
-        if geometry.centroid.any():
-            lever -= ca.DM(np.outer(geometry.centroid, geometry.channel_force))
+        if geometry.is_eccentric:
+            lever -= ca.SX(geometry.centroid) @ ca.SX(geometry.channel_force).T
         first = lever @ acting  # (2,): int r P dA
         return ca.vertcat(first[1], -first[0])
 
@@ -300,7 +321,7 @@ class StrainLaw(ABC):
 
     def _about_axis(self, compliance: ca.SX, centroid: ca.SX) -> ca.SX:
         """Move a compliance from the centroid to the backbone axis (eq. 16)."""
-        if not self.geometry.centroid.any():
+        if not self.geometry.is_eccentric:
             return compliance
         A = lie.adjoint(lie.transform(ca.SX.eye(3), ca.vertcat(centroid, 0)))
         return ca.sparsify(A @ compliance @ A.T)

@@ -16,14 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError, PressureError, shown
 from stiffopt.model.arguments import dead_and_follower
+from stiffopt.model.batch import BatchFunction, InterpretedFunction
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import checkpoint
 from stiffopt.model.compliance import Frame
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.equilibrium import Equilibrium, Loads, State
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import strain_law
-from stiffopt.model.native_calls import BatchFunction, InterpretedFunction
-from stiffopt.model.native_robot import TipFunctions
-from stiffopt.model.native_source import dense
+from stiffopt.model.layout import free_tip_function, layout_of, numbers_of
 from stiffopt.model.numeric import (
     checked_integer,
     checked_number,
@@ -32,6 +33,7 @@ from stiffopt.model.numeric import (
 )
 from stiffopt.model.shape import FreeShape, Shape
 from stiffopt.model.shooting import SAME_STATION, Shooting
+from stiffopt.model.tip_functions import TipFunctions
 
 Vector = NDArray[np.float64]
 Values = Callable[[Shape], Any]
@@ -55,14 +57,11 @@ class Arm:
         self.description = description
         self.resolution = checked_integer("resolution", resolution, 1)
         self._tip_load = _tip_load(force, moment, load_frame)
-        self._actuation = Actuation.of(description)
         self._functions: dict[Hashable, InterpretedFunction] = {}
         self._shared: dict[str, Equilibrium] = {}
         self._kept: dict[Hashable, Any] = {}
-        self._margin = InterpretedFunction(
-            ca.Function("margin", [self._actuation.pressures], [ca.densify(self._actuation.margin)])
-        )
-        self._tip = TipFunctions(description, self._actuation)
+        self.layout, self.numbers = layout_of(description), numbers_of(description)
+        self._tip = TipFunctions(self.layout, self.numbers)
         for corner in (self.pressure_min, self.pressure_max, self._farthest_pressures()):
             self._check_margin(corner[np.newaxis], " within the robot's pressure limits")
 
@@ -129,13 +128,21 @@ class Arm:
     def tip_function(
         self, name: str, outputs: Callable[[Shape, Any], list[Any]], n_parameters: int = 0
     ) -> ca.Function:
-        """Symbolic function of the inputs of the tip's shape and of parameters, dense."""
+        """Symbolic function of the inputs of the tip's shape and of parameters, dense.
+
+        The parameters are those of `parameters`: the arm's numbers, then the caller's own.
+        """
+        if not self.is_loaded:
+            return free_tip_function(self.layout, name, outputs, n_parameters)
         tip = self._symbolic(None)
-        parameters = type(tip.position).sym("parameters", n_parameters)
-        found = [ca.densify(output) for output in outputs(tip, parameters)]
-        if not self.is_loaded:  # there it takes seconds and finds little
-            found = ca.cse(found)
+        parameters = ca.MX.sym("parameters", len(self.numbers) + n_parameters)
+        own = parameters[len(self.numbers) :]
+        found = [ca.densify(output) for output in outputs(tip, own)]
         return dense(ca.Function(name, [*tip.inputs, parameters], found))
+
+    def parameters(self, own: ArrayLike = ()) -> Vector:
+        """Parameters of a `tip_function`: the numbers of the arm, then the caller's own."""
+        return np.concatenate([self.numbers, np.asarray(own, dtype=float)])
 
     def evaluator(
         self,
@@ -143,7 +150,7 @@ class Arm:
         outputs: Callable[[Shape, Any], list[Any]],
         n_parameters: int = 0,
     ) -> "Evaluator":
-        """Outputs of the tip's shape and of parameters; `key` names them in the cache."""
+        """Outputs of the tip's shape and of `parameters`; `key` names them in the cache."""
         return Evaluator(
             self,
             self.kept(
@@ -160,6 +167,10 @@ class Arm:
         return found
 
     # -- numerics ---------------------------------------------------------------------------
+
+    @cached_property
+    def _actuation(self) -> Actuation:
+        return Actuation.of(self.description)
 
     @property
     def _loads(self) -> Loads:
@@ -337,7 +348,8 @@ class Arm:
         """Raise where the strain law of a segment breaks down."""
         if not len(batch):
             return
-        margins = self._margin.many(batch)[0][..., 0]  # (N, segments)
+        (margins,) = self._tip.interpreted("margin").many(batch, self.numbers)
+        margins = margins[..., 0]  # (N, segments)
         if (margins > 0).all():
             return
         segment, row = np.argwhere(~(margins.T > 0))[0]
@@ -392,11 +404,12 @@ class Evaluator:
 
     def many(self, batch: Vector, *parameters: Vector) -> list[Vector]:
         """Outputs at checked pressures (N, n) of an arm without loads, each (N, rows, columns)."""
-        return self._function.many(batch, *(parameters or (np.zeros(0),)))
+        return self._function.many(batch, *(parameters or (self._arm.numbers,)))
 
     def __call__(self, p: Vector, *parameters: Vector) -> list[Vector]:
         """Outputs at checked pressures (n,) and parameters, as 2-D arrays."""
-        parameters = parameters or (np.zeros(0),)
+        checkpoint()
+        parameters = parameters or (self._arm.numbers,)
         if self._arm.is_loaded:
             self._state = self._arm.settle(p, self._state)
             inputs = self._arm._equilibrium.arguments(self._state)

@@ -4,12 +4,13 @@ A segment of constant strain is one exponential; the paper's product of five exp
 (eq. 7) is the same motion, but is undefined at zero curvature where this one is smooth.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import casadi as ca
 
 from stiffopt import lie
-from stiffopt.model.actuation import Section
+from stiffopt.model.actuation import Section, StrainLaw
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.laws import strain_law
 
@@ -33,10 +34,13 @@ class Actuation:
     margin: ca.SX
 
     @classmethod
-    def of(cls, description: RobotDescription) -> "Actuation":
-        """Symbolic actuation of a robot."""
+    def of(
+        cls, description: RobotDescription, laws: Sequence[StrainLaw] | None = None
+    ) -> "Actuation":
+        """Symbolic actuation of a robot, by the strain laws of its segments or by given ones."""
         pressures = ca.SX.sym("p", description.n_pressures)
-        laws = [strain_law(segment) for segment in description.segments]
+        if laws is None:
+            laws = [strain_law(segment) for segment in description.segments]
         offset, sections, margins = 0, [], []
         for segment, law in zip(description.segments, laws, strict=True):
             own = pressures[offset : offset + segment.n_channels]
@@ -46,9 +50,9 @@ class Actuation:
         return cls(pressures, tuple(sections), ca.vertcat(*margins))
 
 
-def connector(length: float) -> ca.SX:
+def connector(length: ca.SX | float) -> ca.SX:
     """Pose of the far end of a rigid connector in its near end."""
-    return lie.transform(ca.SX.eye(3), ca.SX([0, 0, length]))
+    return lie.transform(ca.SX.eye(3), ca.vertcat(0, 0, ca.SX(length)))
 
 
 def segment_pose(section: Section, arc_length: ca.SX | float) -> ca.SX:

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.arguments import Measure
+from stiffopt.model.batch import InterpretedFunction
+from stiffopt.model.codegen import dense
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.equilibrium import Equilibrium, Loads, State
 from stiffopt.model.kinematics import body_jacobian
-from stiffopt.model.native_calls import InterpretedFunction
-from stiffopt.model.native_source import dense
 from stiffopt.model.parameters import Parameter, parametric
 from stiffopt.model.shape import FreeShape, Shape, stiffness_along
 from stiffopt.model.shooting import Shooting

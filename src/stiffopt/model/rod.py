@@ -13,21 +13,22 @@ back, and a zero are four more.  Functions of kind k:
 * ``adjoint{k}``: (y, n, f, a, da, dy, dn, l, dl) to the derivatives of ``l'y' + dl'(y', r')_dot``
   by y (8,), n (3,), pressures (c,) and dy (8,), dn (3,), the dot along (dy, dn).
 
-`a` holds what of the section is not zero: strain, then compliance; `da` is its derivative by the
-section's own pressures.
+`a` holds what of the section is not zero: strain, compliance and centroid; `da` is its derivative
+by the section's own pressures.
 """
 
 from collections.abc import Hashable
+from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 
 from stiffopt import lie
-from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.kinematics import Actuation
-from stiffopt.model.shooting import Shooting, slopes
+from stiffopt.model.layout import Layout, symbolic_arm
+from stiffopt.model.shooting import mass_per_length, pieces_of, slopes
 
 MOST_KINDS = 4
 """Kinds of sections that the integrator in C tells apart; mirrors ``rod.h``."""
@@ -46,81 +47,91 @@ class RodPiece(NamedTuple):
     mass: float
 
 
-class Rod(NamedTuple):
-    """Functions of an arm for the integrator, and its pieces from tip to base."""
+class _Place(NamedTuple):
+    """Where a segment's section is: its kind, and where it begins in a, in da and in p."""
+
+    kind: int
+    parts: int
+    slopes: int
+    channel: int
+    channels: int
+
+
+class RodFunctions(NamedTuple):
+    """Functions of a layout for the integrator, and where each segment's section is."""
 
     functions: list[ca.Function]
-    pieces: list[RodPiece]
+    places: list[_Place]
     parts: int
     slopes: int
 
 
-def rod(description: RobotDescription, actuation: Actuation, resolution: int) -> Rod | None:
-    """Equations of an arm; None if it has more kinds of sections than can be told apart."""
-    shooting = Shooting(description, actuation, resolution)
+@lru_cache(maxsize=64)
+def rod_functions(layout: Layout) -> RodFunctions | None:
+    """Equations of the arms of a layout; None if it has more kinds of sections than C tells apart.
+
+    Functions of the pressures take the arm's numbers next.
+    """
+    arm = symbolic_arm(layout)
     kinds: dict[Hashable, int] = {}
     functions: list[ca.Function] = []
-    own_kind, first_part, first_slope, first_channel = [], [], [], []
+    places: list[_Place] = []
     parts, derivatives = [], []
     n_parts = n_slopes = start = 0
-    for segment, section in zip(description.segments, actuation.sections, strict=True):
-        own = actuation.pressures[start : start + segment.n_channels]
-        strain, compliance = ca.sparsify(section.strain), ca.sparsify(section.compliance)
-        centroid = SectionGeometry.of(segment).centroid
-        a = ca.vertcat(*strain.nonzeros(), *compliance.nonzeros())
-        key = (
-            repr(strain.sparsity()), tuple(compliance.sparsity().row()),
-            tuple(compliance.sparsity().colind()), tuple(strain.sparsity().row()),
-            segment.n_channels, centroid.tobytes(),
-        )  # fmt: skip
+    segments = layout.example.segments
+    for segment, section, at in zip(segments, arm.actuation.sections, arm.centroids, strict=True):
+        own = arm.actuation.pressures[start : start + segment.n_channels]
+        patterns = [ca.sparsify(part) for part in (section.strain, section.compliance, at)]
+        a = ca.vertcat(*(value for part in patterns for value in part.nonzeros()))
+        shapes = [(tuple(part.sparsity().row()), tuple(part.sparsity().colind()))
+                  for part in patterns]  # fmt: skip
+        key = (*shapes, segment.n_channels)
         if key not in kinds:
             if len(kinds) == MOST_KINDS:
                 return None
             kinds[key] = len(kinds)
-            functions += _kind(
-                kinds[key], strain.sparsity(), compliance.sparsity(), centroid, segment.n_channels
-            )
-        own_kind.append(kinds[key])
-        first_part.append(n_parts)
-        first_slope.append(n_slopes)
-        first_channel.append(start)
+            sparsities = [part.sparsity() for part in patterns]
+            functions += _kind(kinds[key], sparsities, segment.n_channels)
+        places.append(_Place(kinds[key], n_parts, n_slopes, start, segment.n_channels))
         parts.append(a)
         derivatives.append(ca.vec(ca.densify(ca.jacobian(a, own))))
         n_parts += a.numel()
         n_slopes += a.numel() * segment.n_channels
         start += segment.n_channels
-    sections = _function(
-        "sections", [actuation.pressures], [ca.vertcat(*parts), ca.vertcat(*derivatives)]
-    )
+    inputs = [arm.actuation.pressures, arm.numbers]
+    sections = _function("sections", inputs, [ca.vertcat(*parts), ca.vertcat(*derivatives)])
+    least = _function("margin", inputs, [ca.mmin(arm.actuation.margin)])
+    return RodFunctions([sections, least, *functions, *_ends()], places, n_parts, n_slopes)
+
+
+def rod_pieces(
+    description: RobotDescription, resolution: int, functions: RodFunctions
+) -> list[RodPiece]:
+    """Pieces of an arm from its tip to its base."""
     pieces = []
-    for piece in shooting.pieces([]):
-        k = piece.segment
+    for piece in pieces_of(description, resolution):
         if piece.rigid:
             pieces.append(RodPiece(-1, 0, 0, 0, 0, 0, piece.length, 0.0))
             continue
-        where = (own_kind[k], first_part[k], first_slope[k], first_channel[k])
-        channels, step = description.segments[k].n_channels, piece.length / piece.steps
-        pieces.append(RodPiece(*where, channels, piece.steps, step, shooting.weight(k)))
-    return Rod([sections, *functions, *_ends()], pieces, n_parts, n_slopes)
+        step = piece.length / piece.steps
+        mass = mass_per_length(description.segments[piece.segment])
+        pieces.append(RodPiece(*functions.places[piece.segment], piece.steps, step, mass))
+    return pieces
 
 
 def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
     return ca.Function(name, inputs, ca.cse([ca.densify(output) for output in outputs]))
 
 
-def _kind(
-    kind: int,
-    strain_pattern: ca.Sparsity,
-    compliance_pattern: ca.Sparsity,
-    centroid: np.ndarray,
-    channels: int,
-) -> list[ca.Function]:
-    """Functions of one kind of section."""
+def _kind(kind: int, patterns: list[ca.Sparsity], channels: int) -> list[ca.Function]:
+    """Functions of one kind of section, by the sparsity of its strain, compliance and centroid."""
     y, n, f = ca.SX.sym("y", 7), ca.SX.sym("n", 3), ca.SX.sym("f", 3)
-    size = strain_pattern.nnz() + compliance_pattern.nnz()
-    a, da = ca.SX.sym("a", size), ca.SX.sym("da", size, channels)
-    strain = ca.SX(strain_pattern, a[: strain_pattern.nnz()])
-    compliance = ca.SX(compliance_pattern, a[strain_pattern.nnz() :])
+    ends = np.cumsum([0, *(pattern.nnz() for pattern in patterns)])
+    a, da = ca.SX.sym("a", ends[-1]), ca.SX.sym("da", ends[-1], channels)
+    strain, compliance, centroid = (
+        ca.SX(pattern, a[int(start) : int(end)])
+        for pattern, (start, end) in zip(patterns, pairwise(ends), strict=True)
+    )
     turning, tangent, moment = slopes(y[:4], y[4:], n, f, strain, compliance, centroid)
     none = ca.SX.zeros(1)
     short = ca.vertcat(turning, moment, none)

@@ -96,7 +96,7 @@ class Piece:
         Those (c,) that it depends on.
     section : Section or None
         None if it is rigid.
-    length : float
+    length : float or casadi.SX
         At rest, in m.
     """
 
@@ -104,7 +104,7 @@ class Piece:
     half: ca.SX
     pressures: ca.SX
     section: Section | None
-    length: float
+    length: ca.SX | float
 
 
 @dataclass(frozen=True)
@@ -127,18 +127,20 @@ class FreeShape:
         cls, description: RobotDescription, actuation: Actuation, at: float | None = None
     ) -> "FreeShape":
         """Shape at arc length `at` at rest, from the base (None: the tip)."""
-        left = description.length if at is None else at
+        left = at
         pieces, start = [], 0
         for segment, section in zip(description.segments, actuation.sections, strict=True):
             own = actuation.pressures[start : start + segment.n_channels]
             start += segment.n_channels
-            soft = min(segment.length, left)
-            rigid = min(segment.connector, left - soft)
-            left -= soft + rigid
-            if soft > 0:
+            soft, rigid = segment.length, segment.connector
+            if left is not None:
+                soft = min(soft, left)
+                rigid = min(rigid, left - soft)
+                left -= soft + rigid
+            if _may_be_positive(soft):
                 motion, half = segment_pose(section, soft), segment_pose(section, soft / 2)
                 pieces.append(Piece(motion, half, own, section, soft))
-            if rigid > 0:
+            if _may_be_positive(rigid):
                 pieces.append(Piece(connector(rigid), connector(rigid / 2), own[:0], None, rigid))
         return cls(actuation.pressures, tuple(pieces))
 
@@ -234,6 +236,10 @@ def stiffness_along(
     return directional_stiffness(
         shape.compliance, shape.rotation, direction, frame=frame, kind=kind, boundary=boundary
     )
+
+
+def _may_be_positive(length: ca.SX | float) -> bool:
+    return isinstance(length, ca.SX) or length > 0
 
 
 def _moved_back(T: ca.SX, wrench: ca.SX) -> ca.SX:

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.compliance import inverse_3x3
-from stiffopt.model.description import RobotDescription
+from stiffopt.model.description import RobotDescription, Segment
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.shape import PointOfArm
 
@@ -112,15 +112,16 @@ def slopes(
     weight: ca.SX,
     strain: ca.SX,
     compliance: ca.SX,
-    centroid: Vector,
+    centroid: ca.SX | Vector,
 ) -> tuple[ca.SX, ca.SX, ca.SX]:
     """Right-hand sides q' and m' of the rod's equations and the tangent -r', per length."""
     R = lie.rotation_from_quaternion(q)
     xi = strain + compliance @ ca.vertcat(R.T @ force, R.T @ m)
     tangent = R @ xi[:3]
     moment = ca.cross(tangent, force)
-    if centroid.any():
-        moment += ca.cross(R @ ca.vertcat(*centroid, 0), weight)
+    centroid = ca.SX(centroid)
+    if not centroid.is_zero():
+        moment += ca.cross(R @ ca.vertcat(centroid, 0), weight)
     return -0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), tangent, moment
 
 
@@ -295,6 +296,30 @@ class Chain:
         return ca.horzcat(*blocks)
 
 
+def pieces_of(
+    description: RobotDescription, resolution: int, cuts: Sequence[float] = ()
+) -> list[Piece]:
+    """The arm from tip to base, cut at the given arc lengths."""
+    pieces: list[Piece] = []
+    start, slack = 0.0, SAME_STATION * description.length
+    for index, segment in enumerate(description.segments):
+        for length, rigid in ((segment.length, False), (segment.connector, True)):
+            end = start + length
+            inside = sorted(c for c in cuts if start + slack < c < end - slack)
+            for near, far in pairwise([start, *inside, end]):
+                if far - near > slack:
+                    longest = STEP_LENGTH * segment.outer_radius / resolution
+                    steps = max(1, ceil((far - near) / longest - 1e-9))
+                    pieces.append(Piece(index, rigid, far - near, steps, far))
+            start = end
+    return pieces[::-1]
+
+
+def mass_per_length(segment: Segment) -> float:
+    """Mass of a segment per length at rest, in kg/m."""
+    return float((segment.material.density or 0.0) * SectionGeometry.of(segment).area)
+
+
 class Shooting:
     """Symbolic shooting problem of one robot, its weight and payload included.
 
@@ -335,19 +360,7 @@ class Shooting:
 
     def pieces(self, cuts: Sequence[float]) -> list[Piece]:
         """The arm from tip to base, cut at the given arc lengths."""
-        pieces: list[Piece] = []
-        start, slack = 0.0, SAME_STATION * self.description.length
-        for index, segment in enumerate(self.description.segments):
-            for length, rigid in ((segment.length, False), (segment.connector, True)):
-                end = start + length
-                inside = sorted(c for c in cuts if start + slack < c < end - slack)
-                for near, far in pairwise([start, *inside, end]):
-                    if far - near > slack:
-                        longest = STEP_LENGTH * segment.outer_radius / self.resolution
-                        steps = max(1, ceil((far - near) / longest - 1e-9))
-                        pieces.append(Piece(index, rigid, far - near, steps, far))
-                start = end
-        return pieces[::-1]
+        return pieces_of(self.description, self.resolution, cuts)
 
     def chain(self, at: float | None = None) -> Chain:
         """Symbolic shooting map with the station at arc length `at` (None: the tip)."""
@@ -404,5 +417,4 @@ class Shooting:
 
     def weight(self, segment: int) -> float:
         """Mass per reference length of a segment, in kg/m."""
-        density = self.description.segments[segment].material.density or 0.0
-        return density * self._geometry[segment].area
+        return mass_per_length(self.description.segments[segment])

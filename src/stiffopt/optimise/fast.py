@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.native_calls import in_parallel
 from stiffopt.optimise.loaded import LoadedArm
 from stiffopt.optimise.program import Program, pressure_ranges
 from stiffopt.optimise.samples import SampleTable
@@ -141,7 +141,7 @@ class FastSolver:
             terms=program.n_terms,
             floors=program.n_floors,
             values=len(program.measures),
-            parameters=program.n_parameters,
+            parameters=len(robot.numbers) + program.n_parameters,
             near=len(program.terms),
             samples=len(table.pressures),
             ball_rows=ball_rows,
@@ -166,8 +166,9 @@ class FastSolver:
             setup.rod = arm.address
         self._setup = setup
         self._address = ctypes.addressof(setup)
-        targets = len(program.target_parameters)
-        self._targets = slice(0, targets)
+        self._numbers = robot.numbers
+        first = len(robot.numbers)
+        self._targets = slice(first, first + len(program.target_parameters))
         self._radii = slice(setup.parameters, setup.parameters + len(constraints))
         limits = self._radii.stop + 2 * n
         self._near = slice(
@@ -181,6 +182,7 @@ class FastSolver:
     def row(self, program: Program, lower: Vector, upper: Vector, floors: Vector) -> Vector:
         """Numbers of a task, its target and guess left out."""
         row = np.zeros(self._width)
+        row[: self._targets.start] = self._numbers
         start = self._targets.stop
         row[start : self._radii.start] = program.measure_parameters
         row[self._radii.stop : self._near.start] = np.concatenate([lower, upper, floors])

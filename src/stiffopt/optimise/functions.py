@@ -1,13 +1,15 @@
 """The functions of a task structure on one arm: machine code where that can be had."""
 
-from functools import cached_property
+from collections.abc import Hashable
+from functools import cached_property, partial
 from pathlib import Path
 
 import casadi as ca
 
+from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.compiled import Library, library
+from stiffopt.model.layout import Layout, free_tip_function
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.native_calls import BatchFunction, InterpretedFunction
 from stiffopt.optimise.program import Program
 
 _SOURCES = (str(Path(__file__).with_name("native") / "solver.c"),)
@@ -16,23 +18,29 @@ _MOST_MEASURES = 6  # of more, code takes too long to compile: the general metho
 
 
 class Functions:
-    """Those of `Program`, on the inputs of the tip's shape and the program's parameters.
+    """Those of `Program`, on the inputs of the tip's shape and `Arm.parameters` of the program's.
 
     From the library, or each made in the CasADi VM when it is first asked for.
-
-    Attributes
-    ----------
-    library : Library or None
-        Machine code of an arm without loads, with the compiled solver; None for the VM.
     """
 
     def __init__(self, robot: Manipulator, program: Program) -> None:
         self._robot = robot
         self._program = program
-        self.library: Library | None = None
-        if not robot.is_loaded and len(program.measures) <= _MOST_MEASURES:
-            content = (robot.description.model_dump_json(), program.structure)
-            self.library = library(content, self._symbolic, _SOURCES, daqp=True)
+        self._library: Library | None = None
+
+    @property
+    def library(self) -> Library | None:
+        """Machine code of an arm without loads, with the compiled solver; None for the VM."""
+        robot, program = self._robot, self._program
+        if (
+            self._library is None
+            and not robot.is_loaded
+            and len(program.measures) <= _MOST_MEASURES
+        ):
+            content = (robot.layout.skeleton, program.structure)
+            make = partial(_free_functions, robot.layout, program)
+            self._library = library(content, make, _SOURCES, daqp=True)
+        return self._library
 
     @cached_property
     def pose(self) -> BatchFunction:
@@ -57,14 +65,35 @@ class Functions:
     def _function(self, name: str) -> BatchFunction:
         if self.library is not None:
             return self.library.function(name)
-        return InterpretedFunction(self._formula(name))
-
-    def _symbolic(self) -> list[ca.Function]:
-        return [self._formula(name) for name in _COMPILED]
-
-    def _formula(self, name: str) -> ca.Function:
         outputs = getattr(self._program, name)
-        return self._robot.tip_function(name, outputs, self._program.n_parameters)
+        if self._robot.is_loaded:
+            formula = self._robot.tip_function(name, outputs, self._program.n_parameters)
+            return InterpretedFunction(formula)
+        return _interpreted(self._robot.layout, self._program.structure, name, self._program)
+
+
+def _free_functions(layout: Layout, program: Program) -> list[ca.Function]:
+    return [_formula(layout, program, name) for name in _COMPILED]
+
+
+def _formula(layout: Layout, program: Program, name: str) -> ca.Function:
+    return free_tip_function(layout, name, getattr(program, name), program.n_parameters)
+
+
+_in_vm: dict[Hashable, InterpretedFunction] = {}
+_MOST_IN_VM = 256
+
+
+def _interpreted(
+    layout: Layout, structure: Hashable, name: str, program: Program
+) -> InterpretedFunction:
+    """One of the functions in the CasADi VM; arms of one layout share it."""
+    key = (layout, structure, name)
+    if key not in _in_vm:
+        while len(_in_vm) >= _MOST_IN_VM:
+            _in_vm.pop(next(iter(_in_vm)), None)
+        _in_vm[key] = InterpretedFunction(_formula(layout, program, name))
+    return _in_vm[key]
 
 
 def functions(robot: Manipulator, program: Program) -> Functions:

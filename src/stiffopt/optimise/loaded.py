@@ -6,6 +6,7 @@ pose terms and measures are functions of the tip, see `tip_functions`.
 
 import ctypes
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError
+from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library, library
-from stiffopt.model.kinematics import Actuation
+from stiffopt.model.layout import Layout, symbolic_arm
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.native_calls import in_parallel
-from stiffopt.model.rod import Rod, rod
+from stiffopt.model.rod import rod_functions, rod_pieces
 from stiffopt.model.shape import PointOfArm
 from stiffopt.optimise.program import Program
 
@@ -83,16 +84,17 @@ class Tip:
         return ca.horzcat(ca.jacobian(values, self.position) @ self.rotation, *by_turn)
 
 
-def tip_functions(program: Program, n_pressures: int) -> list[ca.Function]:
-    """Functions of a tip (see `Tip`) and a program's parameters.
+def tip_functions(program: Program, layout: Layout) -> list[ca.Function]:
+    """Functions of a tip (see `Tip`) and of parameters: the arm's numbers, then the program's own.
 
     ``residuals``: values (m,) and derivative by a twist (m, 6); ``terms``: terms and floors
     (k,), derivatives by a twist (k, 6), by the compliance (k, 36) and by pressures (k, n);
     ``judge``: as `Program.judge`.
     """
-    tip = Tip(n_pressures)
+    arm = symbolic_arm(layout)
+    tip = Tip(arm.tip.pressures.numel())
     parameters = ca.SX.sym("parameters", program.n_parameters)
-    inputs = [*tip.inputs, parameters]
+    inputs = [*tip.inputs, ca.vertcat(arm.numbers, parameters)]
     residuals, _, terms, _, floors, _ = program.point(tip, parameters)
     terms = ca.vertcat(*terms.elements(), *(floors.elements() if program.n_floors else ()))
 
@@ -128,6 +130,7 @@ class _Rod(ctypes.Structure):
     _fields_ = [
         *((name, _integer) for name in ("n", "pieces", "steps", "parts", "slopes")),
         ("piece", ctypes.POINTER(_Piece)),
+        ("numbers", _pointer),
         ("gravity", _double * 3),
         ("load", _double * 12),
         ("tip_mass", _double),
@@ -135,35 +138,25 @@ class _Rod(ctypes.Structure):
     ]
 
 
-def rod_equations(robot: Manipulator) -> Rod | None:
-    """Equations of an arm for the integrator in C; None if that cannot serve it."""
-
-    def make() -> Rod | None:
-        return rod(robot.description, Actuation.of(robot.description), robot.resolution)
-
-    return robot.kept("rod", make)
-
-
 def loaded_library(robot: Manipulator, program: Program) -> Library | None:
     """Machine code for tasks of the program's structure on this arm under any load."""
-    equations = rod_equations(robot)
-    if equations is None:
+    if rod_functions(robot.layout) is None:
         return None
     known: dict[object, Library] = robot.kept("loaded libraries", dict)
     if program.structure in known:
         return known[program.structure]
-    content = (
-        robot.description.model_dump_json(), robot.resolution, program.structure, "loaded"
-    )  # fmt: skip
-    found = library(
-        content,
-        lambda: [*equations.functions, *tip_functions(program, robot.n_pressures)],
-        _SOURCES,
-        daqp=True,
-    )
+    content = (robot.layout.skeleton, program.structure, "loaded")
+    make = partial(_functions, robot.layout, program)
+    found = library(content, make, _SOURCES, daqp=True)
     if found is not None:  # else another thread may be compiling
         known[program.structure] = found
     return found
+
+
+def _functions(layout: Layout, program: Program) -> list[ca.Function]:
+    equations = rod_functions(layout)
+    assert equations is not None  # or nobody would ask
+    return [*equations.functions, *tip_functions(program, layout)]
 
 
 class LoadedArm:
@@ -183,21 +176,23 @@ class LoadedArm:
     """
 
     def __init__(self, code: Library, robot: Manipulator) -> None:
-        equations = rod_equations(robot)
+        equations = rod_functions(robot.layout)
         if equations is None:
             raise EquilibriumError("this arm has no compiled equations")
-        self._library = code
-        pieces = (_Piece * len(equations.pieces))(*(_Piece(*p) for p in equations.pieces))
-        steps = sum(piece.steps for piece in equations.pieces)
+        self._library, self._numbers = code, robot.numbers  # what pointers below lead to
+        found = rod_pieces(robot.description, robot.resolution, equations)
+        pieces = (_Piece * len(found))(*(_Piece(*piece) for piece in found))
+        steps = sum(piece.steps for piece in found)
         self.state_size = robot.n_pressures + 4 + 7 * steps
         self._hanging = np.zeros(self.state_size)
         self._rod = _Rod(
             n=robot.n_pressures,
-            pieces=len(equations.pieces),
+            pieces=len(found),
             steps=steps,
             parts=equations.parts,
             slopes=equations.slopes,
             piece=pieces,
+            numbers=self._numbers.ctypes.data,
             gravity=(_double * 3)(*robot.description.gravity),
             load=(_double * 12)(*robot.tip_load),
             tip_mass=robot.description.tip_mass,

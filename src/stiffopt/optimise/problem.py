@@ -197,7 +197,7 @@ class PressureProblem:
         self.lower, self.upper = lower / self.unit, upper / self.unit
         self.radii: dict[str, float] = {}
         self.program = Program.of(task.target, task.stiffness, robot.description)
-        self.parameters = self.program.parameters
+        self.parameters = robot.parameters(self.program.parameters)
         self._functions = functions(robot, self.program)
         self._is_loaded = robot.is_loaded
         self._pose = Evaluator(robot, self._functions.pose)

@@ -316,7 +316,7 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     """
     program = Program.of(task.target, task.stiffness, robot.description)
     found = Evaluator(robot, functions(robot, program).judge)
-    residuals, pose, compliance, values = found(pressures, program.parameters)
+    residuals, pose, compliance, values = found(pressures, robot.parameters(program.parameters))
     lower, upper = task.pressure_bounds(robot.description)
     within = are_within(pressures, lower, upper)
     numbers = (residuals.ravel().tolist(), pose.T, compliance.T, values.ravel().tolist())

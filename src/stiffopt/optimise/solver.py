@@ -1,6 +1,7 @@
 """From a task to the stiffest pressures: global search, judgement and diagnosis."""
 
 from collections.abc import Iterable
+from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -8,6 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import EquilibriumError, InputError, shown
+from stiffopt.model.compiled import (
+    CodeReadyError,
+    compilation_is_held_off,
+    compiling_at_once,
+    until_ready,
+)
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer, checked_vector
 from stiffopt.optimise import diagnosis
@@ -60,7 +67,7 @@ class PressureSolver:
             raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
         if not isinstance(task, Task):
             raise InputError(f"task must be a Task, see load_task; got {shown(task)}")
-        self.task = task
+        self.task, self._given = task, robot
         self.seed = checked_integer("seed", seed, 0)
         self._prepared = prepared(robot, task, self.seed)
         self.robot = self._prepared.robot
@@ -112,8 +119,19 @@ class PressureSolver:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether there is compiled code for the task; compiles it."""
+        """Whether there is compiled code for the task; if not, it is made in the background."""
         return self._fast(self.task, None) is not None
+
+    def compile(self) -> bool:
+        """Wait for compiled code for the task, unless an arm is armed; return `is_compiled`."""
+        if not compilation_is_held_off():
+            with compiling_at_once():
+                return self.is_compiled
+        return self.is_compiled
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Support pickling: the arm and the task are kept, and what was prepared is made anew."""
+        return partial(PressureSolver, seed=self.seed), (self._given, self.task)
 
     def _compiled(
         self, task: Task, guess: Vector | None, limits: tuple[Vector, Vector] | None = None
@@ -167,6 +185,15 @@ class PressureSolver:
         )
 
     def _general(self, task: Task, guess: Vector | None) -> PressureSolution:
+        """Answer of the general method, or of the compiled solver if its code comes meanwhile."""
+        awaited = self._fast(task, None) is None
+        try:
+            with until_ready(lambda: awaited and self._fast(task, None) is not None):
+                return self._solve_generally(task, guess)
+        except CodeReadyError:
+            return self._compiled(task, guess) or self._solve_generally(task, guess)
+
+    def _solve_generally(self, task: Task, guess: Vector | None) -> PressureSolution:
         try:
             return self._solve(PressureProblem(self.robot, task), guess)
         except EquilibriumError as error:
@@ -431,7 +458,10 @@ def solve_batch(
     solutions = []
     for index, (solver, task, guess) in enumerate(zip(solvers, tasks, checked, strict=True)):
         started = perf_counter()
-        solution = found.get(index) or solver._general(task, guess)
+        solution = found.get(index)
+        if index not in found:  # there was no code then; there may be now
+            solution = solver._compiled(task, guess)
+        solution = solution or solver._general(task, guess)
         solution.timings["total"] = share + perf_counter() - started
         solutions.append(solution)
     return solutions

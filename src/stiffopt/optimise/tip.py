@@ -5,6 +5,7 @@ under gravity or loads.  Here an equilibrium is found from the one before, in ma
 """
 
 import ctypes
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -13,11 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.compiled import CompiledFunction, Library, library
-from stiffopt.model.kinematics import Actuation
+from stiffopt.model.compiled import CompiledFunction, Library, compiling_at_once, library
+from stiffopt.model.layout import Layout
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.shape import FreeShape
-from stiffopt.optimise.loaded import LoadedArm, rod_equations
+from stiffopt.model.rod import rod_functions
+from stiffopt.model.tip_functions import tip_formulas
+from stiffopt.optimise.loaded import LoadedArm
 
 Vector = NDArray[np.float64]
 
@@ -68,8 +70,9 @@ class TipModel:
     Attributes
     ----------
     is_fast : bool
-        Whether machine code serves the calls; without a compiler the model itself does, from
-        rest each time, which takes milliseconds for a loaded arm.
+        Whether machine code serves the calls, which is compiled when an instance is made; without
+        a compiler the model itself does, from rest each time, which takes milliseconds for a
+        loaded arm.
 
     Raises
     ------
@@ -79,7 +82,8 @@ class TipModel:
 
     def __init__(self, robot: Manipulator) -> None:
         self._robot = robot
-        way = _loaded_way(robot) if robot.is_loaded else _free_way(robot)
+        with compiling_at_once():
+            way = _loaded_way(robot) if robot.is_loaded else _free_way(robot)
         self.is_fast = way is not None
         self._way = way or _no_way
 
@@ -112,11 +116,11 @@ def _no_way(pressures: Vector) -> TipAt | None:
 class _FreeTip:
     """Closed form, in machine code."""
 
-    def __init__(self, function: CompiledFunction) -> None:
-        self._function = function
+    def __init__(self, function: CompiledFunction, numbers: Vector) -> None:
+        self._function, self._numbers = function, numbers
 
     def __call__(self, pressures: Vector) -> TipAt | None:
-        pose, jacobian, compliance, margin = self._function(pressures)
+        pose, jacobian, compliance, margin = self._function(pressures, self._numbers)
         return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
 
 
@@ -154,29 +158,23 @@ class _LoadedTip:
 
 
 def _free_way(robot: Manipulator) -> _Way | None:
-    def make() -> list[ca.Function]:
-        actuation = Actuation.of(robot.description)
-        tip = FreeShape.of(robot.description, actuation)
-        outputs = [tip.transform, tip.jacobian, tip.compliance, ca.mmin(actuation.margin)]
-        outputs = ca.cse([ca.densify(output) for output in outputs])
-        return [ca.Function("tip_at", [actuation.pressures], outputs)]
+    code = library(("free tip", robot.layout.skeleton), partial(_free_function, robot.layout))
+    return None if code is None else _FreeTip(code.function("tip_at"), robot.numbers)
 
-    code = library(("free tip", robot.description.model_dump_json()), make)
-    return None if code is None else _FreeTip(code.function("tip_at"))
+
+def _free_function(layout: Layout) -> list[ca.Function]:
+    return [tip_formulas(layout).function("tip_at")]
 
 
 def _loaded_way(robot: Manipulator) -> _Way | None:
-    equations = rod_equations(robot)
-    if equations is None:  # more kinds of sections than the code in C tells apart
+    if rod_functions(robot.layout) is None:
         return None
-
-    def make() -> list[ca.Function]:
-        actuation = Actuation.of(robot.description)
-        least = ca.densify(ca.mmin(actuation.margin))
-        margin = ca.Function("margin", [actuation.pressures], [least])
-        needed = [each for each in equations.functions if "adjoint" not in each.name()]
-        return [margin, *needed]
-
-    content = ("loaded tip", robot.description.model_dump_json(), robot.resolution)
+    content, make = ("loaded tip", robot.layout.skeleton), partial(_loaded_functions, robot.layout)
     code = library(content, make, _SOURCES)
     return None if code is None else _LoadedTip(code, robot)
+
+
+def _loaded_functions(layout: Layout) -> list[ca.Function]:
+    equations = rod_functions(layout)
+    assert equations is not None  # or nobody would ask
+    return [each for each in equations.functions if "adjoint" not in each.name()]

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.directions import direction_name
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.model.arguments import Measure, checked_measure
-from stiffopt.model.compiled import BatchFunction, interpreted, library
+from stiffopt.model.compiled import BatchFunction, compiling_at_once, interpreted, library
 from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer, checked_number
@@ -301,7 +301,7 @@ class MapPlan:
 
     def _in_closed_form(self, pressures: Vector) -> tuple[Vector, Vector]:
         """Positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
-        position, stiffness = self._function.many(pressures, np.zeros(0), threads=1)
+        position, stiffness = self._function.many(pressures, self.robot.numbers, threads=1)
         return position[:, :, 0], np.ascontiguousarray(stiffness[:, :, 0].T)
 
     def _at_equilibria(self, pressures: Vector) -> tuple[Vector, Vector]:
@@ -326,9 +326,10 @@ class MapPlan:
             return [self.robot.tip_function(_NAME, self._outputs)]
 
         def make() -> BatchFunction:
-            description = self.robot.description.model_dump_json()
+            content = (_NAME, self.robot.layout.skeleton, self.measures)
             pays = self.total >= TUNING.compiled_from
-            code = library((_NAME, description, self.measures), functions, build_missing=pays)
+            with compiling_at_once():
+                code = library(content, functions, build_missing=pays)
             return interpreted(functions)[_NAME] if code is None else code.function(_NAME)
 
         return self.robot.kept((_NAME, self.measures), make)

@@ -11,7 +11,7 @@ import pkgutil
 from functools import cache
 
 from stiffopt.errors import InputError, shown
-from stiffopt.model.actuation import StrainLaw
+from stiffopt.model.actuation import SectionGeometry, StrainLaw
 from stiffopt.model.description import Segment
 
 __all__ = ["law_class", "strain_law", "strain_laws"]
@@ -45,6 +45,6 @@ def law_class(name: str) -> type[StrainLaw]:
     return laws[name]
 
 
-def strain_law(segment: Segment) -> StrainLaw:
-    """Return the strain law of a segment."""
-    return law_class(segment.strain_law)(segment)
+def strain_law(segment: Segment, geometry: SectionGeometry | None = None) -> StrainLaw:
+    """Return the strain law of a segment, with its own geometry or a given one."""
+    return law_class(segment.strain_law)(segment, geometry)

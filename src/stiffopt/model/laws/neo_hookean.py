@@ -62,7 +62,7 @@ class NeoHookeanLaw(StrainLaw):
         """Section about the stretched state; see `StrainLaw.section`."""
         geometry = self.geometry
         area = self.compensation.area * geometry.area
-        inertia = self.compensation.inertia * ca.DM(geometry.second_moment)
+        inertia = self.compensation.inertia * ca.SX(geometry.second_moment)
         acting = self._acting(p)
         stretch = neo_hookean_stretch(self._load(acting))
         rise = 1 + 2 * stretch**-3  # E_t / mu

@@ -35,14 +35,14 @@ class LinearLaw(StrainLaw):
         """Section of eqs 8-10; see `StrainLaw.section`."""
         geometry = self.geometry
         area = self.compensation.area * geometry.area
-        inertia = self.compensation.inertia * ca.DM(geometry.second_moment)
+        inertia = self.compensation.inertia * ca.SX(geometry.second_moment)
         acting = self._acting(p)
         E = self._modulus(acting)
         loaded = self._loaded_modulus(acting)
         G = loaded / (2 * (1 + self.segment.material.poisson_ratio))
         force, moment = self._axial_force(acting), self._moment_about_centroid(acting)
         kappa, flexibility = self._bent(
-            ca.inv_minor(bending_matrix(ca.SX(inertia))) @ moment / E,
+            ca.inv_minor(bending_matrix(inertia)) @ moment / E,
             ca.inv_minor(loaded * bending_matrix(inertia)),
         )
         compliance = self._about_axis(

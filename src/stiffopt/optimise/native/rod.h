@@ -48,6 +48,7 @@ typedef struct {
 typedef struct {
     int64_t n, pieces, steps, parts, slopes;
     const RodPiece *piece; /* from the tip to the base */
+    const double *numbers; /* of the arm, see `stiffopt.model.layout` */
     double gravity[3], load[12], tip_mass;
     const double *hanging; /* state (rod_state_size) of the unpressurised arm under its weight */
 } Rod;
@@ -337,8 +338,9 @@ static int rigid_stretch(const Work *work, const RodPiece *piece, int rows, Carr
 }
 
 /* Sections at a condition: a (parts) and its derivatives (slopes). */
-static int sections_at(const Work *work, const Condition *at, double *a, double *da) {
-    work->arg[0] = at->pressures, work->res[0] = a, work->res[1] = da;
+static int sections_at(const Work *work, const Rod *rod, const Condition *at, double *a,
+                       double *da) {
+    work->arg[0] = at->pressures, work->arg[1] = rod->numbers, work->res[0] = a, work->res[1] = da;
     return !sections(work->arg, work->res, work->iw, work->w, 0);
 }
 
@@ -523,7 +525,7 @@ static double follow(const Work *work, const Rod *rod, const Condition *start, c
         for (int i = 0; i < 3; i++)
             at.gravity[i] = (1 - to) * start->gravity[i] + to * end->gravity[i];
         memcpy(trial, state, sizeof trial);
-        if (sections_at(work, &at, a, da) && correct(work, rod, &at, a, trial) &&
+        if (sections_at(work, rod, &at, a, da) && correct(work, rod, &at, a, trial) &&
             (!stable || is_stable(work, rod, &at, a, trial))) {
             memcpy(state, trial, sizeof trial);
             share = to;
@@ -583,7 +585,7 @@ static int tip_pose(const Work *work, const Rod *rod, const double *state, doubl
     double dn[9], Y[TURNS * 8], X[TURNS * 4], a[rod->parts], da[rod->slopes];
     Condition at = condition_of(rod, state);
     Carried c = {.directions = TURNS, .Y = Y, .X = X};
-    if (!sections_at(work, &at, a, da)) return 0;
+    if (!sections_at(work, rod, &at, a, da)) return 0;
     if (!start_at_tip(work, rod, &at, state + rod->n, dn, pose + 3, &c)) return 0;
     memset(X, 0, sizeof X);
     c.directions = c.forced = 0;
@@ -646,7 +648,7 @@ static int linearise(const Work *work, const Rod *rod, const double *state, Line
     double Y[8 * most], X[4 * most], R[9];
     memset(X, 0, sizeof X), memset(Y, 0, sizeof Y), memset(l->dn, 0, sizeof l->dn);
     Carried c = {.directions = FIRST, .Y = Y, .X = X};
-    if (!sections_at(work, &at, l->a, l->da)) return 0;
+    if (!sections_at(work, rod, &at, l->a, l->da)) return 0;
     if (!start_at_tip(work, rod, &at, l->state + rod->n, l->dn, R, &c)) return 0;
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) l->R[3 * i + j] = R[3 * j + i];

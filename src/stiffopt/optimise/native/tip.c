@@ -77,7 +77,7 @@ int stiffopt_tip(const Rod *rod, const double *pressures, double *state, double 
     double *res[WORK_RES], w[WORK_W + 1], least;
     casadi_int iw[WORK_IW + 1];
     Work work = {arg, res, iw, w};
-    arg[0] = pressures, res[0] = &least;
+    arg[0] = pressures, arg[1] = rod->numbers, res[0] = &least;
     if (margin(arg, res, iw, w, 0) || !(least > 0)) return BEYOND_LAW;
     Linear l = linear_in(rod, memory);
     if ((!isnan(state[0]) && settle_stably_nearby(&work, rod, pressures, state)) ||

@@ -1,25 +1,31 @@
 """The functions of an unloaded arm's tip, in machine code where that pays.
 
-What varies from call to call (direction, kind and boundary of a stiffness) is an argument of
-these functions, so that there is one library per robot.  Every function gives the margins of the
-strain laws beside its value, so that no second pass over a batch is needed to check them.
+Arguments of these functions are the arm's numbers (see `stiffopt.model.layout`) and what varies
+from call to call (direction, kind and boundary of a stiffness), so that one library serves all
+arms of a layout.  Every function gives the margins of the strain laws with its value, so that no
+second pass over a batch is needed to check them.
 """
 
 import threading
 from collections.abc import Callable
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.arguments import Measure
-from stiffopt.model.compiled import BatchFunction, InterpretedFunction, Library, library
+from stiffopt.model.batch import is_shared
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import (
+    BatchFunction,
+    CompiledFunction,
+    InterpretedFunction,
+    Library,
+    library,
+)
 from stiffopt.model.compliance import held_stiffness
-from stiffopt.model.description import RobotDescription
-from stiffopt.model.kinematics import Actuation
-from stiffopt.model.native_source import dense
-from stiffopt.model.shape import FreeShape
+from stiffopt.model.layout import Layout, symbolic_arm
 
 Vector = NDArray[np.float64]
 
@@ -32,42 +38,58 @@ takes, about a second, has then been spent in the VM or is about to be."""
 
 
 _BLOCK = 65_536  # rows
+_WAITING_BLOCK = 8192  # rows, while there is no machine code
 
 _Call = Callable[..., list[Vector]]
 _Ends = tuple[list[ca.SX], list[ca.SX]]  # symbols and expressions
 
 
 class TipFunctions:
-    """Functions of the tip by name (see the methods of `_Formulas`), and what builds on them.
+    """Functions of an arm's tip by name (see the methods of `TipFormulas`).
 
     Values from machine code and from the VM are the same to the last bit, so that nobody needs
     to know which it was.
     """
 
-    def __init__(self, description: RobotDescription, actuation: Actuation) -> None:
-        self._description = description
-        self._formulas = _Formulas(description, actuation)
-        self._interpreted: dict[str, InterpretedFunction] = {}
+    def __init__(self, layout: Layout, numbers: Vector) -> None:
+        self._layout, self._numbers = layout, numbers
+        self.interpreted = tip_formulas(layout).interpreted
         self._library: Library | None = None
-        self._looked_up = self._tried = False
+        self._looked_up = False
         self._rows = 0
         self._lock = threading.Lock()
 
     def one(self, name: str, *arguments: Vector) -> list[Vector]:
-        """Results, each (r, c), for one set of arguments, the pressures (n,) first."""
+        """Results, each (r, c), for one set of arguments."""
         if self._library is not None:
             return self._library.function(name)(*arguments)
-        return (self._interpreted.get(name) or self._in_vm(name))(*arguments)
+        return self.interpreted(name)(*arguments)
 
     def many(self, name: str, *arguments: Vector) -> list[Vector]:
-        """Results, each (N, r, c), for rows of arguments; see `BatchFunction.many`."""
-        return self._best(name, len(arguments[0])).many(*arguments)
+        """Results, each (N, r, c), for rows of arguments; see `BatchFunction.many`.
+
+        While machine code is made in the background, blocks of rows go to the VM.
+        """
+        count = len(arguments[0])
+        best = self._best(name, count)
+        if isinstance(best, CompiledFunction) or count <= _WAITING_BLOCK:
+            return best.many(*arguments)
+        shapes = best.signature.inputs
+        blocks = []
+        for start in range(0, count, _WAITING_BLOCK):
+            rows = min(_WAITING_BLOCK, count - start)
+            own = [
+                argument if is_shared(argument, shape) else argument[start : start + rows]
+                for argument, shape in zip(arguments, shapes, strict=True)
+            ]
+            blocks.append(self._best(name, rows).many(*own))
+        return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
 
     def evaluate(self, name: str, p: Vector, *parameters: Vector) -> list[Vector]:
         """Value (..., r, c) and margins (..., segments, 1) at pressures (n,) or (N, n)."""
         if p.ndim == 1:
-            return self.one(name, p, *parameters)
-        return self.many(name, p, *parameters)
+            return self.one(name, p, self._numbers, *parameters)
+        return self.many(name, p, self._numbers, *parameters)
 
     def stiffness(self, p: Vector, measure: Measure) -> list[Vector]:
         """A directional stiffness (..., 1, 1), and margins (..., segments, 1)."""
@@ -82,8 +104,8 @@ class TipFunctions:
         return self._in_blocks(self._held_gradient, p, measure)
 
     def _held(self, call: _Call, p: Vector, measure: Measure) -> list[Vector]:
-        compliance, margins = call("tip_compliance", p)
-        pose, _ = call("tip_pose", p)
+        compliance, margins = call("tip_compliance", p, self._numbers)
+        pose, _ = call("tip_pose", p, self._numbers)
         value, _ = call("held_stiffness", compliance, pose, _held(measure))
         return [value, margins]
 
@@ -93,11 +115,11 @@ class TipFunctions:
         Then ``dk = -W' dC W + 2 W' dD``, of which the former is that of a flexibility.
         """
         held = _held(measure)
-        compliance, margins = call("tip_compliance", p)
-        pose, _ = call("tip_pose", p)
-        jacobian, _ = call("tip_jacobian", p)
+        compliance, margins = call("tip_compliance", p, self._numbers)
+        pose, _ = call("tip_pose", p, self._numbers)
+        jacobian, _ = call("tip_jacobian", p, self._numbers)
         _, load = call("held_stiffness", compliance, pose, held)
-        slope, _ = call("stiffness_gradient", p, load[..., 0], np.zeros(1))
+        slope, _ = call("stiffness_gradient", p, self._numbers, load[..., 0], np.zeros(1))
         (gradient,) = call("held_stiffness_gradient", slope, jacobian, pose, load[..., 0], held)
         return [gradient, margins]
 
@@ -111,28 +133,22 @@ class TipFunctions:
         blocks = [formula(self.many, p[start : start + _BLOCK], measure) for start in ends]
         return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
 
-    def _in_vm(self, name: str) -> InterpretedFunction:
-        with self._lock:
-            if name not in self._interpreted:
-                self._interpreted[name] = InterpretedFunction(self._formulas.function(name))
-            return self._interpreted[name]
-
     def _best(self, name: str, rows: int) -> BatchFunction:
         if rows < LOOKED_UP_FROM:
-            return self._in_vm(name)
+            return self.interpreted(name)
         with self._lock:
             self._rows += rows
-            missing = self._rows >= COMPILED_FROM and not self._tried
+            missing = self._rows >= COMPILED_FROM
             if self._library is None and (missing or not self._looked_up):
-                self._looked_up, self._tried = True, self._tried or missing
+                self._looked_up = True
                 self._library = library(
-                    ("tip", self._description.model_dump_json()),
-                    self._formulas.functions,
+                    ("tip", self._layout.skeleton),
+                    partial(_tip_functions, self._layout),
                     build_missing=missing,
                 )
             if self._library is not None:
                 return self._library.function(name)
-        return self._in_vm(name)
+        return self.interpreted(name)
 
 
 @lru_cache(maxsize=256)
@@ -156,23 +172,48 @@ def _held(measure: Measure) -> Vector:
     return held
 
 
-class _Formulas:
+def _tip_functions(layout: Layout) -> list[ca.Function]:
+    formulas = tip_formulas(layout)
+    return [formulas.function(name) for name in TipFormulas.NAMES]
+
+
+@lru_cache(maxsize=64)
+def tip_formulas(layout: Layout) -> "TipFormulas":
+    """Return the functions of the tip of all arms of a layout; made once in a process."""
+    return TipFormulas(layout)
+
+
+class TipFormulas:
     """Functions of the tip, symbolically, each named as its method.
 
-    Those of the pressures end with the margins of the strain laws.
+    Those of the pressures take the arm's numbers next, and end with the margins of the strain laws.
     """
 
-    def __init__(self, description: RobotDescription, actuation: Actuation) -> None:
-        self._description = description
-        self._actuation = actuation
+    NAMES = (
+        "tip_pose",
+        "tip_jacobian",
+        "tip_compliance",
+        "stiffness",
+        "stiffness_gradient",
+        "held_stiffness",
+        "held_stiffness_gradient",
+    )
 
-    @cached_property
-    def _tip(self) -> FreeShape:
-        return FreeShape.of(self._description, self._actuation)
+    def __init__(self, layout: Layout) -> None:
+        self._arm = symbolic_arm(layout)
+        self._tip = self._arm.tip
+        self._lock = threading.Lock()
+        self._interpreted: dict[str, InterpretedFunction] = {}
 
-    def functions(self) -> list[ca.Function]:
-        """All of them."""
-        return [self.function(name) for name in _NAMES]
+    def interpreted(self, name: str) -> InterpretedFunction:
+        """One of them in the CasADi VM, shared by all arms of the layout."""
+        found = self._interpreted.get(name)
+        if found is None:
+            with self._lock:
+                if name not in self._interpreted:
+                    self._interpreted[name] = InterpretedFunction(self.function(name))
+                found = self._interpreted[name]
+        return found
 
     def function(self, name: str) -> ca.Function:
         """One of them, dense."""
@@ -181,13 +222,26 @@ class _Formulas:
         return dense(ca.Function(name, inputs, ca.cse([ca.densify(part) for part in outputs])))
 
     def tip_pose(self) -> _Ends:
+        """Pose (4, 4)."""
         return self._of_pressures(self._tip.transform)
 
     def tip_jacobian(self) -> _Ends:
+        """Body twist (6, n) per pressure."""
         return self._of_pressures(self._tip.jacobian)
 
     def tip_compliance(self) -> _Ends:
+        """Compliance (6, 6) in tip axes."""
         return self._of_pressures(self._tip.compliance)
+
+    def tip_at(self) -> _Ends:
+        """Pose, Jacobian, compliance and the smallest margin."""
+        tip, inputs = self._tip, [self._tip.pressures, self._arm.numbers]
+        least = ca.mmin(self._arm.actuation.margin)
+        return inputs, [tip.transform, tip.jacobian, tip.compliance, least]
+
+    def margin(self) -> _Ends:
+        """Margins of the strain laws, one per segment."""
+        return [self._tip.pressures, self._arm.numbers], [self._arm.actuation.margin]
 
     def stiffness(self) -> _Ends:
         """Of the free tip along a load (12,), see `_load`."""
@@ -211,7 +265,7 @@ class _Formulas:
 
     def held_stiffness_gradient(self) -> _Ends:
         """Gradient of it from minus that of the flexibility for its load, and how axes turn."""
-        n = self._description.n_pressures
+        n = self._tip.pressures.numel()
         slope, jacobian, pose = ca.SX.sym("g", 1, n), ca.SX.sym("J", 6, n), ca.SX.sym("T", 4, 4)
         load, held = ca.SX.sym("load", 12), ca.SX.sym("held", 8)
         own = ca.if_else(held[6], load[9:], load[6:9])
@@ -226,15 +280,5 @@ class _Formulas:
         return load, self._tip.flexibility(ca.vec(turned) + load[6:])
 
     def _of_pressures(self, value: ca.SX, *parameters: ca.SX) -> _Ends:
-        return [self._tip.pressures, *parameters], [value, self._actuation.margin]
-
-
-_NAMES = (
-    "tip_pose",
-    "tip_jacobian",
-    "tip_compliance",
-    "stiffness",
-    "stiffness_gradient",
-    "held_stiffness",
-    "held_stiffness_gradient",
-)
+        inputs = [self._tip.pressures, self._arm.numbers, *parameters]
+        return inputs, [value, self._arm.actuation.margin]

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.native_source import Signature
+from stiffopt.model.codegen import Signature
 
 Array = NDArray[np.float64]
 
@@ -46,7 +46,7 @@ class BatchFunction(ABC):
         for argument, (rows, columns) in zip(arguments, self.signature.inputs, strict=True):
             size = rows * columns
             values = np.ascontiguousarray(argument, dtype=float)
-            each = values.ndim > (1 if columns == 1 else 2) or not inputs
+            each = not inputs or not is_shared(values, (rows, columns))
             if values.size != (count * size if each else size):
                 raise ValueError(
                     f"expected ({rows}, {columns}) for each of {count} rows; got {values.shape}"
@@ -283,6 +283,11 @@ class _Queue(Iterator[int]):
             if self._stopped:
                 raise StopIteration
             return next(self._items)
+
+
+def is_shared(argument: Array, shape: tuple[int, int]) -> bool:
+    """Whether an argument of `BatchFunction.many` is the same for all rows."""
+    return argument.ndim <= (1 if shape[1] == 1 else 2)
 
 
 def _own(shape: tuple[int, int]) -> tuple[int, ...]:

@@ -25,6 +25,8 @@ FLAGS = ("-O1", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-w")
 _TIMEOUT = 120.0  # s, for one call of the compiler
 _ABANDONED_AFTER = 86400.0  # s
 _POLL = 0.02  # s
+_HELD_OFF = "armed"
+_children: set[int] = set()  # processes that compile in the background
 _DEFAULT_COMPILERS = ("cc", "gcc", "clang")
 
 
@@ -284,3 +286,72 @@ def turn(path: Path, longest: float = _TIMEOUT) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a process has its `turn` now."""
+    import fcntl
+
+    try:
+        descriptor = os.open(path, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(descriptor)
+    return False
+
+
+@contextmanager
+def held_off() -> Iterator[None]:
+    """Have no compilation begin in the background, in any process: an arm is armed."""
+    descriptor = None
+    with suppress(OSError, BuildError, ImportError):
+        import fcntl
+
+        path = cache_directory() / _HELD_OFF
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        fcntl.flock(descriptor, fcntl.LOCK_SH)
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def is_held_off(cache: Path) -> bool:
+    """Whether some process has an arm armed; see `held_off`."""
+    return is_locked(cache / _HELD_OFF)
+
+
+def start_background(request: bytes, cache: Path) -> None:
+    """Start `stiffopt.model.build_process` with a pickled request; it outlives this process."""
+    root = str(Path(__file__).parents[2])
+    path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
+    environment = {**os.environ, "PYTHONPATH": path, "STIFFOPT_CACHE_DIR": str(cache)}
+    if not sys.executable:
+        raise OSError(0, "the Python interpreter is not known")
+    with tempfile.TemporaryFile() as stream, open(os.devnull, "w") as nowhere:
+        stream.write(request)
+        stream.seek(0)
+        stream.flush()
+        command = [sys.executable, "-m", "stiffopt.model.build_process"]
+        actions = [
+            (os.POSIX_SPAWN_DUP2, stream.fileno(), 0),
+            (os.POSIX_SPAWN_DUP2, nowhere.fileno(), 1),
+            (os.POSIX_SPAWN_DUP2, nowhere.fileno(), 2),
+        ]
+        for child in list(_children):  # no zombies but the last
+            with suppress(OSError):
+                if os.waitpid(child, os.WNOHANG) == (0, 0):
+                    continue
+            _children.discard(child)
+        _children.add(
+            os.posix_spawn(sys.executable, command, environment, file_actions=actions, setsid=True)
+        )
