@@ -8,7 +8,7 @@ is seen by who judges alone. Prints a table, side by side. ``--robot-file`` says
 get: the nominal one; one that stiffopt's own calibration made of a recording of that arm (some
 minutes an arm; ``--keep`` keeps it, so that a run can be taken up again); or one with the arm's
 true values, for what of them it has words. With ``--payload`` the tip carries more than it says,
-with ``--loop`` the whole control loop with its safety gate runs and not the steering alone, with
+with ``--loop`` the whole control loop with its safety gate runs and not the controller alone, with
 ``--paths`` figures-of-eight are followed instead of targets reached. ``--tune`` tries the gains of
 plain integral feedback (take other seeds for it).
 
@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from control_baselines import CONTROLLERS, GRID, Gains, IntegralFeedback, MakeSteering
+from control_baselines import CONTROLLERS, GRID, Gains, IntegralFeedback, MakeController
 from control_cases import (
     DYNAMICS,
     Case,
@@ -206,8 +206,8 @@ def tried(seed: int, *, dynamics: Sequence[str], targets: int) -> list[Step]:
             def make(rig: Any, robot: Any, _: str, gains: Gains = gains) -> Any:
                 return IntegralFeedback(rig, robot, gains)
 
-            steering: MakeSteering = make
-            found += run_case(case, f"{gains.gain:g} {gains.slew:g}", steering, kind)
+            controller: MakeController = make
+            found += run_case(case, f"{gains.gain:g} {gains.slew:g}", controller, kind)
     return found
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from stiffopt.control.state import SteeringStatus
-    from stiffopt.control.steering import Steering
+    from stiffopt.control.interface import Controller
+    from stiffopt.control.state import ControllerStatus
     from stiffopt.control.trajectory import Trajectory
     from stiffopt.model.description import RobotDescription
     from stiffopt.optimise.target import Target
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 PERIOD = 0.01  # s
 
 
-MakeSteering = Callable[["Rig", "RobotDescription", str], "Steering"]
+MakeController = Callable[["Rig", "RobotDescription", str], "Controller"]
 """From a rig, the robot file to believe in and the dynamics."""
 
 
@@ -69,7 +69,7 @@ class IntegralFeedback:
         """Nothing to do."""
 
     def begin(self, now: float) -> None:
-        """See `Steering.begin`."""
+        """See `Controller.begin`."""
         n = self._limits.n
         self._commanded, self._added = np.zeros(n), np.zeros(n)
         self._seen = now
@@ -113,7 +113,7 @@ class IntegralFeedback:
         self, now: float, commanded: Array, reading: PressureReading, samples: Sequence[PoseSample]
     ) -> Any:
         """Add up what the frames say."""
-        from stiffopt.control.steering import Seen
+        from stiffopt.control.interface import SampleCounts
 
         self._commanded = commanded.copy()
         for sample in samples:
@@ -130,11 +130,11 @@ class IntegralFeedback:
             change = part * np.linalg.pinv(pose[:3, :3] @ jacobian[:3]) @ error
             # no wind-up: what the limits take away is not added
             self._added = self._limits.clamp(model + self._added + change) - model
-        return Seen(len(samples), 0, self._seen)
+        return SampleCounts(len(samples), 0, self._seen)
 
-    def move(self, now: float) -> Any:
+    def compute(self, now: float) -> Any:
         """Ramp to the sum of both."""
-        from stiffopt.control.steering import Move
+        from stiffopt.control.interface import ControlOutput
 
         wanted = self._commanded
         if self._way is not None:
@@ -142,13 +142,13 @@ class IntegralFeedback:
         most = self._gains.slew * PERIOD
         self._commanded = self._commanded + np.clip(wanted - self._commanded, -most, most)
         at_limit = (wanted <= self._limits.low) | (wanted >= self._limits.high)
-        return Move(self._commanded.copy(), sound=True, saturated=at_limit)
+        return ControlOutput(self._commanded.copy(), valid=True, saturated=at_limit)
 
-    def standing(self, now: float) -> SteeringStatus:
+    def status(self, now: float) -> ControllerStatus:
         """It knows of the tip what the model says."""
-        from stiffopt.control.state import SteeringStatus
+        from stiffopt.control.state import ControllerStatus
 
-        return SteeringStatus(
+        return ControllerStatus(
             plan=np.full(self._limits.n, np.nan), disturbance=np.zeros(3),
             tip_position=self._tip.at(self._commanded).pose[:3, 3], seen_age=now - self._seen,
         )  # fmt: skip
@@ -161,29 +161,29 @@ class IntegralFeedback:
         """Nothing to do."""
 
 
-def stiffopt_steering(rig: Rig, robot: RobotDescription, dynamics: str) -> Steering:
+def stiffopt_controller(rig: Rig, robot: RobotDescription, dynamics: str) -> Controller:
     """The controller that this is all about."""
     from stiffopt import load_robot
-    from stiffopt.control.controller import Controller
+    from stiffopt.control.controller import TipController
 
-    return Controller(
+    return TipController(
         load_robot(robot), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",
     )  # fmt: skip
 
 
-def integral_steering(rig: Rig, robot: RobotDescription, dynamics: str) -> Steering:
+def integral_controller(rig: Rig, robot: RobotDescription, dynamics: str) -> Controller:
     """Plain integral feedback, tuned."""
     return IntegralFeedback(rig, robot, TUNED[dynamics])
 
 
-def open_loop_steering(rig: Rig, robot: RobotDescription, dynamics: str) -> Steering:
+def open_loop_controller(rig: Rig, robot: RobotDescription, dynamics: str) -> Controller:
     """The model alone, as fast as may be."""
     return IntegralFeedback(rig, robot, Gains(0.0, 5e5))
 
 
-CONTROLLERS: dict[str, MakeSteering] = {
-    "stiffopt": stiffopt_steering,
-    "integral": integral_steering,
-    "open-loop": open_loop_steering,
+CONTROLLERS: dict[str, MakeController] = {
+    "stiffopt": stiffopt_controller,
+    "integral": integral_controller,
+    "open-loop": open_loop_controller,
 }

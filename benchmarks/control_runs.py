@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibration import settling_time
-from control_baselines import PERIOD, MakeSteering
+from control_baselines import PERIOD, MakeController
 from control_cases import DIRECTIONS, NEAR, Case, Path8
 
 if TYPE_CHECKING:
-    from stiffopt.control.steering import Steering
+    from stiffopt.control.interface import Controller
     from stiffopt.control.trajectory import Trajectory
     from stiffopt.optimise.task import Task
     from stiffopt.plant.devices import SimulatedRig
@@ -120,24 +120,24 @@ class Trace:
 
 
 class Run:
-    """A steering at a rig, tick by tick, with nothing between it and the supply.
+    """A controller at a rig, tick by tick, with nothing between it and the supply.
 
     `point` is what is looked at, a frame (4, 4) in that of the tip.
     """
 
-    def __init__(self, rig: SimulatedRig, steering: Steering, point: Array) -> None:
-        self.rig, self._steering, self._point = rig, steering, point
+    def __init__(self, rig: SimulatedRig, controller: Controller, point: Array) -> None:
+        self.rig, self._controller, self._point = rig, controller, point
 
     def start(self) -> None:
         """Connect and arm."""
         rig = self.rig
         rig.open()
-        self._steering.check()
+        self._controller.check()
         rig.clock.sleep(CONNECTED)
         rig.supply.arm()
         self._reading = rig.supply.read()
         self._count = round(rig.clock.now() / PERIOD)
-        self._steering.begin(rig.clock.now())
+        self._controller.begin(rig.clock.now())
 
     def tip(self) -> Array:
         """Where that point is (3,)."""
@@ -145,14 +145,14 @@ class Run:
 
     def set_task(self, task: Task) -> None:
         """Pursue a task."""
-        self._steering.set_task(task)
+        self._controller.set_task(task)
 
     def follow(self, trajectory: Trajectory) -> None:
         """Follow a trajectory."""
-        self._steering.follow(trajectory, self.rig.clock.now())
+        self._controller.follow(trajectory, self.rig.clock.now())
 
     def go(self, duration: float) -> Trace:
-        """Let the steering steer."""
+        """Let the controller steer."""
         rig, rows = self.rig, []
         begin = rig.clock.now()
         for _ in range(round(duration / PERIOD)):
@@ -170,31 +170,31 @@ class Run:
     def _tick(self, now: float) -> tuple[NDArray[np.bool_], bool]:
         """Saturated channels, and whether all is well."""
         rig = self.rig
-        self._steering.observe(now, rig.supply.commanded, self._reading, rig.tracker.read())
-        move = self._steering.move(now)
-        self._reading = rig.supply.exchange(move.pressures)
-        return move.saturated, move.sound
+        self._controller.observe(now, rig.supply.commanded, self._reading, rig.tracker.read())
+        output = self._controller.compute(now)
+        self._reading = rig.supply.exchange(output.pressures)
+        return output.saturated, output.valid
 
     def close(self) -> None:
         """Vent and disconnect."""
-        self._steering.close()
+        self._controller.close()
         self.rig.close()
 
 
 class LoopRun(Run):
     """The same in the control loop, with the safety gate in front of the supply."""
 
-    def __init__(self, rig: SimulatedRig, steering: Steering, point: Array) -> None:
+    def __init__(self, rig: SimulatedRig, controller: Controller, point: Array) -> None:
         from stiffopt.control.loop import ControlLoop
         from stiffopt.safety.gate import SafetyGate
 
-        super().__init__(rig, steering, point)
+        super().__init__(rig, controller, point)
         safety = rig.settings.safety
         gate = SafetyGate(
             rig.supply, slew=rig.slew, safety=safety, force_per_pressure=None, clock=rig.clock,
             period=PERIOD,
         )  # fmt: skip
-        self.loop = ControlLoop(rig, steering, gate, safety=safety, period=PERIOD)
+        self.loop = ControlLoop(rig, controller, gate, safety=safety, period=PERIOD)
 
     def start(self) -> None:
         """Configure and arm."""
@@ -227,11 +227,11 @@ class LoopRun(Run):
 
 
 @contextmanager
-def _started(case: Case, make: MakeSteering, dynamics: str, in_loop: bool) -> Iterator[Run]:
-    """Context with a steering that steers a rig."""
+def _started(case: Case, make: MakeController, dynamics: str, in_loop: bool) -> Iterator[Run]:
+    """Context with a controller that steers a rig."""
     rig = case.rig(dynamics)
-    steering = make(rig, case.believed, dynamics)
-    run = (LoopRun if in_loop else Run)(rig, steering, case.point)
+    controller = make(rig, case.believed, dynamics)
+    run = (LoopRun if in_loop else Run)(rig, controller, case.point)
     try:
         run.start()
         yield run
@@ -242,7 +242,7 @@ def _started(case: Case, make: MakeSteering, dynamics: str, in_loop: bool) -> It
 def run_case(
     case: Case,
     name: str,
-    make: MakeSteering,
+    make: MakeController,
     dynamics: str,
     in_loop: bool = False,
 ) -> list[Step]:
@@ -321,7 +321,7 @@ def _swing(trace: Trace, window: tuple[float, float]) -> float:
 
 
 def run_path(
-    case: Case, path: Path8, name: str, make: MakeSteering, dynamics: str, in_loop: bool = False
+    case: Case, path: Path8, name: str, make: MakeController, dynamics: str, in_loop: bool = False
 ) -> Follow:
     """Go to the beginning of a path and follow it."""
     from stiffopt.control.trajectory import Trajectory, Waypoint

@@ -46,7 +46,7 @@ class Soak:
 
     def __init__(self, seed: int) -> None:
         from stiffopt import StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
-        from stiffopt.control.controller import Controller
+        from stiffopt.control.controller import TipController
         from stiffopt.control.loop import ControlLoop
         from stiffopt.rig.assembly import make_rig
         from stiffopt.rig.config import RigDescription, load_rig_description
@@ -61,7 +61,7 @@ class Soak:
         self.rng = np.random.default_rng([seed, 6])
         self.rig: Any = make_rig(description, robot.description)
         self.period = 1 / description.rate
-        steering = Controller(
+        controller = TipController(
             robot, self.rig.supply.limits, self.rig.slew, period=self.period,
             control=description.control, safety=description.safety, vibrates=False,
         )  # fmt: skip
@@ -70,7 +70,7 @@ class Soak:
             force_per_pressure=None, clock=self.rig.clock, period=self.period,
         )  # fmt: skip
         self.loop = ControlLoop(
-            self.rig, steering, gate, safety=description.safety, period=self.period
+            self.rig, controller, gate, safety=description.safety, period=self.period
         )
         self.noticed = NOTICED * float(np.max(description.safety.max_pressure_error))
         self.robot, self.high = robot, self.rig.supply.limits.high

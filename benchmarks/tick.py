@@ -39,10 +39,10 @@ class Recorder:
         return self.solver.solve(*problem)
 
 
-def wait_for_plan(steering: Any) -> None:
+def wait_for_plan(controller: Any) -> None:
     """Until the planner, which compiles first, has an answer; a minute at most."""
     end = time.monotonic() + 60.0
-    while steering.replanner.latest() is None:
+    while controller.replanner.latest() is None:
         if time.monotonic() > end:
             raise RuntimeError("the planner has no answer")
         time.sleep(0.05)
@@ -51,7 +51,7 @@ def wait_for_plan(steering: Any) -> None:
 def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.ndarray, ...]]]:
     """Times of ticks in us, and the quadratic programs."""
     from stiffopt import StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
-    from stiffopt.control.controller import Controller
+    from stiffopt.control.controller import TipController
     from stiffopt.rig.assembly import make_rig
     from stiffopt.rig.config import load_rig_description
     from stiffopt.rig.interface import PressureCommand
@@ -62,7 +62,7 @@ def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.nd
     rig = make_rig(description, robot.description)
     period = 1 / description.rate
     control = description.control.model_copy(update={"solver": solver})
-    steering = Controller(
+    controller = TipController(
         robot, rig.supply.limits, rig.slew, period=period, control=control,
         safety=description.safety, plan_in_process=True,
     )  # fmt: skip
@@ -70,13 +70,13 @@ def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.nd
         rig.supply, slew=rig.slew, safety=description.safety,
         force_per_pressure=None, clock=rig.clock,
     )  # fmt: skip
-    recorder = Recorder(steering._allocation._solver)
-    steering._allocation._solver = recorder
-    steering.check()
+    recorder = Recorder(controller._allocation._solver)
+    controller._allocation._solver = recorder
+    controller.check()
     gate.open()
     rig.tracker.open()
     gate.arm()
-    steering.begin(rig.clock.now())
+    controller.begin(rig.clock.now())
     goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(0.0, 0.0, 1.0)))
     task = Task(robot=description.robot, target=Target(position=TARGETS[0]), stiffness=goal)
     commanded, parts = np.zeros(robot.n_pressures), []
@@ -85,27 +85,27 @@ def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.nd
     for target in TARGETS:
         position = Target(position=target)
         if target == TARGETS[0]:
-            steering.set_task(task)
-            steering.move(0.0)
-            wait_for_plan(steering)
+            controller.set_task(task)
+            controller.compute(0.0)
+            wait_for_plan(controller)
         else:
-            steering.set_target(position)
+            controller.set_target(position)
         for _ in range(round(per_target / period)):
             now = rig.clock.now()
             a = time.perf_counter()
             samples = rig.tracker.read()
             b = time.perf_counter()
-            steering.observe(now, commanded, reading, samples)
+            controller.observe(now, commanded, reading, samples)
             c = time.perf_counter()
-            move = steering.move(now)
+            output = controller.compute(now)
             d = time.perf_counter()
-            applied = gate.apply(PressureCommand(move.pressures, now))
+            applied = gate.apply(PressureCommand(output.pressures, now))
             e = time.perf_counter()
             commanded, reading = applied.pressures, applied.reading
             parts.append((b - a + e - d, c - b, d - c, e - a))
             rig.clock.sleep_until(now + period)
     rig.close()
-    steering.close()
+    controller.close()
     times = 1e6 * np.array(parts)
     moves = np.arange(len(times)) % round(per_target / period) < round(MOVES / period)
     names = ("input and output", "estimator and model", "plan, QP", "tick")

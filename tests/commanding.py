@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fake_bench import FakeBench
-from fake_control import FakeSteering
+from fake_control import FakeController
 from stiffopt.control.loop import ControlLoop
 from stiffopt.errors import StiffoptError
 from stiffopt.experiments.conductor import Conductor
@@ -484,14 +484,14 @@ class Goals(Stream):
 
 
 class Loop(Stream):
-    """The control loop, whose steering wants what it is told to want, behind a guard."""
+    """The control loop, whose controller wants what it is told to want, behind a guard."""
 
     def start(self) -> None:
         limits, supply = self.bench.limits, GoalSupply(self.follower, self.clock)
         rig = Rig(ROBOT, supply, SeenTip(self.clock), clock=self.clock, slew=limits.slew)
         self.limits = self.gate.limits
-        self.steering = FakeSteering(N, np.array([0.0, 0.0, 0.09]), rate=1e9, period=PERIOD)
-        self.loop = ControlLoop(rig, self.steering, self, safety=self.bench.safety, period=PERIOD)
+        self.controller = FakeController(N, np.array([0.0, 0.0, 0.09]), rate=1e9, period=PERIOD)
+        self.loop = ControlLoop(rig, self.controller, self, safety=self.bench.safety, period=PERIOD)
         self.loop.configure()
         for _ in range(60):
             self.tick()
@@ -508,7 +508,7 @@ class Loop(Stream):
 
     def ask(self, pressures: Any) -> None:
         p = np.array(pressures, dtype=float)
-        self.steering.override = lambda _: p
+        self.controller.override = lambda _: p
 
     def push(self, pressures: Any, seconds: float = PERIOD) -> None:
         self.ask(pressures)

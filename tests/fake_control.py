@@ -1,4 +1,4 @@
-"""What stands in for the steering in tests of the loop: it does what a test tells it to."""
+"""What stands in for the controller in tests of the loop: it does what a test tells it to."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.state import SteeringStatus
-from stiffopt.control.steering import Move, Notice, Seen
+from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
+from stiffopt.control.state import ControllerStatus
 from stiffopt.control.trajectory import Trajectory
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
@@ -19,7 +19,7 @@ from stiffopt.rig.interface import PoseSample, PressureReading
 Array = NDArray[np.float64]
 
 
-class FakeSteering:
+class FakeController:
     """Goes to `wanted` at `rate`, believes what moves slower than `speed`, and keeps a diary."""
 
     def __init__(self, n: int, tip: Array, rate: float = 2e5, period: float = 0.01) -> None:
@@ -28,7 +28,7 @@ class FakeSteering:
         self.wanted = np.zeros(n)
         self.p = np.zeros(n)
         self.now = 0.0
-        self.sound = True
+        self.valid = True
         self.calls: list[str] = []
         self.seen: list[PoseSample] = []
         self.observed: tuple[float, Array, PressureReading] | None = None
@@ -76,7 +76,7 @@ class FakeSteering:
         commanded: Array,
         reading: PressureReading,
         samples: Sequence[PoseSample],
-    ) -> Seen:
+    ) -> SampleCounts:
         self.accident("observe")
         self.now, self.observed = now, (now, commanded, reading)
         self.seen.extend(samples)
@@ -93,18 +93,18 @@ class FakeSteering:
             used += 1
             if before is None or sample.time > before.time:
                 self.latest = sample
-        return Seen(used, rejected, -np.inf if self.latest is None else self.latest.time)
+        return SampleCounts(used, rejected, -np.inf if self.latest is None else self.latest.time)
 
-    def move(self, now: float) -> Move:
-        self.accident("move")
+    def compute(self, now: float) -> ControlOutput:
+        self.accident("compute")
         step = self.rate * self.period
         self.p = self.p + np.clip(self.wanted - self.p, -step, step)
         p = self.p if self.override is None else self.override(self.p)
-        return Move(p, self.sound, np.zeros(self.n, dtype=bool))
+        return ControlOutput(p, self.valid, np.zeros(self.n, dtype=bool))
 
-    def standing(self, now: float) -> SteeringStatus:
-        self.accident("standing")
-        return SteeringStatus(
+    def status(self, now: float) -> ControllerStatus:
+        self.accident("status")
+        return ControllerStatus(
             plan=self.wanted,
             tip_position=self.tip,
             tip_quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
@@ -123,7 +123,7 @@ class FakeSteering:
 
 
 class Hang:
-    """An accident: one call of a steering waits until `go_on` is set; `begun` says when."""
+    """An accident: one call of a controller waits until `go_on` is set; `begun` says when."""
 
     def __init__(self, call: str) -> None:
         self.call = call

@@ -1,4 +1,4 @@
-"""A loop on the simulated rig, with a fake steering: what tests of faults begin with."""
+"""A loop on the simulated rig, with a fake controller: what tests of faults begin with."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from fake_control import FakeSteering
+from fake_control import FakeController
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Snapshot, State
 from stiffopt.model.robot_files import load_description
@@ -39,7 +39,9 @@ class Lab:
         self.rig = cast("SimulatedRig", make_rig(description, robot))
         self.world = self.rig.world
         n = robot.n_pressures
-        self.steering = FakeSteering(n, self.world.plant.tip_pose()[:3, 3].copy(), period=PERIOD)
+        self.controller = FakeController(
+            n, self.world.plant.tip_pose()[:3, 3].copy(), period=PERIOD
+        )
         self.gate = SafetyGate(
             self.rig.supply,
             slew=self.rig.slew,
@@ -49,7 +51,7 @@ class Lab:
             period=PERIOD,
         )
         self.loop = ControlLoop(
-            self.rig, self.steering, self.gate, safety=description.safety, period=PERIOD
+            self.rig, self.controller, self.gate, safety=description.safety, period=PERIOD
         )
         if ready:
             self.arm()
@@ -62,10 +64,10 @@ class Lab:
 
     def under_pressure(self, *pressures: float) -> Lab:
         """Go to pressures and stay there for a while."""
-        self.steering.wanted = np.array(pressures or (8e4, 4e4, 0.0))
+        self.controller.wanted = np.array(pressures or (8e4, 4e4, 0.0))
         self.ticks(150)
         assert self.state is State.ACTIVE
-        np.testing.assert_allclose(self.world.pressures, self.steering.wanted, atol=2e3)
+        np.testing.assert_allclose(self.world.pressures, self.controller.wanted, atol=2e3)
         return self
 
     def tick(self) -> Snapshot:

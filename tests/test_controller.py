@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from stiffopt.control.controller import Controller
+from stiffopt.control.controller import TipController
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
@@ -71,7 +71,7 @@ class Bench:
         self.limits = limits_of(self.description, self.robot)
         self.slew = np.broadcast_to(slew_of(self.description, self.robot), n)
         self.period = period
-        self.controller = Controller(
+        self.controller = TipController(
             so.load_robot(robot), self.limits, self.slew, period=period,
             control=control or ControlSettings(), safety=self.description.safety,
             vibrates=dynamics == "full",
@@ -109,9 +109,9 @@ class Bench:
             seen = self.controller.observe(now, before, reading, () if blind else samples)
             self.rejected += seen.rejected
             if steer:
-                move = self.controller.move(now)
-                self.command, self.saturated = move.pressures, move.saturated
-                assert move.sound
+                output = self.controller.compute(now)
+                self.command, self.saturated = output.pressures, output.saturated
+                assert output.valid
                 assert np.isfinite(self.command).all()
                 assert np.all(self.command >= self.limits.low - 1e-3)
                 assert np.all(self.command <= self.limits.high + 1e-3)
@@ -183,7 +183,7 @@ def test_arrives_and_stays(robot, dynamics, kind, duration):
     assert not bench.saturated.any()
     assert bench.rejected == 0
     assert bench.controller.notices() == ()
-    standing = bench.controller.standing(bench.rig.clock.now())
+    standing = bench.controller.status(bench.rig.clock.now())
     assert standing.position_error < 1e-3
     assert standing.tip_position == pytest.approx(bench.tip[:3, 3], abs=3e-4)
     assert standing.stiffness == pytest.approx(standing.best_stiffness, rel=0.05)
@@ -216,7 +216,7 @@ def test_trajectory_is_followed():
         now = bench.rig.clock.now()
         wanted = np.array(bench.controller.replanner.pursuit.course.at(now).position)
         worst = max(worst, float(np.linalg.norm(bench.tip[:3, 3] - wanted)))
-        assert bench.controller.standing(now).task == "trajectory"
+        assert bench.controller.status(now).task == "trajectory"
     assert worst < 2e-3
     assert np.linalg.norm(bench.tip[:3, 3] - way[-1]) < 5e-4
 
@@ -228,11 +228,11 @@ def test_load_at_the_tip_is_found():
     """Across the arm, while the pressures stay: elsewhere, the model's own error is another."""
     bench = Bench(HANGING)
     bench.settled()
-    before = bench.controller.standing(bench.rig.clock.now()).wrench
+    before = bench.controller.status(bench.rig.clock.now()).wrench
     force = np.array([0.02, -0.015, 0.0])
     bench.rig.world.plant.set_load(PlantLoad(force=tuple(force)))
     bench.run(2.0, steer=False)
-    after = bench.controller.standing(bench.rig.clock.now()).wrench
+    after = bench.controller.status(bench.rig.clock.now()).wrench
     assert np.linalg.norm((after - before - [*force, 0, 0, 0])[:2]) < 0.25 * np.linalg.norm(force)
     assert np.abs(after - before)[3:].max() < 2e-3
 
@@ -357,7 +357,7 @@ def test_plan_knows_the_limits_of_the_rig():
         task = Task(robot=HANGING, target=Target(position=position), stiffness=goal)
         bench.controller.set_task(task)
         errors = bench.run(2.5, position)
-        plans[name] = bench.controller.standing(bench.rig.clock.now()).plan
+        plans[name] = bench.controller.status(bench.rig.clock.now()).plan
     assert plans["robot"].max() > 0.64 * BAR
     assert plans["rig"].max() < 0.621 * BAR + 0.01 * BAR
     assert errors[-20:].max() < 1e-3
@@ -367,7 +367,7 @@ def test_tasks_that_do_not_suit_change_nothing():
     bench = Bench(HANGING)
     bench.settled(duration=0.5)
     now = bench.rig.clock.now()
-    before = bench.controller.standing(now)
+    before = bench.controller.status(now)
     position = middle(bench)
     many = Task(
         robot=HANGING, target=Target(position=position), pressure=PressureRange(max=(BAR,) * 3)
@@ -378,7 +378,7 @@ def test_tasks_that_do_not_suit_change_nothing():
     for task, words in ((many, "3"), (empty, "beyond the limits")):
         with pytest.raises(InputError, match=words):
             bench.controller.set_task(task)
-        after = bench.controller.standing(now)
+        after = bench.controller.status(now)
         assert after.target_position == pytest.approx(before.target_position)
         assert after.task == before.task
     bench.run(0.1)
@@ -388,7 +388,7 @@ def test_begin_forgets():
     bench = Bench(HANGING)
     bench.settled(duration=0.5)
     bench.controller.begin(bench.rig.clock.now())
-    standing = bench.controller.standing(bench.rig.clock.now())
+    standing = bench.controller.status(bench.rig.clock.now())
     assert standing.task == ""
     assert standing.target_position is None
     bench.command = np.zeros(bench.n)

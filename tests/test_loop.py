@@ -58,7 +58,7 @@ def test_from_configuration_to_pressure_and_back() -> None:
     lab.loop.set_task(TASK)
     lab.loop.set_target(TASK.target)
     lab.loop.follow_trajectory(WAY)
-    assert lab.steering.calls == ["begin", "begin", "set_task", "set_target", "follow"]
+    assert lab.controller.calls == ["begin", "begin", "set_task", "set_target", "follow"]
     lab.under_pressure()
     lab.loop.disarm()
     assert lab.state is State.HOLDING
@@ -73,7 +73,7 @@ def test_from_configuration_to_pressure_and_back() -> None:
 
 def test_hold_keeps_the_pressures_until_there_is_something_to_do() -> None:
     lab = Lab()
-    lab.steering.wanted = np.full(3, 1e5)
+    lab.controller.wanted = np.full(3, 1e5)
     lab.ticks(20)
     lab.loop.hold("lunch")
     held = lab.tick()
@@ -82,9 +82,9 @@ def test_hold_keeps_the_pressures_until_there_is_something_to_do() -> None:
     np.testing.assert_array_equal(lab.ticks(100).commanded, held.commanded)
     lab.loop.set_target(TASK.target)
     assert lab.state is State.ACTIVE
-    assert lab.steering.calls[-2:] == ["set_target", "resume"]
+    assert lab.controller.calls[-2:] == ["set_target", "resume"]
     first = lab.tick().commanded
-    assert (first - held.commanded).max() <= lab.steering.rate * PERIOD + 1e-6  # without a jump
+    assert (first - held.commanded).max() <= lab.controller.rate * PERIOD + 1e-6  # without a jump
     np.testing.assert_allclose(lab.ticks(100).commanded, 1e5)
 
 
@@ -156,20 +156,20 @@ def test_close_vents_and_ends_everything() -> None:
     assert not lab.rig.supply.is_open
     assert lab.rig.tracker is not None
     assert not lab.rig.tracker.is_open
-    assert lab.steering.closed
+    assert lab.controller.closed
 
 
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_period_is_a_positive_time(period: float) -> None:
     lab = Lab(ready=False)
     with pytest.raises(InputError, match="period must be above 0 s"):
-        ControlLoop(lab.rig, lab.steering, lab.gate, safety=Safety(), period=period)
+        ControlLoop(lab.rig, lab.controller, lab.gate, safety=Safety(), period=period)
 
 
 # Accidents ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("call", ["observe", "move", "notices", "standing", "resume"])
+@pytest.mark.parametrize("call", ["observe", "compute", "notices", "status", "resume"])
 def test_an_exception_of_the_steering_is_a_fault_and_vents(call: str) -> None:
     lab = Lab().under_pressure()
     if call == "resume":
@@ -182,7 +182,7 @@ def test_an_exception_of_the_steering_is_a_fault_and_vents(call: str) -> None:
         if broken and name == call:
             raise ZeroDivisionError("oh")
 
-    lab.steering.accident = fail
+    lab.controller.accident = fail
     lab.until(State.FAULT, within=0.4)
     assert lab.loop.snapshot().reason == "unexpected ZeroDivisionError: oh"
     assert lab.is_vented()
@@ -198,7 +198,7 @@ def test_an_exception_in_a_request_is_a_fault_and_told() -> None:
         if name == "set_task":
             raise ZeroDivisionError("oh")
 
-    lab.steering.accident = fail
+    lab.controller.accident = fail
     with pytest.raises(CommandError, match="unexpected ZeroDivisionError: oh"):
         lab.loop.set_task(TASK)
     assert lab.state is State.FAULT
@@ -230,7 +230,7 @@ def test_an_arming_that_fails_leaves_it_vented(failing: str) -> None:
     if failing == "arm":
         lab.rig.supply.arm = fail  # type: ignore[method-assign]
     else:
-        lab.steering.accident = fail
+        lab.controller.accident = fail
     with pytest.raises(CommandError, match="no answer"):
         lab.loop.arm()
     assert lab.state is State.INACTIVE
@@ -293,7 +293,7 @@ def test_requests_of_other_threads_are_carried_out_by_the_loop() -> None:
         if name == "set_target":
             raise InputError("too far")
 
-    lab.steering.accident = note
+    lab.controller.accident = note
     with running(lab) as thread:
         while lab.loop.snapshot().timing.ticks < 5:
             pass
@@ -339,7 +339,7 @@ def test_requests_that_wait_when_the_loop_ends_are_refused() -> None:
 @pytest.mark.parametrize("served", [True, False])
 def test_while_it_is_configured_nothing_waits_and_a_vent_is_done(served: bool) -> None:
     lab = Lab(ready=False)
-    lab.steering.accident = compiling = Hang("check")
+    lab.controller.accident = compiling = Hang("check")
     with running(lab) if served else nullcontext():
         while served and lab.loop.snapshot().timing.ticks < 5:
             pass
@@ -366,7 +366,7 @@ def test_while_it_is_configured_nothing_waits_and_a_vent_is_done(served: bool) -
         assert lab.state is State.INACTIVE
         assert all("while unconfigured: it is still starting" in text for text in told)
     assert "armed" not in lab.kinds
-    assert lab.steering.calls == ["begin"]
+    assert lab.controller.calls == ["begin"]
 
 
 def test_a_vent_before_the_supply_is_connected_says_so() -> None:
@@ -393,7 +393,7 @@ def refusal(request: Callable[[], None]) -> str:
 @pytest.mark.parametrize("served", [True, False])
 def test_what_was_given_up_is_not_done_later(served: bool) -> None:
     lab = Lab()
-    lab.steering.accident = busy = Hang("set_task")
+    lab.controller.accident = busy = Hang("set_task")
     with running(lab) if served else nullcontext():
         while served and lab.loop.snapshot().timing.ticks < 5:
             pass
@@ -425,8 +425,8 @@ def test_what_was_given_up_is_not_done_later(served: bool) -> None:
             thread.join(30)
         assert told == {second: "nobody waits for this any more; it is not done"}
         assert lab.loop.snapshot().reason == "late"
-    assert lab.steering.calls.count("set_task") == 1
-    assert "set_target" not in lab.steering.calls
+    assert lab.controller.calls.count("set_task") == 1
+    assert "set_target" not in lab.controller.calls
 
 
 def test_nothing_is_begun_by_one_who_gave_up_before() -> None:
@@ -434,7 +434,7 @@ def test_nothing_is_begun_by_one_who_gave_up_before() -> None:
     assert asker.give_up()
     with requested_by(asker), pytest.raises(CommandError, match="it is not done"):
         lab.loop.set_target(TASK.target)
-    assert "set_target" not in lab.steering.calls
+    assert "set_target" not in lab.controller.calls
     lab.loop.set_target(TASK.target)  # of somebody else
 
 
@@ -447,7 +447,7 @@ def test_an_arming_whose_checks_take_too_long_moves_nothing() -> None:
         if call == "check":
             asker.give_up()
 
-    lab.steering.accident = give_up
+    lab.controller.accident = give_up
     with requested_by(asker), pytest.raises(CommandError, match="longer than anybody waited"):
         lab.loop.arm()
     assert lab.state is State.INACTIVE
@@ -470,7 +470,7 @@ def test_ticks_come_at_absolute_times_and_missed_ones_are_left_out() -> None:
         if len(times) == 100:
             stop.set()
 
-    lab.steering.accident = at_each_tick
+    lab.controller.accident = at_each_tick
     lab.loop.run(stop)
     ticks = (np.array(times) - begin) / PERIOD
     np.testing.assert_allclose(ticks[:50], np.arange(50), atol=1e-6)
@@ -505,10 +505,10 @@ def test_an_interrupt_vents_on_its_way_out() -> None:
     lab = Lab().under_pressure()
 
     def interrupt(call: str) -> None:
-        if call == "move":
+        if call == "compute":
             raise KeyboardInterrupt
 
-    lab.steering.accident = interrupt
+    lab.controller.accident = interrupt
     with pytest.raises(KeyboardInterrupt):
         lab.loop.run(threading.Event())
     assert lab.state is State.INACTIVE

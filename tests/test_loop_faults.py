@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from simulated_loop import PERIOD, TASK, Lab
+from stiffopt.control.interface import Notice
 from stiffopt.control.state import State
-from stiffopt.control.steering import Notice
 from stiffopt.control.tuning import TrackerTuning
 from stiffopt.errors import CommandError, InputError
 from stiffopt.model.robot_files import load_description
@@ -56,7 +56,7 @@ def test_1_a_tracker_that_comes_back_in_time_goes_on_by_itself() -> None:
     lab.ticks(20)
     lab.world.inject("tracker", "ok")
     assert (BACK - 1) * FRAME < lab.until(State.ACTIVE) < (BACK + 1) * FRAME + LATENCY
-    assert "resume" in lab.steering.calls
+    assert "resume" in lab.controller.calls
     assert not lab.alarms
 
 
@@ -106,7 +106,7 @@ def test_4_quaternion_sign_flips_do_not_matter() -> None:
     lab.world.inject("tracker", "flip")
     for _ in range(200):
         assert lab.tick().state is State.ACTIVE
-    assert lab.steering.seen[-1].quaternion is not None
+    assert lab.controller.seen[-1].quaternion is not None
     assert not lab.alarms
 
 
@@ -117,7 +117,7 @@ def test_5_a_jump_is_rejected_and_repeated_a_fault() -> None:
     lab.world.inject("tracker", "ok")
     lab.ticks(20)
     assert lab.state is State.ACTIVE
-    lab.steering.speed = 1e-3  # no matter how long it stays there
+    lab.controller.speed = 1e-3  # no matter how long it stays there
     lab.world.inject("tracker", "wrong")
     assert lab.until(State.FAULT) < 5 * FRAME + LATENCY + 0.03
     assert "tracker-jumps" in lab.kinds
@@ -125,7 +125,7 @@ def test_5_a_jump_is_rejected_and_repeated_a_fault() -> None:
     with pytest.raises(CommandError, match="still seems to jump"):
         lab.loop.reset()
     lab.world.inject("tracker", "ok")
-    lab.steering.speed = 0.3
+    lab.controller.speed = 0.3
     lab.ticks(10)
     lab.loop.reset()
 
@@ -188,10 +188,10 @@ def test_6_a_tracker_whose_read_blocks_does_not_block_the_loop() -> None:
 
 def test_7_a_late_sample_keeps_its_time() -> None:
     lab = Lab().under_pressure()
-    known = len(lab.steering.seen)
+    known = len(lab.controller.seen)
     lab.world.inject("tracker", "slow")
     lab.ticks(70)
-    late = lab.steering.seen[known + 4 :]
+    late = lab.controller.seen[known + 4 :]
     assert late
     for sample in late:
         assert sample.received - sample.time == pytest.approx(0.525, abs=1e-6)
@@ -202,7 +202,7 @@ def test_7_a_sample_out_of_order_is_passed_on_but_is_not_new() -> None:
     lab = Lab().under_pressure()
     tracker = lab.rig.tracker
     assert tracker is not None
-    old = lab.steering.seen[-4]
+    old = lab.controller.seen[-4]
     lab.world.inject("tracker", "off")
     begin, number = lab.now, 10_000
     while lab.tick().state is State.ACTIVE:
@@ -211,20 +211,20 @@ def test_7_a_sample_out_of_order_is_passed_on_but_is_not_new() -> None:
         tracker._arrived[-1] = type(old)(old.time, lab.now, number, old.position, old.quaternion)
         assert lab.now < begin + 0.2
     assert lab.state is State.HOLDING
-    assert lab.steering.seen[-1].time == old.time
+    assert lab.controller.seen[-1].time == old.time
 
 
 def test_8_a_regulator_that_saturates_is_flagged_and_does_not_wind_up() -> None:
     lab = Lab(supply={"driver": "simulated", "saturation": 9e4})
-    lab.steering.wanted = np.array([1e5, 5e4, 0.0])
+    lab.controller.wanted = np.array([1e5, 5e4, 0.0])
     snapshot = lab.ticks(300)
     assert snapshot.state is State.ACTIVE
     assert snapshot.saturated.tolist() == [True, False, False]
     assert "saturated" in lab.alarms
-    assert lab.steering.observed is not None
-    assert lab.steering.observed[2].pressures[0] == pytest.approx(9e4, abs=1e3)  # is told so
+    assert lab.controller.observed is not None
+    assert lab.controller.observed[2].pressures[0] == pytest.approx(9e4, abs=1e3)  # is told so
     np.testing.assert_array_equal(snapshot.commanded, [1e5, 5e4, 0.0])  # nothing has wound up
-    lab.steering.wanted = np.array([5e4, 5e4, 0.0])
+    lab.controller.wanted = np.array([5e4, 5e4, 0.0])
     snapshot = lab.ticks(100)
     assert not snapshot.saturated.any()
     assert not lab.alarms
@@ -244,11 +244,11 @@ def test_9_a_leak_before_arming_is_flagged_first_and_a_fault_when_its_command_ch
     lab = Lab(ready=False)
     lab.world.inject("supply", "leak", channel=1)
     lab.arm()
-    lab.steering.wanted = np.array([1e5, 1.1e5, 0.0])
+    lab.controller.wanted = np.array([1e5, 1.1e5, 0.0])
     assert lab.ticks(300).saturated.tolist() == [False, True, False]
     assert lab.state is State.ACTIVE
     assert "saturated" in lab.alarms
-    lab.steering.wanted = np.array([1e5, 1.3e5, 0.0])
+    lab.controller.wanted = np.array([1e5, 1.3e5, 0.0])
     assert lab.until(State.FAULT) < 1.5
     assert "leak" in lab.kinds
     assert "channel 2" in lab.loop.snapshot().reason
@@ -343,13 +343,13 @@ def test_13_requests_above_the_limits_are_refused() -> None:
     after = lab.tick()
     assert after.state is State.ACTIVE
     np.testing.assert_array_equal(after.commanded, before.commanded)
-    assert lab.steering.calls == ["begin", "begin"]
+    assert lab.controller.calls == ["begin", "begin"]
 
 
 def test_13_a_steering_that_goes_above_the_limits_is_held() -> None:
     lab = Lab().under_pressure()
     before = lab.loop.snapshot().commanded
-    lab.steering.override = lambda p: p + 2e5
+    lab.controller.override = lambda p: p + 2e5
     lab.ticks(3)
     assert lab.state is State.HOLDING
     assert "out of range" in lab.loop.snapshot().reason
@@ -361,19 +361,19 @@ def test_a_force_that_is_too_great_is_shortened_and_an_alarm_while_it_is() -> No
     robot = load_description("stiff-flop-1")
     most = float(robot.channel_areas @ np.array([6e4, 3e4, 0.0]))
     lab = Lab(safety={"max_force": most})
-    lab.steering.wanted = np.array([8e4, 4e4, 0.0])
+    lab.controller.wanted = np.array([8e4, 4e4, 0.0])
     snapshot = lab.ticks(150)
     assert "force-limit" in lab.alarms
     assert lab.kinds.count("force-limit") == 1
     assert robot.channel_areas @ snapshot.commanded == pytest.approx(most)
     assert snapshot.saturated[0]
     assert snapshot.state is State.ACTIVE
-    lab.steering.wanted = np.array([5e4, 3e4, 0.0])
+    lab.controller.wanted = np.array([5e4, 3e4, 0.0])
     lab.ticks(20)
     assert "force-limit" in lab.alarms  # now and then it is not: the alarm does not flicker
     lab.ticks(60)
     assert not lab.alarms
-    lab.steering.wanted = np.array([8e4, 4e4, 0.0])
+    lab.controller.wanted = np.array([8e4, 4e4, 0.0])
     lab.ticks(100)
     assert "force-limit" in lab.alarms
     lab.loop.vent()
@@ -382,8 +382,8 @@ def test_a_force_that_is_too_great_is_shortened_and_an_alarm_while_it_is() -> No
 
 def test_14_a_slew_beyond_the_limit_is_limited_and_flagged() -> None:
     lab = Lab()
-    lab.steering.rate = 1e9
-    lab.steering.wanted = np.array([1.4e5, 0.0, 0.0])
+    lab.controller.rate = 1e9
+    lab.controller.wanted = np.array([1.4e5, 0.0, 0.0])
     before, slew = 0.0, lab.rig.slew[0]
     flagged = 0
     for _ in range(60):
@@ -425,7 +425,7 @@ def test_15_malformed_requests_change_nothing(request_: Any, match: str) -> None
     assert after.state is State.ACTIVE
     np.testing.assert_array_equal(after.commanded, before.commanded)
     assert lab.kinds == events
-    assert lab.steering.calls == ["begin", "begin"]
+    assert lab.controller.calls == ["begin", "begin"]
 
 
 def test_15_a_task_that_the_steering_refuses_changes_nothing() -> None:
@@ -435,7 +435,7 @@ def test_15_a_task_that_the_steering_refuses_changes_nothing() -> None:
         if call == "set_task":
             raise InputError("the robot is another one")
 
-    lab.steering.accident = refuse
+    lab.controller.accident = refuse
     with pytest.raises(InputError, match="the robot is another one"):
         lab.loop.set_task(TASK)
     assert lab.tick().state is State.ACTIVE
@@ -455,7 +455,7 @@ def test_18_stopping_lets_down_in_bounded_time(fault: str) -> None:
         if call == "observe" and stop.is_set():
             highest = max(highest, float(lab.world.set_point.max()))
 
-    lab.steering.accident = at_each_tick
+    lab.controller.accident = at_each_tick
     lab.loop.run(stop)
     assert lab.state is State.INACTIVE
     assert 0.9 < lab.now - stopped_at < 1.1
@@ -507,12 +507,12 @@ def test_21_the_wall_clock_may_jump(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_22_no_answer_of_the_solver_means_the_last_one_and_then_hold(kind: str) -> None:
     lab = Lab().under_pressure()
     before = lab.loop.snapshot().commanded
-    lab.steering.wanted = np.full(3, 1e5)
-    lab.steering.sound = kind != "unsound"
+    lab.controller.wanted = np.full(3, 1e5)
+    lab.controller.valid = kind != "unsound"
     bad = {"nan": [0, math.nan, 0], "infinite": [math.inf, 0, 0], "short": [1e4]}.get(
         kind, [1e5] * 3
     )
-    lab.steering.override = lambda p: np.array(bad)
+    lab.controller.override = lambda p: np.array(bad)
     for _ in range(2):
         snapshot = lab.tick()
         assert snapshot.state is State.ACTIVE
@@ -520,7 +520,7 @@ def test_22_no_answer_of_the_solver_means_the_last_one_and_then_hold(kind: str) 
     assert lab.tick().state is State.HOLDING
     assert "solver" in lab.alarms
     np.testing.assert_array_equal(lab.ticks(100).commanded, before)
-    lab.steering.sound, lab.steering.override = True, None
+    lab.controller.valid, lab.controller.override = True, None
     lab.loop.set_task(TASK)
     lab.ticks(100)
     assert lab.state is State.ACTIVE
@@ -531,9 +531,9 @@ def test_22_no_answer_of_the_solver_means_the_last_one_and_then_hold(kind: str) 
 def test_22_a_single_answer_that_is_missing_does_not_matter() -> None:
     lab = Lab().under_pressure()
     for _ in range(10):
-        lab.steering.sound = False
+        lab.controller.valid = False
         lab.ticks(2)
-        lab.steering.sound = True
+        lab.controller.valid = True
         lab.ticks(1)
         assert lab.state is State.ACTIVE
 
@@ -542,10 +542,10 @@ def slow(lab: Lab, duration: float) -> None:
     """Let each move take some time of the rig's clock."""
 
     def take_time(call: str) -> None:
-        if call == "move":
+        if call == "compute":
             lab.rig.clock.sleep(duration)
 
-    lab.steering.accident = take_time
+    lab.controller.accident = take_time
 
 
 def test_23_overruns_are_counted_and_in_a_row_a_fault() -> None:
@@ -631,7 +631,7 @@ def test_25_other_limits_at_the_gate_than_at_the_supply_are_not_armed() -> None:
 
 def test_25_a_model_that_does_not_serve_is_not_armed() -> None:
     lab = Lab(ready=False)
-    lab.steering.problem = "the robot file has no density"
+    lab.controller.problem = "the robot file has no density"
     with pytest.raises(CommandError, match="model: the robot file has no density"):
         lab.loop.configure()
 
@@ -667,18 +667,18 @@ def test_25_a_vented_arm_that_is_under_pressure_is_not_armed() -> None:
 
 def test_26_what_the_steering_says_becomes_an_alarm_until_it_is_over() -> None:
     lab = Lab().under_pressure()
-    lab.steering.said = (
+    lab.controller.said = (
         Notice("planner-died", "the planner has died; the last plan stays", standing=True),
         Notice("planner-restarted", "the planner is started again"),
     )
     lab.tick()
     assert lab.alarms == {"planner-died"}
     assert {"planner-died", "planner-restarted"} <= set(lab.kinds)
-    lab.steering.said = lab.steering.said[:1]
+    lab.controller.said = lab.controller.said[:1]
     lab.ticks(5)
     assert lab.state is State.ACTIVE
     assert lab.kinds.count("planner-died") == 1
-    lab.steering.said = ()
+    lab.controller.said = ()
     lab.tick()
     assert not lab.alarms
     assert lab.kinds[-1] == "planner-died-over"

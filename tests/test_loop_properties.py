@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 from numpy.typing import ArrayLike, NDArray
 
-from fake_control import FakeSteering
+from fake_control import FakeController
+from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.state import State, SteeringStatus
-from stiffopt.control.steering import Move, Notice, Seen
+from stiffopt.control.state import ControllerStatus, State
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
@@ -212,7 +212,7 @@ class Sometimes(PoseTracker):
 
 
 class Whim:
-    """A steering that wants anything."""
+    """A controller that wants anything."""
 
     def __init__(self, chance: random.Random) -> None:
         self.chance = chance
@@ -220,7 +220,7 @@ class Whim:
         self.base = np.zeros(N)
         self.latest = -math.inf
         self.unsaturated = np.zeros(N, dtype=bool)
-        self.nowhere = FakeSteering(N, VENTED_TIP).standing(0.0)
+        self.nowhere = FakeController(N, VENTED_TIP).status(0.0)
 
     def _fail(self) -> None:
         if self.wild and self.chance.random() < 0.02 * self.wild:
@@ -253,7 +253,7 @@ class Whim:
 
     def observe(
         self, now: float, commanded: Array, reading: PressureReading, samples: Sequence[PoseSample]
-    ) -> Seen:
+    ) -> SampleCounts:
         self._fail()
         used = rejected = 0
         for sample in samples:
@@ -265,9 +265,9 @@ class Whim:
                 used += 1
                 if sample.time > self.latest:
                     self.latest = sample.time
-        return Seen(used, rejected, self.latest)
+        return SampleCounts(used, rejected, self.latest)
 
-    def move(self, now: float) -> Move:
+    def compute(self, now: float) -> ControlOutput:
         chance, p, sound = self.chance, self.base, True
         if chance.random() < 0.02:
             self._want()
@@ -289,9 +289,9 @@ class Whim:
                 p = chance.choice([None, "high", [1e5] * N, np.array([True] * N)])  # type: ignore[assignment]
             else:
                 p = p * chance.uniform(-1e3, 1e3)
-        return Move(p, sound, self.unsaturated)
+        return ControlOutput(p, sound, self.unsaturated)
 
-    def standing(self, now: float) -> SteeringStatus:
+    def status(self, now: float) -> ControllerStatus:
         self._fail()
         return self.nowhere
 
@@ -317,7 +317,7 @@ class World:
         self.clock = HandClock()
         self.supply = Recorder(self.clock, chance, low)
         self.tracker = Sometimes(self.clock, chance)
-        self.steering = Whim(chance)
+        self.controller = Whim(chance)
         safety = Safety(max_force=FORCE, ramp_time=0.2, max_pressure=tuple(HIGH))
         pressure = ROBOT.pressure.model_copy(update={"min": low})
         robot = ROBOT.model_copy(update={"pressure": pressure})
@@ -330,7 +330,7 @@ class World:
             clock=self.clock,
             period=PERIOD,
         )
-        self.loop = ControlLoop(self.rig, self.steering, self.gate, safety=safety, period=PERIOD)
+        self.loop = ControlLoop(self.rig, self.controller, self.gate, safety=safety, period=PERIOD)
         self.clear_after = 0
         self.faults = self.unvented = 0
         self.states = dict.fromkeys(State, 0)
@@ -400,13 +400,13 @@ class World:
                 ["silent", "nan", "jumps", "frozen", "times", "broken"]
             )
         elif kind in (4, 5):
-            self.steering.wild = chance.choice([0.1, 1.0])
+            self.controller.wild = chance.choice([0.1, 1.0])
         elif kind == 6:
             self.supply.pinned = chance.randrange(N), chance.choice([0.0, 1e5])
         self.clear_after = chance.choice([2, 10, 60, 200])
 
     def calm(self) -> None:
-        self.supply.trouble = self.supply.garbage = self.steering.wild = 0.0
+        self.supply.trouble = self.supply.garbage = self.controller.wild = 0.0
         self.supply.pinned = None
         self.tracker.mode = "good"
 
@@ -478,11 +478,11 @@ class LoopMachine(RuleBasedStateMachine):
 
     @rule(p=st.lists(st.floats(-1e6, 1e6) | st.just(math.nan), min_size=N, max_size=N))
     def want(self, p: list[float]) -> None:
-        self.world.steering.base = np.array(p)
+        self.world.controller.base = np.array(p)
 
     @rule()
     def want_all(self) -> None:
-        self.world.steering.base = HIGH.copy()
+        self.world.controller.base = HIGH.copy()
 
     @rule(trouble=st.sampled_from([0.0, 0.5, 1.0]), garbage=st.sampled_from([0.0, 1.0]))
     def disturb_the_supply(self, trouble: float, garbage: float) -> None:

@@ -176,11 +176,11 @@ def test_a_message_of_a_target_or_trajectory_says_all_of_it() -> None:
 
 def test_the_loop_refuses_what_its_steering_does_not_understand() -> None:
     lab = Lab().under_pressure()
-    calls = list(lab.steering.calls)
+    calls = list(lab.controller.calls)
     for given, key in gentle_tasks(1.0):
         with pytest.raises(InputError, match=key.split(".")[-1]):
             lab.loop.set_task(given)
-    assert lab.steering.calls == calls
+    assert lab.controller.calls == calls
     assert lab.tick().state is State.ACTIVE
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from stiffopt.control.steering import Seen
+from stiffopt.control.interface import SampleCounts
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.control.tuning import TrackerTuning
 from stiffopt.model.history import History
@@ -500,7 +500,7 @@ def test_what_is_left_in_a_vented_arm() -> None:
 
 
 class Watched:
-    """A tracker of 40 Hz that is 25 ms late, and what a steering makes of it."""
+    """A tracker of 40 Hz that is 25 ms late, and what a controller makes of it."""
 
     def __init__(self, interval: float = 0.025, latency: float = 0.025) -> None:
         self.watch = TrackerWatch(SAFETY, PERIOD)
@@ -534,7 +534,7 @@ class Watched:
         for sample in seen:
             self.latest = max(self.latest, sample.time)
         rejected = 0 if self.used else len(fresh)
-        self.watch.update(self.t, Seen(len(seen), rejected, self.latest))
+        self.watch.update(self.t, SampleCounts(len(seen), rejected, self.latest))
         if not self.armed:
             self.watch.learn(self.t, fresh)
         return self.watch.sight(self.t)

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fake_control import FakeSteering
+from fake_control import FakeController
 from simulated_loop import TASK, Lab
 from stiffopt.control import checks
 from stiffopt.control.checks import limited_range
-from stiffopt.control.controller import Controller
+from stiffopt.control.controller import TipController
+from stiffopt.control.interface import ControlOutput
 from stiffopt.control.state import State
-from stiffopt.control.steering import Move
 from stiffopt.control.trajectory import MAX_WAYPOINTS, Course, Trajectory, Waypoint
 from stiffopt.daemon.messages import task_of, trajectory_of
 from stiffopt.errors import CommandError, DeviceError, GuardTripped, InputError
@@ -44,7 +44,7 @@ def steered_to(pressures: tuple[float, ...], low: float) -> World:
     for _ in range(100):
         world.tick()
     world.loop.arm()
-    world.steering.move = lambda now: Move(np.array(pressures), True, NONE)  # type: ignore[method-assign]
+    world.controller.compute = lambda now: ControlOutput(np.array(pressures), True, NONE)  # type: ignore[method-assign]
     for _ in range(200):
         world.tick()
     assert world.loop.snapshot().state is State.ACTIVE
@@ -137,7 +137,7 @@ def test_a_guard_that_vented_by_itself_is_no_device_that_fails(
 # What is refused changes nothing -----------------------------------------------------------------
 
 
-class Following(FakeSteering):
+class Following(FakeController):
     """Makes a course of a trajectory, as the controller does, and goes nowhere."""
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
@@ -149,20 +149,20 @@ class Following(FakeSteering):
 def armed() -> Lab:
     """An arm under pressure, for many requests."""
     lab = Lab()
-    steering = lab.steering
-    steering.__class__ = Following
+    controller = lab.controller
+    controller.__class__ = Following
     return lab.under_pressure()
 
 
 def ask(lab: Lab, request: Callable[[], object]) -> bool:
     """Ask for something; return whether it was accepted. The arm is as before whether or not."""
-    before, calls = lab.loop.snapshot(), list(lab.steering.calls)
+    before, calls = lab.loop.snapshot(), list(lab.controller.calls)
     accepted = True
     try:
         request()
     except InputError:
         accepted = False
-        assert lab.steering.calls == calls
+        assert lab.controller.calls == calls
     after = lab.tick()
     assert after.state is State.ACTIVE, after.reason
     np.testing.assert_array_equal(after.commanded, before.commanded)
@@ -405,12 +405,12 @@ def test_an_accident_while_it_is_armed_or_configured_is_a_refusal(state: str) ->
         if name == "check":
             raise ZeroDivisionError("oh")
 
-    lab.steering.accident = fail
+    lab.controller.accident = fail
     request = lab.loop.arm if state == "inactive" else lab.loop.configure
     with pytest.raises(CommandError, match="nothing has changed: unexpected ZeroDivisionError"):
         request()
     assert lab.state == state
-    lab.steering.accident = lambda name: None
+    lab.controller.accident = lambda name: None
     request()
 
 
@@ -422,7 +422,7 @@ def test_what_goes_wrong_when_a_task_is_pursued_already_is_a_fault() -> None:
         if name == "resume":
             raise InputError("oh")
 
-    lab.steering.accident = fail
+    lab.controller.accident = fail
     with pytest.raises(CommandError, match="unexpected InputError: oh"):
         lab.loop.set_task(TASK)
     assert lab.state is State.FAULT
@@ -438,14 +438,14 @@ class Turning(StiffnessMeasure):
 
 
 @pytest.fixture(scope="module")
-def controller() -> Controller:
+def controller() -> TipController:
     description = load_description(ROBOT)
     n = description.n_pressures
     limits = PressureLimits(np.zeros(n), np.full(n, 1.5e5))
-    return Controller(Manipulator(description), limits, 2e5, period=0.01)
+    return TipController(Manipulator(description), limits, 2e5, period=0.01)
 
 
-def held(controller: Controller) -> list[Any]:
+def held(controller: TipController) -> list[Any]:
     """Return all that a request may change."""
     replanner = controller.replanner
     named = ("_serial", "_requested_at", "_search", "pursuit")
@@ -455,7 +455,7 @@ def held(controller: Controller) -> list[Any]:
     return [*inside, *parts, prescribed, controller._allocation._high.tolist()]
 
 
-def test_a_controller_that_refuses_is_as_before(controller: Controller) -> None:
+def test_a_controller_that_refuses_is_as_before(controller: TipController) -> None:
     controller.set_task(TASK)
     before = held(controller)
     goal = StiffnessGoal(maximise=(Turning(direction=(1.0, 0.0, 0.0)),))
@@ -521,7 +521,9 @@ def test_limits_are_tightened_and_rounding_is_no_mistake() -> None:
             limited_range(PressureRange(max=tuple(values.tolist())), LIMITS)
 
 
-def test_a_controller_takes_a_task_at_the_limits_but_for_rounding(controller: Controller) -> None:
+def test_a_controller_takes_a_task_at_the_limits_but_for_rounding(
+    controller: TipController,
+) -> None:
     off = 0.1  # Pa
     asked = PressureRange(min=-off, max=1.5e5 + off)
     controller.set_task(TASK.model_copy(update={"pressure": asked}))

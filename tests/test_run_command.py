@@ -40,7 +40,7 @@ from stiffopt.cli.main import main
 from stiffopt.cli.run_ending import Screen
 from stiffopt.cli.run_lines import Lines
 from stiffopt.cli.run_status import LiveStatus, status
-from stiffopt.control.controller import Controller
+from stiffopt.control.controller import TipController
 from stiffopt.control.state import Alarm, Event, Severity, State, Timing
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon.client import Client
@@ -362,13 +362,13 @@ def test_what_hangs_when_all_is_over_is_left(
     )
     monkeypatch.setattr(daemon_module, "TIMES", replace(TIMES, rest=0.2))
     hangs = threading.Event()
-    end = Controller.close
+    end = TipController.close
 
-    def hang(controller: Controller) -> None:
+    def hang(controller: TipController) -> None:
         hangs.wait(20)
         end(controller)
 
-    monkeypatch.setattr(Controller, "close", hang)
+    monkeypatch.setattr(TipController, "close", hang)
     try:
         assert main(["run", rig]) == 2
         assert codes == [2]

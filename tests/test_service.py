@@ -496,7 +496,7 @@ def test_what_the_loop_has_not_begun_in_time_it_never_does_but_it_vents(
     lab = Lab()
     api = Api(lab.loop, robot=lab.rig.robot, patience=0.05)
     api.take()
-    lab.steering.accident = busy = Hang("move")
+    lab.controller.accident = busy = Hang("compute")
     stop = threading.Event()
     loop = threading.Thread(target=lab.loop.run, args=(stop,))
     loop.start()
@@ -510,7 +510,7 @@ def test_what_the_loop_has_not_begun_in_time_it_never_does_but_it_vents(
         busy.go_on.set()
         stop.set()
         loop.join(60)
-    assert call not in lab.steering.calls
+    assert call not in lab.controller.calls
     told = [event.text for event in lab.loop.events.since(0)[0]]
     assert "vented: a client asked for it" in told
 
@@ -519,17 +519,17 @@ def test_of_what_was_begun_the_outcome_is_not_known() -> None:
     lab = Lab()
     api = Api(lab.loop, robot=lab.rig.robot, patience=0.05)
     api.take()
-    lab.steering.accident = slow = Hang("set_target")
+    lab.controller.accident = slow = Hang("set_target")
     refused(api("POST", "/v1/target", TARGET), 503, "whether it will still do this is not known")
     slow.go_on.set()
-    wait_for(lambda: "set_target" in lab.steering.calls)
+    wait_for(lambda: "set_target" in lab.controller.calls)
 
 
 def test_a_daemon_that_starts_answers_at_once() -> None:
     lab = Lab(ready=False)
     api = Api(lab.loop, robot=lab.rig.robot, patience=5.0)
     api.take()
-    lab.steering.accident = compiling = Hang("check")
+    lab.controller.accident = compiling = Hang("check")
     starting = threading.Thread(target=lab.loop.configure)
     starting.start()
     try:
@@ -612,7 +612,7 @@ def test_the_real_loop_is_commanded_held_when_nobody_is_heard_and_vented() -> No
     assert api("POST", "/v1/arm").json() == {"state": "active", "reason": ""}
     task = {"target": {"position_m": [0.0, 0.0, 0.1]}}
     assert api("POST", "/v1/task", task).status_code == 200
-    lab.steering.wanted = np.array([8e4, 4e4, 0.0])
+    lab.controller.wanted = np.array([8e4, 4e4, 0.0])
     lab.ticks(90)
     assert lab.world.pressures.max() > 5e4
     asyncio.run(api.operations.watch())

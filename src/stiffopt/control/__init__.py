@@ -1,4 +1,6 @@
-"""How to get to a pose and stay there: estimator, planner, controller, safety and the loop.
+"""Closed-loop control: estimator, planner, reference, feedback, supervision and the loop.
 
-Everything here sees a rig through `stiffopt.rig.interface` alone.
+`ControlLoop` (loop.py) ticks and takes requests, its `Supervisor` keeps the arm safe, and the
+`TipController` (controller.py) decides on pressures; docs/control.md explains how. The package sees
+a rig only through `stiffopt.rig.interface`.
 """

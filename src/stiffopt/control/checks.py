@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.contents import understood
-from stiffopt.control.steering import Steering
+from stiffopt.control.interface import Controller
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.control.tuning import SupervisionTuning
@@ -146,7 +146,7 @@ def _bound(
     return clipped
 
 
-def check_rig(rig: Rig, outlet: Outlet, steering: Steering) -> Iterator[str]:
+def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]:
     """Yield the problems of a rig's configuration; each begins with the name of its check."""
     robot, limits = rig.robot, outlet.limits
     if rig.tracker is None:
@@ -176,7 +176,7 @@ def check_rig(rig: Rig, outlet: Outlet, steering: Steering) -> Iterator[str]:
             "rig file, or pressure.slew in the robot file"
         )
     try:
-        steering.check()
+        controller.check()
     except InputError as error:
         yield f"model: {error}"
 
@@ -184,7 +184,7 @@ def check_rig(rig: Rig, outlet: Outlet, steering: Steering) -> Iterator[str]:
 def check_vented_arm(
     now: float,
     rig: Rig,
-    steering: Steering,
+    controller: Controller,
     pressures: PressureMonitor,
     reading: PressureReading,
     tracker: TrackerWatch,
@@ -205,10 +205,10 @@ def check_vented_arm(
     if tracker.sight(now) is not Sight.SEEN:
         yield "tracker: the tip is not seen now; bring the sensor into its field"
         return
-    standing = steering.standing(now)
-    modelled = standing.model_position
+    status = controller.status(now)
+    modelled = status.model_position
     if modelled is None:
-        modelled = standing.tip_position - standing.disturbance
+        modelled = status.tip_position - status.disturbance
     off = float(np.linalg.norm(tracker.position - modelled))
     if not off <= tuning.vented_offset * rig.robot.length:  # NaN is too far as well
         seen, model = (", ".join(f"{1e3 * x:.1f}" for x in p) for p in (tracker.position, modelled))

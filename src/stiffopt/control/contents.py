@@ -1,4 +1,4 @@
-"""What a description says, key by key, whatever subclass of a known model says it."""
+"""The contents of schemas as plain data, to compare them and to refuse what would be lost."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ __all__ = ["contents", "differences", "listed", "understood"]
 
 ModelT = TypeVar("ModelT", bound=Schema)
 
-_BESIDE = frozenset({"source"})  # where a description was read, which is no part of what it says
-_TOLD = 5  # keys that an error names
+_NOT_CONTENT = frozenset({"source"})  # the file that a description was read from
+_LISTED = 5  # keys that an error names
 
 
 def contents(value: Any) -> Any:
-    """Return what a model says as plain data, with the fields of subclasses.
+    """Return a schema's fields as plain data, also those of a subclass.
 
-    Fields that are None, which says nothing, are left out.
+    Fields that are None are left out.
     """
     if isinstance(value, BaseModel):
         fields = {name: getattr(value, name) for name in type(value).model_fields}
         fields |= value.model_extra or {}
-        said = {name: field for name, field in fields.items() if field is not None}
-        return {name: contents(field) for name, field in said.items() if name not in _BESIDE}
+        given = {name: field for name, field in fields.items() if field is not None}
+        return {name: contents(field) for name, field in given.items() if name not in _NOT_CONTENT}
     if isinstance(value, list | tuple):
         return [contents(item) for item in value]
     return value
 
 
 def differences(one: Any, other: Any, place: str = "") -> list[str]:
-    """Return the places at which the contents of two models differ, as dotted keys."""
+    """Return the keys at which two contents differ, dotted."""
     if isinstance(one, dict) and isinstance(other, dict):
         return [
             found
@@ -50,24 +50,24 @@ def differences(one: Any, other: Any, place: str = "") -> list[str]:
 
 
 def listed(places: list[str]) -> str:
-    """Return places as an error names them: not more of them than help."""
-    more = f" and {len(places) - _TOLD} more" if len(places) > _TOLD else ""
-    return ", ".join(places[:_TOLD]) + more
+    """Return keys as an error names them, a few of them at most."""
+    more = f" and {len(places) - _LISTED} more" if len(places) > _LISTED else ""
+    return ", ".join(places[:_LISTED]) + more
 
 
 def understood(given: object, model: type[ModelT]) -> ModelT:
-    """Return a description as just this model, which must have a word for all that it says.
+    """Return a description as an instance of exactly this model, without losing a key.
 
     Raises
     ------
     InputError
-        It is no such description, its values do not serve, or it says more than the model knows;
-        the text names the key.
+        It is no such description, a value is not valid, or it has keys that the model lacks; the
+        text names the key.
     """
     if not isinstance(given, model):
         raise InputError(f"expected a {model.__name__}, not {type(given).__name__}")
-    said = contents(given)
-    made = model(**said)
-    if different := differences(said, contents(made)):
+    plain = contents(given)
+    made = model(**plain)
+    if different := differences(plain, contents(made)):
         raise InputError(f"{model.__name__}: {listed(different)}: not a value that can be had")
     return made

@@ -20,13 +20,13 @@ from stiffopt.control.allocation import Allocation
 from stiffopt.control.checks import limited_range, refusing
 from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.feedback import GainSchedule, tracking_rows
+from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LinearisedTip
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import Pursuit, Replanner
-from stiffopt.control.state import Severity, SteeringStatus
-from stiffopt.control.steering import Move, Notice, Seen
+from stiffopt.control.state import ControllerStatus, Severity
 from stiffopt.control.tip_errors import TipErrors, target_arrays, wrench_at
 from stiffopt.control.trajectory import Course, Trajectory
 from stiffopt.control.tuning import ControlTuning
@@ -39,15 +39,15 @@ from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 
-__all__ = ["Controller"]
+__all__ = ["TipController"]
 
 Array = NDArray[np.float64]
 
 _MOST_STEPS = 50  # of the estimators in one tick, after a pause
 
 
-class Controller:
-    """Controls the tip of an arm; see `Steering` for its methods.
+class TipController:
+    """Controls the tip of an arm; see `Controller` for its methods.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ class Controller:
         self.begin(0.0)
 
     def check(self) -> None:
-        """Compile and try the model; see `Steering.check`."""
+        """Compile and try the model; see `Controller.check`."""
         if self._model is not None:
             return
         model = LinearisedTip(self.robot)
@@ -156,19 +156,19 @@ class Controller:
         self._at_rest = True  # the reference begins at the present pressures
 
     def set_task(self, task: Task) -> None:
-        """Pursue a task; see `Steering.set_task`."""
+        """Pursue a task; see `Controller.set_task`."""
         with refusing("task"):
             pursue = self._prepared_task(task)
         pursue()
 
     def set_target(self, target: Target) -> None:
-        """Go to another target; see `Steering.set_target`."""
+        """Go to another target; see `Controller.set_target`."""
         with refusing("target"):
             pursue = self._prepared_target(target)
         pursue()
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
-        """Follow a trajectory; see `Steering.follow`."""
+        """Follow a trajectory; see `Controller.follow`."""
         with refusing("trajectory"):
             estimate = self._estimator.estimate
             course = Course(trajectory, now, estimate.position, estimate.rotation)
@@ -210,8 +210,8 @@ class Controller:
         commanded: Array,
         reading: PressureReading,
         samples: Sequence[PoseSample],
-    ) -> Seen:
-        """Estimate pressures and tip; see `Steering.observe`."""
+    ) -> SampleCounts:
+        """Estimate pressures and tip; see `Controller.observe`."""
         steps = min(max(1, round((now - self._now) / self._period)), _MOST_STEPS)
         self._now = now
         self._pressures.advance(steps, commanded, reading.pressures)
@@ -222,19 +222,19 @@ class Controller:
             self._estimator.advance(moment, effective, tip)
         return self._estimator.take(samples)
 
-    def move(self, now: float) -> Move:
-        """Compute the next command; see `Steering.move`."""
+    def compute(self, now: float) -> ControlOutput:
+        """Compute the next command; see `Controller.compute`."""
         reference, estimator, pressures = self._reference, self._estimator, self._pressures
         omega, command_offset = estimator.omega, pressures.command_offset
         plan = self.replanner.update(now, estimator.offset, command_offset, omega, reference.delay)
         last, n = pressures.command, len(pressures.command)
         if plan is None:  # nothing to do, or no plan yet
             self._at_rest = True
-            return Move(last.copy(), True, np.zeros(n, dtype=bool))
+            return ControlOutput(last.copy(), True, np.zeros(n, dtype=bool))
         if self._at_rest:
             self.resume(now)
         if self._model_is_wrong():
-            return Move(last.copy(), False, self._saturated.copy())
+            return ControlOutput(last.copy(), False, self._saturated.copy())
         tuning = self._tuning.reference
         reference.rate = tuning.rigid_rate
         if self._vibrates:
@@ -251,16 +251,16 @@ class Controller:
             last,
         )
         if command is None:
-            return Move(last.copy(), False, self._saturated.copy())
+            return ControlOutput(last.copy(), False, self._saturated.copy())
         reported = residual > self._tuning.feedback.unreported_error
         self._saturated = held if reported else np.zeros(n, dtype=bool)
-        return Move(command, True, self._saturated.copy())
+        return ControlOutput(command, True, self._saturated.copy())
 
-    def standing(self, now: float) -> SteeringStatus:
-        """Return the controller's part of the state; see `Steering.standing`."""
+    def status(self, now: float) -> ControllerStatus:
+        """Return the controller's part of the state; see `Controller.status`."""
         n, tip, pursuit = self.robot.n_pressures, self._tip, self.replanner.pursuit
         if tip is None:
-            return SteeringStatus(plan=np.full(n, np.nan))
+            return ControllerStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
         target = pursuit.target_at(now)
         position, pointing, quaternion = target_arrays(target)
@@ -273,7 +273,7 @@ class Controller:
         planned = np.full(n, np.nan)
         if plan is not None:
             planned = plan.pressures - self._pressures.history_offset
-        return SteeringStatus(
+        return ControllerStatus(
             plan=planned,
             tip_position=estimate.position,
             tip_quaternion=estimate.quaternion,

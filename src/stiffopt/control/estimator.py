@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.control.formula import Formula
-from stiffopt.control.steering import Seen
+from stiffopt.control.interface import SampleCounts
 from stiffopt.control.tuning import EstimatorTuning
 from stiffopt.control.vibration import BendingMode, transition
 from stiffopt.optimise.tip import TipAt
@@ -187,7 +187,7 @@ class TipEstimator:
             self._past.append(_PastTip(now, static, rotation, driven))
         self._pressures = pressures.copy()
 
-    def take(self, samples: Sequence[PoseSample]) -> Seen:
+    def take(self, samples: Sequence[PoseSample]) -> SampleCounts:
         """Correct the state by samples, each at the time of its capture.
 
         Samples are left out that are older than the newest that was used or than the memory, that
@@ -211,7 +211,7 @@ class TipEstimator:
                 if self._rejected >= self._tuning.patience:  # supervision has acted long before
                     self.sample = self._first = None
             self._last_sample = sample.time
-        return Seen(used, rejected, self._used_until)
+        return SampleCounts(used, rejected, self._used_until)
 
     def _update_mode(self, tip: TipAt) -> None:
         """Compute frequency, soft plane and lean from the compliance, every few steps."""

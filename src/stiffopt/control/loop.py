@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 
 from stiffopt.control.checks import check_target, check_task, check_trajectory
+from stiffopt.control.interface import Controller
 from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.request_queue import RequestQueue, current_requester
-from stiffopt.control.state import Snapshot, State, SteeringStatus
-from stiffopt.control.steering import Steering
+from stiffopt.control.state import ControllerStatus, Snapshot, State
 from stiffopt.control.supervisor import Supervisor
 from stiffopt.control.timing import TickTiming
 from stiffopt.control.trajectory import Trajectory
@@ -49,7 +49,7 @@ class ControlLoop:
     ----------
     rig :
         Robot, tracker and clock; of its supply the limits alone are used.
-    steering :
+    controller :
         The controller.
     outlet :
         The only way to the supply.
@@ -69,7 +69,7 @@ class ControlLoop:
     def __init__(
         self,
         rig: Rig,
-        steering: Steering,
+        controller: Controller,
         outlet: Outlet,
         *,
         safety: Safety,
@@ -81,13 +81,13 @@ class ControlLoop:
         self.rig = rig
         self.period = period
         tuning = tuning or SupervisionTuning()
-        self._supervisor = Supervisor(rig, steering, outlet, safety, period, tuning)
+        self._supervisor = Supervisor(rig, controller, outlet, safety, period, tuning)
         self._requests = RequestQueue()
         self._configuring = False
         self._timing = TickTiming(period)
         self._stop_time = safety.ramp_time + tuning.stop_margin
         self.events: EventBuffer = self._supervisor.events
-        self._unknown = SteeringStatus(plan=np.full(outlet.limits.n, np.nan))
+        self._unknown = ControllerStatus(plan=np.full(outlet.limits.n, np.nan))
         self._snapshot = self._current_snapshot(rig.clock.now())
         self._listeners: list[Callable[[Snapshot], None]] = []
 
@@ -280,7 +280,7 @@ class ControlLoop:
         finally:
             if supervisor.rig.tracker is not None:
                 supervisor.rig.tracker.close()
-            supervisor.steering.close()
+            supervisor.controller.close()
 
     def _ticked(self, due: float) -> float:
         """Tick when it is due; return when the next tick is."""
@@ -334,10 +334,10 @@ class ControlLoop:
         """Return the state now; a controller that fails to give its own is a fault."""
         supervisor = self._supervisor
         limits, reading = supervisor.outlet.limits, supervisor.reading
-        standing = self._unknown
+        status = self._unknown
         if supervisor.lifecycle.state is not State.UNCONFIGURED:
             try:
-                standing = supervisor.steering.standing(now)
+                status = supervisor.controller.status(now)
             except Exception as error:
                 text = f"unexpected {type(error).__name__}: {error}"
                 supervisor.fault(now, "internal", text)
@@ -355,5 +355,5 @@ class ControlLoop:
             rejected=supervisor.rejected,
             alarms=supervisor.alarms.now,
             timing=self._timing.statistics(),
-            **vars(standing),
+            **vars(status),
         )

@@ -27,9 +27,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from stiffopt.control.interface import Notice
 from stiffopt.control.planning import Plan, Planning, PlanRequest
 from stiffopt.control.state import Severity
-from stiffopt.control.steering import Notice
 from stiffopt.errors import StiffoptError
 from stiffopt.model.manipulator import Manipulator
 
@@ -53,7 +53,7 @@ class Planner(Protocol):
         """Return the newest plan."""
 
     def notices(self) -> tuple[Notice, ...]:
-        """Return what is wrong with the planner; see `Steering.notices`."""
+        """Return what is wrong with the planner; see `Controller.notices`."""
 
     def close(self) -> None:
         """End the planner."""

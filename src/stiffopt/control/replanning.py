@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.feedback import prescribed_components
+from stiffopt.control.interface import Notice
 from stiffopt.control.planner import Planner
 from stiffopt.control.planning import Plan, PlanRequest
-from stiffopt.control.steering import Notice
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
 from stiffopt.control.trajectory import Course
 from stiffopt.control.tuning import ReplanningTuning

@@ -21,7 +21,7 @@ from stiffopt.control.state_fields import Shown
 from stiffopt.rig.interface import PoseSample
 
 __all__ = [
-    *("Alarm", "Event", "SeenPose", "Severity", "Snapshot", "State", "SteeringStatus", "Timing"),
+    *("Alarm", "Event", "SeenPose", "Severity", "Snapshot", "State", "ControllerStatus", "Timing"),
 ]
 
 Array = NDArray[np.float64]
@@ -134,8 +134,8 @@ _nan3, _nan4, _nan6 = (partial(np.full, count, np.nan) for count in (3, 4, 6))
 
 
 @dataclass(frozen=True, kw_only=True)
-class SteeringStatus:
-    """What the steering knows of the state. SI units; poses in the base frame; NaN is unknown."""
+class ControllerStatus:
+    """The controller's part of the state. SI units; poses in the base frame; NaN is unknown."""
 
     plan: Annotated[
         Array,
@@ -268,7 +268,7 @@ class SteeringStatus:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Snapshot(SteeringStatus):
+class Snapshot(ControllerStatus):
     """The state of the control loop at the end of a tick.
 
     SI units; poses in the base frame; gauge pressures. NaN is what is not known, None what nobody

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.checks import check_rig, check_vented_arm, highest_pressures, refusing
+from stiffopt.control.interface import Controller
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.state import Severity, State
-from stiffopt.control.steering import Steering
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.control.trajectory import Trajectory
 from stiffopt.control.tuning import SupervisionTuning
@@ -73,13 +73,13 @@ class Supervisor:
     def __init__(
         self,
         rig: Rig,
-        steering: Steering,
+        controller: Controller,
         outlet: Outlet,
         safety: Safety,
         period: float,
         tuning: SupervisionTuning,
     ) -> None:
-        self.rig, self.steering, self.outlet = rig, steering, outlet
+        self.rig, self.controller, self.outlet = rig, controller, outlet
         self._tuning = tuning
         self._clock, self._safety = rig.clock, safety
         self.lifecycle = Lifecycle(in_real_time=isinstance(rig.clock, SystemClock))
@@ -108,7 +108,7 @@ class Supervisor:
         self._trouble: Trouble | None = None
         self._failures = 0  # of the controller, in a row
         self._force_limited_at = -np.inf
-        self._standing_notices: frozenset[str] = frozenset()
+        self._alarm_kinds: frozenset[str] = frozenset()
         self._ticked_at = self._clock.now()
 
     @property
@@ -198,7 +198,7 @@ class Supervisor:
             else:
                 self.fault(now, trouble.kind, trouble.text)
         self.reading = reading
-        seen = self.steering.observe(now, self.commanded, reading, samples)
+        seen = self.controller.observe(now, self.commanded, reading, samples)
         self.rejected = seen.rejected
         if samples and not self.lifecycle.armed:
             self._tracker.learn(now, samples)
@@ -259,15 +259,15 @@ class Supervisor:
 
     def _control(self, now: float) -> None:
         """Command what the controller decides."""
-        move = self.steering.move(now)
-        p, n = move.pressures, len(self._zero)
-        if not move.sound or p.shape != (n,) or not np.isfinite(p).all():
+        output = self.controller.compute(now)
+        p, n = output.pressures, len(self._zero)
+        if not output.valid or p.shape != (n,) or not np.isfinite(p).all():
             self._count_failure(now, "the solver has no answer")
             self._command(now, self.commanded)
         elif self._command(now, p, controlled=True):
             self._failures = 0
             self.alarms.clear(now, "solver")
-            self.saturated = self.saturated | move.saturated
+            self.saturated = self.saturated | output.saturated
 
     def _count_failure(self, now: float, text: str) -> None:
         """Count failures of the controller in a row; after some the pressures are held."""
@@ -321,16 +321,16 @@ class Supervisor:
 
     def _report_notices(self, now: float) -> None:
         """Make alarms and events of the controller's notices."""
-        notices = self.steering.notices()
+        notices = self.controller.notices()
         standing = frozenset(n.kind for n in notices if n.standing)
         for notice in notices:
             if notice.standing:
                 self.alarms.set(now, notice.kind, notice.text, notice.severity)
             else:
                 self.events.add(now, notice.kind, notice.text, notice.severity)
-        for kind in self._standing_notices - standing:
+        for kind in self._alarm_kinds - standing:
             self.alarms.clear(now, kind)
-        self._standing_notices = standing
+        self._alarm_kinds = standing
 
     # -- transitions --------------------------------------------------------------------------
 
@@ -349,7 +349,7 @@ class Supervisor:
         if self._holds:
             self.lifecycle.reason = next(iter(self._holds.values()))
             return
-        self.steering.resume(now)
+        self.controller.resume(now)
         self._failures = 0
         self.lifecycle.change(State.ACTIVE)
         self.events.add(now, "active", "steering again")
@@ -402,7 +402,7 @@ class Supervisor:
                 if self.rig.tracker is not None:
                     self.rig.tracker.open()
                 self.outlet.open()
-                problems = list(check_rig(self.rig, self.outlet, self.steering))
+                problems = list(check_rig(self.rig, self.outlet, self.controller))
                 reading = self.outlet.read()  # after the checks, which may compile the model
             except StiffoptError as error:
                 raise CommandError(f"devices: {error}") from error
@@ -412,7 +412,7 @@ class Supervisor:
         if problems:
             raise CommandError("; ".join(problems))
         if self.lifecycle.state is State.UNCONFIGURED:
-            self.steering.begin(self._clock.now())
+            self.controller.begin(self._clock.now())
             self.lifecycle.change(State.INACTIVE)
             self.events.add(now, "configured", "everything answers; vented")
 
@@ -430,11 +430,11 @@ class Supervisor:
         with refusing("arming"):
             reading = self.outlet.read()
             problems = [
-                *check_rig(self.rig, self.outlet, self.steering),
+                *check_rig(self.rig, self.outlet, self.controller),
                 *check_vented_arm(
                     now,
                     self.rig,
-                    self.steering,
+                    self.controller,
                     self._monitor,
                     reading,
                     self._tracker,
@@ -449,7 +449,7 @@ class Supervisor:
         self._vented = False
         try:
             self.outlet.arm()
-            self.steering.begin(now)
+            self.controller.begin(now)
         except BaseException as error:
             self._try_to_vent(now)
             if not self._vented:
@@ -472,7 +472,7 @@ class Supervisor:
         """Pursue a task; see `ControlLoop.set_task`."""
         self._permit_motion("set a task")
         highest = highest_pressures(task, self.outlet.limits)
-        self.steering.set_task(task)
+        self.controller.set_task(task)
         try:
             self.outlet.restrict(highest)
         except DeviceError as error:  # the controller has the task, and the gate has not
@@ -483,13 +483,13 @@ class Supervisor:
     def set_target(self, now: float, target: Target) -> None:
         """Go to a target; see `ControlLoop.set_target`."""
         self._permit_motion("set a target")
-        self.steering.set_target(target)
+        self.controller.set_target(target)
         self._go_on(now, "target", "")  # targets may come in a stream: no event for each
 
     def follow_trajectory(self, now: float, trajectory: Trajectory) -> None:
         """Follow a trajectory; see `ControlLoop.follow_trajectory`."""
         self._permit_motion("follow a trajectory")
-        self.steering.follow(trajectory, now)
+        self.controller.follow(trajectory, now)
         self._go_on(now, "trajectory", "there is a new trajectory")
 
     def _permit_motion(self, request: str) -> None:
@@ -564,6 +564,6 @@ class Supervisor:
         for kind in ("pressure-reading", "leak", "regulator-stuck", "solver"):
             self.alarms.clear(now, kind)
         self._tracker.forget()
-        self.steering.begin(now)
+        self.controller.begin(now)
         self.lifecycle.change(State.INACTIVE)
         self.events.add(now, "reset", "reset after a fault; vented")

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.steering import Seen
+from stiffopt.control.interface import SampleCounts
 from stiffopt.control.tuning import TrackerTuning
 from stiffopt.rig.interface import PoseSample
 from stiffopt.rig.settings import Safety
@@ -114,7 +114,7 @@ class TrackerWatch:
         """Position of the tip of the vented arm (3,), in m."""
         return np.median(np.array(self._positions), axis=0)
 
-    def update(self, now: float, seen: Seen) -> None:
+    def update(self, now: float, seen: SampleCounts) -> None:
         """Take in how many samples of a tick were used or rejected."""
         if self._latest == -np.inf:
             self._latest = now  # from here on it may be missing

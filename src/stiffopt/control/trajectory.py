@@ -1,4 +1,4 @@
-"""Trajectories: where the tip shall be, and when."""
+"""Trajectories: targets of the tip over time, and their smooth interpolation."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ MAX_WAYPOINTS = 2_000
 _LONGEST = 86_400.0  # s, of a trajectory
 _CLOSEST = 1e-3  # s, between waypoints
 _ROUNDING = 1e-6  # of that
-_OPPOSITE = -0.99  # cosine between directions, beyond which the way is not clear
-_SHORT = 0.05  # length of what is made a unit vector, below which its direction is not clear
-_BETWEEN = np.arange(1, 8) / 8  # shares of the way between two waypoints that are looked at
+_OPPOSITE = -0.99  # cosine between directions beyond which the way between them is ambiguous
+_SHORT = 0.05  # length of an interpolated direction below which it is ambiguous
+_BETWEEN = np.arange(1, 8) / 8  # shares of the way between waypoints at which that is checked
 
 
 class Waypoint(Schema):
@@ -46,12 +46,12 @@ class Waypoint(Schema):
 
 
 class Trajectory(Schema):
-    """Waypoints, through which the tip goes smoothly.
+    """Waypoints through which the tip passes smoothly.
 
     Attributes
     ----------
-    waypoints : in order of time, at least 1 ms apart, the first at 0 or 1 ms later; all ask for
-        the same kinds of things (the same axes).
+    waypoints : in order of time, at least 1 ms apart, the first at 0 or 1 ms later; all
+        prescribe the same components of the pose.
     """
 
     waypoints: Items[Waypoint]
@@ -75,7 +75,7 @@ class Trajectory(Schema):
 
 
 def _check_times(times: list[float]) -> None:
-    """Refuse times at which nothing could be, or not one after the other."""
+    """Refuse times that are out of range, not ascending or too close."""
     if not times:
         raise InputError("has no waypoints")
     for time in (times[0], times[-1]):
@@ -86,7 +86,7 @@ def _check_times(times: list[float]) -> None:
             raise InputError(
                 f"waypoints must be in order of time; {after:g} s follows {before:g} s"
             )
-    begun = times if times[0] == 0 else [0.0, *times]  # from where the tip is
+    begun = times if times[0] == 0 else [0.0, *times]  # the trajectory begins where the tip is
     for before, after in itertools.pairwise(begun):
         if after - before < _CLOSEST * (1 - _ROUNDING):
             raise InputError(
@@ -103,8 +103,8 @@ def _kind(target: Target) -> tuple[object, ...]:
 class Course:
     """A trajectory under way: a target for each moment.
 
-    Positions, directions and quaternions run along cubic splines through the waypoints, the latter
-    two made unit vectors again; at rest at both ends, which are held.
+    Positions, directions and quaternions follow cubic splines through the waypoints; directions and
+    quaternions are normalised. The splines are at rest at both ends, and hold there.
 
     Parameters
     ----------
@@ -113,12 +113,12 @@ class Course:
     begin :
         When it begins, in s.
     position, rotation :
-        Of the tip then, (3,) and (3, 3): where it begins if the first waypoint is later.
+        Of the tip at that time, (3,) and (3, 3): the start, if the first waypoint is later.
 
     Raises
     ------
     InputError
-        Waypoints point in opposite directions, or nothing finite leads through them.
+        Successive waypoints have opposite directions, or no finite spline leads through them.
     """
 
     def __init__(
@@ -140,17 +140,17 @@ class Course:
             rows = [list(t.pointing or ()) for t in targets]
             rows = [list(rotation[:, 2]), *rows] if later else rows
             _refuse_opposites(rows)
-            self._pointing = _clear(_spline(knots, rows), knots)
+            self._pointing = _checked(_spline(knots, rows), knots)
         if first.orientation is not None:
             rows = [list(t.orientation or ()) for t in targets]
             if later:
                 rows.insert(0, lie.quaternion_from_rotation(rotation).tolist())
-            self._orientation = _clear(_spline(knots, _the_short_way(rows)), knots)
+            self._orientation = _checked(_spline(knots, _nearer_signs(rows)), knots)
         self._knots = knots
         self.begin, self.end = begin, begin + times[-1]
 
     def at(self, now: float) -> Target:
-        """Target at a moment, in s."""
+        """Return the target at a time, in s."""
         t = float(np.clip(now - self.begin, self._knots[0], self._knots[-1]))
         update: dict[str, object] = {}
         if self._position is not None and self._first.position is not None:
@@ -177,8 +177,8 @@ def _refuse_opposites(directions: list[list[float]]) -> None:
             )
 
 
-def _the_short_way(quaternions: list[list[float]]) -> list[list[float]]:
-    """Quaternions, each with the sign that is nearer to the one before."""
+def _nearer_signs(quaternions: list[list[float]]) -> list[list[float]]:
+    """Return quaternions, each with the sign that is nearer to the one before."""
     rows = [np.array(quaternions[0])]
     for q in quaternions[1:]:
         closeness = float(rows[-1] @ np.array(q))
@@ -191,7 +191,7 @@ def _the_short_way(quaternions: list[list[float]]) -> list[list[float]]:
 
 
 def _numbers(rows: object) -> Array:
-    """Return numbers in lists as an array; refuse what is none."""
+    """Return lists of numbers as an array; refuse anything else."""
     try:
         return np.array(rows, dtype=float)
     except (TypeError, ValueError, OverflowError):
@@ -216,8 +216,8 @@ def _spline(knots: Array, rows: list[list[float]]) -> Callable[..., Array]:
     return found
 
 
-def _clear(spline: Callable[..., Array], knots: Array) -> Callable[..., Array]:
-    """Return a spline of what is made unit vectors, if it keeps away from zero on its way."""
+def _checked(spline: Callable[..., Array], knots: Array) -> Callable[..., Array]:
+    """Return a spline that will be normalised; refuse it if it comes close to zero."""
     gaps = np.diff(knots)[:, None] * _BETWEEN
     between = spline((knots[:-1, None] + gaps).ravel())
     if (np.linalg.norm(between, axis=-1) < _SHORT).any():

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.controller import Controller
+from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
@@ -136,7 +136,7 @@ class Daemon:
         guarded, self.link = guarded_rig(description, self.robot.description, json_lines=json_lines)
         self._clock = guarded.clock
         period = 1 / description.rate
-        self._controller = Controller(
+        self._controller = TipController(
             self.robot,
             self.link.limits,
             guarded.slew,

@@ -1,0 +1,121 @@
+"""The interface between the supervisor of the control loop and the controller that it runs.
+
+The supervisor keeps the arm safe whatever the controller does; the controller decides on pressures
+and need not know of states, faults or devices. `TipController` implements it, and so do the
+baselines of the closed-loop benchmark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.state import ControllerStatus, Severity
+from stiffopt.control.trajectory import Trajectory
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from stiffopt.rig.interface import PoseSample, PressureReading
+
+__all__ = ["ControlOutput", "Controller", "Notice", "SampleCounts"]
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SampleCounts:
+    """How many of a tick's tracker samples were used.
+
+    Attributes
+    ----------
+    used : plausible samples, late ones included.
+    rejected : samples to which no arm could have moved.
+    latest : capture time of the newest sample that was used so far, in s; minus infinity before it.
+    """
+
+    used: int
+    rejected: int
+    latest: float
+
+
+@dataclass(frozen=True)
+class ControlOutput:
+    """The command that a controller computes in a tick.
+
+    Attributes
+    ----------
+    pressures : ndarray
+        (n,), in Pa.
+    valid : bool
+        Whether they are a solution; if not, the solver failed and they are those of the last tick.
+    saturated : ndarray
+        Channels (n,) at a limit that keeps the tip from its target.
+    """
+
+    pressures: Array
+    valid: bool
+    saturated: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A message of the controller, which becomes an alarm or an event.
+
+    Attributes
+    ----------
+    kind : a word for programs.
+    text : a sentence for people.
+    severity : how bad it is.
+    standing : an alarm while the controller repeats it; otherwise an event.
+    """
+
+    kind: str
+    text: str
+    severity: Severity = Severity.WARNING
+    standing: bool = False
+
+
+class Controller(Protocol):
+    """Decides on pressures. Called from the control thread, one call at a time."""
+
+    def check(self) -> None:
+        """Compile the model; raise `InputError` if model or settings do not permit control."""
+
+    def begin(self, now: float) -> None:
+        """Start anew with a vented arm and without a task, which means to keep the pressures."""
+
+    def set_task(self, task: Task) -> None:
+        """Pursue a task from now on; raise `InputError`, changing nothing, if it is not valid."""
+
+    def set_target(self, target: Target) -> None:
+        """Go to another target, with the stiffness goal and limits of the task; the same errors."""
+
+    def follow(self, trajectory: Trajectory, now: float) -> None:
+        """Follow a trajectory that begins now; the same errors."""
+
+    def resume(self, now: float) -> None:
+        """Control again after others have commanded the pressures, without a jump."""
+
+    def observe(
+        self,
+        now: float,
+        commanded: Array,
+        reading: PressureReading,
+        samples: Sequence[PoseSample],
+    ) -> SampleCounts:
+        """Take in the set-points (n,) since the last tick, pressures and samples; in every tick."""
+
+    def compute(self, now: float) -> ControlOutput:
+        """Return the next command, within all limits; in the ticks in which it is active."""
+
+    def status(self, now: float) -> ControllerStatus:
+        """Return the controller's part of the state."""
+
+    def notices(self) -> tuple[Notice, ...]:
+        """Return the alarms that stand, and the events since the last call."""
+
+    def close(self) -> None:
+        """End the processes of the controller."""
