@@ -144,7 +144,7 @@ def _program(segments: int) -> dict[str, ca.Function]:
     except ImportError:
         return {}
     robot, task = tasks.task_of("position", segments, SEED, 0)
-    program = Program.of(task.target, task.stiffness)
+    program = Program.of(task.target, task.stiffness, robot.description)
     return {
         f"program's {name}": robot.tip_function(name, getattr(program, name), program.n_parameters)
         for name in ("pose", "point", "judge")

@@ -8,7 +8,7 @@ import pytest
 import stiffopt as so
 from independent import ARMS, FLOP, LOPSIDED, Arm, neo_hookean
 from stiffopt.optimise.prepared import prepared
-from stiffopt.optimise.problem import Problem
+from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.solver import PressureSolver
 
 HANGING = (0.0, 0.0, 9.81)
@@ -79,7 +79,7 @@ def compiled_point(solver, program, pressures):
     point.argtypes = [ctypes.c_void_p] * 5
     rows, terms, floors = setup.rows, setup.terms, setup.floors
     values = np.zeros(n + (rows + terms + floors) * (1 + n))
-    radii = np.array([term.radius for term in program.terms])
+    radii = np.array([constraint.radius for constraint in program.constraints(1.0)])
     parameters = np.concatenate([solver._numbers, program.parameters])
     assert point(
         ctypes.addressof(setup), parameters.ctypes.data, radii.ctypes.data,
@@ -102,7 +102,8 @@ def test_evaluation_is_that_of_the_model(name):
     solver, _ = kept.fast(program)
     pressures = np.random.default_rng(5).uniform(0, 0.6e5, arm.n)
     found = compiled_point(solver, program, pressures)
-    point = Problem(kept.robot, task).point(pressures / 1e5)
+    problem = PressureProblem(kept.robot, task)
+    point = problem.point(pressures / problem.unit)
     expected = [
         np.concatenate([ball.residual for ball in point.balls]),
         np.concatenate([ball.jacobian for ball in point.balls]),

@@ -12,9 +12,10 @@ import stiffopt as so
 from stiffopt.optimise import local
 from stiffopt.optimise.local import descend
 from stiffopt.optimise.prepared import Prepared
-from stiffopt.optimise.problem import Problem
+from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.reach import bounded_steps, reach, reach_all
 from stiffopt.optimise.search import search, starts
+from stiffopt.optimise.settings import Effort
 from stiffopt.optimise.solver import PressureSolver
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
@@ -42,8 +43,9 @@ def without_compiler(monkeypatch):
 def program(kind, number=0, name="stiff-flop-2"):
     """A random task's problem, and pressures to start from."""
     task = case(robot(name), kind, SEED, number)
-    problem = Problem(robot(name), task)
-    return problem, np.array(list(starts(problem, Prepared(robot(name), task, 0).samples)))
+    problem = PressureProblem(robot(name), task)
+    table = Prepared(robot(name), task, 0).samples
+    return problem, np.array(list(starts(problem, table).candidates))
 
 
 def feasible(problem, point):
@@ -92,8 +94,8 @@ def lagrangian_gradient(problem, result):
     prices, point = result.multipliers, result.point
     gradients = problem.objective.terms(point)[1]
     slope = prices.terms @ gradients - prices.floors @ point.floor_gradients
-    for ball in point.constraints:
-        slope = slope + prices.balls[ball.name] @ ball.jacobian
+    for ball, pull in zip(point.bounded, prices.balls, strict=True):
+        slope = slope + pull @ ball.jacobian
     free = (point.x > problem.lower) & (point.x < problem.upper)
     at_limits = np.where(point.x <= problem.lower, -slope, slope)[~free]
     assert (at_limits <= 1e-3 * np.linalg.norm(gradients)).all()  # they pull outwards
@@ -129,7 +131,7 @@ def test_search_is_over_when_nothing_new_is_found(without_compiler):
     assert found.results[0].value == min(result.value for result in found.results)
     values = [result.value for result in found.results]
     assert all(a <= b for a, b in pairwise(values))
-    short = search(problem, x, most_descents=1)
+    short = search(problem, x, Effort(len(x), 3, 1))
     assert not short.confidence.complete
     assert short.confidence.reached == 1
 

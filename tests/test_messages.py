@@ -32,6 +32,7 @@ from stiffopt.optimise.goal import (
 )
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task, load_task
+from stiffopt.optimise.terms.above import Plane
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.schema import Items, Schema, Vector
 from stiffopt.units import Length, Number, Speed, TranslationalStiffness
@@ -41,7 +42,7 @@ LIMITS = PressureLimits([0.0] * 3, [1.5e5] * 3)  # type: ignore[arg-type]
 X = (1.0, 0.0, 0.0)
 MESSAGES: tuple[type[Schema], ...] = (
     *(Task, Target, Tolerance, StiffnessGoal, StiffnessMeasure, AtLeast, MatchValue, MatchMatrix),
-    *(Load, PressureRange, Waypoint, Trajectory),
+    *(Load, PressureRange, Plane, Waypoint, Trajectory),
 )
 
 
@@ -219,6 +220,7 @@ EVERYTHING: list[Schema] = [
         target=Target(
             position=(0.01, None, 0.1),
             pointing=(0.0, 0.6, 0.8),
+            above={"point": (0.0, 0.01, 0.1), "normal": (0.0, 0.6, 0.8)},
             tolerance=Tolerance(position=2e-3, angle=0.3),
         ),
         stiffness=StiffnessGoal(

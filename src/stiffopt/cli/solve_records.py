@@ -7,6 +7,7 @@ from typing import Any
 from stiffopt.cli.console import plain_data
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.optimise.solution import PressureSolution, Sensitivities
+from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import least_maximised
 from stiffopt.units import format_quantity
 
@@ -25,6 +26,7 @@ def json_record(solved: SolvedTask) -> Record:
         "tip_quaternion_wxyz": solution.tip_quaternion,
         "position_error_m": solution.position_error,
         "angle_error_rad": solution.angle_error,
+        **{f"{t.result_name}_{t.unit}": solution.errors.get(t.name) for t in _others(solution)},
         "stiffness": solution.stiffness,
         "stiffness_unit": solution.stiffness_unit,
         "stiffnesses": solution.stiffnesses,
@@ -64,9 +66,23 @@ def _json_sensitivities(solution: PressureSolution) -> Record | None:
             "per_bound_per_pa": given.per_bound,
             "per_position_tolerance_per_m": given.per_position_tolerance,
             "per_angle_tolerance_per_rad": given.per_angle_tolerance,
+            **{
+                f"per_{_relaxed(term)}_per_{term.unit}": given.per_tolerance.get(term.name)
+                for term in _others(solution)
+            },
             "objective_unit": given.objective_unit,
         }
     return record
+
+
+def _others(solution: PressureSolution) -> list[Term]:
+    """Terms of the target whose errors have no place in all records."""
+    return [t for t in solution.task.target.terms if t.name not in ("position", "angle")]
+
+
+def _relaxed(term: Term) -> str:
+    """What of a term can be relaxed, and has a price."""
+    return f"{term.name}_{'margin' if term.is_inequality else 'tolerance'}"
 
 
 def _json_point(solution: PressureSolution) -> Record:
@@ -102,6 +118,12 @@ def result_record(solved: SolvedTask) -> Record:
         "uncertainty": _uncertainty(solved),
         "position_error": _quantity(solution.position_error, "m", "mm"),
         "angle_error": _quantity(solution.angle_error, "rad", "deg"),
+        **{
+            term.result_name: _quantity(
+                solution.errors.get(term.name), term.unit, term.shown(0.0)[1]
+            )
+            for term in _others(solution)
+        },
         "stiffness": _stiffnesses(solved),
         "matrix_distance": solution.matrix_distance,
         "compliance": _compliance(solution),
@@ -150,10 +172,7 @@ def _stiffnesses(solved: SolvedTask) -> list[Record] | None:
             "value": _quantity(value, measure.unit),
             "interval": None if ends is None else [_quantity(end, measure.unit) for end in ends],
             "plain": _quantity(blind, measure.unit),
-            "direction": list(measure.direction),
-            "frame": measure.frame,
-            "kind": measure.kind,
-            "boundary": measure.boundary,
+            **measure.said(),
         }
         for measure, value, blind, ends in zip(
             solution.task.measures, solution.stiffnesses, plain, intervals, strict=False
@@ -185,6 +204,10 @@ def _worth(solution: PressureSolution) -> Record | None:
         **{name: _quantity(value, f"{unit}/Pa") for name, value in given.per_bound.items()},
         "position_tolerance": _quantity(given.per_position_tolerance, f"{unit}/m"),
         "angle_tolerance": _quantity(given.per_angle_tolerance, f"{unit}/rad"),
+        **{
+            _relaxed(term): _quantity(given.per_tolerance.get(term.name), f"{unit}/{term.unit}")
+            for term in _others(solution)
+        },
     }
 
 

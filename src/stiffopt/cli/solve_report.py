@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import degrees, radians
+from math import degrees
 from typing import Any
 
 from numpy.typing import NDArray
@@ -17,10 +17,10 @@ from stiffopt.cli.tables import labelled, number_table
 from stiffopt.errors import printable
 from stiffopt.optimise.goal import AtLeast, MatchMatrix, MatchValue, StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import (
     BAR,
     MM,
-    direction_text,
     figures,
     gain_text,
     least_maximised,
@@ -106,25 +106,22 @@ def _pressure(value: float, at: str) -> Text:
 def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
     x, y, z = (f"{value * MM + 0.0:.3f}" for value in pose[:3, 3])
     yield "tip at", Text(f"({x}, {y}, {z}) mm, pointing {vector_text(pose[:3, 2])}")
-    tolerance = solution.task.target.tolerance
-    if solution.position_error is not None:
-        yield (
-            "tip error",
-            _error(solution.position_error * MM, tolerance.position * MM, "mm", "position"),
-        )
-    if solution.angle_error is not None:
-        label = "" if solution.position_error is not None else "tip error"
-        yield label, _error(degrees(solution.angle_error), degrees(tolerance.angle), "deg", "angle")
+    for number, term in enumerate(solution.task.target.terms):
+        yield "" if number else "tip error", _error(term, solution.errors[term.name])
 
 
-def _error(value: float, tolerance: float, unit: str, what: str) -> Text:
-    over = value > tolerance * (1 + 1e-9)
+def _error(term: Term, value: float) -> Text:
+    """By how much a term of the target is missed, or by which margin it holds."""
+    if term.is_inequality:
+        return Text(term.words(value), "bold" if term.holds(value) else "bold yellow")
+    (shown, unit), (tolerance, _) = term.shown(value), term.shown(term.radius)
+    over = value > term.radius * (1 + 1e-9)
     return Text.assemble(
         (
-            f"{figures(value)} {unit}" if over else f"{value:.3f} {unit}",
+            f"{figures(shown)} {unit}" if over else f"{shown:.3f} {unit}",
             "bold yellow" if over else "bold",
         ),
-        f" in {what}, {'more than the ' if over else ''}tolerance {tolerance:g} {unit}",
+        f" in {term.name}, {'more than the ' if over else ''}tolerance {tolerance:g} {unit}",
     )
 
 
@@ -197,14 +194,8 @@ def _stiffness(
     return Text.assemble(
         (f"{figures(value)} {unit_text(measure.unit)}", "bold"),
         f"  ({remark})" if remark else "",
-        f"\n{_meaning(measure)}",
+        f"\n{measure.words()}",
     )
-
-
-def _meaning(measure: StiffnessMeasure) -> str:
-    """Direction, frame, kind and boundary in words."""
-    direction = direction_text(measure)
-    return f"against {measure.kind} {direction}, {measure.frame} axes, {measure.boundary}"
 
 
 def _condition(measure: StiffnessMeasure) -> str:
@@ -223,10 +214,14 @@ def _worth(solution: PressureSolution) -> Iterable[Line]:
         return
     unit = unit_text(given.objective_unit)
     offers = []
-    if given.per_position_tolerance:
-        offers.append((given.per_position_tolerance * 1e-3, "mm of position tolerance"))
-    if given.per_angle_tolerance:
-        offers.append((given.per_angle_tolerance * radians(1), "degree of angle tolerance"))
+    for term in solution.task.target.terms:
+        price = given.per_tolerance.get(term.name)
+        factor, unit_of_term = term.shown(1.0)
+        per = "degree" if unit_of_term == "deg" else unit_of_term
+        what = "by which it may fall short of" if term.is_inequality else "of"
+        if price:
+            tolerance = f"'{term.name}'" if term.is_inequality else f"{term.name} tolerance"
+            offers.append((price / factor, f"{per} {what} {tolerance}"))
     for name, value in sorted(given.per_bound.items(), key=lambda item: -item[1]):
         moved = "raised" if name.endswith("max") else "lowered"
         if value:

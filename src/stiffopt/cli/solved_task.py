@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from stiffopt.errors import EquilibriumError, FileError, InputError
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.uncertainty import TipUncertainty
+from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.pareto import pareto_front
 from stiffopt.optimise.solution import PressureSolution, judge
 from stiffopt.optimise.solver import PressureSolver, stiffness_blind
@@ -98,6 +99,7 @@ def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
         intervals = tuple(
             uncertainty.stiffness_interval(m.direction, m.kind, m.boundary, m.frame)
             for m in measures
+            if isinstance(m, StiffnessMeasure)
         )
     except EquilibriumError:  # no equilibrium there, or hardly: nothing is known of its errors
         return answer

@@ -16,7 +16,6 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt import lie
 from stiffopt.control.tip_errors import TipErrors
 from stiffopt.control.tuning import FeedbackTuning, NearestTuning, PlanningTuning
 from stiffopt.model.manipulator import Manipulator
@@ -231,20 +230,8 @@ def model_target(target: Target, offset: Array, tuning: PlanningTuning | None = 
     tuning :
         Its tolerances.
     """
-    update: dict[str, object] = {"tolerance": _tolerance(tuning or PlanningTuning())}
-    if target.position is not None:
-        update["position"] = tuple(
-            None if axis is None else axis - float(shift)
-            for axis, shift in zip(target.position, offset[:3], strict=True)
-        )
-    back = lie.exp(np.concatenate([np.zeros(3), -offset[3:]]))[:3, :3]
-    if target.pointing is not None:
-        update["pointing"] = tuple((back @ np.array(target.pointing)).tolist())
-    if target.orientation is not None:
-        rotation = back @ lie.rotation_from_quaternion(np.array(target.orientation))
-        q = lie.quaternion_from_rotation(rotation)
-        update["orientation"] = tuple((q if q[0] >= 0 else -q).tolist())
-    return target.model_copy(update=update)
+    update = {"tolerance": _tolerance(tuning or PlanningTuning())}
+    return target.moved_back(offset).model_copy(update=update)
 
 
 def _tolerance(tuning: PlanningTuning) -> Tolerance:

@@ -16,14 +16,20 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.control.formula import Formula
 from stiffopt.model.compliance import directional_stiffness
+from stiffopt.model.shape import PointOfArm
+from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
-from stiffopt.optimise.terms import PoseTerm, pose_terms
+from stiffopt.optimise.term import Term
 from stiffopt.optimise.tip import TipAt
 
 __all__ = ["TipErrors", "stiffness_function", "target_arrays", "wrench_at"]
 
 Array = NDArray[np.float64]
+
+_KEPT = 30.0
+"""Weight of an inequality that is missed against errors, in least squares: it is kept but for
+about a thousandth of the error that remains."""
 
 
 class TipErrors:
@@ -42,7 +48,7 @@ class TipErrors:
         """
         if target is None:
             return math.nan, math.nan
-        terms = pose_terms(target)
+        terms = _terms_of_tip(target)
         key = tuple(term.structure for term in terms)
         if key not in self._norms:
             self._norms[key] = _norms(terms)
@@ -73,7 +79,7 @@ class TipErrors:
         position_error, angle_error : float
             In m and rad; 0 where the target prescribes nothing.
         """
-        terms, n = pose_terms(target), tip.jacobian.shape[1]
+        terms, n = _terms_of_tip(target), tip.jacobian.shape[1]
         key = (n, lever, *(term.structure for term in terms))
         if key not in self._weighted:
             self._weighted[key] = _weighted(terms, n, lever)
@@ -84,7 +90,7 @@ class TipErrors:
         return error, jacobian, found.get("position", 0.0), found.get("angle", 0.0)
 
 
-def _norms(terms: tuple[PoseTerm, ...]) -> Formula:
+def _norms(terms: tuple[Term, ...]) -> Formula:
     """Lengths of residuals; inputs: position (3,), rotation (3, 3), parameters of each term."""
     position, rotation = ca.SX.sym("position", 3), ca.SX.sym("rotation", 3, 3)
     parameters = [ca.SX.sym("parameters", len(term.parameters)) for term in terms]
@@ -92,7 +98,7 @@ def _norms(terms: tuple[PoseTerm, ...]) -> Formula:
     return Formula([position, rotation, *parameters], [ca.norm_2(r) for r in residuals])
 
 
-def _weighted(terms: tuple[PoseTerm, ...], n: int, lever: float) -> Formula:
+def _weighted(terms: tuple[Term, ...], n: int, lever: float) -> Formula:
     """Error (t,), its Jacobian (t, n) and lengths of residuals.
 
     Inputs: pose (4, 4) and Jacobian (6, n) of the tip, parameters of each term. The residuals are
@@ -112,12 +118,18 @@ def _weighted(terms: tuple[PoseTerm, ...], n: int, lever: float) -> Formula:
 
 
 def _residuals(
-    terms: tuple[PoseTerm, ...], position: ca.SX, rotation: ca.SX, parameters: list[ca.SX]
+    terms: tuple[Term, ...], position: ca.SX, rotation: ca.SX, parameters: list[ca.SX]
 ) -> list[ca.SX]:
-    return [
-        term.residual(position, rotation, values)
-        for term, values in zip(terms, parameters, strict=True)
-    ]
+    tip = PointOfArm(position, rotation)
+    found = []
+    for term, values in zip(terms, parameters, strict=True):
+        residual = term.residual(tip, values)
+        found.append(_KEPT * ca.fmin(residual, 0) if term.is_inequality else residual)
+    return found
+
+
+def _terms_of_tip(target: Target) -> tuple[Term, ...]:
+    return tuple(term for term in target.terms if not term.has_stations)
 
 
 def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
@@ -125,6 +137,8 @@ def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
     if not task.measures:
         return None
     measure = task.measures[0]
+    if not isinstance(measure, StiffnessMeasure):
+        return None
     C, R = ca.SX.sym("C", 6, 6), ca.SX.sym("R", 3, 3)
     value = directional_stiffness(
         C, R, ca.DM(measure.direction),

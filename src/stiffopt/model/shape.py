@@ -56,11 +56,30 @@ class Shape(Protocol):
     def pressures(self) -> ca.SX | ca.MX:
         """Channel pressures (n,)."""
 
+    def station(self, at: float) -> "PointOfArm":
+        """Another point of the same arm, at arc length `at` (m, at rest, from the base)."""
+
     def flexibility(self, wrench: ca.SX | ca.MX) -> ca.SX | ca.MX:
         """``w' C w`` of a wrench (6,) at the station, in its own axes: what it does there."""
 
     def total_jacobian(self, values: ca.SX | ca.MX) -> ca.SX | ca.MX:
         """Derivative (k, n) of values (k,) of this shape by the pressures."""
+
+
+@dataclass(frozen=True)
+class PointOfArm:
+    """Where a point of the arm is.
+
+    Attributes
+    ----------
+    position : casadi.SX or casadi.MX
+        In the base frame, (3,).
+    rotation : casadi.SX or casadi.MX
+        Axes (3, 3) of the section in the base frame.
+    """
+
+    position: ca.SX | ca.MX
+    rotation: ca.SX | ca.MX
 
 
 @dataclass(frozen=True)
@@ -169,6 +188,18 @@ class FreeShape:
             if piece.section is not None:
                 C += segment_compliance(piece.section, piece.length, piece.half)
         return C
+
+    def station(self, at: float) -> PointOfArm:
+        """See `Shape.station`."""
+        T, left = ca.SX.eye(4), ca.SX(at)
+        for piece in self.pieces:
+            length = ca.fmax(ca.fmin(left, piece.length), 0)
+            left -= piece.length
+            own = (
+                connector(length) if piece.section is None else segment_pose(piece.section, length)
+            )
+            T = T @ own
+        return PointOfArm(T[:3, 3], T[:3, :3])
 
     def flexibility(self, wrench: ca.SX) -> ca.SX:
         """``w' C w`` of a wrench (6,) at the station: twice the strain energy that it stores."""

@@ -21,9 +21,9 @@ point a moment at the tip turns it without bound, and beyond it turns it the wro
 the rotational compliance of every shorter arm must be positive definite.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from math import ceil, sqrt
 
@@ -36,6 +36,7 @@ from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.compliance import inverse_3x3
 from stiffopt.model.description import RobotDescription, Segment
 from stiffopt.model.kinematics import Actuation
+from stiffopt.model.shape import PointOfArm
 
 Vector = NDArray[np.float64]
 
@@ -149,6 +150,20 @@ def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
     return ca.Function("step", [start, strain, compliance, n, f, h], [end])
 
 
+def _soft_point(
+    step: ca.Function, start: ca.MX, strain: ca.MX, compliance: ca.MX, force: ca.MX, weight: ca.MX,
+    distance: float,
+) -> tuple[ca.MX, ca.MX]:  # fmt: skip
+    state = step(start, strain, compliance, force, weight, distance)
+    return state[:4], state[4:7]
+
+
+def _rigid_point(
+    quaternion: ca.MX, position: ca.MX, axis: ca.MX, distance: float
+) -> tuple[ca.MX, ca.MX]:
+    return quaternion, position - distance * axis
+
+
 def _turn_between(q: ca.MX, dq: ca.MX) -> ca.MX:
     """Rotation vectors (3, k) in body axes of the changes dq (4, k) of a unit quaternion q."""
     w, x, y, z = q[0], q[1], q[2], q[3]
@@ -156,6 +171,22 @@ def _turn_between(q: ca.MX, dq: ca.MX) -> ca.MX:
         ca.horzcat(-x, w, z, -y), ca.horzcat(-y, -z, w, x), ca.horzcat(-z, y, -x, w)
     )
     return 2 * left @ dq
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """One integration step, or a rigid piece, between two arc lengths from the base.
+
+    Attributes
+    ----------
+    proximal, distal : float
+    towards_base : callable
+        Quaternion and position, from the tip, at a distance from its distal end towards the base.
+    """
+
+    proximal: float
+    distal: float
+    towards_base: Callable[[float], tuple[ca.MX, ca.MX]]
 
 
 @dataclass(frozen=True)
@@ -175,6 +206,15 @@ class Chain:
     quaternion: ca.MX  # of the station
     position: ca.MX  # of the station, from the base
     tip_quaternion: ca.MX
+    stretches: tuple[Stretch, ...]
+
+    def station(self, at: float) -> PointOfArm:
+        """See `stiffopt.model.shape.Shape.station`."""
+        stretch = next(each for each in self.stretches if each.proximal <= at)
+        q, position = stretch.towards_base(stretch.distal - at)
+        base = self.stretches[-1]
+        _, origin = base.towards_base(base.distal)
+        return PointOfArm(position - origin, lie.rotation_from_quaternion(q))
 
     @property
     def x(self) -> ca.MX:
@@ -338,8 +378,9 @@ class Shooting:
         length = self.description.length
         station_at = length if at is None else at
         station_quaternion, station_position = tip_quaternion, position
-        nodes = []
+        nodes, stretches = [], []
         for piece in self.pieces([station_at]):
+            distal = piece.distal
             if abs(piece.distal - station_at) <= SAME_STATION * length:
                 R = lie.rotation_from_quaternion(orientation)
                 force = force + station[:3] + added[:3] + R @ station[6:9]
@@ -347,6 +388,8 @@ class Shooting:
                 station_quaternion, station_position = orientation, position
             if piece.rigid:
                 axis = lie.rotation_from_quaternion(orientation)[:, 2]
+                rigid = partial(_rigid_point, orientation, position, axis)
+                stretches.append(Stretch(distal - piece.length, distal, rigid))
                 position = position - piece.length * axis
                 moment = moment + piece.length * ca.cross(axis, force)
                 continue
@@ -354,9 +397,11 @@ class Shooting:
             weight = self.weight(piece.segment) * gravity
             h = piece.length / piece.steps
             for _ in range(piece.steps):
-                state = self.step[piece.segment](
-                    ca.vertcat(orientation, position, moment), strain, compliance, force, weight, h
-                )
+                start = ca.vertcat(orientation, position, moment)
+                given = (self.step[piece.segment], start, strain, compliance, force, weight)
+                stretches.append(Stretch(distal - h, distal, partial(_soft_point, *given)))
+                distal -= h
+                state = self.step[piece.segment](*given[1:], h)
                 orientation, position, moment = state[:4], state[4:7], state[7:]
                 force = force + h * weight
                 nodes.append(orientation)
@@ -367,6 +412,7 @@ class Shooting:
             quaternion=station_quaternion,
             position=station_position - position,
             tip_quaternion=tip_quaternion,
+            stretches=tuple(stretches),
         )
 
     def weight(self, segment: int) -> float:

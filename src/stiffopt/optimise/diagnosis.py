@@ -5,62 +5,65 @@ puts findings into words.
 """
 
 from collections.abc import Iterable
-from math import degrees, inf
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.optimise.goal import MatchMatrix, MatchValue
 from stiffopt.optimise.local import LocalResult
-from stiffopt.optimise.problem import Problem
+from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.search import search
+from stiffopt.optimise.settings import CLOSEST, Effort
 from stiffopt.optimise.solution import Judgement, Sensitivities
 from stiffopt.optimise.task import Task
-from stiffopt.optimise.terms import pose_terms
 
 Vector = NDArray[np.float64]
 
-_MOST_DESCENTS = 16
-_AGREEING = 4  # descents in a row that find nothing nearer before a search for it ends
-_SAME = 1e-7  # half a squared error over a scale, of configurations that are as near
 
+def closest_configurations(
+    problem: PressureProblem, candidates: Iterable[Vector]
+) -> list[LocalResult]:
+    """Pressures that come nearest to the target, from all candidates to start from, best first.
 
-def closest_configurations(problem: Problem, candidates: Iterable[Vector]) -> list[LocalResult]:
-    """Pressures that come nearest to the pose, from all candidates to start from, best first.
-
-    The least position error; where an angle is asked for too, within the angle's tolerance if
-    that can be had, else at the least angle error.
+    The terms are approached one after the other, each within the tolerances of those before or,
+    where these cannot be had, at their least errors: first inequalities, then others, the position
+    last.
     """
     xs = list(candidates)
-    names = [term.name for term in pose_terms(problem.task.target)]
-    free = problem.changed(problem.objective, floors=False, position=inf, angle=inf)
-    if names != ["position", "angle"]:
-        return _descents(free.changed(problem.closest(names[0])), xs)
-    turned = _descents(free.changed(problem.closest("angle")), xs)
-    if not turned:
-        return []
-    least = next(ball.error for ball in turned[0].point.balls if ball.name == "angle")
-    allowed = max(problem.task.target.tolerance.angle, least * (1 + 1e-6) + 1e-7)
-    nearest = free.changed(problem.closest("position"), angle=allowed)
-    return _descents(nearest, [turned[0].point.x, *xs])
+    terms = problem.program.terms
+    free = {term.name: inf for term in terms}
+    stage = problem.changed(problem.objective, free, floors=False)
+    results: list[LocalResult] = []
+    for term in sorted(terms, key=lambda t: (not t.is_inequality, -t.order)):
+        stage = stage.changed(problem.closest(term.name))
+        results = _descents(stage, [*(result.point.x for result in results[:1]), *xs])
+        if not results:
+            return []
+        ball = [b for b in results[0].point.balls if b.name == term.name]
+        least = max(b.error for b in ball)
+        allowed = max(term.radius, least * (1 + 1e-6) + 1e-7)
+        stage = stage.changed(stage.objective, {term.name: allowed})
+    return results
 
 
-def _descents(problem: Problem, xs: list[Vector]) -> list[LocalResult]:
-    return list(search(problem, xs, _MOST_DESCENTS, _SAME, _AGREEING).results)
+def _descents(problem: PressureProblem, xs: list[Vector]) -> list[LocalResult]:
+    tries = Effort(len(xs), CLOSEST.agreeing, CLOSEST.most_descents)
+    return list(search(problem, xs, tries, CLOSEST.same).results)
 
 
-def unimproved(problem: Problem, x: Vector) -> LocalResult:
+def unimproved(problem: PressureProblem, x: Vector) -> LocalResult:
     """Pressures as they are, as a result that can be judged beside those of descents."""
     problem.restart()
     point = problem.pose(x)
-    nearest = problem.changed(problem.closest(point.balls[0].name), floors=False)
+    nearest = problem.changed(problem.closest(problem.program.terms[0].name), floors=False)
     return LocalResult(nearest, point, inf, 0.0, converged=False, is_optimum=False)
 
 
-def freedom(problem: Problem, x: Vector) -> int:
-    """Directions in pressure space in which what is asked of the pose stays what it is."""
+def freedom(problem: PressureProblem, x: Vector) -> int:
+    """Directions in pressure space in which the residuals stay what they are."""
     problem.restart()
-    rows = [ball.jacobian / ball.radius for ball in problem.pose(x).constraints]
+    balls = [ball for ball in problem.pose(x).bounded if not ball.constraint.one_sided]
+    rows = [np.zeros((0, len(x))), *(ball.jacobian / ball.radius for ball in balls)]
     return int(len(x) - np.linalg.matrix_rank(np.vstack(rows), rtol=1e-6))
 
 
@@ -74,54 +77,33 @@ def no_freedom_message(task: Task, n_pressures: int, sensitivities: Sensitivitie
         return text
     unit = sensitivities.objective_unit.replace("*", " ")
     offers = []
-    if sensitivities.per_position_tolerance:
-        offers.append(f"{sensitivities.per_position_tolerance * 1e-3:.3g} {unit} per mm")
-    if sensitivities.per_angle_tolerance:
-        per_degree = sensitivities.per_angle_tolerance * np.pi / 180
-        offers.append(f"{per_degree:.3g} {unit} per degree")
+    for term in task.target.terms:
+        price = sensitivities.per_tolerance.get(term.name)
+        if price and not term.is_inequality:
+            factor, shown = term.shown(1.0)
+            per = "degree" if shown == "deg" else shown
+            offers.append(f"{price / factor:.3g} {unit} per {per}")
     return f"{text}; a larger tolerance would buy {' and '.join(offers)}" if offers else text
 
 
 def unreachable_message(judgement: Judgement, task: Task, holding: list[str]) -> str:
     """Say how far the closest configuration is and what holds it back."""
-    misses = []
-    tolerance = task.target.tolerance
-    if judgement.position_error is not None and judgement.position_error > tolerance.position:
-        misses.append(f"{judgement.position_error * 1e3:.4g} mm")
-    if judgement.angle_error is not None and judgement.angle_error > tolerance.angle:
-        misses.append(f"{degrees(judgement.angle_error):.3g} deg")
+    away: list[str] = []
+    beyond: list[str] = []
+    for term in task.target.terms:
+        value = judgement.errors[term.name]
+        if not term.holds(value):
+            (beyond if term.is_inequality else away).append(term.words(value))
+    misses = [*([f"{' and '.join(away)} away"] if away else []), *beyond]
     held = (
         f"held back by {', '.join(holding)}"
         if holding
         else "no pressure limit holds it back: the target is beyond the arm itself"
     )
-    return f"unreachable: the closest configuration is {' and '.join(misses)} away; {held}"
+    return f"unreachable: the closest configuration is {' and '.join(misses)}; {held}"
 
 
-def demands_message(judgement: Judgement, task: Task) -> str:
+def demands_message(judgement: Judgement) -> str:
     """Say which stiffness cannot be had at the pose, and the best that can."""
-    goal = task.stiffness
-    if goal is None:
-        return ""
-    parts = []
-    match = goal.match
-    first = len(goal.maximise) + isinstance(match, MatchValue)
-    if isinstance(match, MatchValue):
-        value = judgement.stiffnesses[0]
-        if abs(value / match.value - 1) > match.tolerance:
-            parts.append(f"{match.value:.4g} {_unit(match.unit)} asked for, {value:.4g} is nearest")
-    if isinstance(match, MatchMatrix) and judgement.matrix_distance is not None:
-        parts.append(
-            f"the nearest stiffness matrix is {judgement.matrix_distance:.3g} away (relative "
-            f"Frobenius distance, {match.tolerance:.3g} allowed)"
-        )
-    for floor, value in zip(goal.at_least, judgement.stiffnesses[first:], strict=True):
-        if value < floor.value:
-            parts.append(
-                f"at least {floor.value:.4g} {_unit(floor.unit)} asked for, {value:.4g} is the most"
-            )
-    return f"unreachable: the pose can be had, but not this stiffness there: {'; '.join(parts)}"
-
-
-def _unit(unit: str) -> str:
-    return unit.replace("*", " ")
+    missed = "; ".join(judgement.shortfalls)
+    return f"unreachable: the pose can be had, but not this stiffness there: {missed}"

@@ -8,8 +8,9 @@ method.
 
 import ctypes
 from collections.abc import Iterator
-from itertools import pairwise
-from typing import NamedTuple
+from dataclasses import asdict
+from itertools import chain, pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,19 +18,16 @@ from numpy.typing import NDArray
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.effort import effort
-from stiffopt.optimise.loaded import LoadedArm, loaded_effort
-from stiffopt.optimise.local import FIRST_RADIUS, INSIDE, LAST_RADIUS, MOST_ITERATIONS, TOUCHING
-from stiffopt.optimise.problem import FLOOR_MARGIN
-from stiffopt.optimise.program import Program
-from stiffopt.optimise.samples import SampleTable, nearness
-from stiffopt.optimise.search import SAME_OPTIMUM
+from stiffopt.optimise.loaded import LoadedArm
+from stiffopt.optimise.program import Program, pressure_ranges
+from stiffopt.optimise.samples import SampleTable
+from stiffopt.optimise.search import effort
+from stiffopt.optimise.settings import DESCENT, REACH, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
-from stiffopt.optimise.target import Target
 
 Vector = NDArray[np.float64]
 
-_NEAR = 17  # numbers that say how near a sample is
+_NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
 _UNSOLVED = 0
 _CHUNK = 8  # tasks that a thread takes at a time
@@ -37,42 +35,42 @@ _CHUNK = 8  # tasks that a thread takes at a time
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
+def _mirrored(settings: Any) -> ctypes.Structure:
+    """Settings as the structure in C that has the same fields."""
+    kinds = {float: _double, int: _integer}
+    values = settings._asdict() if isinstance(settings, Effort) else asdict(settings)
+    fields = [(name, kinds[type(value)]) for name, value in values.items()]
+    kind = type(type(settings).__name__, (ctypes.Structure,), {"_fields_": fields})
+    found: ctypes.Structure = kind(**values)
+    return found
+
+
+_REACH, _DESCENT, _EFFORT = map(_mirrored, (REACH, DESCENT, SEARCH.placed))
+
+
 class _Setup(ctypes.Structure):
     """`Setup` of native/program.h."""
 
     _fields_ = [
-        ("n", _integer),
-        ("rows", _integer),
-        ("balls", _integer),
-        ("ball_rows", _integer * 2),
-        ("terms", _integer),
-        ("floors", _integer),
-        ("values", _integer),
-        ("parameters", _integer),
-        ("samples", _integer),
-        ("nearest", _integer),
-        ("screened", _integer),
-        ("agreeing", _integer),
-        ("most_descents", _integer),
-        ("most_iterations", _integer),
-        ("scale", _double * 2),
-        ("first_radius", _double),
-        ("last_radius", _double),
-        ("precision", _double),
-        ("curvature", _double),
-        ("inside", _double),
-        ("touching", _double),
-        ("floor_slack", _double),
-        ("same", _double),
-        ("sample_x", _pointer),
-        ("sample_poses", _pointer),
+        *((name, _integer) for name in (
+            "n", "rows", "balls", "terms", "floors", "values", "parameters", "near", "samples"
+        )),
+        *((name, _pointer) for name in ("ball_rows", "one_sided", "scale", "unit")),
+        ("reach", type(_REACH)),
+        ("descent", type(_DESCENT)),
+        ("least_effort", type(_EFFORT)),
+        ("most_effort", type(_EFFORT)),
+        *((name, _double) for name in (
+            "covered", "same_optimum", "unlike", "price_of_floors", "precision"
+        )),
+        *((name, _pointer) for name in ("sample_x", "sample_poses")),
         ("state", _integer),
         ("sample_states", _pointer),
         ("rod", _pointer),
-    ]
+    ]  # fmt: skip
 
 
-class Answer(NamedTuple):
+class CompiledAnswer(NamedTuple):
     """What the compiled solver found.
 
     Attributes
@@ -125,35 +123,41 @@ class FastSolver:
         self._solve.argtypes = [
             _pointer, _pointer, _integer, _pointer, _integer, _integer, _integer
         ]  # fmt: skip
-        n, rows = robot.n_pressures, [term.size for term in program.terms]
-        scales = [robot.length if term.name == "position" else 1.0 for term in program.terms]
-        tries = effort(sum(rows)) if arm is None else loaded_effort(sum(rows))
+        n, constraints = robot.n_pressures, program.constraints(robot.length)
         self._length = robot.length
+        self._arrays = (
+            np.array([c.end - c.first for c in constraints], dtype=np.int64),
+            np.array([c.one_sided for c in constraints], dtype=np.int64),
+            np.array([c.scale for c in constraints]),
+            pressure_ranges(robot.description),
+            table.pressures / pressure_ranges(robot.description),
+        )
+        ball_rows, one_sided, scale, unit, sample_x = (a.ctypes.data for a in self._arrays)
+        least, most = (effort(program.n_equal, share, arm is not None) for share in (0.0, 1.0))
         setup = _Setup(
             n=n,
-            rows=sum(rows),
-            balls=len(rows),
-            ball_rows=(_integer * 2)(*rows),
+            rows=program.n_rows,
+            balls=len(constraints),
             terms=program.n_terms,
             floors=program.n_floors,
             values=len(program.measures),
             parameters=len(robot.numbers) + program.n_parameters,
-            samples=len(table.x),
-            nearest=min(2 * tries.screened, len(table.x)),
-            screened=tries.screened,
-            agreeing=tries.agreeing,
-            most_descents=tries.most_descents,
-            most_iterations=MOST_ITERATIONS,
-            scale=(_double * 2)(*scales),
-            first_radius=FIRST_RADIUS,
-            last_radius=LAST_RADIUS,
+            near=len(program.terms),
+            samples=len(table.pressures),
+            ball_rows=ball_rows,
+            one_sided=one_sided,
+            scale=scale,
+            unit=unit,
+            reach=_REACH,
+            descent=_DESCENT,
+            least_effort=type(_EFFORT)(*least),
+            most_effort=type(_EFFORT)(*most),
+            covered=SEARCH.covered,
+            same_optimum=SEARCH.same_optimum,
+            unlike=SEARCH.unlike,
+            price_of_floors=SEARCH.price_of_floors,
             precision=program.precision,
-            curvature=program.steepness,
-            inside=INSIDE,
-            touching=TOUCHING,
-            floor_slack=0.5 * FLOOR_MARGIN,
-            same=SAME_OPTIMUM,
-            sample_x=table.x.ctypes.data,
+            sample_x=sample_x,
             sample_poses=table.flat_poses.ctypes.data,
         )
         if arm is not None:
@@ -165,11 +169,13 @@ class FastSolver:
         self._numbers = robot.numbers
         first = len(robot.numbers)
         self._targets = slice(first, first + len(program.target_parameters))
-        self._radii = slice(setup.parameters, setup.parameters + len(rows))
+        self._radii = slice(setup.parameters, setup.parameters + len(constraints))
         limits = self._radii.stop + 2 * n
-        self._near = slice(limits + program.n_floors, limits + program.n_floors + _NEAR)
+        self._near = slice(
+            limits + program.n_floors, limits + program.n_floors + _NEAR * setup.near
+        )
         self._width = self._near.stop + 1 + n
-        ends = np.cumsum([_COUNTS + n, sum(rows), 16, 36, len(program.measures)]).tolist()
+        ends = np.cumsum([_COUNTS + n, program.n_rows, 16, 36, len(program.measures)]).tolist()
         self._parts = [slice(start, end) for start, end in pairwise(ends)]
         self._answer_width = ends[-1]
 
@@ -182,14 +188,13 @@ class FastSolver:
         row[self._radii.stop : self._near.start] = np.concatenate([lower, upper, floors])
         return row
 
-    def with_target(
-        self, row: Vector, target: Target, program: Program, guess: Vector | None
-    ) -> Vector:
+    def with_target(self, row: Vector, program: Program, guess: Vector | None) -> Vector:
         """The same task with a target and, if there is one, a guess (Pa)."""
         row = row.copy()
         row[self._targets] = program.target_parameters
-        row[self._radii] = [term.radius for term in program.terms]
-        row[self._near] = nearness(target, self._length)
+        row[self._radii] = [c.radius for c in program.constraints(self._length)]
+        near = [term.nearness(self._length).numbers for term in program.terms]
+        row[self._near] = list(chain.from_iterable(near))
         if guess is not None:
             row[self._near.stop] = 1.0
             row[self._near.stop + 1 :] = guess
@@ -199,13 +204,13 @@ class FastSolver:
         """Have the row of a task keep other limits (n,), in Pa, within those it was made for."""
         row[self._radii.stop : self._radii.stop + 2 * len(lower)] = np.concatenate([lower, upper])
 
-    def solve(self, row: Vector) -> Answer | None:
+    def solve(self, row: Vector) -> CompiledAnswer | None:
         """Answer to one task; None if the general method is needed."""
         numbers = np.empty(self._answer_width)
         self._run(row, numbers, 0, 1)
         return self._answer(numbers)
 
-    def solve_all(self, rows: Vector, threads: int | None = None) -> list[Answer | None]:
+    def solve_all(self, rows: Vector, threads: int | None = None) -> list[CompiledAnswer | None]:
         """Answers to many tasks, a row each, on all cores unless `threads` says otherwise."""
         rows = np.ascontiguousarray(rows)
         numbers = np.empty((len(rows), self._answer_width))
@@ -225,7 +230,7 @@ class FastSolver:
         if failed:
             raise MemoryError("no memory is left for the compiled solver")
 
-    def _answer(self, numbers: Vector) -> Answer | None:
+    def _answer(self, numbers: Vector) -> CompiledAnswer | None:
         outcome, _, _, _, tried, reached, descents, agreeing, optima, complete, *work = map(
             int, numbers[:_COUNTS].tolist()
         )
@@ -234,7 +239,7 @@ class FastSolver:
         numbers.flags.writeable = False
         residuals, pose, compliance, values = self._parts
         iterations, poses, points, programs = work
-        return Answer(
+        return CompiledAnswer(
             numbers[_COUNTS : residuals.start],
             Confidence(tried, descents, agreeing, optima, complete == 1),
             {

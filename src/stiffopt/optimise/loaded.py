@@ -21,7 +21,7 @@ from stiffopt.model.compiled import Library, library
 from stiffopt.model.layout import Layout, symbolic_arm
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.rod import rod_functions, rod_pieces
-from stiffopt.optimise.effort import Effort
+from stiffopt.model.shape import PointOfArm
 from stiffopt.optimise.program import Program
 
 Vector = NDArray[np.float64]
@@ -29,15 +29,7 @@ Vector = NDArray[np.float64]
 _SOURCES = (str(Path(__file__).with_name("native") / "loaded_solver.c"),)
 
 _CHUNK = 8  # equilibria that a thread settles at a time
-_PLACED = Effort(16, 3, 10)
-_LOOSE = Effort(40, 4, 16)
-
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-
-
-def loaded_effort(rows: int) -> Effort:
-    """As `effort`: an evaluation takes a hundred times longer, and weight evens optima out."""
-    return _PLACED if rows >= 3 else _LOOSE
 
 
 class Tip:
@@ -69,6 +61,10 @@ class Tip:
         """Compliance (6, 6) in the tip's axes."""
         X = ca.diagcat(self.rotation, self.rotation)
         return X.T @ self.base_compliance @ X
+
+    def station(self, at: float) -> PointOfArm:
+        """Not known of the tip alone."""
+        raise NotImplementedError
 
     def flexibility(self, wrench: ca.SX) -> ca.SX:
         """``w' C w`` of a wrench (6,) in the tip's axes."""

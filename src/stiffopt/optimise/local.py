@@ -21,18 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.optimise.prices import Multipliers, prices_at
-from stiffopt.optimise.problem import FLOOR_MARGIN, Objective, Point, Problem
+from stiffopt.optimise.problem import Objective, PressureProblem, ProgramPoint
 from stiffopt.optimise.quadratic import FAR, solve_qp
 from stiffopt.optimise.reach import attempt, bounded_step, within
+from stiffopt.optimise.settings import DESCENT
 
 Vector = NDArray[np.float64]
 
-MOST_ITERATIONS = 80
-FIRST_RADIUS = 0.3  # of the trust region, in bar
-LAST_RADIUS = 1e-6
-INSIDE = 1 - 1e-7  # share of a ball's radius that is used, so that rounding stays within
-TOUCHING = 1e-5  # bar; a pressure that near to a limit is meant to be at it
-NEXT_TO = 0.05  # bar; a descent that near to an optimum of the same value is on its way there
 _CURVED = 2.0  # second-order error of a correction, for the squared first order over a scale
 
 
@@ -42,9 +37,9 @@ class LocalResult:
 
     Attributes
     ----------
-    problem : Problem
+    problem : PressureProblem
         What was solved.
-    point : Point
+    point : ProgramPoint
     value : float
         Objective there.
     violation : float
@@ -54,15 +49,15 @@ class LocalResult:
         False: the point is no more than a candidate, and has no prices.
     """
 
-    problem: Problem
-    point: Point
+    problem: PressureProblem
+    point: ProgramPoint
     value: float
     violation: float
     converged: bool
     is_optimum: bool = True
 
     @classmethod
-    def at(cls, problem: Problem, point: Point) -> "LocalResult":
+    def at(cls, problem: PressureProblem, point: ProgramPoint) -> "LocalResult":
         """A solution that is known already."""
         value, missed = problem.objective.value(point), violation(problem, point)
         return cls(problem, point, value, missed, converged=True)
@@ -83,10 +78,10 @@ class LocalResult:
     @property
     def holds_floors(self) -> bool:
         """Whether no floor is missed by more than the margin that is aimed above it."""
-        return self.violation < 0.5 * FLOOR_MARGIN
+        return self.violation < 0.5 * DESCENT.floor_margin
 
 
-def violation(problem: Problem, point: Point) -> float:
+def violation(problem: PressureProblem, point: ProgramPoint) -> float:
     """Sum by which floors are missed, in logarithms of stiffness."""
     if not len(problem.floors):
         return 0.0
@@ -98,7 +93,7 @@ class _Place:
 
     Attributes
     ----------
-    point : Point
+    point : ProgramPoint
     values : ndarray (t,)
         Terms of the objective.
     value, missed : float
@@ -110,7 +105,7 @@ class _Place:
 
     __slots__ = ("missed", "point", "slopes", "value", "values")
 
-    def __init__(self, problem: Problem, point: Point) -> None:
+    def __init__(self, problem: PressureProblem, point: ProgramPoint) -> None:
         self.point = point
         self.values, gradients = problem.objective.terms(point)
         self.value = float(self.values.max())
@@ -122,14 +117,17 @@ class _Place:
 
 
 def descend(
-    problem: Problem, start: Point, known: Sequence[LocalResult] = (), same: float = 0.0
+    problem: PressureProblem,
+    start: ProgramPoint,
+    known: Sequence[LocalResult] = (),
+    same: float = 0.0,
 ) -> LocalResult:
     """Minimise the problem's objective from a point that reaches the pose.
 
     A descent that comes next to a known optimum, with the same value but for `same`, ends there:
     the result is that optimum.
     """
-    point: Point | None = start
+    point: ProgramPoint | None = start
     if not len(start.terms):
         point = attempt(problem.needed, start.x)
     if point is None:
@@ -139,10 +137,10 @@ def descend(
     precision = problem.objective.precision
     B = problem.objective.curvature(point)
     B = B + 1e-8 * np.trace(B) * np.eye(len(B))
-    radius, price = FIRST_RADIUS, 10.0
+    radius, price = DESCENT.first_radius, 10.0
     weights: Vector | None = None
     converged = False
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(DESCENT.iterations):
         step = subproblem.step(here, B, radius, price, weights)
         if step is None:
             break
@@ -156,7 +154,7 @@ def descend(
         trial = _pulled_back(problem, here.point, d, problem.lower, problem.upper)
         if trial is None:
             radius = 0.3 * length
-            if radius < LAST_RADIUS:
+            if radius < DESCENT.last_radius:
                 break
             continue
         there = _Place(problem, trial)
@@ -166,20 +164,20 @@ def descend(
         if share < 0.25:
             radius = 0.4 * length
         elif share > 0.7 and length > 0.8 * radius:
-            radius = min(2.5 * radius, 2.0)
+            radius = min(2.5 * radius, DESCENT.largest_radius)
         if gained > 0:
             here = there
             found = _next_to(here, known, same)
             if found is not None:
                 return found
-        if radius < LAST_RADIUS:
+        if radius < DESCENT.last_radius:
             converged = abs(promised) < 1e3 * precision
             break
     here = _snapped(problem, here)
     return LocalResult(problem, here.point, here.value, here.missed, converged)
 
 
-def _last_step(problem: Problem, here: _Place, d: Vector, price: float) -> _Place:
+def _last_step(problem: PressureProblem, here: _Place, d: Vector, price: float) -> _Place:
     """The place after a step that gains next to nothing, if it gains at all."""
     trial = _pulled_back(problem, here.point, d, problem.lower, problem.upper)
     if trial is None:
@@ -193,7 +191,7 @@ def _next_to(here: _Place, known: Sequence[LocalResult], same: float) -> LocalRe
     """Known optimum that an iterate has all but come to."""
     for result in known:
         same_value = abs(here.value - result.value) <= same
-        if same_value and np.abs(here.point.x - result.point.x).max() < NEXT_TO:
+        if same_value and np.abs(here.point.x - result.point.x).max() < DESCENT.next_to:
             return result
     return None
 
@@ -213,14 +211,14 @@ def _update(B: Vector, s: Vector, y: Vector) -> None:
 
 
 def _pulled_back(
-    problem: Problem, point: Point, d: Vector, lower: Vector, upper: Vector
-) -> Point | None:
+    problem: PressureProblem, point: ProgramPoint, d: Vector, lower: Vector, upper: Vector
+) -> ProgramPoint | None:
     """Point near x + d within all balls, evaluated as needed; None if there is none near."""
     bounding = problem.bounding
     x = within(lower, point.x + d, upper)
-    if not bounding.spheres:
+    if not bounding.constraints:
         return attempt(problem.needed, x)
-    allowed = 2 * float(np.abs(d).max()) + 1e-4
+    allowed = 2 * float(np.abs(d).max()) + DESCENT.shortest_pull_back
     trial, complete = attempt(problem.pose, x), False
     for _ in range(8):
         if trial is None:
@@ -231,19 +229,20 @@ def _pulled_back(
             trial = attempt(problem.needed, x)
             return trial if trial is not None and trial.reached else None
         wanted = trial.residual[bounding.rows].copy()
-        for index, (_, first, end, radius) in zip(bounding.indices, bounding.spheres, strict=True):
-            beyond = trial.errors[index] - radius * INSIDE
+        _, jacobian = bounding.missing(wanted, trial.jacobian[bounding.rows])
+        for index, c in zip(bounding.indices, bounding.constraints, strict=True):
+            beyond = trial.errors[index] - c.radius * DESCENT.inside
             if beyond > 0:
                 # while steps are long, further in by as much as the correction may be wrong
-                wrong = min(_CURVED * beyond**2 / bounding.scale[first], 0.3 * radius)
-                wrong = wrong if beyond > radius else 0.0
-                wanted[first:end] *= -(beyond + wrong) / trial.errors[index]
+                wrong = min(_CURVED * beyond**2 / c.scale, 0.3 * c.radius)
+                wrong = wrong if beyond > c.radius else 0.0
+                wanted[c.first : c.end] *= -(beyond + wrong) / trial.errors[index]
             else:
-                wanted[first:end] = 0.0
+                wanted[c.first : c.end] = 0.0
         back = bounded_step(
-            trial.jacobian[bounding.rows],
+            jacobian,
             wanted,
-            1e-3 * bounding.near_damping,
+            DESCENT.pull_back_damping * bounding.near_damping,
             lower - x,
             upper - x,
         )
@@ -255,11 +254,11 @@ def _pulled_back(
     return None
 
 
-def _snapped(problem: Problem, here: _Place) -> _Place:
+def _snapped(problem: PressureProblem, here: _Place) -> _Place:
     """The same place with pressures that all but touch a limit put onto it, if that holds."""
     x = here.point.x
-    low = x < problem.lower + TOUCHING
-    high = x > problem.upper - TOUCHING
+    low = x < problem.lower + DESCENT.touching
+    high = x > problem.upper - DESCENT.touching
     d = np.where(low, problem.lower, np.where(high, problem.upper, x)) - x
     if not d.any():
         return here
@@ -281,7 +280,7 @@ class _Subproblem:
     slack s (if there are any).  Its rows are those of `_Place.slopes`, less a single term.
     """
 
-    def __init__(self, problem: Problem, n_terms: int) -> None:
+    def __init__(self, problem: PressureProblem, n_terms: int) -> None:
         n, floors, rows = len(problem.lower), len(problem.floors), len(problem.bounding.radius)
         self._problem, self._n = problem, n
         self._several, self._floored = n_terms > 1, floors > 0
@@ -308,6 +307,7 @@ class _Subproblem:
         self._size = size
         self._axes = np.zeros((rows, rows))  # over the radii
         self._curvature = np.zeros(rows)
+        self._one_sided = [c.first for c in problem.bounding.constraints if c.one_sided]
 
     def dearest_floor(self, weights: Vector) -> float:
         """Largest multiplier of a floor."""
@@ -338,6 +338,7 @@ class _Subproblem:
         A[self._ball_rows, :n] = self._axes @ jacobian
         across = self._axes @ residual
         np.minimum(-1.0 - across, 0.0, out=low[size + above :])
+        low[size + above :][self._one_sided] = -FAR
         np.maximum(1.0 - across, 0.0, out=high[size + above :])
         answer = solve_qp(H, g, A, low, high)
         if answer is None:
@@ -356,17 +357,20 @@ class _Subproblem:
         bounding = self._problem.bounding
         residuals = residual.tolist()
         pulls = None if weights is None else weights[self._balls :].tolist()
-        for index, (_, first, end, radius) in zip(bounding.indices, bounding.spheres, strict=True):
-            rho = radius * INSIDE
+        for index, c in zip(bounding.indices, bounding.constraints, strict=True):
+            first, end, rho = c.first, c.end, c.radius * DESCENT.inside
+            if c.one_sided:
+                self._axes[first, first] = 1 / rho
+                continue
             if pulls is None:
                 steepest = here.slopes[int(here.values.argmax())]
                 pull = _least_squares(jacobian[first:end], -steepest)
             else:
                 pull = pulls[first:end]
             self._curvature[first:end] = math.hypot(*pull) / rho
-            binds = here.point.errors[index] > 0.9 * radius
-            along = _axes_along(residuals[first:end] if binds else pull)
-            self._axes[first:end, first:end] = [[value / rho for value in row] for row in along]
+            binds = here.point.errors[index] > 0.9 * c.radius
+            self._axes[first:end, first:end] = axes_along(residuals[first:end] if binds else pull)
+            self._axes[first:end, first:end] /= rho
 
 
 def _least_squares(rows: Vector, wanted: Vector) -> list[float]:
@@ -380,20 +384,14 @@ def _least_squares(rows: Vector, wanted: Vector) -> list[float]:
     return found
 
 
-def _axes_along(vector: list[float]) -> list[list[float]]:
-    """Orthonormal axes, the first along a vector of one to three components; any if it is zero."""
+def axes_along(vector: list[float]) -> Vector:
+    """Orthonormal axes (k, k) by rows, the first along a vector (k,); any if it is zero."""
     length = math.hypot(*vector)
+    axes = np.eye(len(vector))
     if not length > 0:
-        vector, length = [1.0, 0.0, 0.0][: len(vector)], 1.0
-    a = [value / length for value in vector]
-    if len(a) == 1:
-        return [a]
-    if len(a) == 2:
-        return [a, [-a[1], a[0]]]
-    least = min(range(3), key=lambda i: abs(a[i]))
-    b = [-a[least] * value for value in a]
-    b[least] += 1.0
-    length = math.hypot(*b)
-    b = [value / length for value in b]
-    c = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    return [a, b, c]
+        return axes
+    first = np.array(vector) / length
+    mirror = first + math.copysign(1.0, first[0]) * axes[0]  # Householder's reflection
+    axes -= np.outer(mirror, mirror / (1 + abs(first[0])))
+    axes[0] = first
+    return axes

@@ -35,7 +35,10 @@ def pareto_front(
         raise InputError("a trade-off needs a stiffness to maximise; add 'stiffness: maximise'")
     n = checked_integer("n, the number of points of a trade-off,", n, 2)
     solver = PressureSolver(robot, task, seed=seed)
-    which = "position" if task.target.position is not None else "angle"
+    names = {term.name for term in task.target.terms}
+    which = next((name for name in ("position", "angle") if name in names), None)
+    if which is None:
+        raise InputError("a trade-off needs a target with a position or an angle")
     own: float = getattr(task.target.tolerance, which)
     largest = LARGEST_SHARE * robot.length if which == "position" else pi
     front: list[PressureSolution] = []

@@ -14,7 +14,7 @@ from stiffopt.optimise.fast import FastSolver
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.loaded import LoadedArm, loaded_library
 from stiffopt.optimise.problem import floor_bounds
-from stiffopt.optimise.program import BAR, Program, Structure
+from stiffopt.optimise.program import Program, ProgramStructure
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -43,11 +43,11 @@ class Prepared:
         load = task.load
         self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
         self.lower, self.upper = task.pressure_bounds(robot.description)
-        self._program = Program.of(task.target, task.stiffness)
+        self._program = Program.of(task.target, task.stiffness, robot.description)
         self._floors = floor_bounds(task.stiffness)
         self.unit = task.measures[0].unit if task.measures else None
         self._seed = seed
-        self._rows: dict[Structure, tuple[FastSolver, Vector] | None] = {}
+        self._rows: dict[ProgramStructure, tuple[FastSolver, Vector] | None] = {}
 
     def program(self, target: Target) -> Program:
         """Program of a task with this target."""
@@ -55,6 +55,8 @@ class Prepared:
 
     def fast(self, program: Program) -> tuple[FastSolver, Vector] | None:
         """Compiled solver and the row of a task without its target; None if there is none."""
+        if self.robot.is_loaded and program.has_stations:
+            return None  # the integrator in C knows of the tip alone
         structure = program.structure
         if structure not in self._rows:
             loaded = self.robot.is_loaded
@@ -88,7 +90,7 @@ class Prepared:
 
     def _loaded_start(self, library: Library) -> tuple[LoadedArm, SampleTable] | None:
         """The arm under its load and its samples; None if it does not stand at rest."""
-        lower, upper = self.lower / BAR, self.upper / BAR
+        lower, upper = self.lower, self.upper
         key = (self.robot.tip_load, lower.tobytes(), upper.tobytes(), self._seed)
 
         def make() -> tuple[LoadedArm, SampleTable] | None:
@@ -97,14 +99,14 @@ class Prepared:
                 table = SampleTable(self.robot, lower, upper, self._seed, arm.settled)
             except EquilibriumError:
                 return None
-            return (arm, table) if len(table.x) else None
+            return (arm, table) if len(table.pressures) else None
 
         return _recent(self.robot, "loaded arms", key, make)
 
     @cached_property
     def samples(self) -> SampleTable:
         """Configurations that searches start from."""
-        lower, upper = self.lower / BAR, self.upper / BAR
+        lower, upper = self.lower, self.upper
         key = (self.robot.tip_load, lower.tobytes(), upper.tobytes(), self._seed)
         return _recent(
             self.robot, "samples", key, lambda: SampleTable(self.robot, lower, upper, self._seed)

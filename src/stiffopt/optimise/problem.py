@@ -1,17 +1,17 @@
 """From a task and an arm to a nonlinear program over the pressures.
 
-Variables are the pressures x (n,) in bar.  The pose is asked for by *balls*: residuals r(x) with
-|r| <= radius, which is how tolerances are used and not ignored.  What is sought is the lowest
-value of an objective, with some stiffnesses bounded from below.  The functions behind it belong
-to the structure of the task (`stiffopt.optimise.program`) and stay with the robot.
+Variables are the pressures x (n,), each as a share of its channel's range (`pressure_ranges`).
+Terms of the task bound rows of a residual: ``|r(x)| <= radius``, which is how tolerances are used
+and not ignored, or ``r(x) <= radius`` for an inequality.  What is sought is the lowest value of an
+objective, with some stiffnesses bounded from below.  The functions behind it belong to the
+structure of the task (`stiffopt.optimise.program`) and stay with the robot.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,54 +20,82 @@ from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.goal import StiffnessGoal
-from stiffopt.optimise.program import BAR, Program
+from stiffopt.optimise.program import BAR, Constraint, Program, pressure_ranges
+from stiffopt.optimise.settings import DESCENT
 from stiffopt.optimise.task import Task
-from stiffopt.optimise.terms import Ball
 
 Vector = NDArray[np.float64]
 
-FLOOR_MARGIN = 1e-6
-"""How far above a stiffness that must be kept the optimiser aims, relatively."""
+
+@dataclass(frozen=True)
+class Ball:
+    """A constraint with its residual at a point: ``|r| <= radius``.
+
+    Attributes
+    ----------
+    constraint : Constraint
+    residual : ndarray (k,)
+    jacobian : ndarray (k, n)
+        Per variable.
+    """
+
+    constraint: Constraint
+    residual: Vector
+    jacobian: Vector
+
+    @property
+    def name(self) -> str:
+        """Of the term."""
+        return self.constraint.name
+
+    @property
+    def radius(self) -> float:
+        """Largest error."""
+        return self.constraint.radius
+
+    @property
+    def error(self) -> float:
+        """Length of the residual, or the residual itself if it is bounded on one side."""
+        if self.constraint.one_sided:
+            return float(self.residual[0])
+        return math.sqrt(self.residual @ self.residual)
+
+    @property
+    def pull(self) -> Vector:
+        """Gradient (n,) of the error, which is not zero."""
+        if self.constraint.one_sided:
+            row: Vector = self.jacobian[0]
+            return row
+        gradient: Vector = self.residual / self.error @ self.jacobian
+        return gradient
 
 
-class Sphere(NamedTuple):
-    """The ball of some rows, first to end - 1, of the residual."""
-
-    name: str
-    first: int
-    end: int
-    radius: float
-
-
-class Point:
+class ProgramPoint:
     """The program at one set of pressures.
 
     Attributes
     ----------
     x : ndarray (n,)
-        Pressures in bar.
+        Pressures, as shares of the channels' ranges; all derivatives are by them.
     residual : ndarray (m,)
-        Of all balls, in m or rad.
+        Of all terms, in their units.
     jacobian : ndarray (m, n)
-        Per bar.
-    spheres : tuple of Sphere
-        Which rows make which ball.
+    constraints : tuple of Constraint
+        How the rows are bounded.
     errors : tuple of float
-        Length of each ball's residual.
+        Of each constraint, see `Ball.error`.
     reached : bool
-        Whether every residual lies within its ball.
+        Whether every constraint holds.
     terms : ndarray (t,)
         Of the task's objective; empty where only the pose was evaluated.
     term_gradients : ndarray (t, n)
-        Per bar.
     floors : ndarray (f,)
         Logarithms of the stiffnesses that are bounded from below.
     floor_gradients : ndarray (f, n)
-        Per bar.
     """
 
     __slots__ = (
-        "errors", "floor_gradients", "floors", "jacobian", "reached", "residual", "spheres",
+        "constraints", "errors", "floor_gradients", "floors", "jacobian", "reached", "residual",
         "term_gradients", "terms", "x",
     )  # fmt: skip
 
@@ -76,33 +104,36 @@ class Point:
         x: Vector,
         residual: Vector,
         jacobian: Vector,
-        spheres: tuple[Sphere, ...],
+        constraints: tuple[Constraint, ...],
         terms: Vector,
         term_gradients: Vector,
         floors: Vector,
         floor_gradients: Vector,
     ) -> None:
         self.x, self.residual, self.jacobian = x, residual, jacobian
-        self.spheres = spheres
+        self.constraints = constraints
         values = residual.tolist()
-        self.errors = tuple([math.hypot(*values[first:end]) for _, first, end, _ in spheres])
+        self.errors = tuple(
+            [values[c.first] if c.one_sided else math.hypot(*values[c.first : c.end])
+             for c in constraints]
+        )  # fmt: skip
         self.reached = all(
-            error <= sphere.radius for error, sphere in zip(self.errors, spheres, strict=True)
+            error <= c.radius for error, c in zip(self.errors, constraints, strict=True)
         )
         self.terms, self.term_gradients = terms, term_gradients
         self.floors, self.floor_gradients = floors, floor_gradients
 
     @property
     def balls(self) -> tuple[Ball, ...]:
-        """The balls one by one."""
+        """The constraints one by one."""
         return tuple(
-            Ball(name, self.residual[first:end], self.jacobian[first:end], radius)
-            for name, first, end, radius in self.spheres
+            Ball(c, self.residual[c.first : c.end], self.jacobian[c.first : c.end])
+            for c in self.constraints
         )
 
     @property
-    def constraints(self) -> tuple[Ball, ...]:
-        """The balls that are not infinite."""
+    def bounded(self) -> tuple[Ball, ...]:
+        """Those of them that are not infinitely wide."""
         return tuple(ball for ball in self.balls if ball.radius < math.inf)
 
     @property
@@ -126,59 +157,61 @@ class Objective:
     `of_pose` the residuals are all that it needs.
     """
 
-    terms: Callable[[Point], tuple[Vector, Vector]]  # values (t,), gradients (t, n)
-    curvature: Callable[[Point], Vector]  # (n, n)
+    terms: Callable[[ProgramPoint], tuple[Vector, Vector]]  # values (t,), gradients (t, n)
+    curvature: Callable[[ProgramPoint], Vector]  # (n, n)
     precision: float  # decrease that no longer matters
     unit: str  # of what a decrease gains, for prices
-    gain: Callable[[Point], float]  # that gain per unit of decrease
+    gain: Callable[[ProgramPoint], float]  # that gain per unit of decrease
     of_pose: bool = False
+    held: Callable[[ProgramPoint, ProgramPoint], Vector] | None = None
+    """Gradients (t, n) at the second point with weights that depend on x held at the first."""
 
-    def value(self, point: Point) -> float:
+    def value(self, point: ProgramPoint) -> float:
         """Value at a point."""
         return float(self.terms(point)[0].max())
 
 
-class Problem:
+class PressureProblem:
     """The nonlinear program of one task on one arm (which carries the task's load).
 
     Attributes
     ----------
     lower, upper : ndarray (n,)
-        Bounds of the variables, in bar.
+        Bounds of the variables.
+    unit : ndarray (n,)
+        Pressures in Pa that are one unit of the variables.
     objective : Objective
     floors : ndarray (f,)
-        What `Point.floors` may not fall below; empty where they do not matter.
+        What `ProgramPoint.floors` may not fall below; empty where they do not matter.
+    constraints : tuple of Constraint
+        How the residual is bounded.
     radii : dict of str to float
-        Radii of balls, by name, other than the target's.
+        Radii by name of the term, other than the target's.
     """
 
     def __init__(self, robot: Manipulator, task: Task) -> None:
         self.robot = robot
         self.task = task
         lower, upper = task.pressure_bounds(robot.description)
-        self.lower, self.upper = lower / BAR, upper / BAR
+        self.unit = pressure_ranges(robot.description)
+        self.lower, self.upper = lower / self.unit, upper / self.unit
         self.radii: dict[str, float] = {}
-        self._set_program(Program.of(task.target, task.stiffness))
+        self.program = Program.of(task.target, task.stiffness, robot.description)
+        self.parameters = robot.parameters(self.program.parameters)
+        self._functions = functions(robot, self.program)
+        self._is_loaded = robot.is_loaded
+        self._pose = Evaluator(robot, self._functions.pose)
+        self._full = Evaluator(robot, self._functions.point)
+        self._set_constraints()
         self.objective = self._objective()
         self.floors = floor_bounds(task.stiffness)
 
-    def _set_program(self, program: Program) -> None:
-        self.program = program
-        self.parameters = self.robot.parameters(program.parameters)
-        self._functions = functions(self.robot, program)
-        self._is_loaded = self.robot.is_loaded
-        self._pose = Evaluator(self.robot, self._functions.pose)
-        self._full = Evaluator(self.robot, self._functions.point)
-        self._set_spheres()
-
-    def _set_spheres(self) -> None:
-        spheres, first = [], 0
-        for term in self.program.terms:
-            end = first + term.size
-            spheres.append(Sphere(term.name, first, end, self.radii.get(term.name, term.radius)))
-            first = end
-        self.spheres = tuple(spheres)
-        self.bounding = Bounding(self.spheres, self.robot.length)
+    def _set_constraints(self) -> None:
+        self.constraints = tuple(
+            c._replace(radius=self.radii.get(c.name, c.radius))
+            for c in self.program.constraints(self.robot.length)
+        )
+        self.bounding = Bounding(self.constraints)
 
     # -- evaluation -------------------------------------------------------------------------
 
@@ -186,54 +219,54 @@ class Problem:
         """Forget the equilibrium of the last evaluation (see `Evaluator`)."""
         self._pose.restart()
 
-    def pose(self, x: Vector) -> Point:
+    def pose(self, x: Vector) -> ProgramPoint:
         """The balls alone at pressures x; cheaper than `point`."""
         if self._is_loaded:
-            residual, jacobian = self._pose(x * BAR, self.parameters)
+            residual, jacobian = self._pose(x * self.unit, self.parameters)
         else:
-            residual, jacobian = self._functions.pose(x * BAR, self.parameters)
-        return Point(x, residual[:, 0], jacobian.T * BAR, self.spheres, *_NOTHING)
+            residual, jacobian = self._functions.pose(x * self.unit, self.parameters)
+        return ProgramPoint(x, residual[:, 0], jacobian.T * self.unit, self.constraints, *_NOTHING)
 
     def poses(self, x: Vector) -> tuple[Vector, Vector]:
         """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads."""
-        residuals, jacobians = self._functions.pose.many(x * BAR, self.parameters, threads=1)
-        return residuals[:, :, 0], jacobians.swapaxes(1, 2) * BAR
+        residuals, jacobians = self._functions.pose.many(x * self.unit, self.parameters, threads=1)
+        return residuals[:, :, 0], jacobians.swapaxes(1, 2) * self.unit
 
-    def point(self, x: Vector) -> Point:
+    def point(self, x: Vector) -> ProgramPoint:
         """Everything at pressures x."""
         if self._is_loaded:
             self._full.restart(self._pose.state)
-            outputs = self._full(x * BAR, self.parameters)
+            outputs = self._full(x * self.unit, self.parameters)
             self._pose.restart(self._full.state)
         else:
-            outputs = self._functions.point(x * BAR, self.parameters)
+            outputs = self._functions.point(x * self.unit, self.parameters)
         residual, jacobian, terms, term_gradients, floors, floor_gradients = outputs
-        return Point(
+        return ProgramPoint(
             x,
             residual[:, 0],
-            jacobian.T * BAR,
-            self.spheres,
+            jacobian.T * self.unit,
+            self.constraints,
             terms[:, 0],
-            term_gradients.T * BAR,
+            term_gradients.T * self.unit,
             floors[:, 0] if floors.size else _NONE,
-            floor_gradients.reshape(len(x), -1).T * BAR,
+            floor_gradients.reshape(len(x), -1).T * self.unit,
         )
 
-    def needed(self, x: Vector) -> Point:
+    def needed(self, x: Vector) -> ProgramPoint:
         """As much as objective and floors take at pressures x."""
         of_pose = self.objective.of_pose and not len(self.floors)
         return self.pose(x) if of_pose else self.point(x)
 
-    def worth(self, x: Vector) -> Point:
+    def worth(self, x: Vector) -> ProgramPoint:
         """Enough of a point at pressures x that reach the pose to rank it by its objective."""
         worth = self._functions.worth
         if self.objective.of_pose or worth is None:
             return self.needed(x)
-        terms, floors = worth(x * BAR, self.parameters)
-        at_target = np.zeros(self.spheres[-1].end)
+        terms, floors = worth(x * self.unit, self.parameters)
+        at_target = np.zeros(self.program.n_rows)
         none = np.zeros((0, len(x)))
         floors = floors[:, 0] if floors.size else _NONE
-        return Point(x, at_target, none, self.spheres, terms[:, 0], none, floors, none)
+        return ProgramPoint(x, at_target, none, self.constraints, terms[:, 0], none, floors, none)
 
     def judged(self, pressures: Vector) -> tuple[list[float], Vector, Vector, list[float]]:
         """What `Judgement.of` takes, at pressures (n,) in Pa of an arm without loads."""
@@ -245,94 +278,109 @@ class Problem:
     def _objective(self) -> Objective:
         n = len(self.lower)
         program, goal = self.program, self.task.stiffness
-        unit = "bar^2" if program.aim == "least pressure" else "1"
-        gain: Callable[[Point], float] = lambda point: 1.0  # noqa: E731
+        unit, gain = "1", _one
+        if program.aim == "least pressure":
+            unit = "bar^2"
+            gain = lambda point: (program.reference / BAR) ** 2  # noqa: E731
         if program.aim == "maximise" and goal is not None:
             unit = goal.maximise[0].unit
             gain = lambda point: float(np.exp(-point.terms.max()))  # noqa: E731
         return Objective(
             lambda point: (point.terms, point.term_gradients),
-            lambda point: program.steepness * np.eye(n),
+            lambda point: DESCENT.curvature * np.eye(n),
             precision=program.precision,
             unit=unit,
             gain=gain,
         )
 
     def closest(self, name: str) -> Objective:
-        """Half the squared error of one ball over a scale: what brings the tip closest."""
-        scale = self.robot.length if name == "position" else 1.0
+        """Half the squared error of one term over a scale: what brings the arm closest to it."""
+        own = [c for c in self.constraints if c.name == name]
+        rows, one_sided, scale = slice(own[0].first, own[-1].end), own[0].one_sided, own[0].scale
+        (radius,) = {term.radius for term in self.program.terms if term.name == name}
 
-        (rows,) = [slice(first, end) for which, first, end, _ in self.spheres if which == name]
+        def error(point: ProgramPoint) -> Vector:
+            residual = point.residual[rows]
+            return (np.maximum(residual - radius, 0.0) if one_sided else residual) / scale
 
-        def terms(point: Point) -> tuple[Vector, Vector]:
-            residual, jacobian = point.residual[rows] / scale, point.jacobian[rows] / scale
-            return np.array([0.5 * residual.dot(residual)]), (residual @ jacobian)[np.newaxis]
+        def terms(point: ProgramPoint) -> tuple[Vector, Vector]:
+            e = error(point)
+            return np.array([0.5 * e.dot(e)]), held(point, point)
 
-        def curvature(point: Point) -> Vector:
+        def held(point: ProgramPoint, moved: ProgramPoint) -> Vector:
+            gradient: Vector = error(point) @ moved.jacobian[rows] / scale
+            return gradient[np.newaxis]
+
+        def curvature(point: ProgramPoint) -> Vector:
             jacobian = point.jacobian[rows] / scale
             return jacobian.T @ jacobian
 
-        def gain(point: Point) -> float:
-            return scale**2 / max(math.hypot(*point.residual[rows].tolist()), 1e-12)
+        def gain(point: ProgramPoint) -> float:
+            return scale / max(math.hypot(*error(point).tolist()), 1e-12)
 
-        unit = "m" if name == "position" else "rad"
-        return Objective(terms, curvature, precision=1e-10, unit=unit, gain=gain, of_pose=True)
+        (unit,) = {term.unit for term in self.program.terms if term.name == name}
+        return Objective(terms, curvature, 1e-10, unit, gain, of_pose=True, held=held)
 
     def best_floors(self) -> Objective:
         """The most by which a floor is missed: what brings all floors as close as they come."""
         return Objective(
             lambda point: (self.floors - point.floors, -point.floor_gradients),
-            lambda point: self.program.steepness * np.eye(len(point.x)),
+            lambda point: DESCENT.curvature * np.eye(len(point.x)),
             precision=1e-7,
             unit="1",
-            gain=lambda point: 1.0,
+            gain=_one,
         )
 
     # -- similar programs -------------------------------------------------------------------
 
-    def changed(self, objective: Objective, floors: bool = True, **radii: float) -> "Problem":
-        """The same program with another objective, without floors, or with other radii.
+    def changed(
+        self, objective: Objective, radii: Mapping[str, float] | None = None, floors: bool = True
+    ) -> "PressureProblem":
+        """The same program with another objective, without floors, or with other radii by name.
 
-        An infinite radius frees a ball.
+        An infinite radius frees a term.
         """
         other = copy(self)
         other.objective = objective
         if not floors:
             other.floors = np.zeros(0)
-        other.radii = {**self.radii, **radii}
-        other._set_spheres()
+        other.radii = {**self.radii, **(radii or {})}
+        other._set_constraints()
         return other
 
 
 class Bounding:
-    """What the steps of local searches take from the balls that are not infinite.
+    """What the steps of local searches take from the constraints that are not infinitely wide.
 
     Attributes
     ----------
-    spheres : tuple of Sphere
+    constraints : tuple of Constraint
         Rows are counted within `rows`.
     indices : tuple of int
-        Which of all balls they are.
-    rows : slice
+        Which of all constraints they are.
+    rows : slice or ndarray of int
         Their rows of the residual.
     radius, scale : ndarray (m,)
-        Radius of each row's ball; what its residual is compared with while the pose is far.
+        Of each row's constraint.
     """
 
-    def __init__(self, spheres: tuple[Sphere, ...], length: float) -> None:
-        kept = [(i, sphere) for i, sphere in enumerate(spheres) if sphere.radius < math.inf]
-        begin = kept[0][1].first if kept else 0
+    def __init__(self, constraints: tuple[Constraint, ...]) -> None:
+        kept = [(i, c) for i, c in enumerate(constraints) if c.radius < math.inf]
         self.indices = tuple(i for i, _ in kept)
-        self.spheres = tuple(
-            sphere._replace(first=sphere.first - begin, end=sphere.end - begin)
-            for _, sphere in kept
-        )
-        self.rows = slice(begin, kept[-1][1].end if kept else 0)
-        self.radius = np.ones(self.rows.stop - begin)
-        self.scale = np.ones(self.rows.stop - begin)
-        for name, first, end, radius in self.spheres:
-            self.radius[first:end] = radius
-            self.scale[first:end] = length if name == "position" else 1.0
+        moved, rows = [], [row for _, c in kept for row in range(c.first, c.end)]
+        end = 0
+        for _, c in kept:
+            first, end = end, end + c.end - c.first
+            moved.append(c._replace(first=first, end=end))
+        self.constraints = tuple(moved)
+        begin = rows[0] if rows else 0
+        contiguous = rows == list(range(begin, begin + len(rows)))
+        self.rows = slice(begin, begin + len(rows)) if contiguous else np.array(rows)
+        sizes = [c.end - c.first for c in moved]
+        self.radius = np.repeat([c.radius for c in moved], sizes).astype(float)
+        self.scale = np.repeat([c.scale for c in moved], sizes).astype(float)
+        self._one_sided = np.repeat([c.one_sided for c in moved], sizes).astype(bool)
+        self._is_one_sided = bool(self._one_sided.any())
 
     @cached_property
     def far_damping(self) -> Vector:
@@ -344,20 +392,37 @@ class Bounding:
         """Squared radii (m, m), on the diagonal."""
         return np.diag(self.radius**2)
 
+    def missing(self, residual: Vector, jacobian: Vector) -> tuple[Vector, Vector]:
+        """What residuals (..., m) lack of their middle, or of a bound on one side, and slopes.
+
+        Rows (..., m, n) of the Jacobian are zero where a bound on one side holds.
+        """
+        if not self._is_one_sided:
+            return residual, jacobian
+        inside = DESCENT.inside * self.radius
+        holds = self._one_sided & (residual <= inside)
+        lacks = np.where(self._one_sided, np.maximum(residual - inside, 0.0), residual)
+        return lacks, np.where(holds[..., np.newaxis], 0.0, jacobian)
+
     def errors(self, residuals: Vector) -> Vector:
-        """Largest ratio (N,) of a residual's length to its ball's radius, of (N, m)."""
+        """Largest ratio (N,) of a constraint's error to its radius, of residuals (N, m)."""
         worst = np.zeros(len(residuals))
-        for _, first, end, radius in self.spheres:
-            part = residuals[:, first:end]
-            np.maximum(worst, np.sqrt(np.einsum("ij,ij->i", part, part)) / radius, out=worst)
+        for c in self.constraints:
+            part = residuals[:, c.first : c.end]
+            lengths = part[:, 0] if c.one_sided else np.sqrt(np.einsum("ij,ij->i", part, part))
+            np.maximum(worst, lengths / c.radius, out=worst)
         return worst
 
 
 def floor_bounds(goal: StiffnessGoal | None) -> Vector:
     """Logarithms (f,) that the floors of a goal may not fall below, with some margin."""
     values = [floor.value for floor in goal.at_least] if goal is not None else []
-    bounds: Vector = np.log(np.array(values)) + FLOOR_MARGIN
+    bounds: Vector = np.log(np.array(values)) + DESCENT.floor_margin
     return bounds
+
+
+def _one(point: ProgramPoint) -> float:
+    return 1.0
 
 
 _total = np.add.reduce

@@ -6,8 +6,9 @@ Variables are the pressures; all stiffnesses enter by their logarithm, so that a
 per metre weighs the same wherever it is a tenth.
 """
 
+import math
 from collections.abc import Hashable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -15,25 +16,58 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.shape import Shape
-from stiffopt.optimise.goal import MatchMatrix, StiffnessGoal
-from stiffopt.optimise.measures import LogStiffness, MatrixDistance, Measure
+from stiffopt.optimise.goal import StiffnessGoal
+from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.terms import PoseTerm, pose_terms
+from stiffopt.optimise.term import Term
 
 Vector = NDArray[np.float64]
 
 BAR = 1e5
-"""Pressure scale of the variables, in Pa."""
+"""In Pa."""
 
-_SOME_PRESSURE = 1e-7
+_SOME_PRESSURE = 2.25e-7
 """Weight of the mean square pressure where a stiffness is matched: of all that match as well the
 one with less pressure."""
 
-Aim = Literal["maximise", "match value", "match matrix", "least pressure"]
+Aim = Literal["maximise", "match", "least pressure"]
 
 
-class Structure(NamedTuple):
+def pressure_ranges(description: RobotDescription) -> Vector:
+    """Units (n,) of the optimiser's variables in Pa: the range of each channel.
+
+    A channel of no range has the largest range of the others.
+    """
+    ranges = np.array(description.pressure_max) - np.array(description.pressure_min)
+    largest = ranges.max()
+    return np.where(ranges > 0, ranges, largest if largest > 0 else BAR)
+
+
+class Constraint(NamedTuple):
+    """Rows of the residual, first to end - 1, that are bounded together.
+
+    Attributes
+    ----------
+    name : str
+        Of the term.
+    radius : float
+        Of the ball that the rows may not leave, ``|r| <= radius``; or the largest value of a
+        single row, ``r <= radius``, if `one_sided`.
+    scale : float
+        What the residual is compared with while the target is far.
+    """
+
+    name: str
+    first: int
+    end: int
+    radius: float
+    scale: float
+    one_sided: bool
+
+
+class ProgramStructure(NamedTuple):
     """What functions are made for; equal for tasks that share them."""
 
     terms: tuple[Hashable, ...]
@@ -44,48 +78,41 @@ class Structure(NamedTuple):
 
 @dataclass(frozen=True)
 class Program:
-    """A task's pose terms and stiffness measures.
+    """A task's terms and stiffness measures.
 
     Attributes
     ----------
-    terms : tuple of PoseTerm
+    terms : tuple of Term
     measures : tuple of Measure
         What is maximised, or matched, then the floors.
     aim : what is done with those that are no floors.
     n_floors : int
-    wanted : float
-        Logarithm of the value to match.
+    reference : float
+        Pressure in Pa that is one unit of mean square pressure.
     """
 
-    terms: tuple[PoseTerm, ...]
+    terms: tuple[Term, ...]
     measures: tuple[Measure, ...]
     aim: Aim
     n_floors: int
-    wanted: float = 0.0
+    reference: float = BAR
 
     @classmethod
-    def of(cls, target: Target, goal: StiffnessGoal | None) -> "Program":
-        """Program of a task."""
-        terms = pose_terms(target)
+    def of(
+        cls, target: Target, goal: StiffnessGoal | None, description: RobotDescription
+    ) -> "Program":
+        """Program of a task on a robot."""
+        reference = float(pressure_ranges(description).max())
         if goal is None:
-            return cls(terms, (), "least pressure", 0)
-        floors = tuple(LogStiffness(floor) for floor in goal.at_least)
-        if goal.maximise:
-            found = tuple(LogStiffness(measure) for measure in goal.maximise)
-            return cls(terms, (*found, *floors), "maximise", len(floors))
-        if isinstance(goal.match, MatchMatrix):
-            distance = MatrixDistance(goal.match)
-            return cls(terms, (distance, *floors), "match matrix", len(floors))
-        if goal.match is not None:
-            wanted = float(np.log(goal.match.value))
-            stiffness = LogStiffness(goal.match)
-            return cls(terms, (stiffness, *floors), "match value", len(floors), wanted)
-        return cls(terms, floors, "least pressure", len(floors))
+            return cls(target.terms, (), "least pressure", 0, reference)
+        aim: Aim = "maximise" if goal.maximise else "match" if goal.match else "least pressure"
+        measures = (*goal.first, *goal.at_least)
+        return cls(target.terms, measures, aim, len(goal.at_least), reference)
 
     @cached_property
-    def structure(self) -> Structure:
+    def structure(self) -> ProgramStructure:
         """What the functions depend on."""
-        return Structure(
+        return ProgramStructure(
             tuple(term.structure for term in self.terms),
             tuple(measure.structure for measure in self.measures),
             self.aim,
@@ -99,15 +126,15 @@ class Program:
 
     @cached_property
     def target_parameters(self) -> tuple[float, ...]:
-        """Parameters of the pose terms, which come first."""
+        """Parameters of the terms, which come first."""
         return tuple(value for term in self.terms for value in term.parameters)
 
     @cached_property
     def measure_parameters(self) -> tuple[float, ...]:
-        """Parameters of the measures, then the logarithm of the value to match."""
+        """Parameters of the measures, then `reference`."""
         return (
             *(float(value) for measure in self.measures for value in measure.parameters),
-            self.wanted,
+            self.reference,
         )
 
     @property
@@ -118,16 +145,49 @@ class Program:
     @property
     def precision(self) -> float:
         """Decrease of the objective that no longer matters."""
-        return {"maximise": 1e-7, "least pressure": 1e-9}.get(self.aim, 1e-10)
+        return {"maximise": 1e-7, "least pressure": 4e-10}.get(self.aim, 1e-10)
+
+    def constraints(self, length: float) -> tuple[Constraint, ...]:
+        """How the residual is bounded, for an arm of this length."""
+        found: list[Constraint] = []
+        first = 0
+        for term in self.terms:
+            scale = length if term.unit == "m" else 1.0
+            step = 1 if term.is_inequality else term.size
+            for row in range(first, first + term.size, step):
+                found.append(
+                    Constraint(term.name, row, row + step, term.radius, scale, term.is_inequality)
+                )
+            first += term.size
+        return tuple(found)
 
     @property
-    def steepness(self) -> float:
-        """First guess of the objective's curvature, per bar^2."""
-        return 0.1
+    def n_rows(self) -> int:
+        """Number of components m of the residual."""
+        return sum(term.size for term in self.terms)
+
+    @property
+    def n_equal(self) -> int:
+        """Number of them that a target wants to be zero, but for its tolerance."""
+        return sum(term.size for term in self.terms if not term.is_inequality)
+
+    @property
+    def has_stations(self) -> bool:
+        """Whether a term is one of stations along the body, not of the tip alone."""
+        return any(term.has_stations for term in self.terms)
+
+    def errors(self, residuals: list[float]) -> dict[str, float]:
+        """Length of the residual of each term, or least margin of an inequality, from (m,)."""
+        found, start = {}, 0
+        for term in self.terms:
+            own = residuals[start : start + term.size]
+            found[term.name] = term.radius - max(own) if term.is_inequality else math.hypot(*own)
+            start += term.size
+        return found
 
     def at(self, target: Target) -> "Program":
         """The same program for another target."""
-        return Program(pose_terms(target), self.measures, self.aim, self.n_floors, self.wanted)
+        return replace(self, terms=target.terms)
 
     @property
     def n_terms(self) -> int:
@@ -148,7 +208,7 @@ class Program:
         """
         values, gradients = self._values(tip, parameters), self._gradients(tip, parameters)
         first = len(self.measures) - self.n_floors
-        terms, slopes = self._terms(values[:first], gradients[:first, :], tip, parameters[-1])
+        terms, slopes = self._terms(values[:first], gradients[:first, :], tip, parameters)
         parts = (terms, slopes.T, values[first:], gradients[first:, :].T)
         return [*self.pose(tip, parameters), *(ca.densify(part) for part in parts)]
 
@@ -157,7 +217,7 @@ class Program:
         values = self._values(tip, parameters)
         first = len(self.measures) - self.n_floors
         none = type(tip.pressures)(first, tip.pressures.numel())
-        terms, _ = self._terms(values[:first], none, tip, parameters[-1])
+        terms, _ = self._terms(values[:first], none, tip, parameters)
         return [ca.densify(terms), ca.densify(values[first:])]
 
     def judge(self, tip: Shape, parameters: Any) -> list[Any]:
@@ -173,16 +233,18 @@ class Program:
         found, start = [], 0
         for term in self.terms:
             end = start + len(term.parameters)
-            found.append(term.residual(tip.position, tip.rotation, parameters[start:end]))
+            residual = term.residual(tip, parameters[start:end])
+            # g >= 0 as r = radius - g <= radius, as balls are bounded
+            found.append(term.radius - residual if term.is_inequality else residual)
             start = end
         return ca.densify(ca.vertcat(*found))
 
     def _values(self, tip: Shape, parameters: Any) -> Any:
-        found = [m.value(tip, own) for m, own in self._own_parameters(parameters)]
+        found = [m.formula(tip, own) for m, own in self._own_parameters(parameters)]
         return ca.vertcat(*found) if found else type(tip.pressures)(0, 1)
 
     def _gradients(self, tip: Shape, parameters: Any) -> Any:
-        found = [m.gradient(tip, own) for m, own in self._own_parameters(parameters)]
+        found = [m.formula_gradient(tip, own) for m, own in self._own_parameters(parameters)]
         return ca.vertcat(*found) if found else type(tip.pressures)(0, tip.pressures.numel())
 
     def _own_parameters(self, parameters: Any) -> Iterator[tuple[Measure, Any]]:
@@ -192,15 +254,15 @@ class Program:
             yield measure, parameters[start:end]
             start = end
 
-    def _terms(self, values: Any, gradients: Any, tip: Shape, wanted: Any) -> tuple[Any, Any]:
+    def _terms(self, values: Any, gradients: Any, tip: Shape, parameters: Any) -> tuple[Any, Any]:
         """Terms of the objective and their gradients."""
         if self.aim == "maximise":
             return -values, -gradients
-        x = tip.pressures / BAR
-        mean_square, slope = ca.sumsqr(x) / x.numel(), 2 / BAR / x.numel() * x.T
+        reference = parameters[-1]
+        x = tip.pressures / reference
+        mean_square, slope = ca.sumsqr(x) / x.numel(), 2 / reference / x.numel() * x.T
         if self.aim == "least pressure":
             return mean_square, slope
-        mismatch, slopes = values, gradients
-        if self.aim == "match value":
-            mismatch, slopes = (values - wanted) ** 2, 2 * (values - wanted) * gradients
-        return mismatch + _SOME_PRESSURE * mean_square, slopes + _SOME_PRESSURE * slope
+        measure, own = next(self._own_parameters(parameters))
+        mismatch, factor = measure.mismatch(values, own)
+        return mismatch + _SOME_PRESSURE * mean_square, factor * gradients + _SOME_PRESSURE * slope

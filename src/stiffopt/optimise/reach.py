@@ -1,4 +1,4 @@
-"""Onto the pose: Levenberg-Marquardt steps that mind the pressure limits."""
+"""From any pressures to ones that meet the target: Levenberg-Marquardt within the limits."""
 
 import math
 from collections.abc import Callable
@@ -7,12 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.optimise.problem import Point, Problem
+from stiffopt.optimise.problem import PressureProblem, ProgramPoint
+from stiffopt.optimise.settings import REACH
 
 Vector = NDArray[np.float64]
 
 
-def reach(problem: Problem, x: Vector, most_iterations: int = 40) -> Point | None:
+def reach(
+    problem: PressureProblem, x: Vector, most_iterations: int = REACH.iterations
+) -> ProgramPoint | None:
     """Bring pressures to the pose; the point nearest to it that was found otherwise.
 
     None if the arm has no equilibrium at the start.
@@ -20,37 +23,44 @@ def reach(problem: Problem, x: Vector, most_iterations: int = 40) -> Point | Non
     point = attempt(problem.pose, x)
     if point is None:
         return None
-    rows, scale = problem.bounding.rows, problem.bounding.scale
-    damping = 1e-4
-    before = _misfit(point.residual[rows] / scale)
+    bounding = problem.bounding
+    rows, scale, step = bounding.rows, bounding.scale, REACH.longest_step
+    damping = REACH.damping
+    residual, jacobian = bounding.missing(point.residual[rows], point.jacobian[rows])
+    before = _misfit(residual / scale)
     for _ in range(most_iterations):
         if point.reached:
             return point
-        residual, jacobian = point.residual[rows], point.jacobian[rows]
         d = bounded_step(
             jacobian,
             -residual,
-            damping * problem.bounding.far_damping,
-            np.maximum(problem.lower - point.x, -1.0),
-            np.minimum(problem.upper - point.x, 1.0),
+            damping * bounding.far_damping,
+            np.maximum(problem.lower - point.x, -step),
+            np.minimum(problem.upper - point.x, step),
         )
         promised = before - _misfit((residual + jacobian @ d) / scale)
-        if not promised >= 1e-9 * before:
+        if not promised >= REACH.least_progress * before:
             return point
         trial = attempt(problem.pose, within(problem.lower, point.x + d, problem.upper))
-        after = math.inf if trial is None else _misfit(trial.residual[rows] / scale)
+        after = math.inf
+        if trial is not None:
+            lacking = bounding.missing(trial.residual[rows], trial.jacobian[rows])
+            after = _misfit(lacking[0] / scale)
         gained = before - after
         if trial is not None and gained > 0.1 * promised:
             point, before = trial, after
-            damping = max(damping * (0.1 if gained > 0.7 * promised else 1.0), 1e-10)
+            residual, jacobian = lacking
+            damping = max(damping * (0.1 if gained > 0.7 * promised else 1.0), REACH.least_damping)
         else:
             damping *= 10
-            if damping > 1e6:
+            if damping > REACH.most_damping:
                 return point
     return point
 
 
-def reach_all(problem: Problem, x: Vector, most_iterations: int = 20) -> tuple[Vector, Vector]:
+def reach_all(
+    problem: PressureProblem, x: Vector, most_iterations: int = REACH.iterations_of_many
+) -> tuple[Vector, Vector]:
     """Bring pressures (N, n) of an arm without loads to the pose, all at once.
 
     Returns where they came to, and by how much (N,) the worst residual there exceeds its radius,
@@ -58,36 +68,40 @@ def reach_all(problem: Problem, x: Vector, most_iterations: int = 20) -> tuple[V
     """
     bounding = problem.bounding
     x = within(problem.lower, x, problem.upper)
-    if not bounding.spheres:
+    if not bounding.constraints:
         return x, np.zeros(len(x))
-    rows, scale = bounding.rows, bounding.scale
-    residual, jacobian = (part[:, rows] for part in problem.poses(x))
+    rows, scale, step = bounding.rows, bounding.scale, REACH.longest_step
+    full, slopes = (part[:, rows] for part in problem.poses(x))
+    ratio = bounding.errors(full)
+    residual, jacobian = bounding.missing(full, slopes)
     before = _misfits(residual / scale)
-    ratio = bounding.errors(residual)
-    damping = np.full(len(x), 1e-4)
+    damping = np.full(len(x), REACH.damping)
     going = np.flatnonzero((ratio > 1) & np.isfinite(before))
     for _ in range(most_iterations):
         if not len(going):
             break
         here, r, J, misfit = x[going], residual[going], jacobian[going], before[going]
-        low = np.maximum(problem.lower - here, -1.0)
-        high = np.minimum(problem.upper - here, 1.0)
+        low = np.maximum(problem.lower - here, -step)
+        high = np.minimum(problem.upper - here, step)
         D = damping[going, np.newaxis, np.newaxis] * bounding.far_damping
         d = bounded_steps(J, -r, D, low, high)
         left = _misfits((r + np.matmul(J, d[..., np.newaxis])[..., 0]) / scale)
         promised = misfit - left
         trial = within(problem.lower, here + d, problem.upper)
-        new_residual, new_jacobian = (part[:, rows] for part in problem.poses(trial))
+        full, slopes = (part[:, rows] for part in problem.poses(trial))
+        new_residual, new_jacobian = bounding.missing(full, slopes)
         after = _misfits(new_residual / scale)
         gained = misfit - after
         better = gained > 0.1 * promised
         taken = going[better]
         x[taken], before[taken] = trial[better], after[better]
         residual[taken], jacobian[taken] = new_residual[better], new_jacobian[better]
-        ratio[taken] = bounding.errors(new_residual[better])
+        ratio[taken] = bounding.errors(full[better])
         change = np.where(better, np.where(gained > 0.7 * promised, 0.1, 1.0), 10.0)
-        damping[going] = np.maximum(damping[going] * change, 1e-10)
-        hopeful = (promised >= 1e-9 * misfit) & (damping[going] <= 1e6)
+        damping[going] = np.maximum(damping[going] * change, REACH.least_damping)
+        hopeful = (promised >= REACH.least_progress * misfit) & (
+            damping[going] <= REACH.most_damping
+        )
         going = going[hopeful & (ratio[going] > 1)]
     return x, ratio
 
@@ -144,7 +158,7 @@ def within(low: Vector, x: Vector, high: Vector) -> Vector:
     return np.minimum(np.maximum(x, low), high)
 
 
-def attempt(evaluate: Callable[[Vector], Point], x: Vector) -> Point | None:
+def attempt(evaluate: Callable[[Vector], ProgramPoint], x: Vector) -> ProgramPoint | None:
     """Evaluate; None where the arm has no stable equilibrium or anything is not finite."""
     try:
         point = evaluate(x)

@@ -1,6 +1,5 @@
 """Sampled configurations of an arm, from which searches start."""
 
-import math
 from collections.abc import Callable
 from functools import cached_property
 
@@ -9,17 +8,12 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.program import BAR
-from stiffopt.optimise.target import Target
+from stiffopt.optimise.settings import SAMPLES
+from stiffopt.optimise.term import Term
 
 Vector = NDArray[np.float64]
 
 Settled = Callable[[Vector], tuple[NDArray[np.bool_], Vector, Vector]]
-
-_FREE_SAMPLES = 4096
-_LOADED_SAMPLES = 128  # an equilibrium takes a thousand times longer than a closed form
-_COMPILED_SAMPLES = 64  # each load has its own; measured to do
-_HOPELESS_SAMPLES = 16  # if none of so many first ones has an equilibrium, the arm has none
 
 
 class SampleTable:
@@ -29,7 +23,7 @@ class SampleTable:
     ----------
     robot : Manipulator
     lower, upper : ndarray (n,)
-        Range in bar.
+        Range in Pa.
     seed : int
         Shifts the low-discrepancy sequence.
     settled : callable, optional
@@ -38,8 +32,8 @@ class SampleTable:
 
     Attributes
     ----------
-    x : ndarray (N, n)
-        In bar.
+    pressures : ndarray (N, n)
+        In Pa.
     poses : ndarray (N, 4, 4)
     states : ndarray (N, s)
         Of the equilibria, if `settled` is given.
@@ -53,9 +47,9 @@ class SampleTable:
         seed: int,
         settled: Settled | None = None,
     ) -> None:
-        count = _FREE_SAMPLES
+        count = SAMPLES.free
         if robot.is_loaded:
-            count = _LOADED_SAMPLES if settled is None else _COMPILED_SAMPLES
+            count = SAMPLES.loaded if settled is None else SAMPLES.compiled
         x = lower + (upper - lower) * _spread_with_edges(count, len(lower), seed)
         if robot.is_loaded:
             # under load little pressure can do much: every other sample is scaled down
@@ -63,14 +57,14 @@ class SampleTable:
             scale[::2] = 1.0
             x = lower + (x - lower) * scale[:, np.newaxis]
             if settled is not None:
-                found, states, flat = settled(x * BAR)
+                found, states, flat = settled(x)
                 x, self.states = x[found], np.ascontiguousarray(states[found])
                 poses = _unflattened(flat[found])
             else:
                 x, poses = _settled(robot, x)
         else:
-            poses = robot.tip_pose(x * BAR)
-        self.x, self.poses = np.ascontiguousarray(x), poses
+            poses = robot.tip_pose(x)
+        self.pressures, self.poses = np.ascontiguousarray(x), poses
 
     @cached_property
     def flat_poses(self) -> Vector:
@@ -78,48 +72,25 @@ class SampleTable:
         columns = self.poses[:, :3, [3, 0, 1, 2]].swapaxes(1, 2)
         return np.ascontiguousarray(columns.reshape(-1, 12))
 
-    def nearest_first(
-        self, target: Target, length: float, most: int | None = None
-    ) -> NDArray[np.intp]:
-        """Indices of the samples with the smallest pose errors (see `nearness`), in order."""
-        near = np.array(nearness(target, length))
-        apart = near[:3] * (self.flat_poses[:, :3] - near[3:6])
-        errors = np.sqrt(np.einsum("ij,ij->i", apart, apart))
-        if near[6]:
-            square = np.maximum(near[7] - self.flat_poses[:, 3:] @ near[8:], 0.0)
-            errors += near[6] * np.sqrt(square)
-        if most is None or most >= len(errors):
-            return np.argsort(errors, kind="stable")
-        nearest = np.sort(np.argpartition(errors, most)[:most])
-        return nearest[np.argsort(errors[nearest], kind="stable")]
+    def distances(self, terms: tuple[Term, ...], length: float) -> Vector:
+        """How far (N,) the samples' tips are from meeting all terms, roughly (see `Nearness`)."""
+        position, rotation = self.flat_poses[:, :3], self.flat_poses[:, 3:]
+        total = np.zeros(len(self.flat_poses))
+        for term in terms:
+            near = term.nearness(length)
+            value = near.offset + position @ np.array(near.linear)
+            value += position**2 @ np.array(near.square) + rotation @ np.array(near.turn)
+            np.maximum(value, 0.0, out=value)
+            value = np.sqrt(value) if near.root else value
+            total += np.maximum(value - near.limit, 0.0)
+        return total
 
-
-def nearness(target: Target, length: float) -> tuple[float, ...]:
-    """How far a pose is from a target, roughly, as 17 numbers.
-
-    Weights w (3), position q (3), factor a, offset b and matrix M (9, by columns), so that the
-    distance is ``|w * (position - q)| + a sqrt(b - <M, rotation>)``: the position error over the
-    arm's length plus a chord for the angle over pi.
-    """
-    weights, wanted = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
-    for axis, value in enumerate(target.position or ()):
-        if value is not None:
-            weights[axis], wanted[axis] = 1 / length, value
-    if target.pointing is not None:
-        # |z - d|^2 = 2 - 2 z.d
-        matrix = (0.0,) * 6 + tuple(2 * value for value in target.pointing)
-        return (*weights, *wanted, 1 / math.pi, 2.0, *matrix)
-    if target.orientation is not None:
-        w, x, y, z = target.orientation
-        # |R - W|^2 = 6 - 2 <W, R>, twice the square of a small angle
-        columns = (
-            1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
-            2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
-            2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y),
-        )  # fmt: skip
-        matrix = tuple(2 * value for value in columns)
-        return (*weights, *wanted, 1 / (math.pi * math.sqrt(2)), 6.0, *matrix)
-    return (*weights, *wanted, *(0.0,) * 11)
+    def nearest_first(self, distances: Vector, most: int | None = None) -> NDArray[np.intp]:
+        """Indices of the samples with the smallest distances (N,), in order."""
+        if most is None or most >= len(distances):
+            return np.argsort(distances, kind="stable")
+        nearest = np.sort(np.argpartition(distances, most)[:most])
+        return nearest[np.argsort(distances[nearest], kind="stable")]
 
 
 def _spread_with_edges(count: int, n: int, seed: int) -> Vector:
@@ -153,9 +124,9 @@ def _settled(robot: Manipulator, x: Vector) -> tuple[Vector, Vector]:
     for index in range(len(x)):
         evaluator.restart()  # each from rest, so that local searches start on the right branch
         try:
-            (pose,) = evaluator(x[index] * BAR)
+            (pose,) = evaluator(x[index])
         except EquilibriumError:
-            if not kept and index >= _HOPELESS_SAMPLES:
+            if not kept and index >= SAMPLES.hopeless:
                 raise
             continue
         kept.append(index)

@@ -3,8 +3,8 @@
 Samples whose tip is nearest to the target are brought to the pose and ranked by the objective
 there.  Descents start from the best, those unlike each other first; one that comes next to an
 optimum that is known already ends there.  The search ends when so many descents in a row have
-found no new local optimum (`stiffopt.optimise.effort`): those with a basin of some size have been
-seen then, but nothing is proved.
+found no new local optimum: those with a basin of some size have been seen then, but nothing is
+proved.  How many is a matter of how much the target leaves open (`effort`).
 
 The folder ``native`` holds the same method in C.
 """
@@ -12,41 +12,82 @@ The folder ``native`` holds the same method in C.
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.optimise.effort import Effort, effort
-from stiffopt.optimise.local import NEXT_TO, LocalResult, descend, violation
-from stiffopt.optimise.problem import Point, Problem
+from stiffopt.optimise.local import LocalResult, descend, violation
+from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.reach import reach, reach_all
 from stiffopt.optimise.samples import SampleTable
+from stiffopt.optimise.settings import DESCENT, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
 
 Vector = NDArray[np.float64]
 
-SAME_OPTIMUM = 1e-3
-"""Objectives closer than this (0.1 % of a stiffness) count as the same optimum."""
 
-MOST_STARTS_LOADED = 12
-"""Starts at most for an arm under gravity or load, where each takes far longer than without."""
+def effort(rows: int, covered: float, loaded: bool = False) -> Effort:
+    """Effort of a search.
 
-_UNLIKE = 0.2  # share of the diagonal of the pressure range that starts lie apart
-_PRICE_OF_FLOORS = 10.0  # in a rank, of a floor that is missed
+    A target that asks for less than a position is reached in very different ways, and the best of
+    them is easily overlooked; so it is with one of a large tolerance.  Measured against hundreds of
+    descents: see benchmarks.
 
-
-def starts(problem: Problem, table: SampleTable) -> Iterator[Vector]:
-    """Pressures to start from: those near the target.
-
-    Under load, where few are tried, near ones and any are given in turn, unlike each other.
+    Parameters
+    ----------
+    rows : int
+        Components of the residuals that are to be zero.
+    covered : float
+        Share of the sampled configurations that meet the target.
+    loaded : bool
+        Whether it is that of machine code for an arm under gravity or a load.
     """
-    target, length = problem.task.target, problem.robot.length
+    placed, loose = SEARCH.placed, SEARCH.loose
+    if loaded:
+        placed, loose = SEARCH.loaded_placed, SEARCH.loaded_loose
+    if rows < 3:
+        return loose
+    share = min(1.0, covered / SEARCH.covered)
+    return Effort(*(int(a + share * (b - a)) for a, b in zip(placed, loose, strict=True)))
+
+
+class Starts(NamedTuple):
+    """Where a search starts.
+
+    Attributes
+    ----------
+    candidates : iterator of ndarray (n,)
+        Variables of the problem.
+    effort : Effort
+    """
+
+    candidates: Iterator[Vector]
+    effort: Effort
+
+
+def starts(problem: PressureProblem, table: SampleTable) -> Starts:
+    """Pressures to start from, those near the target, and how hard to try.
+
+    Less hard than compiled code does for an arm without loads, since all takes longer here: one
+    descent less must agree and, with up to six pressures, where there are few optima, half of the
+    samples.  Under load, where few are tried, near ones and any are given in turn, unlike each
+    other.
+    """
+    distances = table.distances(problem.program.terms, problem.robot.length)
+    full = effort(problem.program.n_equal, float((distances == 0).mean()))
+    x = table.pressures / problem.unit
     if not problem.robot.is_loaded:
-        return iter(table.x[table.nearest_first(target, length, _effort(problem).screened)])
-    order = table.nearest_first(target, length)
+        few = len(problem.lower) <= 6
+        screened = full.screened // 2 if few else full.screened
+        order = table.nearest_first(distances, screened)
+        tries = full._replace(screened=screened, agreeing=full.agreeing - 1)
+        return Starts(iter(x[order]), tries)
+    order = table.nearest_first(distances)
     mixed = [i for pair in zip(order, range(len(order)), strict=True) for i in pair]
-    x = table.x[list(dict.fromkeys(mixed))]
-    return islice((x[i] for i in _unlike_first(problem, x)), MOST_STARTS_LOADED)
+    x = x[list(dict.fromkeys(mixed))]
+    unlike = (x[i] for i in _unlike_first(problem, x))
+    return Starts(islice(unlike, SEARCH.general_starts_loaded), full)
 
 
 @dataclass(frozen=True)
@@ -58,31 +99,27 @@ class Search:
     results : tuple of LocalResult
         Where descents ended, the best first; one that stopped next to an optimum that was known
         already is left out.
-    nearest : tuple of Point
+    nearest : tuple of ProgramPoint
         Where starts that did not reach the pose ended, if none reached it.
     confidence : Confidence
     """
 
     results: tuple[LocalResult, ...]
-    nearest: tuple[Point, ...]
+    nearest: tuple[ProgramPoint, ...]
     confidence: Confidence
 
 
 def search(
-    problem: Problem,
+    problem: PressureProblem,
     candidates: Iterable[Vector],
-    most_descents: int | None = None,
-    same: float = SAME_OPTIMUM,
-    agreeing: int | None = None,
+    tries: Effort = SEARCH.placed,
+    same: float = SEARCH.same_optimum,
 ) -> Search:
     """Run local optimisations from candidates until so many in a row find nothing new.
 
-    That many, and how many at most, is a matter of `_effort` if not told otherwise.  `same` is
-    the difference of values below which optima count as one.
+    `same` is the difference of values below which optima count as one.
     """
-    tries = _effort(problem)
-    most = tries.most_descents if most_descents is None else most_descents
-    trail = _Trail(same, tries.agreeing if agreeing is None else agreeing)
+    trail = _Trail(same, tries.agreeing)
     ends: dict[int, LocalResult] = {}
     for tried, point in _places(problem, candidates):
         trail.starts = tried
@@ -94,7 +131,7 @@ def search(
         if id(point) not in ends:
             ends[id(point)] = descend(problem, point, trail.optima, same)
         trail.add(ends[id(point)])
-        if trail.is_complete or trail.descents >= most:
+        if trail.is_complete or trail.descents >= tries.most_descents:
             break
     return trail.outcome()
 
@@ -105,7 +142,7 @@ class _Trail:
     def __init__(self, same: float, agreeing: int) -> None:
         self._same, self._agreeing = same, agreeing
         self.starts = self.descents = self._nothing_new = 0
-        self.nearest: list[Point] = []
+        self.nearest: list[ProgramPoint] = []
         self.optima: list[LocalResult] = []
         self._results: list[LocalResult] = []
         self._converged: list[LocalResult] = []
@@ -149,25 +186,12 @@ def _rank(result: LocalResult) -> tuple[float, float]:
     return (round(result.violation, 7), result.value)
 
 
-def _effort(problem: Problem) -> Effort:
-    """Less than that of compiled code for an arm without loads, since all takes longer here.
-
-    One descent less that must agree and, with up to six pressures, where there are few optima, half
-    of the samples.
-    """
-    full = effort(problem.spheres[-1].end)
-    if problem.robot.is_loaded:
-        return full
-    few = len(problem.lower) <= 6
-    return full._replace(
-        screened=full.screened // 2 if few else full.screened, agreeing=full.agreeing - 1
-    )
-
-
 # -- where descents start -------------------------------------------------------------------
 
 
-def _places(problem: Problem, candidates: Iterable[Vector]) -> Iterator[tuple[int, Point | None]]:
+def _places(
+    problem: PressureProblem, candidates: Iterable[Vector]
+) -> Iterator[tuple[int, ProgramPoint | None]]:
     """Points to descend from, each with the number of candidates that were tried until then.
 
     None or points that have not reached the pose where a candidate led nowhere.
@@ -189,7 +213,7 @@ def _places(problem: Problem, candidates: Iterable[Vector]) -> Iterator[tuple[in
     place = _first_at_same_place(come)
     promise = {i: _promise(problem, come[i]) for i in set(place)}
     ranked = sorted(range(len(come)), key=lambda i: promise[place[i]])
-    points_at: dict[int, Point] = {}
+    points_at: dict[int, ProgramPoint] = {}
     for i in _unlike_first(problem, come[ranked]):
         at = place[ranked[i]]
         if at not in points_at:
@@ -200,22 +224,22 @@ def _places(problem: Problem, candidates: Iterable[Vector]) -> Iterator[tuple[in
 
 def _first_at_same_place(x: Vector) -> list[int]:
     """For each of some pressures (N, n) the first that are the same but for little."""
-    same_place = np.abs(x[:, np.newaxis] - x).max(axis=2) < NEXT_TO
+    same_place = np.abs(x[:, np.newaxis] - x).max(axis=2) < DESCENT.next_to
     first: list[int] = same_place.argmax(axis=1).tolist()
     return first
 
 
-def _promise(problem: Problem, x: Vector) -> float:
+def _promise(problem: PressureProblem, x: Vector) -> float:
     """Objective at pressures (n,) with a penalty on floors that are missed; less is better."""
     point = problem.worth(x)
-    value = problem.objective.value(point) + _PRICE_OF_FLOORS * violation(problem, point)
+    value = problem.objective.value(point) + SEARCH.price_of_floors * violation(problem, point)
     return value if np.isfinite(value) else np.inf
 
 
-def _unlike_first(problem: Problem, x: Vector) -> Iterator[int]:
+def _unlike_first(problem: PressureProblem, x: Vector) -> Iterator[int]:
     """Indices of pressures (N, n), in order: those far from all before, then the others."""
     range_ = problem.upper - problem.lower
-    apart = _UNLIKE**2 * float(range_ @ range_)
+    apart = SEARCH.unlike**2 * float(range_ @ range_)
     squares = np.einsum("ij,ij->i", x, x)
     close = squares[:, np.newaxis] + squares - 2 * x @ x.T <= apart
     passed_over = np.zeros(len(x), dtype=bool)

@@ -13,7 +13,6 @@ from stiffopt import lie
 from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.functions import functions
-from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.task import Task
 
@@ -52,7 +51,7 @@ class Confidence:
         Distinct local optima among them.
     complete : bool
         Whether the search ended because so many descents in a row found nothing new (see
-        `stiffopt.optimise.effort`).  False: it ran out of starts.
+        `stiffopt.optimise.search.effort`).  False: it ran out of starts.
     """
 
     starts: int
@@ -87,8 +86,11 @@ class Sensitivities:
     per_bound : dict of str to float
         For each active pressure limit what moving it outwards is worth, in `objective_unit`
         per Pa.
+    per_tolerance : dict of str to float
+        The same for each term of the target by its name, per m or rad of tolerance or, of an
+        inequality, of margin.
     per_position_tolerance, per_angle_tolerance : float or None
-        The same per m and per rad of tolerance; None where not asked for.
+        Those of position and angle; None where not asked for.
     objective_unit : str
         What is gained: "N/m" or "N*m/rad" of the (smallest) stiffness that is maximised; "m" or
         "rad" of the error of an unreachable pose; "bar^2" of mean square pressure where no
@@ -98,12 +100,21 @@ class Sensitivities:
     tip_jacobian: Vector
     stiffness_gradient: Vector | None
     per_bound: dict[str, float]
-    per_position_tolerance: float | None
-    per_angle_tolerance: float | None
+    per_tolerance: dict[str, float]
     objective_unit: str
 
     def __post_init__(self) -> None:
         _protect(self, "tip_jacobian", "stiffness_gradient")
+
+    @property
+    def per_position_tolerance(self) -> float | None:
+        """Gain per m of the position's tolerance."""
+        return self.per_tolerance.get("position")
+
+    @property
+    def per_angle_tolerance(self) -> float | None:
+        """Gain per rad of the angle's tolerance."""
+        return self.per_tolerance.get("angle")
 
 
 class Explanation(NamedTuple):
@@ -129,6 +140,9 @@ class PressureSolution:
     pressures : ndarray (n,) or None
         In Pa.
     tip_pose : ndarray (4, 4) or None
+    errors : dict of str to float
+        By name of each term of the target: the length of its residual or, of an inequality, the
+        margin by which it holds, in the term's unit.
     position_error : float or None
         Over the axes that were asked for, in m; None where none was.
     angle_error : float or None
@@ -160,8 +174,7 @@ class PressureSolution:
     task: Task
     pressures: Vector | None = None
     tip_pose: Vector | None = None
-    position_error: float | None = None
-    angle_error: float | None = None
+    errors: dict[str, float] = field(default_factory=dict)
     compliance: Vector | None = None
     stiffness: float | None = None
     stiffness_unit: str | None = None
@@ -211,6 +224,16 @@ class PressureSolution:
         return self.status == "solved"
 
     @property
+    def position_error(self) -> float | None:
+        """Length of the position's residual in m; None where no position was asked for."""
+        return self.errors.get("position")
+
+    @property
+    def angle_error(self) -> float | None:
+        """Angle in rad by which the tip is off; None where none was asked for."""
+        return self.errors.get("angle")
+
+    @property
     def tip_position(self) -> Vector | None:
         """Tip position (3,) in the base frame, in m."""
         return None if self.tip_pose is None else self.tip_pose[:3, 3]
@@ -228,25 +251,23 @@ class Judgement(NamedTuple):
     """A task's quantities at given pressures, from the model alone."""
 
     tip_pose: Vector
-    position_error: float | None
-    angle_error: float | None
+    errors: dict[str, float]
     compliance: Vector
     stiffnesses: tuple[float, ...]
     matrix_distance: float | None
     pose_holds: bool
     limits_hold: bool
-    demands_hold: bool
+    shortfalls: tuple[str, ...]
 
     @property
     def holds(self) -> bool:
         """Whether everything that the task asks for is so."""
-        return self.pose_holds and self.limits_hold and self.demands_hold
+        return self.pose_holds and self.limits_hold and not self.shortfalls
 
     @classmethod
     def of(
         cls,
         program: Program,
-        goal: StiffnessGoal | None,
         numbers: tuple[list[float], Vector, Vector, list[float]],
         within: bool,
     ) -> "Judgement":
@@ -254,43 +275,29 @@ class Judgement(NamedTuple):
 
         Parameters
         ----------
-        program, goal : of the task
+        program : of the task
         numbers : tuple
             Residuals (m,), tip pose (4, 4), compliance (6, 6), values of the measures (k,).
         within : bool
             Whether the pressures are within their limits.
         """
         residuals, tip_pose, compliance, values = numbers
-        errors: dict[str, float] = {}
-        holds, start = True, 0
-        for term in program.terms:
-            end = start + term.size
-            error = math.hypot(*residuals[start:end])
-            holds = holds and error <= term.radius
-            errors[term.name] = error
-            start = end
-        stiffnesses = [math.exp(value) for value in values]
-        distance, demands = None, True
-        if goal is not None:
-            if program.aim == "match matrix" and isinstance(goal.match, MatchMatrix):
-                distance = math.sqrt(values[0])
-                demands = distance <= goal.match.tolerance
-                stiffnesses = stiffnesses[1:]
-            elif isinstance(goal.match, MatchValue):
-                demands = abs(stiffnesses[0] / goal.match.value - 1) <= goal.match.tolerance
-            floored = stiffnesses[len(stiffnesses) - len(goal.at_least) :]
-            for floor, value in zip(goal.at_least, floored, strict=True):
-                demands = demands and value >= floor.value
+        errors = program.errors(residuals)
+        holds = all(term.holds(errors[term.name]) for term in program.terms)
+        judged = [
+            math.exp(value) if measure.is_stiffness else math.sqrt(value)
+            for measure, value in zip(program.measures, values, strict=True)
+        ]
+        pairs = list(zip(program.measures, judged, strict=True))
         return cls(
             tip_pose=tip_pose,
-            position_error=errors.get("position"),
-            angle_error=errors.get("angle"),
+            errors=errors,
             compliance=compliance,
-            stiffnesses=tuple(stiffnesses),
-            matrix_distance=distance,
+            stiffnesses=tuple(value for measure, value in pairs if measure.is_stiffness),
+            matrix_distance=next((v for measure, v in pairs if not measure.is_stiffness), None),
             pose_holds=holds,
             limits_hold=within,
-            demands_hold=bool(demands),
+            shortfalls=tuple(m.shortfall(value) for m, value in pairs if not m.holds(value)),
         )
 
 
@@ -307,13 +314,13 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     EquilibriumError
         If the arm has no equilibrium at these pressures that is reached from rest.
     """
-    program = Program.of(task.target, task.stiffness)
+    program = Program.of(task.target, task.stiffness, robot.description)
     found = Evaluator(robot, functions(robot, program).judge)
     residuals, pose, compliance, values = found(pressures, robot.parameters(program.parameters))
     lower, upper = task.pressure_bounds(robot.description)
     within = are_within(pressures, lower, upper)
     numbers = (residuals.ravel().tolist(), pose.T, compliance.T, values.ravel().tolist())
-    return Judgement.of(program, task.stiffness, numbers, within)
+    return Judgement.of(program, numbers, within)
 
 
 def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str, tuple[int, int]]:

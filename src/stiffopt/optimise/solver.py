@@ -1,8 +1,7 @@
 """From a task to the stiffest pressures: global search, judgement and diagnosis."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from functools import partial
-from itertools import islice
 from time import perf_counter
 from typing import Any
 
@@ -19,13 +18,14 @@ from stiffopt.model.compiled import (
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer, checked_vector
 from stiffopt.optimise import diagnosis
-from stiffopt.optimise.fast import Answer, FastSolver
+from stiffopt.optimise.fast import CompiledAnswer, FastSolver
 from stiffopt.optimise.local import LocalResult, descend
 from stiffopt.optimise.prepared import prepared
-from stiffopt.optimise.problem import Problem
-from stiffopt.optimise.program import BAR, Program
+from stiffopt.optimise.problem import PressureProblem, ProgramPoint
+from stiffopt.optimise.program import Program
 from stiffopt.optimise.reach import reach
 from stiffopt.optimise.search import Search, search, starts
+from stiffopt.optimise.settings import PRICES, Effort
 from stiffopt.optimise.solution import (
     Confidence,
     Explanation,
@@ -38,12 +38,11 @@ from stiffopt.optimise.solution import (
 )
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
-from stiffopt.optimise.terms import pose_terms
 
 Vector = NDArray[np.float64]
 
 _JUDGED = 5  # local optima that are tried in turn if the best does not hold from rest
-_PRICE_OF_NOTHING = 1e-9  # multipliers below are rounding
+_ONE = Effort(1, 1, 1)
 
 
 class PressureSolver:
@@ -155,23 +154,23 @@ class PressureSolver:
         if fast is None:
             return None
         solver, row = fast
-        return solver, solver.with_target(row, task.target, program, guess), program
+        return solver, solver.with_target(row, program, guess), program
 
     def _accepted(
-        self, task: Task, program: Program, answer: Answer | None
+        self, task: Task, program: Program, answer: CompiledAnswer | None
     ) -> PressureSolution | None:
         """Solution from an answer of the compiled solver, if it holds."""
         if answer is None:
             return None
         p = answer.pressures
         within = are_within(p, self._prepared.lower, self._prepared.upper)
-        judgement = Judgement.of(program, task.stiffness, answer.judged, within)
+        judgement = Judgement.of(program, answer.judged, within)
         if not judgement.holds:
             return None
 
         def explain() -> Explanation:
-            problem = Problem(self.robot, task)
-            point = problem.point(p / BAR)
+            problem = PressureProblem(self.robot, task)
+            point = problem.point(p / problem.unit)
             result = LocalResult.at(problem, point)
             return self._explanation(problem, result, judgement, p)
 
@@ -196,16 +195,16 @@ class PressureSolver:
 
     def _solve_generally(self, task: Task, guess: Vector | None) -> PressureSolution:
         try:
-            return self._solve(Problem(self.robot, task), guess)
+            return self._solve(PressureProblem(self.robot, task), guess)
         except EquilibriumError as error:
             return PressureSolution("failed", str(error), task)
 
-    def _solve(self, problem: Problem, guess: Vector | None) -> PressureSolution:
+    def _solve(self, problem: PressureProblem, guess: Vector | None) -> PressureSolution:
         if guess is not None:
             nearby = self._from_guess(problem, guess)
             if nearby is not None:
                 return nearby
-        found = search(problem, self._starts(problem))
+        found = search(problem, *starts(problem, self._prepared.samples))
         if not found.results:
             return self._closest(problem, found)
         if len(problem.floors) and not found.results[0].holds_floors:
@@ -213,9 +212,9 @@ class PressureSolver:
         at_once = self._judged(problem, found.results[0], found.confidence)
         return at_once or self._first_that_holds(problem, found)
 
-    def _from_guess(self, problem: Problem, guess: Vector) -> PressureSolution | None:
+    def _from_guess(self, problem: PressureProblem, guess: Vector) -> PressureSolution | None:
         problem.restart()
-        point = reach(problem, np.clip(guess / BAR, problem.lower, problem.upper))
+        point = reach(problem, np.clip(guess / problem.unit, problem.lower, problem.upper))
         if point is None or not point.reached:
             return None
         result = descend(problem, point)
@@ -229,16 +228,16 @@ class PressureSolver:
         return solution if solution.found else None
 
     def _judged(
-        self, problem: Problem, result: LocalResult, confidence: Confidence
+        self, problem: PressureProblem, result: LocalResult, confidence: Confidence
     ) -> PressureSolution | None:
         """Solution of an arm without loads, if it holds; it is explained when that is asked for."""
         if self.robot.is_loaded:
             return None
-        p = np.clip(result.point.x * BAR, self._prepared.lower, self._prepared.upper)
-        answer = Answer(p, confidence, {}, problem.judged(p))
+        p = np.clip(result.point.x * problem.unit, self._prepared.lower, self._prepared.upper)
+        answer = CompiledAnswer(p, confidence, {}, problem.judged(p))
         return self._accepted(problem.task, problem.program, answer)
 
-    def _first_that_holds(self, problem: Problem, found: Search) -> PressureSolution:
+    def _first_that_holds(self, problem: PressureProblem, found: Search) -> PressureSolution:
         """Best local optimum that the model confirms from rest."""
         best: PressureSolution | None = None
         for result in found.results[:_JUDGED]:
@@ -258,20 +257,22 @@ class PressureSolver:
 
     # -- what cannot be had -----------------------------------------------------------------
 
-    def _closest(self, problem: Problem, found: Search) -> PressureSolution:
+    def _closest(self, problem: PressureProblem, found: Search) -> PressureSolution:
         """Closest configuration to a pose that no start came to."""
-        near = sorted(found.nearest, key=lambda point: sum(b.error for b in point.balls))
-        anywhere = self._prepared.samples.x[:32]
-        candidates = [*(point.x for point in near), *self._nearest(problem, 16), *anywhere]
+        near = sorted(found.nearest, key=_beyond)
+        table = self._prepared.samples
+        order = table.nearest_first(table.distances(problem.program.terms, self.robot.length), 16)
+        sampled = np.concatenate([table.pressures[order], table.pressures[:32]]) / problem.unit
+        candidates = [*(point.x for point in near), *sampled]
         results = diagnosis.closest_configurations(problem, candidates)
         if results and _reaches(problem, results[0]):
-            again = search(problem, iter([results[0].point.x]), 1)
+            again = search(problem, [results[0].point.x], _ONE)
             if again.results:
                 return self._first_that_holds(problem, again)
         results = results[:1]
         if self.robot.is_loaded:  # what is found need not be what is reached from rest
-            sampled = (diagnosis.unimproved(problem, x) for x in islice(candidates, _JUDGED))
-            results = [*results[:_JUDGED], *sampled]
+            as_they_are = (diagnosis.unimproved(problem, x) for x in candidates[:_JUDGED])
+            results = [*results[:_JUDGED], *as_they_are]
         judged = []
         for result in results:
             try:
@@ -282,13 +283,13 @@ class PressureSolver:
             raise EquilibriumError("no stable equilibrium was found near the target")
         return min(judged, key=_distance)
 
-    def _without_floors(self, problem: Problem, found: Search) -> PressureSolution:
+    def _without_floors(self, problem: PressureProblem, found: Search) -> PressureSolution:
         """Best that can be had where a stiffness that is demanded was not found."""
         nearest = problem.changed(problem.best_floors(), floors=False)
         candidates = (result.point.x for result in found.results)
         best = search(nearest, candidates)
         if best.results and best.results[0].value <= 0:
-            again = search(problem, iter([best.results[0].point.x]), 1)
+            again = search(problem, [best.results[0].point.x], _ONE)
             if again.results and again.results[0].holds_floors:
                 return self._first_that_holds(problem, again)
         return self._first_that_holds(nearest, best if best.results else found)
@@ -296,10 +297,12 @@ class PressureSolver:
     # -- words and numbers ------------------------------------------------------------------
 
     def _solution(
-        self, problem: Problem, result: LocalResult, confidence: Confidence
+        self, problem: PressureProblem, result: LocalResult, confidence: Confidence
     ) -> PressureSolution:
         """Judge a result and put it into words."""
-        pressures = np.clip(result.point.x * BAR, self._prepared.lower, self._prepared.upper)
+        pressures = np.clip(
+            result.point.x * problem.unit, self._prepared.lower, self._prepared.upper
+        )
         judgement = judge(self.robot, problem.task, pressures)
         return PressureSolution(
             status="solved" if judgement.holds else "unreachable",
@@ -314,8 +317,7 @@ class PressureSolver:
         return {
             "task": task,
             "tip_pose": judgement.tip_pose,
-            "position_error": judgement.position_error,
-            "angle_error": judgement.angle_error,
+            "errors": judgement.errors,
             "compliance": judgement.compliance,
             "stiffness": judgement.stiffnesses[0] if judgement.stiffnesses else None,
             "stiffness_unit": self._prepared.unit,
@@ -324,18 +326,18 @@ class PressureSolver:
         }
 
     def _explanation(
-        self, problem: Problem, result: LocalResult, judgement: Judgement, pressures: Vector
+        self, problem: PressureProblem, result: LocalResult, judgement: Judgement, pressures: Vector
     ) -> Explanation:
         """Put a judged result into words."""
         task = problem.task
         active = active_bounds(self.robot, task, pressures)
         sensitivities = self._sensitivities(problem, result, judgement, pressures, active)
-        freedom = diagnosis.freedom(problem, pressures / BAR)
+        freedom = diagnosis.freedom(problem, pressures / problem.unit)
         message = ""
         if not judgement.pose_holds:
             message = diagnosis.unreachable_message(judgement, task, self._holding(result, active))
         elif not judgement.holds:
-            message = diagnosis.demands_message(judgement, task)
+            message = diagnosis.demands_message(judgement)
         elif freedom == 0 and task.stiffness is not None:
             message = diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
         return Explanation(message, tuple(active), freedom, sensitivities)
@@ -346,11 +348,12 @@ class PressureSolver:
         if result.multipliers is None:
             return list(active)
         prices = result.multipliers.bounds
-        return [name for name, (index, side) in active.items() if side * prices[index] > 1e-9]
+        least = 1e-6 * float(np.abs(prices).max())
+        return [name for name, (index, side) in active.items() if side * prices[index] > least]
 
     def _sensitivities(
         self,
-        problem: Problem,
+        problem: PressureProblem,
         result: LocalResult,
         judgement: Judgement,
         pressures: Vector,
@@ -361,38 +364,25 @@ class PressureSolver:
             return None
         gradient = None
         if problem.task.measures:
-            first = problem.task.measures[0]
-            gradient = self.robot.stiffness_gradient(
-                pressures, first.direction, first.kind, first.boundary, first.frame
-            )
+            gradient = problem.task.measures[0].stiffness_gradient(self.robot, pressures)
         scale = result.objective.gain(result.point)
 
-        def radius_price(name: str) -> float | None:
-            pull = prices.balls.get(name)
-            return None if pull is None else scale * _clean(float(np.linalg.norm(pull)))
-
+        per_tolerance: dict[str, float] = {}
+        for ball, pull in zip(result.point.bounded, prices.balls, strict=True):
+            price = scale * _clean(float(np.linalg.norm(pull)))
+            per_tolerance[ball.name] = per_tolerance.get(ball.name, 0.0) + price
         return Sensitivities(
             tip_jacobian=self.robot.tip_jacobian(pressures),
             stiffness_gradient=gradient,
             per_bound={
-                name: scale * _clean(max(0.0, side * float(prices.bounds[index]))) / BAR
+                name: scale
+                * _clean(max(0.0, side * float(prices.bounds[index])))
+                / float(problem.unit[index])
                 for name, (index, side) in active.items()
             },
-            per_position_tolerance=radius_price("position"),
-            per_angle_tolerance=radius_price("angle"),
+            per_tolerance=per_tolerance,
             objective_unit=result.objective.unit,
         )
-
-    # -- starts -----------------------------------------------------------------------------
-
-    def _starts(self, problem: Problem) -> Iterator[Vector]:
-        return starts(problem, self._prepared.samples)
-
-    def _nearest(self, problem: Problem, count: int) -> list[Vector]:
-        """Samples that are nearest to the target."""
-        table = self._prepared.samples
-        order = table.nearest_first(problem.task.target, self.robot.length)
-        return list(table.x[order[:count]])
 
     def _checked(self, guess: ArrayLike | None) -> Vector | None:
         if guess is None:
@@ -484,17 +474,28 @@ def stiffness_blind(solver: PressureSolver, solution: PressureSolution) -> Press
     return blind.solve(guess=solution.pressures)
 
 
-def _reaches(problem: Problem, result: LocalResult) -> bool:
+def _reaches(problem: PressureProblem, result: LocalResult) -> bool:
     """Whether a result of another program lies within the tolerances of this one."""
-    radii = {term.name: term.radius for term in pose_terms(problem.task.target)}
-    return all(ball.error <= radii[ball.name] for ball in result.point.balls)
+    pairs = zip(result.point.errors, problem.constraints, strict=True)
+    return all(error <= constraint.radius for error, constraint in pairs)
 
 
-def _distance(solution: PressureSolution) -> tuple[float, float]:
-    """Rank of a closest configuration: the angle beyond its tolerance, then the distance."""
-    beyond = (solution.angle_error or 0.0) - solution.task.target.tolerance.angle * (1 + 1e-6)
-    return max(0.0, beyond), solution.position_error or 0.0
+def _beyond(point: ProgramPoint) -> float:
+    """Sum by which constraints are missed, each over its scale."""
+    pairs = zip(point.errors, point.constraints, strict=True)
+    return sum(max(0.0, error - c.radius * c.one_sided) / c.scale for error, c in pairs)
+
+
+def _distance(solution: PressureSolution) -> list[float]:
+    """Rank of a closest configuration: how far each term is missed, the position last."""
+    terms = sorted(solution.task.target.terms, key=lambda t: (not t.is_inequality, -t.order))
+    rank = []
+    for term in terms:
+        value = solution.errors[term.name]
+        rank.append(-value if term.is_inequality else value - term.radius * (1 + 1e-6))
+    last = rank.pop() if terms[-1].order == 0 else 0.0
+    return [*(max(0.0, value) for value in rank), last]
 
 
 def _clean(price: float) -> float:
-    return price if price > _PRICE_OF_NOTHING else 0.0
+    return price if price > PRICES.least else 0.0

@@ -1,74 +1,101 @@
-"""What is asked of the tip's pose: the part ``target`` of the task."""
+"""What a task asks of the arm's configuration: the part ``target`` of the task file.
+
+Its keys are those of the terms in `stiffopt.optimise.terms`.
+"""
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, Any
+from functools import cache
+from typing import TYPE_CHECKING, Annotated
 
-from pydantic import AfterValidator, BeforeValidator, Field, PlainSerializer, model_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import create_model, model_validator
 
-from stiffopt.directions import Direction, Quaternion
-from stiffopt.schema import BadKeyError, Schema, Vector
-from stiffopt.units import Angle, Length, format_quantity, within
+from stiffopt.optimise.term import Term, Tolerance
+from stiffopt.optimise.terms import TERMS
+from stiffopt.schema import BadKeyError, Schema
 
 __all__ = ["Target", "Tolerance"]
 
+if TYPE_CHECKING:
 
-def _coordinate(value: Any) -> Any:
-    """Let `free` (None in code) stand for an axis that does not matter."""
-    return None if isinstance(value, str) and value.strip() == "free" else value
+    class _Keys(Schema):
+        position: tuple[float | None, float | None, float | None] | None = None
+        pointing: tuple[float, float, float] | None = None
+        orientation: tuple[float, float, float, float] | None = None
 
-
-def _all_free_is_none(position: tuple[float | None, ...] | None) -> tuple[float | None, ...] | None:
-    return None if position is None or all(x is None for x in position) else position
-
-
-def _write_coordinate(value: float | None) -> str:
-    return "free" if value is None else format_quantity(value, "m", "mm")
-
-
-Coordinate = Annotated[
-    Annotated[Length, within(1e3, "m")] | None,
-    BeforeValidator(_coordinate),
-    PlainSerializer(_write_coordinate, return_type=str, when_used="json"),
-]
+else:
+    _Keys = create_model(
+        "_Keys",
+        __base__=Schema,
+        **{kind.key: (Annotated[kind.annotation | None, kind], None) for kind in TERMS},
+    )
 
 
-class Tolerance(Schema):
-    """How near is near enough.
+class Target(_Keys):
+    """What the arm's tip and body have to meet, in the base frame.
 
-    Attributes
-    ----------
-    position : Euclidean norm over the axes that are not free, in m.
-    angle : between the axes (pointing) or of the rotation (orientation), in rad.
-    """
-
-    position: Annotated[Length, Field(gt=0)] = 1e-4
-    angle: Annotated[Angle, Field(gt=0)] = math.radians(1)
-
-
-class Target(Schema):
-    """The tip pose asked for, in the base frame.
+    A subclass may have further terms: fields with the class of the term in their annotation,
+    ``Annotated[MyValue | None, MyTerm]``, and None as default.
 
     Attributes
     ----------
     position : x, y, z in m, None for an axis that is free; or None if all are.
     pointing : unit vector along which the tip's z axis shall point, or None.
     orientation : unit quaternion (w, x, y, z) with w >= 0, or None.
+    above : plane above which the tip stays, or None.
     tolerance : how near is near enough.
     """
 
-    position: Annotated[Vector[Coordinate] | None, AfterValidator(_all_free_is_none)] = None
-    pointing: Direction | None = None
-    orientation: Quaternion | None = None
     tolerance: Tolerance = Tolerance()
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The conditions that it has: the position first, then the angle, then others."""
+        given = ((kind, getattr(self, key)) for key, kind in _kinds(type(self)))
+        return tuple(kind(value, self.tolerance) for kind, value in given if value is not None)
+
+    def moved_back(self, offset: NDArray[np.float64]) -> Target:
+        """The target for the model such that an arm off by an offset meets this one.
+
+        Parameters
+        ----------
+        offset : (6,)
+            Displacement in m and rotation vector in rad, in base axes.
+        """
+        given = ((key, kind, getattr(self, key)) for key, kind in _kinds(type(self)))
+        return self.model_copy(
+            update={
+                key: kind.moved_back(value, offset)
+                for key, kind, value in given
+                if value is not None
+            }
+        )
 
     @model_validator(mode="after")
     def _check(self) -> Target:
-        if self.pointing is not None and self.orientation is not None:
-            raise BadKeyError(
-                "orientation", "cannot be combined with pointing; remove one of the two"
-            )
-        if self.position is None and self.pointing is None and self.orientation is None:
-            raise ValueError("asks for nothing; expected a position, pointing or orientation")
+        known: dict[str, str] = {}
+        for key, kind in _kinds(type(self)):
+            if getattr(self, key) is None:
+                continue
+            if kind.name in known:
+                other = known[kind.name]
+                raise BadKeyError(key, f"cannot be combined with {other}; remove one of the two")
+            known[kind.name] = key
+        if not known:
+            *most, last = (key for key, kind in _kinds(type(self)) if not kind.is_inequality)
+            raise ValueError(f"asks for nothing; expected a {', '.join(most)} or {last}")
         return self
+
+
+@cache
+def _kinds(model: type[Target]) -> tuple[tuple[str, type[Term]], ...]:
+    """Keys of a target with the terms that they make, in their order."""
+    found = [
+        (key, kind)
+        for key, field in model.model_fields.items()
+        for kind in field.metadata
+        if isinstance(kind, type) and issubclass(kind, Term)
+    ]
+    return tuple(sorted(found, key=lambda item: item[1].order))

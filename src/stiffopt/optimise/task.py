@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from stiffopt.errors import FileError, InputError
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
-from stiffopt.optimise.goal import MatchValue, StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import Force, Moment, Pressure, read_from_file, within
@@ -99,12 +99,12 @@ class Task(Schema):
 
     @property
     def measures(self) -> tuple[StiffnessMeasure, ...]:
-        """All directional stiffnesses that are named: maximised, then matched, then floors."""
+        """All stiffnesses that are named: maximised, then matched, then floors."""
         goal = self.stiffness
         if goal is None:
             return ()
-        match = (goal.match,) if isinstance(goal.match, MatchValue) else ()
-        return (*goal.maximise, *match, *goal.at_least)
+        named = (*goal.first, *goal.at_least)
+        return tuple(cast(StiffnessMeasure, m) for m in named if m.is_stiffness)
 
     def resolve_robot(self) -> RobotDescription:
         """Return the robot; a relative path starts at the task file's folder.

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.wording import MM, direction_text, figures, unit_text
@@ -126,6 +127,8 @@ class _Scene:
         """An arrow along each direction whose stiffness the task names."""
         pairs = zip(self.solution.task.measures, self.solution.stiffnesses, strict=False)
         for number, (measure, value) in enumerate(pairs):
+            if not isinstance(measure, StiffnessMeasure):
+                continue
             shade = style.DIRECTIONS[number % len(style.DIRECTIONS)]
             way = np.asarray(measure.direction)
             way = self.rotation @ way if measure.frame == "tip" else way

@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 
 from stiffopt.optimise.goal import StiffnessMeasure
+from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.solution import PressureSolution
 
 MM = 1e3
@@ -40,7 +41,9 @@ def vector_text(values: Iterable[float]) -> str:
     return f"({', '.join(f'{round(float(value), 3) + 0.0:g}' for value in values)})"
 
 
-def direction_text(measure: StiffnessMeasure) -> str:
-    """Return along or about what a stiffness is meant."""
+def direction_text(measure: Measure) -> str:
+    """Return along or about what a stiffness is meant, or what else it is of."""
+    if not isinstance(measure, StiffnessMeasure):
+        return measure.words()
     way = "along" if measure.kind == "translation" else "about"
     return f"{way} {vector_text(measure.direction)}"

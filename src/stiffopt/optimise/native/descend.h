@@ -6,7 +6,6 @@
 
 #include "reach.h"
 
-#define NEXT_TO 0.05 /* bar */
 #define FAR 1e6 /* stands for no bound in the quadratic program */
 
 /* Prices of the constraints at a step: of the balls, the terms and the floors. */
@@ -21,38 +20,30 @@ typedef struct {
     int64_t iterations;
 } Descent;
 
-/* Orthonormal axes (k, k) by rows, the first along a vector of length > 0. */
-static void axes_along(const double *first, int64_t k, double *axes) {
-    double length = sqrt(dot(first, first, k));
-    for (int64_t i = 0; i < k; i++) axes[i] = first[i] / length;
-    if (k == 2) {
-        axes[2] = -axes[1], axes[3] = axes[0];
-    } else if (k == 3) {
-        const double *a = axes;
-        double other[3] = {0, 0, 0};
-        int least = fabs(a[0]) <= fabs(a[1]) ? 0 : 1;
-        if (fabs(a[2]) < fabs(a[least])) least = 2;
-        other[least] = 1;
-        double *b = axes + 3, *c = axes + 6;
-        double along = a[least];
-        for (int i = 0; i < 3; i++) b[i] = other[i] - along * a[i];
-        length = sqrt(dot(b, b, 3));
-        for (int i = 0; i < 3; i++) b[i] /= length;
-        c[0] = a[1] * b[2] - a[2] * b[1];
-        c[1] = a[2] * b[0] - a[0] * b[2];
-        c[2] = a[0] * b[1] - a[1] * b[0];
-    }
+/* Orthonormal axes (k, k) by rows, the first along a vector; any if that is zero. */
+static void axes_along(const double *vector, int64_t k, double *axes) {
+    double length = sqrt(dot(vector, vector, k)), first[k], mirror[k];
+    memset(axes, 0, (size_t)(k * k) * sizeof(double));
+    for (int64_t i = 0; i < k; i++) axes[i * k + i] = 1;
+    if (!(length > 0)) return;
+    for (int64_t i = 0; i < k; i++) mirror[i] = first[i] = vector[i] / length;
+    mirror[0] += copysign(1, first[0]); /* Householder's reflection */
+    for (int64_t i = 1; i < k; i++)
+        for (int64_t j = 0; j < k; j++)
+            axes[i * k + j] -= mirror[i] * mirror[j] / (1 + fabs(first[0]));
+    memcpy(axes, first, sizeof first);
 }
 
 /* Axes of the box around a ball, the first where it will bind, and the length of its pull. */
 static double box_axes(const Program *P, const Point *p, int64_t ball, int64_t row,
                        const Multipliers *prices, const double *gradient, double *axes) {
     int64_t n = P->setup->n, k = P->setup->ball_rows[ball];
-    double pull[3];
+    if (P->setup->one_sided[ball]) return axes[0] = 1, 0.0;
+    double pull[k];
     if (prices->known) {
-        memcpy(pull, prices->balls + row, (size_t)k * sizeof(double));
+        memcpy(pull, prices->balls + row, sizeof pull);
     } else { /* least-squares estimate of the multiplier */
-        double A[9];
+        double A[k * k];
         for (int64_t i = 0; i < k; i++) {
             for (int64_t j = 0; j < k; j++)
                 A[i * k + j] = dot(p->J + (row + i) * n, p->J + (row + j) * n, n);
@@ -63,15 +54,8 @@ static double box_axes(const Program *P, const Point *p, int64_t ball, int64_t r
         for (int64_t i = 0; i < k; i++) A[i * k + i] += 1e-10 * trace;
         if (!cholesky_solve(A, pull, k)) memset(pull, 0, sizeof pull);
     }
-    double size = sqrt(dot(pull, pull, k));
-    const double *first = p->error[ball] > 0.9 * P->radius[ball] ? p->r + row : pull;
-    if (!(dot(first, first, k) > 0)) {
-        memset(axes, 0, (size_t)(k * k) * sizeof(double));
-        for (int64_t i = 0; i < k; i++) axes[i * k + i] = 1;
-    } else {
-        axes_along(first, k, axes);
-    }
-    return size;
+    axes_along(p->error[ball] > 0.9 * P->radius[ball] ? p->r + row : pull, k, axes);
+    return sqrt(dot(pull, pull, k));
 }
 
 /* Minimise z'Hz/2 + g'z with low <= (z, Az) <= high; 0 where there is no finite answer. */
@@ -104,7 +88,10 @@ static int quadratic_step(Program *P, const Point *p, const double *B, double ra
     int64_t size = n + (terms > 0) + (floors > 0), last = size - 1;
     int64_t extra = terms + floors + s->rows, all = size + extra;
     double H[size * size], g[size], A[extra * size], low[all], high[all], z[size], dual[all];
-    double axes[MOST_BALLS][9];
+    int64_t axis_count = 0;
+    for (int64_t ball = 0; ball < s->balls; ball++)
+        axis_count += s->ball_rows[ball] * s->ball_rows[ball];
+    double all_axes[axis_count], *axes = all_axes;
     memset(H, 0, sizeof H), memset(g, 0, sizeof g), memset(A, 0, sizeof A);
     for (int64_t i = 0; i < n; i++) {
         memcpy(H + i * size, B + i * n, (size_t)n * sizeof(double));
@@ -135,21 +122,22 @@ static int quadratic_step(Program *P, const Point *p, const double *B, double ra
     }
     for (int64_t ball = 0, first = 0; ball < s->balls; ball++) {
         int64_t k = s->ball_rows[ball];
-        double rho = P->radius[ball] * s->inside;
-        double pull = box_axes(P, p, ball, first, prices, p->df + steepest * n, axes[ball]);
+        double rho = P->radius[ball] * s->descent.inside;
+        double pull = box_axes(P, p, ball, first, prices, p->df + steepest * n, axes);
         const double *J = p->J + first * n;
         for (int64_t i = 0; i < n; i++)
             for (int64_t j = 0; j < n; j++)
                 for (int64_t a = 0; a < k; a++)
                     H[i * size + j] += pull / rho * J[a * n + i] * J[a * n + j];
         for (int64_t a = 0; a < k; a++, row += size) {
-            const double *axis = axes[ball] + a * k;
+            const double *axis = axes + a * k;
             double across = dot(axis, p->r + first, k) / rho;
             for (int64_t b = 0; b < k; b++)
                 for (int64_t i = 0; i < n; i++) row[i] += axis[b] * J[b * n + i] / rho;
-            *lo++ = fmin(-1 - across, 0), *hi++ = fmax(1 - across, 0);
+            *lo++ = s->one_sided[ball] ? -FAR : fmin(-1 - across, 0);
+            *hi++ = fmax(1 - across, 0);
         }
-        first += k;
+        first += k, axes += k * k;
     }
     double full_H[size * size], full_g[size];
     memcpy(full_H, H, sizeof H), memcpy(full_g, g, sizeof g);
@@ -163,14 +151,15 @@ static int quadratic_step(Program *P, const Point *p, const double *B, double ra
     prices->terms[0] = 1;
     for (int64_t i = 0; i < terms; i++) prices->terms[i] = *weight++;
     for (int64_t i = 0; i < floors; i++) prices->floors[i] = -*weight++;
+    axes = all_axes;
     for (int64_t ball = 0, first = 0; ball < s->balls; ball++) {
         int64_t k = s->ball_rows[ball];
         for (int64_t b = 0; b < k; b++) {
             double sum = 0;
-            for (int64_t a = 0; a < k; a++) sum += axes[ball][a * k + b] * weight[a];
-            prices->balls[first + b] = sum / (P->radius[ball] * s->inside);
+            for (int64_t a = 0; a < k; a++) sum += axes[a * k + b] * weight[a];
+            prices->balls[first + b] = sum / (P->radius[ball] * s->descent.inside);
         }
-        weight += k, first += k;
+        weight += k, first += k, axes += k * k;
     }
     return 1;
 }
@@ -209,7 +198,8 @@ static void snap(Program *P, Point *p) {
     int64_t n = s->n, moved = 0;
     double lower[n], upper[n], d[n];
     for (int64_t i = 0; i < n; i++) {
-        int low = p->x[i] < P->lower[i] + s->touching, high = p->x[i] > P->upper[i] - s->touching;
+        int low = p->x[i] < P->lower[i] + s->descent.touching;
+        int high = p->x[i] > P->upper[i] - s->descent.touching;
         double x = low ? P->lower[i] : high ? P->upper[i] : p->x[i];
         d[i] = x - p->x[i];
         moved += d[i] != 0;
@@ -234,10 +224,10 @@ static const Descent *arrives(const Setup *s, const Point *p, const Known *known
     double value = objective(s, p);
     for (int64_t k = 0; k < known->count; k++) {
         const double *x = known->x + k * s->n;
-        if (fabs(value - known->ends[k].value) > s->same) continue;
+        if (fabs(value - known->ends[k].value) > s->same_optimum) continue;
         double far = 0;
         for (int64_t i = 0; i < s->n; i++) far = fmax(far, fabs(p->x[i] - x[i]));
-        if (far < NEXT_TO) return known->ends + k;
+        if (far < s->descent.next_to) return known->ends + k;
     }
     return NULL;
 }
@@ -245,16 +235,17 @@ static const Descent *arrives(const Setup *s, const Point *p, const Known *known
 /* Minimise the objective from a point that reaches the pose and was evaluated in full. */
 static Descent descend(Program *P, Point *p, const Known *known) {
     const Setup *s = P->setup;
+    const DescentSettings *set = &s->descent;
     int64_t n = s->n;
     double B[n * n], d[n], before[n], after[n], step[n];
-    double ball_prices[MOST_ROWS], term_prices[s->terms], floor_prices[s->floors + 1];
+    double ball_prices[s->rows], term_prices[s->terms], floor_prices[s->floors + 1];
     Multipliers prices = {ball_prices, term_prices, floor_prices, 0};
-    double radius = s->first_radius, price = 10, promised = 0;
+    double radius = set->first_radius, price = 10, promised = 0;
     Descent end = {0, 0, 0, 0};
     memset(B, 0, sizeof B);
-    for (int64_t i = 0; i < n; i++) B[i * n + i] = s->curvature;
+    for (int64_t i = 0; i < n; i++) B[i * n + i] = set->curvature;
     NEW_POINT(trial, s);
-    while (end.iterations++ < s->most_iterations) {
+    while (end.iterations++ < set->iterations) {
         if (!quadratic_step(P, p, B, radius, price, &prices, d, &promised)) break;
         for (int64_t i = 0; i < s->floors; i++) price = fmax(price, 2 * prices.floors[i]);
         if (promised < s->precision) {
@@ -264,7 +255,7 @@ static Descent descend(Program *P, Point *p, const Known *known) {
         double length = largest(d, n);
         if (!pulled_back(P, p, d, P->lower, P->upper, &trial)) {
             radius = 0.3 * length;
-            if (radius < s->last_radius) break;
+            if (radius < set->last_radius) break;
             continue;
         }
         double gained = objective(s, p) + price * violation(P, p) - objective(s, &trial) -
@@ -277,7 +268,7 @@ static Descent descend(Program *P, Point *p, const Known *known) {
         if (share < 0.25)
             radius = 0.4 * length;
         else if (share > 0.7 && length > 0.8 * radius)
-            radius = fmin(2.5 * radius, 2);
+            radius = fmin(2.5 * radius, set->largest_radius);
         if (gained > 0) {
             copy_point(s, &trial, p);
             const Descent *same = known ? arrives(s, p, known) : NULL;
@@ -287,7 +278,7 @@ static Descent descend(Program *P, Point *p, const Known *known) {
                 return end;
             }
         }
-        if (radius < s->last_radius) {
+        if (radius < set->last_radius) {
             end.converged = fabs(promised) < 1e3 * s->precision;
             break;
         }

@@ -4,25 +4,31 @@
 
 #include "program.h"
 
+/* Derivatives (rows, n) by pressures become those by x. */
+static void per_share(const Setup *s, double *J, int64_t rows) {
+    for (int64_t k = 0; k < rows; k++)
+        for (int64_t i = 0; i < s->n; i++) J[k * s->n + i] *= s->unit[i];
+}
+
 /* Residuals at p->x and, if full, terms and floors too; 0 where anything is not finite. */
 static int evaluate(Program *P, Point *p, int full) {
     const Setup *s = P->setup;
     double pressures[s->n];
-    for (int64_t i = 0; i < s->n; i++) pressures[i] = p->x[i] * BAR;
+    for (int64_t i = 0; i < s->n; i++) pressures[i] = p->x[i] * s->unit[i];
     P->arg[0] = pressures, P->arg[1] = P->parameters;
     P->res[0] = p->r, P->res[1] = p->J;
     int64_t bad;
     if (full) {
         P->res[2] = p->f, P->res[3] = p->df, P->res[4] = p->g, P->res[5] = p->dg;
         bad = point(P->arg, P->res, P->iw, P->w, 0);
-        multiply(p->df, BAR, s->terms * s->n);
-        multiply(p->dg, BAR, s->floors * s->n);
+        per_share(s, p->df, s->terms);
+        per_share(s, p->dg, s->floors);
         P->points++;
     } else {
         bad = pose(P->arg, P->res, P->iw, P->w, 0);
         P->poses++;
     }
-    multiply(p->J, BAR, s->rows * s->n);
+    per_share(s, p->J, s->rows);
     int64_t size = s->n + s->rows * (1 + s->n);
     if (bad || !all_finite(p->x, full ? value_count(s) : size)) return 0;
     measure_balls(P, p);

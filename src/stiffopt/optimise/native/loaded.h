@@ -60,8 +60,8 @@ static int evaluate(Program *P, Point *p, int full) {
     Linear *l = P->linear;
     Work work = work_of(P);
     int64_t n = s->n, values = s->terms + s->floors;
-    double pressures[n], R[9], C[36], by_twist[MOST_ROWS * 6];
-    for (int64_t i = 0; i < n; i++) pressures[i] = p->x[i] * BAR;
+    double pressures[n], R[9], C[36], by_twist[6 * s->rows];
+    for (int64_t i = 0; i < n; i++) pressures[i] = p->x[i] * s->unit[i];
     *(full ? &P->points : &P->poses) += 1;
     if (isnan(p->state[0])) {
         if (!settle(&work, rod, pressures, p->state)) {
@@ -81,7 +81,7 @@ static int evaluate(Program *P, Point *p, int full) {
         for (int64_t i = 0; i < n; i++) {
             double sum = 0;
             for (int j = 0; j < 6; j++) sum += by_twist[j * s->rows + k] * twist[6 * i + j];
-            p->J[k * n + i] = sum * BAR;
+            p->J[k * n + i] = sum * s->unit[i];
         }
     if (full) {
         double value[values], value_twist[values * 6], value_C[values * 36], value_p[values * n];
@@ -100,7 +100,7 @@ static int evaluate(Program *P, Point *p, int full) {
             }
             for (int i = 0; i < 36; i++) G[i] = value_C[i * values + k];
             if (!add_by_compliance(P, l, G, gradient)) return 0;
-            for (int64_t i = 0; i < n; i++) gradient[i] *= BAR;
+            for (int64_t i = 0; i < n; i++) gradient[i] *= s->unit[i];
         }
     }
     int64_t size = n + s->rows * (1 + n);

@@ -15,7 +15,7 @@ int stiffopt_point(const Setup *setup, const double *parameters, const double *r
     program.parameters = parameters, program.radius = radii;
     if (!add_memory(&program)) return 0;
     NEW_POINT(p, setup);
-    for (int64_t i = 0; i < setup->n; i++) p.x[i] = pressures[i] / BAR;
+    for (int64_t i = 0; i < setup->n; i++) p.x[i] = pressures[i] / setup->unit[i];
     forget_state(setup, &p);
     int good = evaluate(&program, &p, 1);
     memcpy(values, p.x, (size_t)value_count(setup) * sizeof(double));

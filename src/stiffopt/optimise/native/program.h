@@ -1,7 +1,8 @@
 /* The nonlinear program of a task at one set of pressures, and small dense algebra.
  *
- * Minimise the largest of the terms over the pressures x (in bar), with floors g(x) >= bound,
- * balls |r(x)| <= radius and lower <= x <= upper.  The model itself is generated code.
+ * Minimise the largest of the terms over the pressures x, each as a share of its channel's range,
+ * with floors g(x) >= bound, balls |r(x)| <= radius (one-sided ones: r(x) <= radius, of one row)
+ * and lower <= x <= upper.  The model itself is generated code, which takes Pa.
  * All matrices are stored row by row.
  */
 #ifndef STIFFOPT_PROGRAM_H
@@ -11,29 +12,39 @@
 #include <stdint.h>
 #include <string.h>
 
-#define BAR 1e5
-#define MOST_BALLS 2
-#define MOST_ROWS 6
+/* Settings as in settings.py, which explains them. */
+typedef struct {
+    double longest_step, damping, least_damping, most_damping, least_progress;
+    int64_t iterations, iterations_of_many;
+} ReachSettings;
+
+typedef struct {
+    int64_t iterations;
+    double first_radius, largest_radius, last_radius, curvature, inside, touching, next_to;
+    double floor_margin, pull_back_damping, shortest_pull_back;
+} DescentSettings;
+
+typedef struct {
+    int64_t screened, agreeing, most_descents;
+} Effort;
 
 /* Sizes of a task structure and settings; mirrors `_Setup` in fast.py. */
 typedef struct {
-    int64_t n;        /* pressures */
-    int64_t rows;     /* of all residuals */
-    int64_t balls;    /* position, angle */
-    int64_t ball_rows[MOST_BALLS];
+    int64_t n;     /* pressures */
+    int64_t rows;  /* of all residuals */
+    int64_t balls; /* constraints on them */
     int64_t terms, floors, values;
     int64_t parameters;
-    int64_t samples;           /* in the table */
-    int64_t nearest;           /* samples that are brought to the pose */
-    int64_t screened;          /* of them, at most so many that came to it are ranked */
-    int64_t agreeing;          /* descents that must find nothing new before a search ends */
-    int64_t most_descents;
-    int64_t most_iterations;
-    double scale[MOST_BALLS]; /* of residuals while the pose is far */
-    double first_radius, last_radius;
-    double precision, curvature;
-    double inside, touching, floor_slack, same;
-    const double *sample_x;     /* (samples, n) in bar */
+    int64_t near;    /* terms of the target that say how near a sample is */
+    int64_t samples; /* in the table */
+    const int64_t *ball_rows, *one_sided; /* (balls) */
+    const double *scale;                  /* (balls) of residuals while the target is far */
+    const double *unit;                   /* (n) Pa per unit of x */
+    ReachSettings reach;
+    DescentSettings descent;
+    Effort least_effort, most_effort;
+    double covered, same_optimum, unlike, price_of_floors, precision;
+    const double *sample_x;     /* (samples, n) */
     const double *sample_poses; /* (samples, 12): position, rotation by columns */
     /* of an arm under gravity or loads: */
     int64_t state;               /* numbers of an equilibrium's state, else 0 */
@@ -44,6 +55,7 @@ typedef struct {
 typedef struct {
     const Setup *setup;
     const double *parameters, *radius, *lower, *upper, *floor, *near;
+    const int64_t *turns; /* (near): whether a term's nearness depends on the rotation */
     const double **arg;
     double **res;
     casadi_int *iw;
@@ -58,7 +70,7 @@ typedef struct {
     double *f, *df;         /* terms (terms), (terms, n) */
     double *g, *dg;         /* floors (floors), (floors, n) */
     double *state;          /* of the equilibrium (setup->state); NaN where none is known */
-    double error[MOST_BALLS];
+    double *error;          /* (balls): length of the residual, or itself if one-sided */
     int reached;
 } Point;
 
@@ -67,7 +79,7 @@ static int64_t value_count(const Setup *s) {
     return s->n + (s->rows + s->terms + s->floors) * (1 + s->n);
 }
 
-static int64_t point_size(const Setup *s) { return value_count(s) + s->state; }
+static int64_t point_size(const Setup *s) { return value_count(s) + s->state + s->balls; }
 
 static Point point_in(const Setup *s, double *memory) {
     Point p;
@@ -78,8 +90,8 @@ static Point point_in(const Setup *s, double *memory) {
     p.df = memory, memory += s->terms * s->n;
     p.g = memory, memory += s->floors;
     p.dg = memory, memory += s->floors * s->n;
-    p.state = memory;
-    p.error[0] = p.error[1] = 0;
+    p.state = memory, memory += s->state;
+    p.error = memory;
     p.reached = 0;
     return p;
 }
@@ -90,7 +102,6 @@ static Point point_in(const Setup *s, double *memory) {
 
 static void copy_point(const Setup *s, const Point *from, Point *to) {
     memcpy(to->x, from->x, (size_t)point_size(s) * sizeof(double));
-    to->error[0] = from->error[0], to->error[1] = from->error[1];
     to->reached = from->reached;
 }
 
@@ -124,10 +135,6 @@ static int all_finite(const double *a, int64_t n) {
     return 1;
 }
 
-static void multiply(double *a, double factor, int64_t n) {
-    for (int64_t i = 0; i < n; i++) a[i] *= factor;
-}
-
 /* Solve A y = b with A (m, m) symmetric positive definite, in place; 0 if it is not. */
 static int cholesky_solve(double *A, double *b, int64_t m) {
     for (int64_t j = 0; j < m; j++) {
@@ -145,16 +152,40 @@ static int cholesky_solve(double *A, double *b, int64_t m) {
     return 1;
 }
 
-/* Lengths of the residuals, and whether each lies in its ball. */
+/* Errors of the constraints, and whether each holds. */
 static void measure_balls(const Program *P, Point *p) {
+    const Setup *s = P->setup;
     const double *r = p->r;
     p->reached = 1;
-    for (int64_t k = 0; k < P->setup->balls; k++) {
-        int64_t rows = P->setup->ball_rows[k];
-        p->error[k] = sqrt(dot(r, r, rows));
+    for (int64_t k = 0; k < s->balls; r += s->ball_rows[k++]) {
+        p->error[k] = s->one_sided[k] ? r[0] : sqrt(dot(r, r, s->ball_rows[k]));
         p->reached = p->reached && p->error[k] <= P->radius[k];
-        r += rows;
     }
+}
+
+/* Weights (rows) of residuals: one over a number for each constraint. */
+static void row_weights(const Setup *s, const double *of_ball, double *weight) {
+    for (int64_t k = 0, i = 0; k < s->balls; k++)
+        for (int64_t end = i + s->ball_rows[k]; i < end; i++) weight[i] = 1 / of_ball[k];
+}
+
+/* What residuals (rows) lack of their middle, or of a bound on one side.  Returns their Jacobian,
+ * in which rows are zero where a bound on one side holds; J is memory for it. */
+static const double *lacking(const Program *P, const Point *p, double *lacks, double *J) {
+    const Setup *s = P->setup;
+    const double *found = p->J;
+    memcpy(lacks, p->r, (size_t)s->rows * sizeof(double));
+    for (int64_t k = 0, i = 0; k < s->balls; i += s->ball_rows[k++]) {
+        if (!s->one_sided[k]) continue;
+        double inside = s->descent.inside * P->radius[k];
+        if (found != J) {
+            memcpy(J, p->J, (size_t)(s->rows * s->n) * sizeof(double));
+            found = J;
+        }
+        lacks[i] = fmax(0, p->r[i] - inside);
+        if (p->r[i] <= inside) memset(J + i * s->n, 0, (size_t)s->n * sizeof(double));
+    }
+    return found;
 }
 
 /* Largest term, and the sum by which floors are missed. */

@@ -1,4 +1,4 @@
-/* Onto the pose: Gauss-Newton steps that mind the pressure limits. */
+/* To the target: Gauss-Newton steps that mind the pressure limits. */
 #ifndef STIFFOPT_REACH_H
 #define STIFFOPT_REACH_H
 
@@ -16,11 +16,11 @@ static int bounded_step(const Setup *s, const double *J, const double *wanted,
                         const double *weight, double damping, const double *low,
                         const double *high, double *d) {
     int64_t n = s->n, m = s->rows, held[n], left = n;
-    double rest[MOST_ROWS];
+    double rest[m];
     memcpy(rest, wanted, (size_t)m * sizeof(double));
     memset(held, 0, sizeof held);
     while (left > 0) {
-        double A[MOST_ROWS * MOST_ROWS], y[MOST_ROWS];
+        double A[m * m], y[m];
         for (int64_t i = 0; i < m; i++) {
             for (int64_t j = 0; j <= i; j++) {
                 double sum = 0;
@@ -51,76 +51,83 @@ static int bounded_step(const Setup *s, const double *J, const double *wanted,
     return 1;
 }
 
-static double misfit(const Setup *s, const Point *p, const double *weight) {
+static double misfit(const Setup *s, const double *lacks, const double *weight) {
     double sum = 0;
-    for (int64_t i = 0; i < s->rows; i++) sum += weight[i] * weight[i] * p->r[i] * p->r[i];
+    for (int64_t i = 0; i < s->rows; i++) sum += weight[i] * weight[i] * lacks[i] * lacks[i];
     return sum;
 }
 
-/* Bring a point, of which p->x is given, into all balls; 0 if that fails. */
+/* Bring a point, of which p->x is given, to where all constraints hold; 0 if that fails. */
 static int reach(Program *P, Point *p, int64_t most) {
     const Setup *s = P->setup;
-    double weight[MOST_ROWS], damping = 1e-4;
-    for (int64_t k = 0, i = 0; k < s->balls; k++)
-        for (int64_t end = i + s->ball_rows[k]; i < end; i++) weight[i] = 1 / s->scale[k];
+    const ReachSettings *set = &s->reach;
+    double weight[s->rows], lacks[s->rows], memory[s->rows * s->n], damping = set->damping;
+    row_weights(s, s->scale, weight);
     if (!evaluate(P, p, 0)) return 0;
+    if (p->reached) return 1;
     NEW_POINT(trial, s);
-    double before = misfit(s, p, weight);
+    const double *J = lacking(P, p, lacks, memory);
+    double before = misfit(s, lacks, weight);
     for (int64_t iteration = 0; iteration < most && !p->reached; iteration++) {
-        double wanted[MOST_ROWS], low[s->n], high[s->n], d[s->n];
-        for (int64_t i = 0; i < s->rows; i++) wanted[i] = -p->r[i];
+        double wanted[s->rows], low[s->n], high[s->n], d[s->n];
+        for (int64_t i = 0; i < s->rows; i++) wanted[i] = -lacks[i];
         for (int64_t i = 0; i < s->n; i++) {
-            low[i] = fmax(P->lower[i] - p->x[i], -1);
-            high[i] = fmin(P->upper[i] - p->x[i], 1);
+            low[i] = fmax(P->lower[i] - p->x[i], -set->longest_step);
+            high[i] = fmin(P->upper[i] - p->x[i], set->longest_step);
         }
-        if (!bounded_step(s, p->J, wanted, weight, damping, low, high, d)) return 0;
+        if (!bounded_step(s, J, wanted, weight, damping, low, high, d)) return 0;
         double left = 0;
         for (int64_t i = 0; i < s->rows; i++) {
-            double each = weight[i] * (p->r[i] + dot(p->J + i * s->n, d, s->n));
+            double each = weight[i] * (lacks[i] + dot(J + i * s->n, d, s->n));
             left += each * each;
         }
         double promised = before - left;
-        if (promised < 1e-9 * before) return 0;
+        if (promised < set->least_progress * before) return 0;
         for (int64_t i = 0; i < s->n; i++)
             trial.x[i] = clip(p->x[i] + d[i], P->lower[i], P->upper[i]);
-        double gained = -INFINITY, after = INFINITY;
+        double gained = -INFINITY, after = INFINITY, trial_lacks[s->rows], unused[s->rows * s->n];
         inherit_state(s, p, &trial);
-        if (evaluate(P, &trial, 0)) after = misfit(s, &trial, weight), gained = before - after;
+        if (evaluate(P, &trial, 0)) {
+            lacking(P, &trial, trial_lacks, unused);
+            after = misfit(s, trial_lacks, weight), gained = before - after;
+        }
         if (gained > 0.1 * promised) {
             copy_point(s, &trial, p);
+            J = lacking(P, p, lacks, memory);
             before = after;
-            if (gained > 0.7 * promised) damping = fmax(0.1 * damping, 1e-10);
-        } else if ((damping *= 10) > 1e6) {
+            if (gained > 0.7 * promised) damping = fmax(0.1 * damping, set->least_damping);
+        } else if ((damping *= 10) > set->most_damping) {
             return 0;
         }
     }
     return p->reached;
 }
 
-/* Point within all balls near from->x + d, evaluated in full; 0 if there is none near. */
+/* Point near from->x + d where all constraints hold, evaluated in full; 0 if there is none. */
 static int pulled_back(Program *P, const Point *from, const double *d, const double *lower,
                        const double *upper, Point *to) {
     const Setup *s = P->setup;
-    double allowed = 2 * largest(d, s->n) + 1e-4, weight[MOST_ROWS];
-    for (int64_t k = 0, i = 0; k < s->balls; k++)
-        for (int64_t end = i + s->ball_rows[k]; i < end; i++) weight[i] = 1 / P->radius[k];
+    const DescentSettings *set = &s->descent;
+    double allowed = 2 * largest(d, s->n) + set->shortest_pull_back, weight[s->rows];
+    row_weights(s, P->radius, weight);
     for (int64_t i = 0; i < s->n; i++) to->x[i] = clip(from->x[i] + d[i], lower[i], upper[i]);
     inherit_state(s, from, to);
     for (int tries = 0; tries < 8; tries++) {
         if (!evaluate(P, to, 0)) return 0;
         if (to->reached) return evaluate(P, to, 1) && to->reached;
-        double wanted[MOST_ROWS], low[s->n], high[s->n], back[s->n];
+        double wanted[s->rows], low[s->n], high[s->n], back[s->n], memory[s->rows * s->n];
+        const double *J = lacking(P, to, wanted, memory);
         for (int64_t k = 0, i = 0; k < s->balls; k++) {
-            double share = 0;
-            if (to->error[k] > P->radius[k] * s->inside)
-                share = P->radius[k] * s->inside / to->error[k] - 1;
+            double share = 0, inside = P->radius[k] * set->inside;
+            if (to->error[k] > inside) share = inside / to->error[k] - 1;
             for (int64_t end = i + s->ball_rows[k]; i < end; i++) wanted[i] = share * to->r[i];
         }
         for (int64_t i = 0; i < s->n; i++) {
             low[i] = lower[i] - to->x[i];
             high[i] = upper[i] - to->x[i];
         }
-        if (!bounded_step(s, to->J, wanted, weight, 1e-3, low, high, back)) return 0;
+        if (!bounded_step(s, J, wanted, weight, set->pull_back_damping, low, high, back))
+            return 0;
         if (!(largest(back, s->n) <= allowed)) return 0;
         for (int64_t i = 0; i < s->n; i++)
             to->x[i] = clip(to->x[i] + back[i], lower[i], upper[i]);

@@ -51,37 +51,52 @@ static void sort_ranked(Ranked *items, int64_t count) {
     }
 }
 
-/* Samples whose tip is nearest to the target, the nearest first.
- *
- * P->near holds weights (3) and wanted position (3), a factor a, an offset b and a matrix M (9):
- * the distance is |weights * (position - wanted)| + a sqrt(b - <M, rotation>).
- */
-static int64_t nearest_samples(const Program *P, Ranked *nearest) {
-    const Setup *s = P->setup;
-    const double *weight = P->near, *wanted = P->near + 3, *M = P->near + 8;
-    double factor = P->near[6], offset = P->near[7];
-    int64_t count = 0;
-    for (int64_t i = 0; i < s->samples; i++) {
-        const double *pose = s->sample_poses + 12 * i;
-        double sum = 0;
-        for (int k = 0; k < 3; k++) {
-            double each = weight[k] * (pose[k] - wanted[k]);
-            sum += each * each;
-        }
-        sum = sqrt(sum);
-        if (factor > 0) sum += factor * sqrt(fmax(0, offset - dot(M, pose + 3, 9)));
-        keep_smallest(nearest, &count, s->nearest, (Ranked){sum, i});
+/* How far a sample's tip is from meeting all terms, roughly; see `Nearness` in term.py. */
+static double distance(const Program *P, const double *pose) {
+    const double *near = P->near;
+    double total = 0;
+    for (int64_t k = 0; k < P->setup->near; k++, near += 18) {
+        double value = near[0];
+        for (int i = 0; i < 3; i++) value += pose[i] * (near[1 + i] + near[4 + i] * pose[i]);
+        if (P->turns[k]) value += dot(near + 7, pose + 3, 9);
+        value = fmax(value, 0);
+        total += fmax((near[16] != 0 ? sqrt(value) : value) - near[17], 0);
     }
+    return total;
+}
+
+/* Samples nearest to the target, the nearest first, and how hard to search: the more, the more of
+ * the samples meet the target. */
+static int64_t nearest_samples(Program *P, Ranked *nearest, Effort *effort) {
+    const Setup *s = P->setup;
+    const Effort *least = &s->least_effort, *most = &s->most_effort;
+    int64_t count = 0, covered = 0, kept = 2 * most->screened, turns[s->near];
+    double distances[s->samples];
+    for (int64_t k = 0; k < s->near; k++)
+        turns[k] = largest(P->near + 18 * k + 7, 9) > 0;
+    P->turns = turns;
+    for (int64_t i = 0; i < s->samples; i++) {
+        distances[i] = distance(P, s->sample_poses + 12 * i);
+        covered += distances[i] == 0;
+    }
+    double share = fmin(1, (double)covered / (double)s->samples / s->covered);
+    effort->screened = least->screened + (int64_t)(share * (double)(most->screened - least->screened));
+    effort->agreeing = least->agreeing + (int64_t)(share * (double)(most->agreeing - least->agreeing));
+    effort->most_descents = least->most_descents +
+        (int64_t)(share * (double)(most->most_descents - least->most_descents));
+    kept = 2 * effort->screened < s->samples ? 2 * effort->screened : s->samples;
+    for (int64_t i = 0; i < s->samples; i++)
+        keep_smallest(nearest, &count, kept, (Ranked){distances[i], i});
     sort_ranked(nearest, count);
     return count;
 }
 
 static int same(const Setup *s, const Descent *a, const Descent *b) {
-    return fabs(a->value - b->value) < s->same && fabs(a->violation - b->violation) < s->same;
+    return fabs(a->value - b->value) < s->same_optimum && fabs(a->violation - b->violation) < s->same_optimum;
 }
 
 static int better(const Setup *s, const Descent *a, const Descent *b) {
-    if (fabs(a->violation - b->violation) > s->floor_slack) return a->violation < b->violation;
+    if (fabs(a->violation - b->violation) > 0.5 * s->descent.floor_margin) return a->violation < b->violation;
     return a->value < b->value;
 }
 
@@ -89,11 +104,13 @@ static int better(const Setup *s, const Descent *a, const Descent *b) {
 static int search(Program *P, Point *best, Descent *end, Found *found) {
     const Setup *s = P->setup;
     int64_t size = point_size(s), ranked = 0;
-    Ranked nearest[s->nearest], screened[s->screened];
-    double memory[s->screened * size];
-    int64_t count = nearest_samples(P, nearest);
+    Effort effort;
+    Ranked nearest[2 * s->most_effort.screened];
+    int64_t count = nearest_samples(P, nearest, &effort);
+    Ranked screened[effort.screened];
+    double memory[effort.screened * size];
     memset(found, 0, sizeof *found);
-    for (int64_t i = 0; i < count && ranked < s->screened; i++) {
+    for (int64_t i = 0; i < count && ranked < effort.screened; i++) {
         Point p = point_in(s, memory + ranked * size);
         memcpy(p.x, s->sample_x + nearest[i].index * s->n, (size_t)s->n * sizeof(double));
         for (int64_t k = 0; k < s->n; k++) p.x[k] = clip(p.x[k], P->lower[k], P->upper[k]);
@@ -101,8 +118,8 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
             memcpy(p.state, s->sample_states + nearest[i].index * s->state,
                    (size_t)s->state * sizeof(double));
         found->tried++;
-        if (!reach(P, &p, 20) || !evaluate(P, &p, 1)) continue;
-        screened[ranked] = (Ranked){objective(s, &p) + 10 * violation(P, &p), ranked};
+        if (!reach(P, &p, s->reach.iterations_of_many) || !evaluate(P, &p, 1)) continue;
+        screened[ranked] = (Ranked){objective(s, &p) + s->price_of_floors * violation(P, &p), ranked};
         ranked++;
     }
     found->reached = ranked;
@@ -110,10 +127,10 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
     double apart = 0;
     for (int64_t k = 0; k < s->n; k++) {
         double range = P->upper[k] - P->lower[k];
-        apart += 0.04 * range * range;
+        apart += s->unlike * s->unlike * range * range;
     }
     /* in the order of their rank, first those unlike each other, then the others */
-    int64_t used[s->screened], order[s->screened], given = 0;
+    int64_t used[effort.screened], order[effort.screened], given = 0;
     memset(used, 0, sizeof used);
     for (int pass = 0; pass < 2; pass++)
         for (int64_t i = 0; i < ranked; i++) {
@@ -128,12 +145,12 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
             }
             if (alone) used[i] = 1, order[given++] = i;
         }
-    Descent ends[s->screened], optima[s->screened];
-    double optimal_x[s->screened * s->n];
+    Descent ends[effort.screened], optima[effort.screened];
+    double optimal_x[effort.screened * s->n];
     Known known = {0, optima, optimal_x};
     int64_t nothing_new = 0;
     NEW_POINT(p, s);
-    for (int64_t i = 0; i < given && i < s->most_descents; i++) {
+    for (int64_t i = 0; i < given && i < effort.most_descents; i++) {
         Point from = point_in(s, memory + screened[order[i]].index * size);
         copy_point(s, &from, &p);
         measure_balls(P, &p);
@@ -152,7 +169,7 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
             copy_point(s, &p, best);
         }
         ends[found->descents++] = now;
-        if (nothing_new >= s->agreeing) {
+        if (nothing_new >= effort.agreeing) {
             found->complete = 1;
             break;
         }

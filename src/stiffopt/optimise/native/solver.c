@@ -1,7 +1,7 @@
 /* Tasks of one structure on one arm, solved row by row.
  *
  * A task is a row of numbers: parameters of its functions, radii of the balls, lower and upper
- * pressure limits (Pa), floors, what `nearest_samples` needs, a flag and a guess (Pa).
+ * pressure limits (Pa), floors, the `Nearness` of each term, a flag and a guess (Pa).
  * An answer is a row of numbers too, see `solve_row`.
  */
 #include "functions.h"
@@ -19,10 +19,10 @@ static void solve_row(Program *P, const double *task, double *answer) {
     P->radius = task, task += s->balls;
     const double *least = task, *most = task + s->n;
     double lower[s->n], upper[s->n];
-    for (int64_t i = 0; i < s->n; i++) lower[i] = least[i] / BAR, upper[i] = most[i] / BAR;
+    for (int64_t i = 0; i < s->n; i++) lower[i] = least[i] / s->unit[i], upper[i] = most[i] / s->unit[i];
     P->lower = lower, P->upper = upper, task += 2 * s->n;
     P->floor = task, task += s->floors;
-    P->near = task, task += 17;
+    P->near = task, task += 18 * s->near;
     int guessed = *task++ != 0;
     P->poses = P->points = P->programs = 0;
 
@@ -31,15 +31,15 @@ static void solve_row(Program *P, const double *task, double *answer) {
     Found found = {0, 0, 0, 0, 0, 0, 0};
     int64_t outcome = NEEDS_GENERAL_METHOD;
     if (guessed) {
-        for (int64_t i = 0; i < s->n; i++) p.x[i] = clip(task[i] / BAR, lower[i], upper[i]);
+        for (int64_t i = 0; i < s->n; i++) p.x[i] = clip(task[i] / s->unit[i], lower[i], upper[i]);
         forget_state(s, &p);
-        if (reach(P, &p, 40) && evaluate(P, &p, 1)) {
+        if (reach(P, &p, s->reach.iterations) && evaluate(P, &p, 1)) {
             end = descend(P, &p, NULL);
             found = (Found){1, 1, 1, 1, 1, 0, end.iterations};
-            if (end.converged && end.violation < s->floor_slack) outcome = LOCAL;
+            if (end.converged && end.violation < 0.5 * s->descent.floor_margin) outcome = LOCAL;
         }
     }
-    if (outcome != LOCAL && search(P, &p, &end, &found) && end.violation < s->floor_slack)
+    if (outcome != LOCAL && search(P, &p, &end, &found) && end.violation < 0.5 * s->descent.floor_margin)
         outcome = GLOBAL;
     double *out = answer;
     *out++ = (double)outcome, *out++ = end.value, *out++ = end.violation, *out++ = end.converged;
@@ -49,7 +49,7 @@ static void solve_row(Program *P, const double *task, double *answer) {
     *out++ = (double)P->poses, *out++ = (double)P->points, *out++ = (double)P->programs;
     double *pressures = out;
     for (int64_t i = 0; i < s->n; i++)
-        *out++ = clip(p.x[i] * BAR, least[i], most[i]);
+        *out++ = clip(p.x[i] * s->unit[i], least[i], most[i]);
     if (outcome != NEEDS_GENERAL_METHOD && !judge_at(P, pressures, out))
         answer[0] = NEEDS_GENERAL_METHOD;
 }

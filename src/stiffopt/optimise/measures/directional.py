@@ -1,0 +1,162 @@
+"""Stiffness along, or about, a direction."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, ClassVar, Literal
+
+import casadi as ca
+from pydantic import Field, ValidationInfo, field_serializer, field_validator
+
+from stiffopt import lie
+from stiffopt.directions import Direction, Frame
+from stiffopt.model.compliance import held_stiffness
+from stiffopt.model.shape import FreeShape, stiffness_along
+from stiffopt.optimise.measure import Measure, Role, Vector
+from stiffopt.units import Ratio, finite_number, format_quantity, parse_quantity, read_from_file
+
+Kind = Literal["translation", "rotation"]
+Boundary = Literal["free", "guided", "clamped"]
+
+_STIFFNESS_UNITS = {"translation": "N/m", "rotation": "N*m/rad"}
+
+
+class StiffnessMeasure(Measure):
+    """One directional stiffness of the tip.
+
+    Attributes
+    ----------
+    direction : unit vector of the force or, for a rotation, axis of the moment.
+    frame : the axes in which `direction` is given.
+    kind : stiffness against translation or rotation.
+    boundary : free, the rest of the tip may move; guided, it may not translate (for a rotation:
+        not rotate) otherwise; clamped, it may not move otherwise at all.
+    """
+
+    key: ClassVar[str] = "direction"
+    role: ClassVar[Role] = "maximise"
+
+    direction: Direction
+    frame: Frame = "base"
+    kind: Kind = "translation"
+    boundary: Boundary = "free"
+
+    @property
+    def unit(self) -> Literal["N/m", "N*m/rad"]:
+        """Unit of the stiffness."""
+        return "N/m" if self.kind == "translation" else "N*m/rad"
+
+    @property
+    def structure(self) -> tuple[str, ...]:
+        """Kind, frame and boundary."""
+        return ("direction", self.kind, self.frame, self.boundary)
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """The unit direction (3,)."""
+        return self.direction
+
+    def formula(self, tip: Any, parameters: Any) -> Any:
+        """``log k``; see `stiffopt.model.compliance.directional_stiffness`."""
+        k = stiffness_along(tip, parameters[:3], self.frame, self.kind, self.boundary)
+        return ca.log(k)
+
+    def formula_gradient(self, tip: Any, parameters: Any) -> Any:
+        """Derivative of the value; see `Measure.formula_gradient`.
+
+        Where other motions are held, ``k = d' K d`` and W is the wrench that moves the tip by d:
+        then ``dk = -W' dC W``, in axes in which d does not turn.  That is the derivative of a
+        flexibility, of a third of the operations.
+        """
+        if self.boundary == "free" or not isinstance(tip, FreeShape):
+            return super().formula_gradient(tip, parameters)
+        turn = tip.rotation.T if self.frame == "base" else ca.SX.eye(3)
+        stiffness, wrench = held_stiffness(
+            tip.compliance,
+            turn @ parameters[:3],
+            self.kind == "rotation",
+            self.boundary == "clamped",
+        )
+        still = ca.SX.sym("wrench", 6)
+        slope = tip.total_jacobian(tip.flexibility(lie.rotate_blocks(turn) @ still))
+        return -ca.substitute(slope, still, lie.rotate_blocks(turn.T) @ wrench) / stiffness
+
+    def words(self) -> str:
+        """Direction, frame, kind and boundary."""
+        way = "along" if self.kind == "translation" else "about"
+        vector = ", ".join(f"{round(value, 3) + 0.0:g}" for value in self.direction)
+        return f"against {self.kind} {way} ({vector}), {self.frame} axes, {self.boundary}"
+
+    def stiffness_gradient(self, robot: Any, pressures: Vector) -> Vector | None:
+        """See `Measure.stiffness_gradient`."""
+        gradient: Vector = robot.stiffness_gradient(
+            pressures, self.direction, self.kind, self.boundary, self.frame
+        )
+        return gradient
+
+
+class _ValuedMeasure(StiffnessMeasure):
+    value: Annotated[float, Field(gt=0)]
+
+    @field_validator("value", mode="before")
+    @classmethod
+    def _read_value(cls, value: Any, info: ValidationInfo) -> float:
+        if not isinstance(value, str) and not read_from_file(info):
+            return finite_number(value)
+        kind = info.data.get("kind", "translation")
+        return parse_quantity(value, _STIFFNESS_UNITS[kind], f"stiffness against {kind}")
+
+    @field_serializer("value", when_used="json")
+    def _write_value(self, value: float) -> str:
+        return format_quantity(value, self.unit)
+
+
+class AtLeast(_ValuedMeasure):
+    """A stiffness that shall not be less than `value` (N/m, for a rotation N m/rad)."""
+
+    role: ClassVar[Role] = "at_least"
+
+    def holds(self, value: float) -> bool:
+        """See `Measure.holds`."""
+        return value >= self.value
+
+    def shortfall(self, value: float) -> str:
+        """See `Measure.shortfall`."""
+        unit = self.unit.replace("*", " ")
+        return f"at least {self.value:.4g} {unit} asked for, {value:.4g} is the most"
+
+
+class MatchValue(_ValuedMeasure):
+    """A stiffness that shall be `value` (N/m, for a rotation N m/rad).
+
+    Attributes
+    ----------
+    tolerance : relative deviation that is near enough.
+    """
+
+    role: ClassVar[Role] = "match"
+
+    tolerance: Annotated[Ratio, Field(gt=0, lt=1)] = 0.01
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """The unit direction (3,) and the logarithm of the value."""
+        return (*self.direction, math.log(self.value))
+
+    @property
+    def structure(self) -> tuple[str, ...]:
+        """Kind, frame and boundary of what is matched."""
+        return ("match", *super().structure)
+
+    def mismatch(self, value: Any, parameters: Any) -> tuple[Any, Any]:
+        """``(log k - log value)^2``."""
+        return (value - parameters[3]) ** 2, 2 * (value - parameters[3])
+
+    def holds(self, value: float) -> bool:
+        """See `Measure.holds`."""
+        return abs(value / self.value - 1) <= self.tolerance
+
+    def shortfall(self, value: float) -> str:
+        """See `Measure.shortfall`."""
+        unit = self.unit.replace("*", " ")
+        return f"{self.value:.4g} {unit} asked for, {value:.4g} is nearest"

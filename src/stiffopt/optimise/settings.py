@@ -1,0 +1,165 @@
+"""Tuning values of the optimiser, grouped by the method that they belong to.
+
+Variables of all methods are the pressures as shares of each channel's range, so that steps and
+distances mean the same for a channel of 0.2 bar and for one of 10 bar.  The methods written in C
+(folder ``native``) are given the same values.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+
+@dataclass(frozen=True)
+class ReachSettings:
+    """Levenberg-Marquardt method that brings pressures to the target (`stiffopt.optimise.reach`).
+
+    Attributes
+    ----------
+    longest_step : of a pressure, as a share of its range.
+    damping : at the start, and the range in which it is adapted.
+    least_progress : share of the misfit that a step must promise.
+    iterations : of a start that is followed alone, as a guess is.
+    iterations_of_many : of each of many starts.
+    """
+
+    longest_step: float = 2 / 3
+    damping: float = 2.25e-4
+    least_damping: float = 2e-10
+    most_damping: float = 2e6
+    least_progress: float = 1e-9
+    iterations: int = 40
+    iterations_of_many: int = 20
+
+
+@dataclass(frozen=True)
+class DescentSettings:
+    """Feasible-path SQP method (`stiffopt.optimise.local`); steps are shares of a range.
+
+    Attributes
+    ----------
+    iterations : at most.
+    first_radius, largest_radius, last_radius : of the trust region.
+    curvature : first guess of the objective's second derivative.
+    inside : share of a tolerance that is used, so that rounding stays within it.
+    touching : a pressure that near to a limit is meant to be at it.
+    next_to : a descent that near to an optimum of the same value is on its way there.
+    floor_margin : how far above a stiffness that must be kept the method aims, relatively.
+    pull_back_damping : of the corrections back into the tolerances.
+    shortest_pull_back : correction that is allowed after however short a step.
+    """
+
+    iterations: int = 80
+    first_radius: float = 0.2
+    largest_radius: float = 4 / 3
+    last_radius: float = 7e-7
+    curvature: float = 0.225
+    inside: float = 1 - 1e-7
+    touching: float = 7e-6
+    next_to: float = 1 / 30
+    floor_margin: float = 1e-6
+    pull_back_damping: float = 2.25e-3
+    shortest_pull_back: float = 7e-5
+
+
+class Effort(NamedTuple):
+    """Limits of a global search.
+
+    Attributes
+    ----------
+    screened : samples that are brought to the target and ranked by what they are worth there.
+    agreeing : descents in a row that must find nothing new before the search ends.
+    most_descents : after which it ends anyway.
+    """
+
+    screened: int
+    agreeing: int
+    most_descents: int
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """Global search (`stiffopt.optimise.search`).
+
+    Attributes
+    ----------
+    placed, loose : effort for a target of at least a position, and of less than that: what is
+        loosely asked for is reached in very different ways.  `loose` is also the effort for any
+        target whose tolerances cover the share `covered` of the sampled configurations.
+    loaded_placed, loaded_loose : the same in machine code for an arm under gravity or a load, of
+        which an evaluation takes a hundred times longer.
+    covered : share of the configurations, see above; the effort grows with the share up to it.
+    same_optimum : difference of two objectives (0.1 % of a stiffness) that count as one optimum.
+    unlike : share of the diagonal of the pressure range that first starts lie apart.
+    price_of_floors : weight of a stiffness that is missed, when starts are ranked.
+    general_starts_loaded : starts of the general method for an arm under gravity or a load.
+    """
+
+    placed: Effort = field(default=Effort(64, 4, 32))
+    loose: Effort = field(default=Effort(256, 8, 64))
+    loaded_placed: Effort = field(default=Effort(16, 3, 10))
+    loaded_loose: Effort = field(default=Effort(40, 4, 16))
+    covered: float = 0.02
+    same_optimum: float = 1e-3
+    unlike: float = 0.2
+    price_of_floors: float = 10.0
+    general_starts_loaded: int = 12
+
+
+@dataclass(frozen=True)
+class ClosestSettings:
+    """Search for the configuration closest to what cannot be reached (`diagnosis`).
+
+    Attributes
+    ----------
+    most_descents, agreeing : as those of `Effort`.
+    same : difference of two objectives (half a squared error over a scale) that count as one.
+    """
+
+    most_descents: int = 16
+    agreeing: int = 4
+    same: float = 1e-7
+
+
+@dataclass(frozen=True)
+class SampleSettings:
+    """Table of sampled configurations (`stiffopt.optimise.samples`).
+
+    Attributes
+    ----------
+    free : number for an arm without loads.
+    loaded : for one under gravity or a load, whose equilibria take a thousand times longer.
+    compiled : the same in machine code; each load has its own.
+    hopeless : if none of so many first ones has an equilibrium, the arm has none.
+    """
+
+    free: int = 4096
+    loaded: int = 128
+    compiled: int = 64
+    hopeless: int = 16
+
+
+@dataclass(frozen=True)
+class PriceSettings:
+    """Prices of the constraints at a solution (`stiffopt.optimise.prices`).
+
+    Attributes
+    ----------
+    near : how nearly, relatively, a constraint must hold to be weighed at all.
+    slack : how much less a constraint that is off by a share of itself explains: the price of one
+        that binds is not found to be zero since the solution is not exact.
+    beyond : how far outside a pressure limit its price is taken, as a share of the range.
+    least : below which a price is rounding.
+    """
+
+    near: float = 0.01
+    slack: float = 10.0
+    beyond: float = 7e-4
+    least: float = 1e-9
+
+
+REACH = ReachSettings()
+DESCENT = DescentSettings()
+SEARCH = SearchSettings()
+CLOSEST = ClosestSettings()
+SAMPLES = SampleSettings()
+PRICES = PriceSettings()

@@ -1,0 +1,185 @@
+"""What a term is: one condition of a task on the configured arm.
+
+A term is a smooth function of the tip, or of stations along the body: a residual r whose length
+must not exceed a tolerance, ``|r| <= tolerance``, or inequalities ``g >= 0``.  Each kind of term
+has a file of its own in `stiffopt.optimise.terms`, with all that is known of it: its key in task
+files, its formula, its words.
+
+The formula is symbolic.  A term splits into its *structure*, for which functions are compiled, and
+its *parameters*, which are arguments of them.
+"""
+
+import hashlib
+import inspect
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Hashable
+from functools import cache
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from stiffopt.schema import Schema
+from stiffopt.units import Angle, Length
+
+Vector = NDArray[np.float64]
+
+_SHOWN = {"m": ("mm", 1e3), "rad": ("deg", 180 / math.pi)}
+
+
+class Tolerance(Schema):
+    """How near is near enough.
+
+    Attributes
+    ----------
+    position : Euclidean norm over the axes that are not free, in m.
+    angle : between the axes (pointing) or of the rotation (orientation), in rad.
+    """
+
+    position: Annotated[Length, Field(gt=0)] = 1e-4
+    angle: Annotated[Angle, Field(gt=0)] = math.radians(1)
+
+
+class Nearness(NamedTuple):
+    """How far a tip is from meeting a term, roughly: ``max(0, d - limit)``, d = v or sqrt(v).
+
+    ``v = offset + linear . r + square . r^2 + turn . R`` of the tip's position r and rotation R (by
+    columns), but at least 0; d is its root if `root` is 1, v itself if it is 0.  A search starts
+    from the samples for which the sum over all terms is least; so d counts in lengths of the arm,
+    or in half turns.
+    """
+
+    offset: float = 0.0
+    linear: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    square: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, ...] = (0.0,) * 9
+    root: float = 0.0
+    limit: float = 0.0
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """All 18 in order."""
+        return (self.offset, *self.linear, *self.square, *self.turn, self.root, self.limit)
+
+
+class Term(ABC):
+    """One condition of a task; see the module.
+
+    Parameters
+    ----------
+    value :
+        What the task file says under `key`, read and in SI.
+    tolerance : Tolerance
+        The tolerances of the target, for terms that have none of their own.
+
+    Attributes
+    ----------
+    key : str
+        In task files, under ``target``.
+    annotation :
+        Pydantic type of the value there: a `Schema`, or one of the types of `stiffopt.units` and
+        `stiffopt.directions`.  Those define how it is written in files and messages too.
+    example :
+        A value as in a task file that the built-in arm stiff-flop-2 can meet, for tests.
+    name : str
+        In results: ``<name>_error`` or, of an inequality, ``<name>_margin``.  A task has one term
+        of a name at most.
+    unit : str
+        SI unit of the residual or margin.
+    has_stations : bool
+        Whether the formula asks for stations.
+    is_inequality : bool
+        Whether `residual` must not be negative, component by component, instead of small.
+    order : int
+        Terms are listed by it.
+    size : int
+        Number k of components of the residual.
+    radius : float
+        The tolerance; of an inequality a size (in `unit`) by which it is scaled.
+    """
+
+    key: ClassVar[str]
+    annotation: ClassVar[Any]
+    example: ClassVar[Any]
+    name: ClassVar[str]
+    unit: ClassVar[str] = "m"
+    has_stations: ClassVar[bool] = False
+    is_inequality: ClassVar[bool] = False
+    order: ClassVar[int] = 10
+    size: int = 1
+    radius: float = 1e-3
+
+    def __init__(self, value: Any, tolerance: Tolerance) -> None:
+        self.value = value
+
+    # -- the formula ------------------------------------------------------------------------
+
+    @abstractmethod
+    def residual(self, tip: Any, parameters: Any) -> Any:
+        """Symbolic residual (k,) for symbolic parameters.
+
+        `tip` is a `stiffopt.model.shape.Shape`: ``tip.position`` (3,) and ``tip.rotation`` (3, 3),
+        in base axes; ``tip.station(s)`` has the same at arc length s (m, at rest, from the base).
+        """
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """Arguments of the formula, always as many for one structure."""
+        return ()
+
+    @property
+    def variant(self) -> Hashable:
+        """What else the formula depends on, such as numbers of components or arc lengths."""
+        return ()
+
+    @property
+    def structure(self) -> Hashable:
+        """All that the compiled function depends on."""
+        return (self.key, self.variant, self.is_inequality, self.radius * self.is_inequality,
+                _version(type(self)))  # fmt: skip
+
+    # -- how searches and controllers see it --------------------------------------------------
+
+    def nearness(self, length: float) -> Nearness:
+        """How far a tip is from meeting the term, for an arm of this length; default: unknown."""
+        return Nearness()
+
+    @classmethod
+    def moved_back(cls, value: Any, offset: Vector) -> Any:
+        """Value for the model such that an arm off by an offset (6,) meets `value`.
+
+        `offset` is a displacement in m and a rotation vector in rad, in base axes.
+        """
+        return value
+
+    # -- words ------------------------------------------------------------------------------
+
+    @property
+    def result_name(self) -> str:
+        """Of its value in results: ``position_error``."""
+        return f"{self.name}_{'margin' if self.is_inequality else 'error'}"
+
+    def holds(self, value: float) -> bool:
+        """Whether an error, or a margin, is as it has to be."""
+        return value >= 0 if self.is_inequality else value <= self.radius
+
+    def shown(self, value: float) -> tuple[float, str]:
+        """A value in the unit in which people read it, and that unit."""
+        unit, factor = _SHOWN.get(self.unit, (self.unit, 1.0))
+        return value * factor, unit
+
+    def words(self, value: float) -> str:
+        """An error or margin as people read it: ``0.35 mm``."""
+        number, unit = self.shown(value)
+        return f"{number:.4g} {unit}"
+
+
+@cache
+def _version(kind: type[Term]) -> str:
+    """Name of a class of terms, with a hash of its text if it is not stiffopt's own."""
+    name = f"{kind.__module__}.{kind.__qualname__}"
+    if kind.__module__.startswith("stiffopt."):  # whose text is part of all keys
+        return name
+    return f"{name} {hashlib.sha256(inspect.getsource(kind).encode()).hexdigest()[:16]}"

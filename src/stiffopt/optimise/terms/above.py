@@ -1,0 +1,62 @@
+"""The tip stays above a plane, that is, on the side to which the plane's normal points."""
+
+from typing import Annotated, Any, ClassVar
+
+import casadi as ca
+
+from stiffopt.directions import Direction
+from stiffopt.optimise.term import Nearness, Term, Vector
+from stiffopt.schema import Schema
+from stiffopt.schema import Vector as Three
+from stiffopt.units import Length, within
+
+
+class Plane(Schema):
+    """A plane in the base frame.
+
+    Attributes
+    ----------
+    point : of the plane, in m.
+    normal : unit vector across it, to the side where the tip stays.
+    """
+
+    point: Three[Annotated[Length, within(1e3, "m")]]
+    normal: Direction
+
+
+class AboveTerm(Term):
+    """Height of the tip above a plane, which must not be negative."""
+
+    key = name = "above"
+    annotation = Plane
+    example: ClassVar[Any] = {"point": ["0 mm", "0 mm", "185 mm"], "normal": [0.2, 0, 1]}
+    is_inequality = True
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """Normal, and height of the plane along it."""
+        return (*self.value.normal, self._height)
+
+    @property
+    def _height(self) -> float:
+        pairs = zip(self.value.normal, self.value.point, strict=True)
+        return float(sum(n * p for n, p in pairs))
+
+    def residual(self, tip: Any, parameters: Any) -> Any:
+        """``n . (r - point)``; see `Term.residual`."""
+        return ca.dot(parameters[:3], tip.position) - parameters[3]
+
+    def nearness(self, length: float) -> Nearness:
+        """Depth below the plane over the arm's length."""
+        x, y, z = self.value.normal
+        return Nearness(self._height / length, (-x / length, -y / length, -z / length))
+
+    def words(self, value: float) -> str:
+        """Height above or depth below the plane."""
+        return f"{abs(value) * 1e3:.4g} mm {'above' if value >= 0 else 'below'} the plane"
+
+    @classmethod
+    def moved_back(cls, value: Any, offset: Vector) -> Any:
+        """See `Term.moved_back`."""
+        pairs = zip(value.point, offset[:3], strict=True)
+        return value.model_copy(update={"point": tuple(p - float(d) for p, d in pairs)})

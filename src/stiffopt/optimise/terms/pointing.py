@@ -1,0 +1,71 @@
+"""Direction of the tip's z axis: its angle to a unit vector."""
+
+import math
+from typing import Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+from stiffopt import lie
+from stiffopt.directions import Direction
+from stiffopt.optimise.term import Nearness, Term, Tolerance, Vector
+
+_ALIGNED = 1e-8  # squared sine of an angle below which its series is used
+
+
+class PointingTerm(Term):
+    """Angle between the tip's z axis and a direction.
+
+    The axis is unrolled from the sphere onto the plane that touches it at the wanted direction
+    (azimuthal equidistant projection), so that the residual's length is the angle.
+    """
+
+    key = "pointing"
+    annotation = Direction
+    name, unit = "angle", "rad"
+    example: ClassVar[Any] = [0.1, -0.2, 0.9]
+    order = 1
+    size = 2
+
+    def __init__(self, value: tuple[float, ...], tolerance: Tolerance) -> None:
+        super().__init__(value, tolerance)
+        self.radius = tolerance.angle
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """The direction, and two unit vectors across it."""
+        x, y, z = self.value
+        # J. Duff et al., Building an Orthonormal Basis, Revisited, JCGT 6 (2017)
+        sign = math.copysign(1.0, z)
+        a = -1.0 / (sign + z)
+        b = x * y * a
+        return (x, y, z, 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y)
+
+    def residual(self, tip: Any, parameters: Any) -> Any:
+        """Unrolled axis (2,); see `Term.residual`."""
+        axis = tip.rotation[:, 2]
+        cosine = ca.dot(parameters[:3], axis)
+        flat = ca.vertcat(ca.dot(parameters[3:6], axis), ca.dot(parameters[6:], axis))
+        square = ca.sumsqr(flat)
+        aligned = square < _ALIGNED
+        sine = ca.sqrt(ca.if_else(aligned, _ALIGNED, square))
+        factor = ca.if_else(aligned, 1 + square / 6, ca.atan2(sine, cosine) / sine)
+        # exactly opposite every way round is as good: take one
+        opposite = ca.logic_and(aligned, cosine < 0)
+        return factor * flat + ca.vertcat(ca.if_else(opposite, np.pi, 0), 0)
+
+    def nearness(self, length: float) -> Nearness:
+        """Chord ``|z - d| / pi``, of which the square is ``(2 - 2 z . d) / pi^2``."""
+        turn = (0.0,) * 6 + tuple(-2 * value / math.pi**2 for value in self.value)
+        limit = 2 * math.sin(min(self.radius, math.pi) / 2) / math.pi
+        return Nearness(offset=2 / math.pi**2, turn=turn, root=1.0, limit=limit)
+
+    def words(self, value: float) -> str:
+        """In degrees."""
+        return f"{math.degrees(value):.3g} deg"
+
+    @classmethod
+    def moved_back(cls, value: Any, offset: Vector) -> Any:
+        """See `Term.moved_back`."""
+        back = lie.exp(np.concatenate([np.zeros(3), -offset[3:]]))[:3, :3]
+        return tuple((back @ np.array(value)).tolist())

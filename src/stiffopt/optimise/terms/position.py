@@ -1,0 +1,79 @@
+"""The tip's position, along the base axes that are not free."""
+
+from collections.abc import Hashable
+from typing import Annotated, Any, ClassVar
+
+from pydantic import AfterValidator, BeforeValidator, PlainSerializer
+
+from stiffopt.optimise.term import Nearness, Term, Tolerance
+from stiffopt.optimise.term import Vector as Numbers
+from stiffopt.schema import Vector
+from stiffopt.units import Length, format_quantity, within
+
+
+def _coordinate(value: Any) -> Any:
+    """Let `free` (None in code) stand for an axis that does not matter."""
+    return None if isinstance(value, str) and value.strip() == "free" else value
+
+
+def _all_free_is_none(position: tuple[float | None, ...] | None) -> tuple[float | None, ...] | None:
+    return None if position is None or all(x is None for x in position) else position
+
+
+def _write_coordinate(value: float | None) -> str:
+    return "free" if value is None else format_quantity(value, "m", "mm")
+
+
+Coordinate = Annotated[
+    Annotated[Length, within(1e3, "m")] | None,
+    BeforeValidator(_coordinate),
+    PlainSerializer(_write_coordinate, return_type=str, when_used="json"),
+]
+
+
+class PositionTerm(Term):
+    """Difference between the tip's position and the wanted one."""
+
+    key = name = "position"
+    annotation = Annotated[Vector[Coordinate] | None, AfterValidator(_all_free_is_none)]
+    example: ClassVar[Any] = ["-30 mm", "free", "190 mm"]
+    order = 0
+
+    def __init__(self, value: tuple[float | None, ...], tolerance: Tolerance) -> None:
+        super().__init__(value, tolerance)
+        self.radius = tolerance.position
+        self.axes = tuple(axis for axis, wanted in enumerate(value) if wanted is not None)
+        self.size = len(self.axes)
+
+    @property
+    def variant(self) -> Hashable:
+        """The axes that are not free."""
+        return self.axes
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """The position along these axes."""
+        return tuple(self.value[axis] for axis in self.axes)
+
+    def residual(self, tip: Any, parameters: Any) -> Any:
+        """``r - r_wanted`` along these axes; see `Term.residual`."""
+        return tip.position[list(self.axes)] - parameters
+
+    def nearness(self, length: float) -> Nearness:
+        """Distance over the arm's length."""
+        wanted = [(value or 0.0) / length for value in self.value]
+        square = [(value is not None) / length**2 for value in self.value]
+        linear = [-2 * value / length for value in wanted]
+        return Nearness(
+            offset=sum(value**2 for value in wanted),
+            linear=(linear[0], linear[1], linear[2]),
+            square=(square[0], square[1], square[2]),
+            root=1.0,
+            limit=self.radius / length,
+        )
+
+    @classmethod
+    def moved_back(cls, value: Any, offset: Numbers) -> Any:
+        """See `Term.moved_back`."""
+        pairs = zip(value, offset[:3], strict=True)
+        return tuple(None if axis is None else axis - float(shift) for axis, shift in pairs)
