@@ -140,9 +140,6 @@ class PressureSolution:
     pressures : ndarray (n,) or None
         In Pa.
     tip_pose : ndarray (4, 4) or None
-    errors : dict of str to float
-        By name of each term of the target: the length of its residual or, of an inequality, the
-        margin by which it holds, in the term's unit.
     position_error : float or None
         Over the axes that were asked for, in m; None where none was.
     angle_error : float or None
@@ -167,6 +164,9 @@ class PressureSolution:
         with gradients, quadratic programs.
     timings : dict of str to float
         Seconds.
+    errors : dict of str to float
+        By name of each term of the target: the length of its residual or, of an inequality, the
+        margin by which it holds, in the term's unit.
     """
 
     status: Status
@@ -174,7 +174,8 @@ class PressureSolution:
     task: Task
     pressures: Vector | None = None
     tip_pose: Vector | None = None
-    errors: dict[str, float] = field(default_factory=dict)
+    position_error: float | None = None
+    angle_error: float | None = None
     compliance: Vector | None = None
     stiffness: float | None = None
     stiffness_unit: str | None = None
@@ -186,6 +187,7 @@ class PressureSolution:
     sensitivities: Sensitivities | None = field(default_factory=lambda: None)
     counts: dict[str, int] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _protect(self, "pressures", "tip_pose", "compliance")
@@ -222,16 +224,6 @@ class PressureSolution:
     def found(self) -> bool:
         """Whether every tolerance, limit and demand of the task holds."""
         return self.status == "solved"
-
-    @property
-    def position_error(self) -> float | None:
-        """Length of the position's residual in m; None where no position was asked for."""
-        return self.errors.get("position")
-
-    @property
-    def angle_error(self) -> float | None:
-        """Angle in rad by which the tip is off; None where none was asked for."""
-        return self.errors.get("angle")
 
     @property
     def tip_position(self) -> Vector | None:

@@ -318,6 +318,8 @@ class PressureSolver:
             "task": task,
             "tip_pose": judgement.tip_pose,
             "errors": judgement.errors,
+            "position_error": judgement.errors.get("position"),
+            "angle_error": judgement.errors.get("angle"),
             "compliance": judgement.compliance,
             "stiffness": judgement.stiffnesses[0] if judgement.stiffnesses else None,
             "stiffness_unit": self._prepared.unit,
