@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from independent import body_twists, derivative
-from stiffopt.model.arguments import Measure, checked_measure
+from stiffopt.model.arguments import DirectionalMeasure, checked_measure
 from stiffopt.model.description import Corrections, RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
@@ -105,7 +105,7 @@ def test_it_is_the_robot_that_is_built_anew(name: str, law: str) -> None:
             assert k == pytest.approx(stiffness_of(robot, p, measure), rel=1e-8)
 
 
-def stiffness_of(robot: Manipulator, p: Vector, measure: Measure) -> Vector:
+def stiffness_of(robot: Manipulator, p: Vector, measure: DirectionalMeasure) -> Vector:
     direction, kind, boundary, frame = measure
     return np.array(
         [robot.stiffness(q, direction, kind=kind, boundary=boundary, frame=frame) for q in p]

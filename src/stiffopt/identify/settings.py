@@ -56,7 +56,7 @@ class CalibrationSettings(Schema):
 
 
 @dataclass(frozen=True)
-class TrackerSettings:
+class TrackerFaultSettings:
     """Which readings of a tracker count as faults (`stiffopt.identify.tracker_faults`).
 
     Attributes
@@ -273,7 +273,7 @@ class ReportSettings:
     correlation_digits: int = 4
 
 
-TRACKER = TrackerSettings()
+TRACKER = TrackerFaultSettings()
 PLAUSIBLE = PlausibilitySettings()
 SAMPLING = SamplingSettings()
 START = StartSettings()

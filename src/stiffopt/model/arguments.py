@@ -13,7 +13,7 @@ from stiffopt.model.screws import Wrench
 Vector = NDArray[np.float64]
 
 
-class Measure(NamedTuple):
+class DirectionalMeasure(NamedTuple):
     """A directional stiffness that was checked; `direction` is of unit length."""
 
     direction: tuple[float, ...]
@@ -22,7 +22,9 @@ class Measure(NamedTuple):
     frame: Frame
 
 
-def checked_measure(direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame) -> Measure:
+def checked_measure(
+    direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
+) -> DirectionalMeasure:
     """Directional stiffness from arguments; the direction need not be of unit length."""
     vector = checked_vector("direction", direction)
     if not vector.any():
@@ -30,7 +32,7 @@ def checked_measure(direction: ArrayLike, kind: Kind, boundary: Boundary, frame:
     check_choice("kind", kind, get_args(Kind))
     check_choice("boundary", boundary, get_args(Boundary))
     check_choice("frame", frame, get_args(Frame))
-    return Measure(tuple(length_and_unit(vector)[1].tolist()), kind, boundary, frame)
+    return DirectionalMeasure(tuple(length_and_unit(vector)[1].tolist()), kind, boundary, frame)
 
 
 def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:

@@ -21,7 +21,7 @@ from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import checkpoint
 from stiffopt.model.compliance import Frame
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.equilibrium import Equilibrium, Loads, State
+from stiffopt.model.equilibrium import Equilibrium, EquilibriumState, Loads
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import strain_law
 from stiffopt.model.layout import free_tip_function, layout_of, numbers_of
@@ -249,7 +249,7 @@ class Arm:
         """Value of a function of the loaded shape at pressures (n,)."""
         return function(*self._equilibrium.arguments(self.settle(p)))[0]
 
-    def settle(self, p: Vector, nearby: State | None = None) -> State:
+    def settle(self, p: Vector, nearby: EquilibriumState | None = None) -> EquilibriumState:
         """Equilibrium of the loaded arm at pressures (n,), from rest or from a nearby one.
 
         What is found from a nearby one is not checked for stability.
@@ -391,14 +391,14 @@ class Evaluator:
     def __init__(self, arm: Arm, function: BatchFunction) -> None:
         self._arm = arm
         self._function = function
-        self._state: State | None = None
+        self._state: EquilibriumState | None = None
 
-    def restart(self, state: State | None = None) -> None:
+    def restart(self, state: EquilibriumState | None = None) -> None:
         """Forget the previous equilibrium, or continue from the given one."""
         self._state = state
 
     @property
-    def state(self) -> State | None:
+    def state(self) -> EquilibriumState | None:
         """Equilibrium at the last evaluation; None for an arm without loads."""
         return self._state
 

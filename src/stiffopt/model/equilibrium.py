@@ -42,7 +42,7 @@ class Loads(NamedTuple):
         return not (self.tip[3:].any() or self.station[3:].any())
 
 
-class State(NamedTuple):
+class EquilibriumState(NamedTuple):
     """An equilibrium: the tip's orientation (w, x, y, z), from which all else follows.
 
     `states` (7, k) hold orientation and moment after each integration step, which Newton's
@@ -60,7 +60,7 @@ class Path(NamedTuple):
 
     Attributes
     ----------
-    state : State
+    state : EquilibriumState
         The last one that was found.
     share : float
         Of the way that it is at; 1.0 means arrived.
@@ -68,7 +68,7 @@ class Path(NamedTuple):
         Whether the path ends because stability is lost there.
     """
 
-    state: State
+    state: EquilibriumState
     share: float
     unstable: bool
 
@@ -81,7 +81,7 @@ class Equilibrium:
         self._functions: dict[tuple[str, float | None], ca.Function] = {}
         self._rest: dict[tuple[bytes, float | None], Path] = {}
 
-    def arguments(self, state: State) -> tuple[Vector, ...]:
+    def arguments(self, state: EquilibriumState) -> tuple[Vector, ...]:
         """Numbers for the inputs of a `Chain` at an equilibrium."""
         x = np.concatenate([np.zeros(3), state.pressures, np.zeros(6)])
         return (state.quaternion, x, *state.loads)
@@ -99,7 +99,7 @@ class Equilibrium:
             self._functions[name, at] = function
         return self._functions[name, at]
 
-    def correct(self, guess: State, at: float | None = None) -> State | None:
+    def correct(self, guess: EquilibriumState, at: float | None = None) -> EquilibriumState | None:
         """Newton's method from a nearby state; None if that is not near.
 
         "Near" means that the first correction turns no part of the arm by more than a radian
@@ -121,7 +121,7 @@ class Equilibrium:
             previous = size
         return None
 
-    def is_stable(self, state: State, at: float | None = None) -> bool:
+    def is_stable(self, state: EquilibriumState, at: float | None = None) -> bool:
         """Whether an equilibrium is a minimum of the energy (Jacobi's condition).
 
         Follower loads and moments have no energy.  There what counts is that the arm has not
@@ -142,8 +142,8 @@ class Equilibrium:
 
     def follow(
         self,
-        start: State,
-        end: State,
+        start: EquilibriumState,
+        end: EquilibriumState,
         at: float | None = None,
         shortest: float = _SHORTEST_STEP,
         stable: bool = True,
@@ -169,7 +169,7 @@ class Equilibrium:
                 step, halved = step if halved else 2 * step, False
         return Path(state, 1.0, False)
 
-    def settle(self, pressures: Vector, loads: Loads, at: float | None = None) -> State:
+    def settle(self, pressures: Vector, loads: Loads, at: float | None = None) -> EquilibriumState:
         """Equilibrium reached from rest: first the arm's weight, then pressures and loads.
 
         Raises
@@ -192,7 +192,7 @@ class Equilibrium:
             raise EquilibriumError(_lost(share, what))
         return state
 
-    def _at_rest(self, gravity: Vector, at: float | None = None) -> State:
+    def _at_rest(self, gravity: Vector, at: float | None = None) -> EquilibriumState:
         """The unpressurised arm under its own weight and payload."""
         key = (gravity.tobytes(), at)
         if key not in self._rest:
@@ -201,7 +201,7 @@ class Equilibrium:
             steps = self._function("newton", at).size2_in(1)
             states = np.repeat(np.concatenate([upright, np.zeros(3)])[:, np.newaxis], steps, 1)
             pressures = np.zeros(self.shooting.n_variables)
-            straight = State(pressures, upright, states, none)
+            straight = EquilibriumState(pressures, upright, states, none)
             weighted = straight._replace(loads=none._replace(gravity=gravity))
             self._rest[key] = self.follow(straight, weighted, at)
         path = self._rest[key]
@@ -215,7 +215,7 @@ class Equilibrium:
             raise EquilibriumError(_lost(path.share, "its own weight and payload"))
         return path.state
 
-    def shape(self, state: State, stations: Vector, at: float | None = None) -> Vector:
+    def shape(self, state: EquilibriumState, stations: Vector, at: float | None = None) -> Vector:
         """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium with its load at `at`."""
         sections = [np.asarray(part) for part in self.shooting.sections(state.pressures)]
         length = self.shooting.description.length
@@ -266,7 +266,7 @@ def _lost(share: float, what: str) -> str:
     )
 
 
-def _between(start: State, end: State, share: float) -> tuple[Vector, Loads]:
+def _between(start: EquilibriumState, end: EquilibriumState, share: float) -> tuple[Vector, Loads]:
     """Pressures and loads at a share of the straight way between two states."""
 
     def mix(a: Vector, b: Vector) -> Vector:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt import lie
 from stiffopt.errors import InputError
 from stiffopt.model.arguments import (
-    Measure,
+    DirectionalMeasure,
     check_choice,
     checked_measure,
     checked_wrench,
@@ -352,7 +352,9 @@ def _is_table(direction: ArrayLike) -> TypeGuard[Sequence[ArrayLike]]:
     return len(shape) == 2 and shape[0] > 0
 
 
-def _measure(direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame) -> Measure:
+def _measure(
+    direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
+) -> DirectionalMeasure:
     """Checked directional stiffness; what was checked before is remembered."""
     values = direction.tolist() if isinstance(direction, np.ndarray) else direction
     if isinstance(values, list | tuple) and all(type(value) in (float, int) for value in values):
@@ -366,7 +368,7 @@ def _measure(direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame)
 _checked_before = lru_cache(maxsize=256)(checked_measure)
 
 
-def _stiffness_of(measure: Measure) -> Values:
+def _stiffness_of(measure: DirectionalMeasure) -> Values:
     def value(shape: Shape) -> Any:
         return stiffness_along(
             shape,

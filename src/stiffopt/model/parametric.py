@@ -9,11 +9,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.arguments import Measure
+from stiffopt.model.arguments import DirectionalMeasure
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.equilibrium import Equilibrium, Loads, State
+from stiffopt.model.equilibrium import Equilibrium, EquilibriumState, Loads
 from stiffopt.model.kinematics import body_jacobian
 from stiffopt.model.parameters import Parameter, parametric
 from stiffopt.model.shape import FreeShape, Shape, stiffness_along
@@ -66,7 +66,7 @@ class ParametricArm:
         self.parameters = tuple(parameters)
         self._actuation, self._coordinates = parametric(description, parameters)
         self._functions: dict[Hashable, InterpretedFunction] = {}
-        self._near: dict[Hashable, list[State]] = {}
+        self._near: dict[Hashable, list[EquilibriumState]] = {}
         self._equilibrium: Equilibrium | None = None
         self._loads = Loads(np.array(description.gravity), np.array(tip_load), np.zeros(12))
         if any(description.gravity) or any(tip_load):
@@ -95,7 +95,7 @@ class ParametricArm:
         return Poses(transforms, twists[..., :n], twists[..., n:])
 
     def stiffnesses(
-        self, pressures: Vector, coordinates: Vector, measure: Measure
+        self, pressures: Vector, coordinates: Vector, measure: DirectionalMeasure
     ) -> tuple[Vector, Vector, Vector]:
         """Stiffness of the tip (N,), its derivatives by pressures (N, n) and coordinates (N, k)."""
 
@@ -148,12 +148,12 @@ class ParametricArm:
             return self._equilibrium.shooting.chain(at)
         return FreeShape.of(self.description, self._actuation, at)
 
-    def _states(self, pressures: Vector, coordinates: Vector) -> list[State]:
+    def _states(self, pressures: Vector, coordinates: Vector) -> list[EquilibriumState]:
         """Equilibria (N,), each found from the one that this row had the last time."""
         assert self._equilibrium is not None
         loads = self._loads
         near = self._near.get(len(pressures), [])
-        states: list[State] = []
+        states: list[EquilibriumState] = []
         for row, p in enumerate(pressures):
             variables = np.concatenate([p, coordinates])
             start = near[row] if near else (states[-1] if states else None)

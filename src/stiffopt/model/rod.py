@@ -47,7 +47,7 @@ class RodPiece(NamedTuple):
     mass: float
 
 
-class _Place(NamedTuple):
+class _SectionPlace(NamedTuple):
     """Where a segment's section is: its kind, and where it begins in a, in da and in p."""
 
     kind: int
@@ -61,7 +61,7 @@ class RodFunctions(NamedTuple):
     """Functions of a layout for the integrator, and where each segment's section is."""
 
     functions: list[ca.Function]
-    places: list[_Place]
+    places: list[_SectionPlace]
     parts: int
     slopes: int
 
@@ -75,7 +75,7 @@ def rod_functions(layout: Layout) -> RodFunctions | None:
     arm = symbolic_arm(layout)
     kinds: dict[Hashable, int] = {}
     functions: list[ca.Function] = []
-    places: list[_Place] = []
+    places: list[_SectionPlace] = []
     parts, derivatives = [], []
     n_parts = n_slopes = start = 0
     segments = layout.example.segments
@@ -92,7 +92,7 @@ def rod_functions(layout: Layout) -> RodFunctions | None:
             kinds[key] = len(kinds)
             sparsities = [part.sparsity() for part in patterns]
             functions += _kind(kinds[key], sparsities, segment.n_channels)
-        places.append(_Place(kinds[key], n_parts, n_slopes, start, segment.n_channels))
+        places.append(_SectionPlace(kinds[key], n_parts, n_slopes, start, segment.n_channels))
         parts.append(a)
         derivatives.append(ca.vec(ca.densify(ca.jacobian(a, own))))
         n_parts += a.numel()

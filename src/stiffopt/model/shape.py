@@ -83,7 +83,7 @@ class PointOfArm:
 
 
 @dataclass(frozen=True)
-class Piece:
+class ShapePiece:
     """A soft stretch of constant strain, or a rigid one.
 
     Attributes
@@ -115,12 +115,12 @@ class FreeShape:
     ----------
     pressures : casadi.SX
         Those (n,) of the whole arm.
-    pieces : tuple of Piece
+    pieces : tuple of ShapePiece
         From the base to the station.
     """
 
     pressures: ca.SX
-    pieces: tuple[Piece, ...]
+    pieces: tuple[ShapePiece, ...]
 
     @classmethod
     def of(
@@ -139,9 +139,11 @@ class FreeShape:
                 left -= soft + rigid
             if _may_be_positive(soft):
                 motion, half = segment_pose(section, soft), segment_pose(section, soft / 2)
-                pieces.append(Piece(motion, half, own, section, soft))
+                pieces.append(ShapePiece(motion, half, own, section, soft))
             if _may_be_positive(rigid):
-                pieces.append(Piece(connector(rigid), connector(rigid / 2), own[:0], None, rigid))
+                pieces.append(
+                    ShapePiece(connector(rigid), connector(rigid / 2), own[:0], None, rigid)
+                )
         return cls(actuation.pressures, tuple(pieces))
 
     @property

@@ -95,7 +95,7 @@ SAME_STATION = 1e-12
 
 
 @dataclass(frozen=True)
-class Piece:
+class RodStretch:
     """A stretch of arm between two stations, integrated in equal steps from tip to base."""
 
     segment: int
@@ -298,9 +298,9 @@ class Chain:
 
 def pieces_of(
     description: RobotDescription, resolution: int, cuts: Sequence[float] = ()
-) -> list[Piece]:
+) -> list[RodStretch]:
     """The arm from tip to base, cut at the given arc lengths."""
-    pieces: list[Piece] = []
+    pieces: list[RodStretch] = []
     start, slack = 0.0, SAME_STATION * description.length
     for index, segment in enumerate(description.segments):
         for length, rigid in ((segment.length, False), (segment.connector, True)):
@@ -310,7 +310,7 @@ def pieces_of(
                 if far - near > slack:
                     longest = STEP_LENGTH * segment.outer_radius / resolution
                     steps = max(1, ceil((far - near) / longest - 1e-9))
-                    pieces.append(Piece(index, rigid, far - near, steps, far))
+                    pieces.append(RodStretch(index, rigid, far - near, steps, far))
             start = end
     return pieces[::-1]
 
@@ -358,7 +358,7 @@ class Shooting:
         """Number of what the sections depend on: pressures, and parameters if there are any."""
         return int(self.sections.numel_in(0))
 
-    def pieces(self, cuts: Sequence[float]) -> list[Piece]:
+    def pieces(self, cuts: Sequence[float]) -> list[RodStretch]:
         """The arm from tip to base, cut at the given arc lengths."""
         return pieces_of(self.description, self.resolution, cuts)
 

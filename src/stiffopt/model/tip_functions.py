@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.arguments import Measure
+from stiffopt.model.arguments import DirectionalMeasure
 from stiffopt.model.batch import is_shared
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import (
@@ -91,25 +91,25 @@ class TipFunctions:
             return self.one(name, p, self._numbers, *parameters)
         return self.many(name, p, self._numbers, *parameters)
 
-    def stiffness(self, p: Vector, measure: Measure) -> list[Vector]:
+    def stiffness(self, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
         """A directional stiffness (..., 1, 1), and margins (..., segments, 1)."""
         if measure.boundary == "free":
             return self.evaluate("stiffness", p, _load(measure))
         return self._in_blocks(self._held, p, measure)
 
-    def stiffness_gradient(self, p: Vector, measure: Measure) -> list[Vector]:
+    def stiffness_gradient(self, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
         """Its derivative (..., 1, n) by the pressures, and margins (..., segments, 1)."""
         if measure.boundary == "free":
             return self.evaluate("stiffness_gradient", p, _load(measure), np.ones(1))
         return self._in_blocks(self._held_gradient, p, measure)
 
-    def _held(self, call: _Call, p: Vector, measure: Measure) -> list[Vector]:
+    def _held(self, call: _Call, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
         compliance, margins = call("tip_compliance", p, self._numbers)
         pose, _ = call("tip_pose", p, self._numbers)
         value, _ = call("held_stiffness", compliance, pose, _held(measure))
         return [value, margins]
 
-    def _held_gradient(self, call: _Call, p: Vector, measure: Measure) -> list[Vector]:
+    def _held_gradient(self, call: _Call, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
         """``k = D' C_held^-1 D`` by way of the wrench ``W`` that moves the held tip by ``D``.
 
         Then ``dk = -W' dC W + 2 W' dD``, of which the former is that of a flexibility.
@@ -124,7 +124,10 @@ class TipFunctions:
         return [gradient, margins]
 
     def _in_blocks(
-        self, formula: Callable[[_Call, Vector, Measure], list[Vector]], p: Vector, measure: Measure
+        self,
+        formula: Callable[[_Call, Vector, DirectionalMeasure], list[Vector]],
+        p: Vector,
+        measure: DirectionalMeasure,
     ) -> list[Vector]:
         """A formula of several functions, with little memory for what goes between them."""
         if p.ndim == 1:
@@ -152,7 +155,7 @@ class TipFunctions:
 
 
 @lru_cache(maxsize=256)
-def _load(measure: Measure) -> Vector:
+def _load(measure: DirectionalMeasure) -> Vector:
     """Unit load (12,): a wrench in base axes and one in tip axes, of which one is zero."""
     start = (0 if measure.frame == "base" else 6) + (0 if measure.kind == "translation" else 3)
     load = np.zeros(12)
@@ -162,7 +165,7 @@ def _load(measure: Measure) -> Vector:
 
 
 @lru_cache(maxsize=256)
-def _held(measure: Measure) -> Vector:
+def _held(measure: DirectionalMeasure) -> Vector:
     """Unit direction (3,) in base axes and in tip axes, one of them zero, and two conditions."""
     own, none = measure.direction, (0.0, 0.0, 0.0)
     axes = (*own, *none) if measure.frame == "base" else (*none, *own)

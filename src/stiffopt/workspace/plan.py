@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.directions import direction_name
 from stiffopt.errors import EquilibriumError, InputError
-from stiffopt.model.arguments import Measure, checked_measure
+from stiffopt.model.arguments import DirectionalMeasure, checked_measure
 from stiffopt.model.compiled import BatchFunction, compiling_at_once, interpreted, library
 from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
 from stiffopt.model.manipulator import Manipulator
@@ -221,7 +221,7 @@ class MapPlan:
     """
 
     robot: Manipulator
-    measures: tuple[Measure, ...]
+    measures: tuple[DirectionalMeasure, ...]
     sampling: Sampling
     cell: float
 
@@ -376,7 +376,7 @@ class MapPlan:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _stiffness(shape: Shape, measure: Measure) -> Any:
+def _stiffness(shape: Shape, measure: DirectionalMeasure) -> Any:
     return directional_stiffness(
         shape.compliance,
         shape.rotation,
@@ -389,7 +389,7 @@ def _stiffness(shape: Shape, measure: Measure) -> Any:
 
 def _measures(
     directions: Iterable[ArrayLike], kind: Kind, boundary: Boundary, frame: Frame
-) -> tuple[Measure, ...]:
+) -> tuple[DirectionalMeasure, ...]:
     try:
         given = list(directions)
     except TypeError:
