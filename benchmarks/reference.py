@@ -103,7 +103,9 @@ class Reference:
     def _values(self, x: Vector) -> tuple[Vector, ...]:
         key = x.tobytes()
         if key not in self._cache:
-            self._cache = {key: self._checked(self._function(x * BAR, self._parameters))}
+            self._cache = {
+                key: self._checked(self._function(x * BAR, self.robot.parameters(self._parameters)))
+            }
         return self._cache[key]
 
     def _pose_values(self, x: Vector) -> tuple[Vector, ...]:
