@@ -458,7 +458,8 @@ def held(controller: TipController) -> list[Any]:
 def test_a_controller_that_refuses_is_as_before(controller: TipController) -> None:
     controller.set_task(TASK)
     before = held(controller)
-    goal = StiffnessGoal(maximise=(Turning(direction=(1.0, 0.0, 0.0)),))
+    turning = Turning(direction=(1.0, 0.0, 0.0))
+    goal = StiffnessGoal.model_construct(maximise=(turning,), at_least=(), match=None)
     low = TASK.model_copy(update={"pressure": PressureRange(min=2e5)})
     for task in (TASK.model_copy(update={"stiffness": goal}), low, None):
         with pytest.raises(InputError):
