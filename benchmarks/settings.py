@@ -61,6 +61,7 @@ NEAR_BEST = 5e-3
 SHARE_BEST = {1: 0.99, 2: 0.99, 3: 0.98}
 KIND_FACTOR, LOADED_FACTOR = 3.0, 10.0
 COMPILE_SECONDS = 3.0  # three segments
+FIRST_ANSWER = 1.5  # times what it takes without a compiler
 COMMAND_SECONDS = 0.8
 TIMES_REAL_TIME = 10.0  # of the simulated arm, two segments, full dynamics
 BATCH_SOLVES = 1500.0  # per second, two segments

@@ -260,4 +260,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
+    os.environ.setdefault("STIFFOPT_COMPILE", "wait")  # times and seeds are of compiled code
     sys.exit(main())
