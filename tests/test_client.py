@@ -244,22 +244,22 @@ def test_strangers_who_come_again_and_again_keep_the_tokens_holder_from_nothing(
     server = Server(create_app(loop, robot=ROBOT, token=TOKEN, heartbeat=30.0, patience=20.0))
     server.start()
 
-    def within_2_s(do: Callable[[], object]) -> None:
+    def soon(do: Callable[[], object]) -> None:
         begin = time.monotonic()
         do()
-        assert time.monotonic() - begin < 2
+        assert time.monotonic() - begin < 10  # half of the time that a stranger may take
 
     with Strangers(server, 100 if says == UPGRADE else 200, says):
         for _ in range(3):
             with Client(server.url, TOKEN, name="planner", heartbeat="manual") as client:
-                within_2_s(client.take_control)
+                soon(client.take_control)
                 stream = client.stream(rate=20)
-                within_2_s(stream.__enter__)
+                soon(stream.__enter__)
                 for _ in range(5):
-                    within_2_s(stream.state)
-                within_2_s(client.vent)
+                    soon(stream.state)
+                soon(client.vent)
                 stream.__exit__(None, None, None)
-                within_2_s(client.release)
+                soon(client.release)
     server.stop()
     assert loop.names.count("vent") == 3
 
