@@ -308,7 +308,9 @@ def test_two_labs_run_beside_each_other_and_without_anybody_at_the_terminal(
 
 def test_unknown_drivers_are_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["lab", str(RIGS / "sim.yaml"), "--supply", "steam"]) == 2
-    assert "modbus or nidaq" in capsys.readouterr().err
+    told = capsys.readouterr().err  # drivers of other tests may be known too
+    assert "modbus" in told
+    assert "nidaq" in told
 
 
 def test_faults_must_be_enabled() -> None:

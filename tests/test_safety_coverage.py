@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import subprocess
@@ -14,7 +15,7 @@ pytest.importorskip("coverage", reason="coverage is not installed; it is part of
 
 ROOT = Path(__file__).parents[1]
 GUARDING = {
-    "safety/gate.py": ("tests/test_safety.py", "tests/test_claim.py"),
+    "safety/gate.py": ("tests/test_safety.py", "tests/test_claim.py", "tests/test_goal.py"),
     "safety/goal.py": ("tests/test_goal.py",),
     "safety/claim.py": ("tests/test_claim.py",),
     "safety/guard.py": ("tests/test_guard.py",),
@@ -22,6 +23,16 @@ GUARDING = {
     "safety/vent_line.py": ("tests/test_vent_line.py",),
 }
 """Files that must be covered to the last line, and the tests that do so."""
+
+
+def lines_for_types(path: Path) -> set[int]:
+    """Lines that only a type checker reads: no test can run them."""
+    return {
+        line
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        for line in range(node.lineno - 1, (node.end_lineno or node.lineno) + 1)  # and a blank one
+    }
 
 
 @pytest.mark.parametrize("source", GUARDING)
@@ -43,5 +54,5 @@ def test_every_line_is_run(source: str, tmp_path: Path) -> None:
     (found,) = json.loads(report.read_text())["files"].values()
     assert found["summary"]["num_statements"] > 40
     assert found["missing_lines"] == []
-    assert found["excluded_lines"] == []
+    assert set(found["excluded_lines"]) <= lines_for_types(path)
     assert found["missing_branches"] == []
