@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import random
 from collections.abc import Sequence
 
@@ -440,16 +441,17 @@ class World:
 
 
 @pytest.mark.parametrize(("seed", "low"), [(1, 0.0), (2, 0.0), (3, 2e4), (4, -3e4)])
-def test_a_quarter_of_a_million_random_ticks(seed: int, low: float) -> None:
-    """Four of these are a million. `Recorder` judges every write, `World.judge` every state."""
+def test_random_ticks(seed: int, low: float) -> None:
+    """Long, these are a million ticks. `Recorder` judges every write, `World.judge` every state."""
     world = World(seed, low)
-    for _ in range(10):
+    parts = 10 if os.environ.get("STIFFOPT_LONG", "") not in ("", "0") else 3
+    for _ in range(parts):
         world.live(25_000)
         world.settle()
     ticks = sum(world.states.values())
-    assert ticks >= 250_000
+    assert ticks >= 25_000 * parts
     # it was no quiet time, and not spent in fault alone
-    assert world.faults > 300
+    assert world.faults > 30 * parts
     assert world.states[State.ACTIVE] > 0.2 * ticks
     assert min(world.states[s] for s in State if s is not State.UNCONFIGURED) > 0.01 * ticks
     assert world.unvented > 0
