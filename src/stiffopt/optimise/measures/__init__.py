@@ -1,27 +1,10 @@
 """The kinds of stiffness measures that a task may name: one file each, found by scanning."""
 
-from importlib import import_module
-from pkgutil import iter_modules
-
+from stiffopt.optimise.kinds import kinds_in
 from stiffopt.optimise.measure import Measure, Role
 
-
-def _found() -> tuple[type[Measure], ...]:
-    kinds = []
-    for file in iter_modules(__path__):
-        module = import_module(f"{__name__}.{file.name}")
-        kinds += [
-            kind
-            for kind in vars(module).values()
-            if isinstance(kind, type)
-            and issubclass(kind, Measure)
-            and kind.__module__ == module.__name__
-            and "role" in vars(kind)
-        ]
-    return tuple(kinds)
-
-
-MEASURES = _found()
+_FOUND = kinds_in(__name__, Measure)  # type: ignore[type-abstract]
+MEASURES = tuple(kind for kind in _FOUND if "role" in vars(kind))
 """All kinds of measures."""
 
 
