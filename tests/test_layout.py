@@ -182,6 +182,18 @@ def test_the_first_answer_does_not_wait_for_the_compiler(empty_cache):
     assert second.stiffness == pytest.approx(first.stiffness, rel=1e-4)
 
 
+def test_one_process_is_started_however_often_code_is_asked_for(empty_cache, monkeypatch):
+    started = []
+    monkeypatch.setattr(compiler, "start_background", lambda *request: started.append(request))
+    solver = so.PressureSolver(so.load_robot("stiff-flop-1"), one_segment_task())
+    with pytest.warns(so.SlowWarning, match="made in the background"):
+        assert not solver.is_compiled
+    for _ in range(3):
+        time.sleep(0.25)  # longer than it takes until the cache is looked at again
+        assert not solver.is_compiled
+    assert len(started) == 1
+
+
 def one_segment_task():
     target = so.Target(position=(0.01, 0.01, None))
     return so.Task(robot="stiff-flop-1", target=target, stiffness=TASK.stiffness)

@@ -81,6 +81,8 @@ _lock = threading.RLock()
 _loaded: dict[tuple[Path, str], Library | None] = {}
 _awaited: dict[Hashable, float] = {}  # code that another process makes, and when to look again
 _LOOK_AGAIN = 0.2  # s
+_begun: dict[tuple[Path, str], float] = {}  # when a process was started to make code
+_BEGUN_AGAIN_AFTER = 30.0  # s: such a process takes a second to start before it takes the lock
 _notified: set[str] = set()
 _in_foreground: ContextVar[bool] = ContextVar("in_foreground", default=False)
 _watch: ContextVar[Callable[[], None] | None] = ContextVar("watch", default=None)
@@ -215,7 +217,8 @@ def _is_made_in_background(
     if build.is_locked(cache / f"{key}.lock"):
         _notify_of_waiting()
         return True
-    if build.is_held_off(cache):
+    begun = _begun.get((cache, key), -math.inf)
+    if build.is_held_off(cache) or time.monotonic() < begun + _BEGUN_AGAIN_AFTER:
         return True
     try:
         request = pickle.dumps((text, make, tuple(sources), daqp))
@@ -227,6 +230,7 @@ def _is_made_in_background(
     except OSError as error:
         _notify(build.BuildError(f"no process can be started to make it ({error.strerror})"))
         return False
+    _begun[cache, key] = time.monotonic()
     _notify_of_waiting()
     return True
 
