@@ -496,15 +496,20 @@ def test_a_name_that_no_host_has() -> None:
             ZaberStage(ZaberStageSettings(host=host), 0.5, SystemClock())
 
 
-def test_a_stage_that_takes_one_connection_at_a_time(started: Any) -> None:
-    rig = started()
-    taken: list[float] = []
+def test_a_stage_that_takes_one_connection_at_a_time(
+    started: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attend, taken = ZaberPeer._attend, []
 
-    def is_free(*_: Any) -> bool:
+    async def take_one(self: ZaberPeer, reader: Any, writer: Any) -> None:
         taken.append(time.monotonic())
-        return len(taken) == 1 or taken[-1] - taken[-2] > 0.05  # it takes a moment to see the end
+        if len(taken) == 1 or taken[-1] - taken[-2] > 0.05:  # it takes a moment to see the end
+            await attend(self, reader, writer)
+        else:
+            writer.close()
 
-    rig.peer._stage._server.verify_request = is_free
+    monkeypatch.setattr(ZaberPeer, "_attend", take_one)
+    rig = started()
     with rig.probe as probe:
         assert probe.sample().position == pytest.approx(0, abs=MICROSTEP)
     assert len(taken) == 2

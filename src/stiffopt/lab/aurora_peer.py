@@ -8,29 +8,18 @@ have a header.
 
 from __future__ import annotations
 
-import contextlib
+import asyncio
 import os
-import select
 import struct
-import threading
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 import numpy as np
 
 from stiffopt.errors import DeviceError
-from stiffopt.lab.bench import Bench, DevicePeer, TrackerFrame
+from stiffopt.lab.bench import Bench, ServedPeer, TrackerFrame
 from stiffopt.rig.drivers.aurora import AuroraSettings
-
-__all__ = [
-    "AuroraPeer",
-    "NdiRefusedError",
-    "crc16",
-    "framed",
-    "hexadecimal",
-    "parse",
-    "pose_as_text",
-]
 
 FIRST_HANDLE = 0x0A  # that an Aurora gives to a wired tool
 SLOW = 0.2  # s, by which a slow device answers late
@@ -43,7 +32,7 @@ VERSION = (
 )
 
 
-class AuroraPeer(DevicePeer[AuroraSettings]):
+class AuroraPeer(ServedPeer[AuroraSettings]):
     """The tracker's control unit with one sensor or more, the bench's at the driver's port.
 
     Attributes
@@ -59,8 +48,6 @@ class AuroraPeer(DevicePeer[AuroraSettings]):
         self.firmware = firmware
         self.garble = False
         self._handles = [FIRST_HANDLE + i for i in range(settings.sensor)]
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
         self._speed = 9600
         self._forget()
 
@@ -69,8 +56,9 @@ class AuroraPeer(DevicePeer[AuroraSettings]):
         """Return settings with the simulated tracker's registration and latency."""
         return AuroraSettings(registration=simulated.registration, latency=simulated.latency)
 
-    def start(self) -> AuroraSettings:
-        """Make a pseudo-terminal and answer on it."""
+    @asynccontextmanager
+    async def _listening(self) -> AsyncIterator[AuroraSettings]:
+        """Answer on a pseudo-terminal."""
         try:
             import termios
             import tty
@@ -80,27 +68,21 @@ class AuroraPeer(DevicePeer[AuroraSettings]):
             ) from None
         self._attributes = termios.tcgetattr
         self._baud = {getattr(termios, f"B{speed}"): speed for speed in SPEEDS.values()}
-        self._stopping.clear()
         self._speed = 9600
         self._forget()
         self._master, self._slave = os.openpty()  # the slave is held, or the line would hang up
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self._woken, self._wake = os.pipe()
-        self._thread = threading.Thread(target=self._serve, name="aurora-peer", daemon=True)
-        self._thread.start()
-        return self.settings.model_copy(update={"port": os.ttyname(self._slave)})
-
-    def close(self) -> None:
-        """Stop answering; the pseudo-terminal is gone."""
-        if self._thread is None:
-            return
-        self._stopping.set()
-        os.write(self._wake, b"x")
-        self._thread.join()
-        self._thread = None
-        for fd in (self._master, self._slave, self._woken, self._wake):
-            os.close(fd)
+        try:
+            tty.setraw(self._slave)
+            reader = asyncio.StreamReader()
+            line, _ = await asyncio.get_running_loop().connect_read_pipe(
+                lambda: asyncio.StreamReaderProtocol(reader), os.fdopen(self._master, "rb", 0)
+            )
+            answering = asyncio.create_task(self._answer_all(reader))
+            yield self.settings.model_copy(update={"port": os.ttyname(self._slave)})
+            answering.cancel()
+            line.close()
+        finally:
+            os.close(self._slave)
 
     def _forget(self) -> None:
         self._initialised = False
@@ -110,29 +92,21 @@ class AuroraPeer(DevicePeer[AuroraSettings]):
 
     # The line -----------------------------------------------------------------------------------
 
-    def _serve(self) -> None:
-        received = b""
-        while not self._stopping.is_set():
-            readable, _, _ = select.select([self._master, self._woken], [], [])
-            if self._master not in readable:
-                continue
-            received += os.read(self._master, 4096)
-            *commands, received = received.split(b"\r")
-            for command in commands:
-                self._answer(command)
-            received = received[-1024:]
+    async def _answer_all(self, reader: asyncio.StreamReader) -> None:
+        while command := await reader.readuntil(b"\r"):
+            await self._answer(command[:-1])
 
-    def _answer(self, command: bytes) -> None:
+    async def _answer(self, command: bytes) -> None:
         fault = self.bench.fault("tracker")
         if fault == "off" or not self._hears():
             return
-        if fault == "slow" and self._stopping.wait(SLOW):
-            return
+        if fault == "slow":
+            await asyncio.sleep(SLOW)
         speed = self._speed
         reply = self._reply(command)
         if self.garble:
             reply = reply[:-2] + bytes([reply[-2] ^ 0x01]) + reply[-1:]
-        with contextlib.suppress(BlockingIOError):
+        with suppress(BlockingIOError):
             os.write(self._master, reply)
         if command.startswith(b"COMM") and reply.startswith(b"OKAY"):
             speed = SPEEDS[command.partition(b":")[2][:1].decode()]

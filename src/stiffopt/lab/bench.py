@@ -1,24 +1,26 @@
-"""The bench of the virtual lab: a simulated arm in real time, and the base of its devices."""
+"""The bench of the virtual lab: a simulated arm in real time, and the bases of its devices."""
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+from contextlib import AbstractAsyncContextManager, suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import InputError
+from stiffopt.errors import DeviceError, InputError
 from stiffopt.rig.device import DeviceSettings
 
 if TYPE_CHECKING:  # numba takes its time, and peers need none of it
     from stiffopt.plant.hardware import Frame
     from stiffopt.plant.world import World
-
-__all__ = ["FULL_SCALE", "Bench", "DevicePeer", "TrackerFrame"]
 
 Array = NDArray[np.float64]
 SettingsT = TypeVar("SettingsT", bound=DeviceSettings)
@@ -27,6 +29,7 @@ FULL_SCALE = 10e5
 """Pressure in Pa that a regulator of the lab reaches at full scale, as of a K8P at 10 V."""
 
 _TICK = 0.005  # s, at most, by which the world is behind
+_START = 5.0  # s, within which a device must listen, and within which it must have stopped
 
 
 @dataclass(frozen=True)
@@ -212,3 +215,57 @@ class DevicePeer(ABC, Generic[SettingsT]):
     @abstractmethod
     def close(self) -> None:
         """Stop listening and end every thread; to close twice does nothing."""
+
+
+class ServedPeer(DevicePeer[SettingsT]):
+    """A device that an event loop plays, in a thread of its own.
+
+    A subclass listens in `_listening`; what it does there runs in the loop and never blocks it.
+    """
+
+    def __init__(self, settings: SettingsT, bench: Bench) -> None:
+        super().__init__(settings, bench)
+        self._thread: threading.Thread | None = None
+        self._end: Callable[[], object] = lambda: None
+
+    def start(self) -> SettingsT:
+        """Start the loop; see `DevicePeer.start`."""
+        if self._thread is not None:
+            raise DeviceError(f"the {type(self).__name__} of the virtual lab runs already")
+        started: Future[SettingsT] = Future()
+        self._thread = threading.Thread(
+            target=self._run, args=(started,), name=type(self).__name__, daemon=True
+        )
+        self._thread.start()
+        try:
+            return started.result(_START)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Stop listening and end the loop; to close twice does nothing."""
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            with suppress(RuntimeError):  # the loop has ended by itself
+                self._end()
+            thread.join(_START)
+
+    @abstractmethod
+    def _listening(self) -> AbstractAsyncContextManager[SettingsT]:
+        """Listen in a context, which gives the settings that lead here; see `DevicePeer.start`."""
+
+    def _run(self, started: Future[SettingsT]) -> None:
+        try:
+            asyncio.run(self._serve(started))
+        except BaseException as error:
+            if started.done():
+                raise
+            started.set_exception(error)
+
+    async def _serve(self, started: Future[SettingsT]) -> None:
+        ending = asyncio.Event()
+        self._end = partial(asyncio.get_running_loop().call_soon_threadsafe, ending.set)
+        async with self._listening() as settings:
+            started.set_result(settings)
+            await ending.wait()

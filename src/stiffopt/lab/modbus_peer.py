@@ -5,16 +5,14 @@ from __future__ import annotations
 import asyncio
 import os
 import time
-from collections.abc import Sequence
-from concurrent.futures import Future
-from contextlib import suppress
-from threading import Thread
+from collections.abc import AsyncIterator, Sequence
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import Any
 
 import numpy as np
 
 from stiffopt.errors import DeviceError
-from stiffopt.lab.bench import FULL_SCALE, Bench, DevicePeer
+from stiffopt.lab.bench import FULL_SCALE, Bench, ServedPeer
 from stiffopt.rig.drivers.modbus import (
     ModbusSerial,
     ModbusSettings,
@@ -23,15 +21,12 @@ from stiffopt.rig.drivers.modbus import (
 )
 from stiffopt.rig.drivers.modbus_registers import PressureRegister
 
-__all__ = ["ModbusPeer"]
-
 LATE = 0.1  # s, by which a slow device's answers come late
 _TICK = 0.01  # s, between looks at the watchdog
 _COILS, _INPUTS = (1, 5, 15), 4  # function codes
-_START = 5.0  # s, within which the server must listen
 
 
-class ModbusPeer(DevicePeer[ModbusSettings]):
+class ModbusPeer(ServedPeer[ModbusSettings]):
     """A coupler with regulators on its outputs.
 
     What is written to set-points goes to the bench, readings come from it. An address that the
@@ -43,9 +38,6 @@ class ModbusPeer(DevicePeer[ModbusSettings]):
         super().__init__(settings, bench)
         self._memory = dict.fromkeys(self._holding(), 0)  # holding registers
         self._last_write: float | None = None
-        self._thread: Thread | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._stop: asyncio.Event | None = None
 
     @classmethod
     def stand_in(cls, simulated: Any, n: int) -> ModbusSettings:
@@ -59,57 +51,23 @@ class ModbusPeer(DevicePeer[ModbusSettings]):
             dump_valve={"coil": 0},
         )
 
-    def start(self) -> ModbusSettings:
-        """Listen on loopback or a pseudo-terminal; return the settings that lead here."""
-        pymodbus_library("pymodbus.server")
-        if self._thread is not None:
-            raise DeviceError(f"{self.settings.connection} of the virtual lab runs already")
-        self._fall()
-        started: Future[ModbusTcp | ModbusSerial] = Future()
-        self._thread = Thread(target=self._run, args=(started,), name="modbus-peer", daemon=True)
-        self._thread.start()
-        try:
-            connection = started.result(_START)
-        except BaseException:
-            self.close()
-            raise
-        kind = "tcp" if isinstance(connection, ModbusTcp) else "serial"
-        return self.settings.model_copy(update={kind: connection})
-
-    def close(self) -> None:
-        """Stop; to close twice does nothing."""
-        thread, self._thread = self._thread, None
-        if thread is None:
-            return
-        if self._loop is not None and self._stop is not None:
-            with suppress(RuntimeError):  # the loop has ended by itself
-                self._loop.call_soon_threadsafe(self._stop.set)
-        thread.join(_START)
-
     # server --------------------------------------------------------------------------------------
 
-    def _run(self, started: Future[ModbusTcp | ModbusSerial]) -> None:
-        try:
-            asyncio.run(self._serve(started))
-        except BaseException as error:
-            if started.done():
-                raise
-            started.set_exception(error)
-
-    async def _serve(self, started: Future[ModbusTcp | ModbusSerial]) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        terminals = _Terminals() if self.settings.serial is not None else None
-        try:
+    @asynccontextmanager
+    async def _listening(self) -> AsyncIterator[ModbusSettings]:
+        """Listen on loopback or a pseudo-terminal."""
+        self._fall()
+        async with AsyncExitStack() as stack:
+            terminals = None
+            if self.settings.serial is not None:
+                terminals = _Terminals()
+                stack.callback(terminals.close)
             server, connection = await self._listen(terminals)
-            watchdog = asyncio.create_task(self._watch())
-            started.set_result(connection)
-            await self._stop.wait()
-            watchdog.cancel()
-            await server.shutdown()
-            await asyncio.sleep(0)  # transports close in the next round
-        finally:
-            if terminals is not None:
-                terminals.close()
+            stack.push_async_callback(asyncio.sleep, 0)  # transports close in the next round
+            stack.push_async_callback(server.shutdown)
+            stack.callback(asyncio.create_task(self._watch()).cancel)
+            kind = "tcp" if isinstance(connection, ModbusTcp) else "serial"
+            yield self.settings.model_copy(update={kind: connection})
 
     async def _listen(self, terminals: _Terminals | None) -> tuple[Any, ModbusTcp | ModbusSerial]:
         servers = pymodbus_library("pymodbus.server")
@@ -170,10 +128,8 @@ class ModbusPeer(DevicePeer[ModbusSettings]):
     ) -> Any:
         """Carry out a request; pymodbus answers with what is left in ``registers``."""
         fault = self.bench.fault("supply")
-        if fault == "off":
-            return pymodbus_library(
-                "pymodbus.constants"
-            ).ExcCodes.DEVICE_FAILURE  # `_trace` keeps it back
+        if fault == "off":  # `_trace` keeps the answer back
+            return pymodbus_library("pymodbus.constants").ExcCodes.DEVICE_FAILURE
         if fault == "slow":
             await asyncio.sleep(LATE)
         if function in _COILS:

@@ -21,8 +21,6 @@ from stiffopt.lab.bench import FULL_SCALE, Bench, DevicePeer
 from stiffopt.rig.device import library
 from stiffopt.rig.drivers.nidaq import NidaqInput, NidaqOutput, NidaqSettings
 
-__all__ = ["DaqHardware", "DaqServer", "NidaqPeer", "local"]
-
 LATE = 0.3  # s after which a slow device answers
 THREADS = 8
 

@@ -6,19 +6,16 @@ moves, stops and watches one axis, and rejects the rest as the real device does.
 
 from __future__ import annotations
 
-import socket
-import socketserver
-from collections.abc import Callable
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
 from functools import partial
-from threading import Event, RLock, Thread
 from typing import Any, NamedTuple
 
 from stiffopt.errors import DeviceError
-from stiffopt.lab.bench import Bench, DevicePeer
+from stiffopt.lab.bench import Bench, DevicePeer, ServedPeer
 from stiffopt.lab.nidaq_peer import DaqHardware, DaqServer
 from stiffopt.rig.drivers.probe import SPEED_FACTOR, ZaberProbeSettings
-
-__all__ = ["ProbePeer", "ZaberPeer"]
 
 LATE = 0.3  # s after which a slow device answers
 
@@ -59,7 +56,7 @@ _BAD_COMMAND = _Answer("BADCOMMAND", accepted=False)
 _BAD_DATA = _Answer("BADDATA", accepted=False)
 
 
-class ZaberPeer(DevicePeer[ZaberProbeSettings]):
+class ZaberPeer(ServedPeer[ZaberProbeSettings]):
     """The stage of a probe; its middle of travel is where the bench has it aligned.
 
     Parameters
@@ -74,53 +71,43 @@ class ZaberPeer(DevicePeer[ZaberProbeSettings]):
         self._stage = stage
         self._middle = 0.5 * (stage.travel[0] + stage.travel[1])
         self._flags: set[str] = set() if homed else {_NOT_HOMED}
-        self._lock = RLock()
-        self._closing = Event()
-        self._server: _Server | None = None
-        self._thread: Thread | None = None
 
-    def start(self) -> ZaberProbeSettings:
-        """Listen, and return the settings with the address."""
-        on_loopback = self._stage.host in _LOOPBACK
-        port = self._stage.port if on_loopback else 0
+    @asynccontextmanager
+    async def _listening(self) -> AsyncIterator[ZaberProbeSettings]:
+        port = self._stage.port if self._stage.host in _LOOPBACK else 0
         try:
-            self._server = _Server(port, self._reply)
+            server = await asyncio.start_server(self._attend, "127.0.0.1", port)
         except OSError:
             raise DeviceError(
                 f"the virtual stage cannot listen on 127.0.0.1:{port}: the port is in use; end "
                 "what uses it, or remove 'host' to take a free one"
             ) from None
-        self._thread = Thread(
-            target=partial(self._server.serve_forever, poll_interval=0.05), name="zaber-peer"
-        )
-        self._thread.start()
-        host, port = self._server.socket.getsockname()
+        host, port = server.sockets[0].getsockname()
         stage = self._stage.model_copy(update={"host": host, "port": port, "serial": None})
-        return self.settings.model_copy(update={"stage": stage})
+        yield self.settings.model_copy(update={"stage": stage})
+        server.close()
 
-    def close(self) -> None:
-        """Stop listening, end all connections and threads."""
-        self._closing.set()
-        server, self._server = self._server, None
-        if server is not None:
-            server.shutdown()
-            server.end_connections()
-            server.server_close()
-        if self._thread is not None:
-            self._thread.join()
+    async def _attend(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer the lines of a connection."""
+        try:
+            with suppress(OSError, ValueError):  # the other side has gone, or sends no lines
+                async for line in reader:
+                    if text := line.decode("ascii", "replace").strip():
+                        writer.write((await self._reply(text)).encode())
+        finally:
+            writer.close()
 
-    def _reply(self, line: str) -> str | None:
-        """Return the answer to a line, or None where the device keeps silent."""
+    async def _reply(self, line: str) -> str:
+        """Return the answer to a line; empty where the device keeps silent."""
         fault = self.bench.fault("probe")
         if fault == "slow":
-            self._closing.wait(LATE)
+            await asyncio.sleep(LATE)
         request = _parsed(line)
         if fault == "off" or request is None or request.device not in (0, self._stage.device):
-            return None
-        with self._lock:
-            answer = self._carry_out(request)
-            status = "BUSY" if self.bench.stage_moving else "IDLE"
-            flag = max(self._flags, default="--")  # WR outranks NI
+            return ""
+        answer = self._carry_out(request)
+        status = "BUSY" if self.bench.stage_moving else "IDLE"
+        flag = max(self._flags, default="--")  # WR outranks NI
         number = f" {request.number}" if request.number else ""
         verdict = "OK" if answer.accepted else "RJ"
         text = f"{self._stage.device:02d} {request.axis}{number} {verdict} {status} {flag}"
@@ -219,50 +206,6 @@ def _parsed(line: str) -> _Request | None:
         numbers.append(words.pop(0))
     device, axis, number = [*numbers, *["0", "0", ""][len(numbers) :]]
     return _Request(int(device), int(axis), number, words)
-
-
-class _Server(socketserver.ThreadingTCPServer):
-    """A thread for each connection, all of which can be ended."""
-
-    allow_reuse_address = True  # else the port stays taken for a minute after each run
-
-    def __init__(self, port: int, reply: Callable[[str], str | None]) -> None:
-        self.reply = reply
-        self._connections: set[socket.socket] = set()
-        super().__init__(("127.0.0.1", port), _Handler)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Remember a connection, and serve it."""
-        request.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._connections.add(request)
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        """Forget a connection that has ended."""
-        self._connections.discard(request)
-        super().shutdown_request(request)
-
-    def end_connections(self) -> None:
-        """Shut all connections, so that their threads end."""
-        for connection in list(self._connections):
-            try:
-                connection.shutdown(socket.SHUT_RDWR)
-            except OSError:  # it has just ended by itself
-                continue
-
-
-class _Handler(socketserver.StreamRequestHandler):
-    server: _Server
-
-    def handle(self) -> None:
-        try:
-            for line in self.rfile:
-                if text := line.decode("ascii", "replace").strip():
-                    reply = self.server.reply(text)
-                    if reply is not None:
-                        self.wfile.write(reply.encode())
-        except OSError:
-            return  # the other side has gone
 
 
 class ProbePeer(DevicePeer[ZaberProbeSettings]):

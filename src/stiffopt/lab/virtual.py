@@ -15,8 +15,6 @@ from stiffopt.rig.config import RigDescription, limits_of
 from stiffopt.rig.device import DeviceSettings
 from stiffopt.rig.registry import driver_class, driver_names, load, one_of
 
-__all__ = ["VirtualLab", "with_real_devices"]
-
 
 def with_real_devices(
     description: RigDescription, robot: RobotDescription, **drivers: str

@@ -18,16 +18,6 @@ from stiffopt.plant.rod import DiscreteRod
 from stiffopt.plant.settings import Mismatch, PlantSettings
 from stiffopt.registration import Placement
 
-__all__ = [
-    "ChannelEffects",
-    "draw",
-    "make_channels",
-    "make_material",
-    "make_memory",
-    "make_rod",
-    "node_at",
-]
-
 Array = NDArray[np.float64]
 
 _ON_RING = 6  # fibres on each of two rings

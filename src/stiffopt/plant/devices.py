@@ -26,14 +26,6 @@ from stiffopt.rig.interface import (
     Rig,
 )
 
-__all__ = [
-    "SimulatedProbe",
-    "SimulatedRig",
-    "SimulatedSupply",
-    "SimulatedTracker",
-    "simulated_rig",
-]
-
 Array = NDArray[np.float64]
 
 _TICK = 0.005  # s, at which a moving stage is looked after
@@ -42,9 +34,13 @@ _TICK = 0.005  # s, at which a moving stage is looked after
 class SimulatedSupply(PressureSupply):
     """Regulators of a simulated arm."""
 
+    is_simulated = True
+
     def __init__(self, world: World, limits: PressureLimits, clock: Clock) -> None:
         super().__init__(limits, clock)
         self._world = world
+        self.has_watchdog = world.supply.watchdog is not None
+        self.has_dump_valve = world.supply.dump_valve
 
     def _open(self) -> None:
         self._answer()
@@ -61,21 +57,6 @@ class SimulatedSupply(PressureSupply):
     def endpoints(self) -> tuple[str, ...]:
         """None: every rig has a world of its own."""
         return ()
-
-    @property
-    def is_simulated(self) -> bool:
-        """It is."""
-        return True
-
-    @property
-    def has_watchdog(self) -> bool:
-        """Whether the rig file gives it one."""
-        return self._world.supply.watchdog is not None
-
-    @property
-    def has_dump_valve(self) -> bool:
-        """Whether the rig file gives it one."""
-        return self._world.supply.dump_valve
 
     def _write(self, pressures: Array) -> None:
         if pressures.any():

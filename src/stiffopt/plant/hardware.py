@@ -22,8 +22,6 @@ from stiffopt.plant.settings import (
     SimulatedTrackerSettings,
 )
 
-__all__ = ["Camera", "Frame", "Regulators", "SimulatedStage", "regulate"]
-
 Array = NDArray[np.float64]
 Compiled = Any  # an array of floats in compiled code; numba infers the rest
 

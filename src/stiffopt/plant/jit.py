@@ -17,8 +17,6 @@ from typing import Any, TypeVar
 
 from stiffopt.errors import MissingExtraError, SlowWarning
 
-__all__ = ["jit", "tell_if_new"]
-
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
 _REORDER = {"contract", "reassoc", "arcp", "nsz"}  # but NaN and infinity stay what they are

@@ -36,8 +36,6 @@ from stiffopt.plant.material import FibreMemory, Scheme
 from stiffopt.plant.rod import RodLoads, contact_energy, contact_force, depth_of
 from stiffopt.plant.settings import PlantLoad, PlantSettings
 
-__all__ = ["Energies", "Plant", "SimulationError"]
-
 Array = NDArray[np.float64]
 
 _STILL = 1e-3  # s; step for stiffness to motions so fast that nothing creeps or slips

@@ -35,24 +35,6 @@ from stiffopt.units import (
     TranslationalStiffness,
 )
 
-__all__ = [
-    "FAULT_SIZES",
-    "Discretisation",
-    "FaultSizes",
-    "LabSettings",
-    "Mismatch",
-    "PlantLoad",
-    "PlantSettings",
-    "Silicone",
-    "SiliconeCreep",
-    "SiliconeHysteresis",
-    "SimulatedProbeSettings",
-    "SimulatedSupplySettings",
-    "SimulatedTrackerSettings",
-    "Spread",
-    "plant_of",
-]
-
 Positive = Field(gt=0)
 NotNegative = Field(ge=0)
 Share = Annotated[Ratio, Field(ge=0, le=1)]
@@ -271,6 +253,7 @@ class SimulatedSupplySettings(SupplySettings):
     """
 
     simulated: ClassVar[bool] = True
+    simulator: ClassVar[str] = "stiffopt.plant.devices:simulated_rig"
 
     driver: Literal["simulated"] = "simulated"
     dead_time: Annotated[Duration, Field(ge=0, le=1)] = 0.01
@@ -283,12 +266,6 @@ class SimulatedSupplySettings(SupplySettings):
     leak: Annotated[Duration, Positive] | None = None
     watchdog: Annotated[Duration, Positive] | None = None
     dump_valve: bool = False
-
-    def simulated_rig(self, description: Any, robot: RobotDescription, **options: Any) -> Any:
-        """Return the rig of a simulated arm, see `stiffopt.plant.devices.simulated_rig`."""
-        from stiffopt.plant.devices import simulated_rig  # here: numba takes its time
-
-        return simulated_rig(description, robot, **options)
 
 
 class SimulatedTrackerSettings(TrackerSettings):

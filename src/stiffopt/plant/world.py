@@ -26,8 +26,6 @@ from stiffopt.plant.settings import (
 )
 from stiffopt.rig.interface import Clock, PressureLimits
 
-__all__ = ["FAULTS", "World", "WorldClock"]
-
 Array = NDArray[np.float64]
 
 FAULTS = {

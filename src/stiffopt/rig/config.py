@@ -5,11 +5,18 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError, ValidationInfo
+from pydantic import (
+    BeforeValidator,
+    Field,
+    SerializeAsAny,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import InitErrorDetails
 
 from stiffopt.errors import FileError, InputError, dotted
@@ -26,16 +33,6 @@ from stiffopt.rig.settings import ControlSettings, LogSettings, Safety, ServiceS
 from stiffopt.rig.tracking import TrackerSettings
 from stiffopt.schema import BadKeyError, Schema, explain
 from stiffopt.units import Frequency, read_from_file
-
-__all__ = [
-    "LogSettings",
-    "RigDescription",
-    "Safety",
-    "limits_of",
-    "load_rig_description",
-    "registration_of",
-    "slew_of",
-]
 
 _SECTIONS = {
     "plant": "stiffopt.plant.settings:PlantSettings",
@@ -122,6 +119,19 @@ class RigDescription(Schema):
     plant: Annotated[SerializeAsAny[RigSection] | None, _section("plant")] = None
     lab: Annotated[SerializeAsAny[RigSection] | None, _section("lab")] = None
 
+    @model_validator(mode="after")
+    def _simulated_or_real(self) -> Self:
+        devices = {"supply": self.supply, "tracker": self.tracker, "probe": self.probe}
+        simulated = [name for name, device in devices.items() if device and device.simulated]
+        real = [name for name, device in devices.items() if device and not device.simulated]
+        if simulated and real:
+            raise BadKeyError(
+                simulated[0],
+                f"is simulated and the {real[0]} is not; a simulated arm has simulated devices "
+                "only ('stiffopt lab' puts a simulated arm behind real protocols)",
+            )
+        return self
+
 
 def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
     """Read a rig file and check it against its robot.
@@ -169,9 +179,9 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
                 f"({robot.channel_name(index)})",
                 *("supply", "channels", index, "max"),
             )
-    for key, highest, unit, factor in (
-        ("max_pressure", robot.pressure_max, "bar", 1e-5),
-        ("max_slew", robot.pressure_slew, "bar/s", 1e-5),
+    for key, highest, unit in (
+        ("max_pressure", robot.pressure_max, "bar"),
+        ("max_slew", robot.pressure_slew, "bar/s"),
     ):
         value = getattr(description.safety, key)
         if value is None:
@@ -182,7 +192,7 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
         for index, (given, limit) in enumerate(zip(values, highest or values, strict=True)):
             if given > limit * (1 + 1e-9):
                 raise MisfitError(
-                    f"{given * factor:g} {unit} is above the robot's {limit * factor:g} {unit} "
+                    f"{given * 1e-5:g} {unit} is above the robot's {limit * 1e-5:g} {unit} "
                     f"({robot.channel_name(index)})",
                     "safety",
                     key,
@@ -206,15 +216,6 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
     for part in (tracker, description.probe, supply, description.plant, description.lab):
         if part is not None:
             part.check_against(description, robot)
-    devices = {"supply": supply, "tracker": tracker, "probe": description.probe}
-    simulated = [name for name, device in devices.items() if device and device.simulated]
-    real = [name for name, device in devices.items() if device and not device.simulated]
-    if simulated and real:
-        raise MisfitError(
-            f"is simulated and the {real[0]} is not; a simulated arm has simulated devices only "
-            "('stiffopt lab' puts a simulated arm behind real protocols)",
-            simulated[0],
-        )
 
 
 def limits_of(description: RigDescription, robot: RobotDescription) -> PressureLimits:

@@ -14,17 +14,6 @@ from stiffopt.errors import DeviceError, InputError, MissingExtraError
 from stiffopt.model.description import RobotDescription
 from stiffopt.schema import Schema
 
-__all__ = [
-    "Clock",
-    "Device",
-    "DeviceSettings",
-    "MisfitError",
-    "Opened",
-    "RigSection",
-    "SystemClock",
-    "library",
-]
-
 
 class Clock(ABC):
     """Base of the clocks of a rig."""

@@ -13,8 +13,6 @@ from contextlib import suppress
 
 from stiffopt.errors import DeviceError
 
-__all__ = ["serial_endpoints", "tcp_endpoints"]
-
 _THIS_MACHINE = "this machine"
 
 

@@ -7,25 +7,13 @@ import sys
 import threading
 from abc import abstractmethod
 from dataclasses import dataclass, field
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import CommandError, DeviceError, InputError
-from stiffopt.model.description import RobotDescription
 from stiffopt.rig.device import Clock, Device, DeviceSettings
-
-__all__ = [
-    "PressureCommand",
-    "PressureLimits",
-    "PressureReading",
-    "PressureSupply",
-    "Supply",
-    "SupplySettings",
-    "total_force",
-    "vent_at_exit",
-]
 
 Array = NDArray[np.float64]
 
@@ -221,23 +209,46 @@ class Supply(Device):
 
     @abstractmethod
     def arm(self) -> None:
-        """Take commands from now on; all set-points are 0 then."""
+        """Take commands from now on; all set-points are 0 then.
+
+        Raises
+        ------
+        CommandError
+            This supply may not be armed, see `check_arming`.
+        DeviceError
+            The device did not take it; the supply is not armed.
+        """
 
     @abstractmethod
     def command(self, pressures: ArrayLike | PressureCommand) -> None:
-        """Set the pressures (n,), in Pa."""
+        """Set the pressures (n,), in Pa.
+
+        Raises
+        ------
+        CommandError
+            Wrong number, not finite, out of range, expired, or the supply is not armed: nothing
+            has changed.
+        DeviceError
+            The device did not take it, or held something else than it was told before.
+        """
 
     @abstractmethod
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
-        """Set the pressures (n,), in Pa, and read the measured ones."""
+        """Set the pressures (n,), in Pa, and read the measured ones; raises as `command` does."""
 
     @abstractmethod
     def read(self) -> PressureReading:
-        """Read the measured pressures."""
+        """Read the measured pressures; raise `DeviceError` if the device does not answer."""
 
     @abstractmethod
     def vent(self) -> None:
-        """Let all pressure out at once; no pressure is taken until `arm`."""
+        """Let all pressure out at once; no pressure is taken until `arm`.
+
+        Raises
+        ------
+        DeviceError
+            The device did not take it.
+        """
 
 
 class SupplySettings(DeviceSettings):
@@ -246,7 +257,14 @@ class SupplySettings(DeviceSettings):
     A subclass has the key ``channels`` with an item for each channel of the robot. Where such an
     item has ``min`` or ``max``, in Pa, no supply that `device` returns commands less or more,
     whatever its driver does.
+
+    Attributes
+    ----------
+    simulator : of a supply that is `simulated`, the ``module:function`` that makes the rig of the
+        whole simulated arm, see `stiffopt.rig.assembly.make_rig`.
     """
+
+    simulator: ClassVar[str] = ""
 
     def device(self, limits: PressureLimits, clock: Clock | None = None) -> PressureSupply:
         """Return the supply, not yet open, limited to what rig and channels allow.
@@ -286,13 +304,6 @@ class SupplySettings(DeviceSettings):
                 raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
         return PressureLimits(low, high)
 
-    def simulated_rig(self, description: Any, robot: RobotDescription, **options: Any) -> Any:
-        """Return the `Rig` of a whole simulated arm; only for settings that are `simulated`.
-
-        See `stiffopt.rig.assembly.make_rig`, which passes on limits, slew and kind of time.
-        """
-        raise NotImplementedError(f"{type(self).__name__} simulates nothing")
-
     def _make(self, limits: PressureLimits, clock: Clock | None) -> PressureSupply:
         """Return the supply, not yet open, with these limits."""
         raise NotImplementedError(f"{type(self).__name__} makes no supply")
@@ -312,7 +323,19 @@ class PressureSupply(Supply):
 
     It knows nothing of rates, forces and other programs: those are the business of
     `stiffopt.safety`, in front of it.
+
+    Attributes
+    ----------
+    is_simulated : whether nobody can be hurt by it.
+    has_watchdog : whether the device vents by itself when no command comes any more.
+    has_dump_valve : whether `vent` also opens a valve that needs no regulator's cooperation.
+    patience : seconds that one call may take at most, while the device answers within its timeout.
     """
+
+    is_simulated: bool = False
+    has_watchdog: bool = False
+    has_dump_valve: bool = False
+    patience: float = 1.0
 
     def __init__(self, limits: PressureLimits, clock: Clock | None = None) -> None:
         super().__init__(clock)
@@ -337,26 +360,6 @@ class PressureSupply(Supply):
             The address cannot be resolved.
         """
         return (f"{type(self).__module__}.{type(self).__qualname__}",)
-
-    @property
-    def is_simulated(self) -> bool:
-        """Whether nobody can be hurt by it."""
-        return False
-
-    @property
-    def has_watchdog(self) -> bool:
-        """Whether the device vents by itself when no command comes any more."""
-        return False
-
-    @property
-    def has_dump_valve(self) -> bool:
-        """Whether `vent` also opens a valve that needs no regulator's cooperation."""
-        return False
-
-    @property
-    def patience(self) -> float:
-        """Seconds that one call may take at most, while the device answers within its timeout."""
-        return 1.0
 
     @property
     def limits(self) -> PressureLimits:
@@ -420,31 +423,14 @@ class PressureSupply(Supply):
                 super().close()
 
     def command(self, pressures: ArrayLike | PressureCommand) -> None:
-        """Set the pressures (n,), in Pa, until they are set again: a device keeps no time.
-
-        Raises
-        ------
-        CommandError
-            Wrong number, not finite, out of range, expired, or the supply is not armed: nothing
-            was written.
-        DeviceError
-            The device did not take it, or held something else than it was told before.
-        """
+        """Set the pressures (n,), in Pa, until they are set again: a device keeps no time."""
         with self._lock:
             checked = self._checked(pressures)
             self._look_for_others()
             self._write_clamped(checked)
 
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
-        """Set the pressures and read the measured ones, in one exchange where the device can.
-
-        Raises
-        ------
-        CommandError
-            As for `command`: nothing was written.
-        DeviceError
-            The device did not take it, does not answer, or held something else than it was told.
-        """
+        """Set the pressures and read the measured ones, in one exchange where the device can."""
         with self._lock:
             last = self.limits.clamp(self._checked(pressures))
             self._look_for_others()
@@ -456,25 +442,13 @@ class PressureSupply(Supply):
             return self._reading(values)
 
     def read(self) -> PressureReading:
-        """Read the measured pressures.
-
-        Raises
-        ------
-        DeviceError
-            The device does not answer.
-        """
+        """Read the measured pressures (n,), in Pa."""
         with self._lock:
             self._must_be_open()
             return self._reading(self._read())
 
     def vent(self) -> None:
-        """Open the dump valve, where there is one, and set all channels to 0 Pa.
-
-        Raises
-        ------
-        DeviceError
-            The device did not take it.
-        """
+        """Open the dump valve, where there is one, and set all channels to 0 Pa."""
         with self._lock:
             self._must_be_open()
             self._armed = False
@@ -492,11 +466,6 @@ class PressureSupply(Supply):
         """Take commands from now on, and close the dump valve, which `vent` opens.
 
         All set-points are 0 then: that was written before the valve closed.
-
-        Raises
-        ------
-        DeviceError
-            The device did not take it; the supply is not armed.
         """
         with self._lock:
             self._must_be_open()

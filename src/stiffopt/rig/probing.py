@@ -8,8 +8,6 @@ from dataclasses import dataclass
 
 from stiffopt.rig.device import Clock, Device, DeviceSettings
 
-__all__ = ["ForceProbe", "ForceSample", "ProbeSettings"]
-
 
 @dataclass(frozen=True)
 class ForceSample:

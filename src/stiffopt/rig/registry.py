@@ -24,8 +24,6 @@ from stiffopt.rig.pressure import SupplySettings
 from stiffopt.rig.probing import ProbeSettings
 from stiffopt.rig.tracking import TrackerSettings
 
-__all__ = ["KINDS", "driver_class", "driver_names", "load", "one_of"]
-
 KINDS: dict[str, type[DeviceSettings]] = {
     "supply": SupplySettings,
     "tracker": TrackerSettings,

@@ -10,8 +10,6 @@ from stiffopt.model.description import PerChannelPressure, PerChannelRate
 from stiffopt.schema import Schema
 from stiffopt.units import Duration, Force, Length, Ratio, Speed
 
-__all__ = ["ControlSettings", "LogSettings", "Safety", "ServiceSettings"]
-
 
 def _none(value: Any) -> Any:
     """Read the word ``none`` as None, which a file cannot say otherwise."""

@@ -16,15 +16,6 @@ from stiffopt.registration import Registration
 from stiffopt.rig.device import Clock, Device, DeviceSettings
 from stiffopt.units import Duration, Length
 
-__all__ = [
-    "PoseSample",
-    "PoseTracker",
-    "RawPose",
-    "StreamedSettings",
-    "StreamedTracker",
-    "TrackerSettings",
-]
-
 Array = NDArray[np.float64]
 
 _QUEUED = 4096  # samples that a tracker keeps until they are read; the oldest go first

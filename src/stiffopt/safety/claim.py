@@ -18,8 +18,6 @@ from threading import Lock
 
 from stiffopt.errors import DeviceError
 
-__all__ = ["Claim", "address_of"]
-
 _WAIT = 1.0  # s; a program that is just ending still vents for some tens of milliseconds
 _AGAIN = 0.02  # s between two attempts
 

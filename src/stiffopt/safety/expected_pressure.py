@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.settings import ControlSettings
 
-__all__ = ["ExpectedPressure", "Regulation"]
-
 Array = NDArray[np.float64]
 
 _TOLD = 1000  # commands kept, at most, while a dead time passes

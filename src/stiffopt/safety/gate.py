@@ -29,16 +29,6 @@ from stiffopt.safety.claim import Claim
 from stiffopt.safety.settings import COMMANDS
 from stiffopt.safety.vent_line import guards_of
 
-__all__ = [
-    "Applied",
-    "Outlet",
-    "SafetyGate",
-    "check_protection",
-    "effective_slew",
-    "gate_before",
-    "let_down",
-]
-
 Array = NDArray[np.float64]
 
 

@@ -30,8 +30,6 @@ from stiffopt.safety.settings import COMMANDS
 if TYPE_CHECKING:
     from stiffopt.safety.guard_client import GuardLink
 
-__all__ = ["GoalFollower", "GoalSupply", "TickingClock", "check_goal"]
-
 Array = NDArray[np.float64]
 
 _EXPIRED = (

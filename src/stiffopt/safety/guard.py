@@ -54,8 +54,6 @@ from stiffopt.safety.realtime import real_time
 from stiffopt.safety.settings import GUARD
 from stiffopt.safety.vent_line import VentLine
 
-__all__ = ["Guard", "main"]
-
 _ASKED = "asked to"
 _POSES = 200  # tracker samples per packet
 _LONGEST = 500  # characters of a text: an answer must fit into one packet

@@ -48,8 +48,6 @@ from stiffopt.safety.messages import (
 from stiffopt.safety.rescue import GuardWatch
 from stiffopt.safety.settings import CLIENT
 
-__all__ = ["Exchange", "GuardLink", "GuardProcess"]
-
 Array = NDArray[np.float64]
 
 _START_SLICE = 0.05  # s between looks at a guard that starts

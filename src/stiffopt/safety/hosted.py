@@ -35,15 +35,6 @@ from stiffopt.safety.vent_line import VentLine
 if TYPE_CHECKING:
     from stiffopt.safety.guard_client import GuardLink
 
-__all__ = [
-    "ForwardedProbe",
-    "ForwardedTracker",
-    "HostedDevices",
-    "Owned",
-    "owned",
-    "simulated_endpoint",
-]
-
 _LOOK = 0.005  # s between two looks at a stage that moves
 
 

@@ -22,19 +22,6 @@ from numpy.typing import NDArray
 
 from stiffopt.rig.interface import PoseSample
 
-__all__ = [
-    "JSON",
-    "CommandFrame",
-    "GuardAnswer",
-    "GuardChannel",
-    "GuardNotice",
-    "GuardRequest",
-    "Message",
-    "TrackedPoses",
-    "json_line",
-    "unpack",
-]
-
 Array = NDArray[np.float64]
 
 _LARGEST = 1 << 16  # bytes in a packet

@@ -13,8 +13,6 @@ from stiffopt.safety.expected_pressure import ExpectedPressure, Regulation
 from stiffopt.safety.settings import MONITOR
 from stiffopt.safety.shortage import Shortage, SupplyLine
 
-__all__ = ["PressureMonitor", "Trouble"]
-
 Array = NDArray[np.float64]
 
 

@@ -14,8 +14,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["RealTimeReport", "real_time", "tidy"]
-
 _SWITCH_INTERVAL = 5e-4  # s, after which another thread of this interpreter may run
 _CURRENT, _FUTURE, _ON_FAULT = 1, 2, 4  # of mlockall
 _SET_TIMER_SLACK, _GET_TIMER_SLACK = 29, 30  # of prctl

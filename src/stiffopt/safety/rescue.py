@@ -18,8 +18,6 @@ from stiffopt.safety.settings import CLIENT
 if TYPE_CHECKING:
     from stiffopt.safety.guard_client import GuardLink
 
-__all__ = ["GuardWatch", "vent_directly"]
-
 _log = logging.getLogger(__name__)
 
 

@@ -24,8 +24,6 @@ from stiffopt.safety.goal import GoalFollower, GoalSupply, TickingClock
 from stiffopt.safety.guard_client import GuardLink
 from stiffopt.safety.hosted import ForwardedProbe, ForwardedTracker
 
-__all__ = ["gated_rig", "guarded_rig", "open_rig", "rig_for_programs"]
-
 
 def open_rig(path: str | os.PathLike[str], *, real_time: bool = False) -> Rig:
     """Return the rig that a rig file describes; nothing is connected before `Rig.open`.

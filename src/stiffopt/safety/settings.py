@@ -9,17 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = [
-    "CLIENT",
-    "COMMANDS",
-    "GUARD",
-    "MONITOR",
-    "ClientTiming",
-    "CommandRules",
-    "GuardTiming",
-    "MonitorRules",
-]
-
 
 @dataclass(frozen=True)
 class CommandRules:

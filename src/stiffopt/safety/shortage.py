@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from stiffopt.safety.settings import MONITOR
 
-__all__ = ["Shortage", "SupplyLine"]
-
 Array = NDArray[np.float64]
 
 

@@ -17,8 +17,6 @@ from stiffopt.safety.hosted import simulated_endpoint
 from stiffopt.safety.rescue import vent_directly
 from stiffopt.safety.vent_line import SocketPeer, ask_to_vent, trusted
 
-__all__ = ["vent_rig"]
-
 _PATIENCE = 3.0  # s in which a guard must have vented, beyond the time that its driver needs
 _CALLS = 4  # driver calls, at most, that venting takes
 _GONE = 2.0  # s in which a killed process must be gone

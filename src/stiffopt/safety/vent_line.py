@@ -24,8 +24,6 @@ from pathlib import Path
 
 from stiffopt.safety.claim import address_of
 
-__all__ = ["Caller", "Reply", "SocketPeer", "VentLine", "ask_to_vent", "guards_of", "trusted"]
-
 _WORD = b"vent"
 _BACKLOG = 64
 _AT_ONCE = 64  # callers that are accepted in one step

@@ -18,8 +18,6 @@ from stiffopt.errors import DeviceError, MissingExtraError
 from stiffopt.rig.interface import Clock, StreamedSettings, StreamedTracker
 from stiffopt.units import Duration, Frequency
 
-__all__ = ["AuroraSettings", "AuroraTracker"]
-
 _READER = Path(__file__).with_name("ndi_reader.py")
 _END = 0.9  # s that the reader is given to end by itself
 _BETWEEN_TRIES = 0.5  # s before a lost device is looked for again

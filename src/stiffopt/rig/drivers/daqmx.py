@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import importlib
 import time
+from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from threading import Lock
+from contextlib import contextmanager, suppress
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -22,23 +22,6 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from stiffopt.errors import DeviceError, InputError, shown
 from stiffopt.rig.device import library
 from stiffopt.schema import items_of
-
-__all__ = [
-    "Address",
-    "AnalogueInput",
-    "AnalogueOutput",
-    "Daqmx",
-    "DigitalOutput",
-    "InputChannel",
-    "InputName",
-    "LineName",
-    "OutputName",
-    "Pair",
-    "SilentError",
-    "Terminals",
-    "WatchdogExpiredError",
-    "WatchdogTask",
-]
 
 Array = NDArray[np.float64]
 ItemT = TypeVar("ItemT")
@@ -92,23 +75,8 @@ class SilentError(DeviceError):
     """The server has not answered, or not in time."""
 
 
-class _LeftTasks:
-    """Tasks that could not be closed, by the address of the server that holds them."""
-
-    def __init__(self) -> None:
-        self._handles: dict[str, list[Any]] = {}
-        self._lock = Lock()
-
-    def add(self, address: str, handle: Any) -> None:
-        with self._lock:
-            self._handles.setdefault(address, []).append(handle)
-
-    def take(self, address: str) -> list[Any]:
-        with self._lock:
-            return self._handles.pop(address, [])
-
-
-_left = _LeftTasks()
+_left: dict[str, deque[Any]] = defaultdict(deque)
+"""Tasks that could not be closed, by the address of the server that holds them."""
 
 
 class Daqmx:
@@ -156,28 +124,24 @@ class Daqmx:
     def leave(self, handle: Any) -> None:
         """Keep in mind a task that the server did not close, by nidaqmx's name for it."""
         if self._address and handle is not None:
-            _left.add(self._address, handle)
+            _left[self._address].append(handle)
 
     def _close_left(self, address: str) -> None:
-        handles = _left.take(address)
-        if not handles:
+        if not _left[address]:
             return
         interpreter = importlib.import_module("nidaqmx._grpc_interpreter").GrpcStubInterpreter(
             self.options["grpc_options"]
         )
-        try:
-            while handles:
+        with suppress(IndexError):
+            while handle := _left[address].pop():  # each is closed by one thread
                 try:
                     with self.errors("closing a task that was left behind"):
-                        interpreter.clear_task(handles[-1])
+                        interpreter.clear_task(handle)
                 except SilentError:
+                    _left[address].append(handle)
                     raise
                 except DeviceError:
-                    pass  # the server has started anew and does not know it
-                handles.pop()
-        finally:
-            for handle in handles:
-                _left.add(address, handle)
+                    continue  # the server has started anew and does not know it
 
     @property
     def options(self) -> dict[str, Any]:

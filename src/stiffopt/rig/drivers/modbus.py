@@ -10,6 +10,7 @@ import logging
 import struct
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from threading import RLock
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -36,16 +37,6 @@ from stiffopt.rig.endpoints import serial_endpoints, tcp_endpoints
 from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration
-
-__all__ = [
-    "ModbusLine",
-    "ModbusRefusedError",
-    "ModbusSerial",
-    "ModbusSettings",
-    "ModbusSupply",
-    "ModbusTcp",
-    "pymodbus_library",
-]
 
 Array = NDArray[np.float64]
 Registers = dict[int, tuple[int, ...]]
@@ -218,7 +209,7 @@ class ModbusSettings(SupplySettings):
         """Where each channel's command can be read back."""
         pairs = zip(self.channels, self.setpoints, strict=True)
         return tuple(
-            point if c.setpoint.read_back is None else point.at(c.setpoint.read_back)
+            point if c.setpoint.read_back is None else replace(point, address=c.setpoint.read_back)
             for c, point in pairs
         )
 
@@ -280,22 +271,15 @@ class ModbusSupply(PressureSupply):
         self._measured = runs_of(self._readings.items())
         self._joint = self._joint_run() if settings.read_write else None
         self._told: Registers | None = None  # what the device must hold; None: that is not known
+        self.has_watchdog = settings.watchdog is not None
+        self.has_dump_valve = settings.dump_valve is not None
+        requests = len(self._written) + len(self._verified) + len(self._measured) + 1
+        self.patience = requests * settings.timeout
 
     @property
     def endpoints(self) -> tuple[str, ...]:
         """The address of the device; its unit does not count, for many devices ignore it."""
         return self.settings.connection.endpoints()
-
-    @property
-    def has_watchdog(self) -> bool:
-        """Whether the rig file names one."""
-        return self.settings.watchdog is not None
-
-    @property
-    def patience(self) -> float:
-        """An answer to each request of an exchange."""
-        requests = len(self._written) + len(self._verified) + len(self._measured) + 1
-        return requests * self.settings.timeout
 
     def prepare(self) -> None:
         """Import pymodbus, which takes a third of a second."""
@@ -458,11 +442,6 @@ class ModbusSupply(PressureSupply):
         return measured
 
     # dump valve ----------------------------------------------------------------------------------
-
-    @property
-    def has_dump_valve(self) -> bool:
-        """Whether the rig file names one."""
-        return self.settings.dump_valve is not None
 
     def _dump(self, *, open_valve: bool) -> None:
         valve = self.settings.dump_valve

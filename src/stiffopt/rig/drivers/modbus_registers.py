@@ -15,24 +15,6 @@ from stiffopt.errors import InputError
 from stiffopt.schema import BadKeyError, Items, Schema, items_of
 from stiffopt.units import Duration, Number, Pressure, finite_number, parse_quantity, read_from_file
 
-__all__ = [
-    "Address",
-    "ModbusChannel",
-    "ModbusDumpValve",
-    "ModbusWatchdog",
-    "PressureRegister",
-    "PressureScale",
-    "ReadingRegister",
-    "RegisterRun",
-    "RegisterTable",
-    "RegisterType",
-    "RegisterValue",
-    "SetPointRegister",
-    "WordOrder",
-    "runs_of",
-    "values_of",
-]
-
 ItemT = TypeVar("ItemT")
 Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
@@ -246,10 +228,6 @@ class PressureRegister:
     def addresses(self) -> range:
         """Its registers."""
         return range(self.address, self.address + self.width)
-
-    def at(self, address: int) -> PressureRegister:
-        """Return the same at another address."""
-        return PressureRegister(address, self.table, self.type, self.word_order, self.scale)
 
     def pressure_range(self) -> tuple[float, float]:
         """Lowest and highest pressure that can be written, in Pa."""

@@ -30,15 +30,6 @@ from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, Supply
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Pressure, Voltage
 
-__all__ = [
-    "NidaqChannel",
-    "NidaqDumpValve",
-    "NidaqInput",
-    "NidaqOutput",
-    "NidaqSettings",
-    "NidaqSupply",
-]
-
 Array = NDArray[np.float64]
 
 
@@ -194,12 +185,6 @@ class NidaqSettings(SupplySettings):
         return NidaqSupply(self, limits, clock)
 
 
-def _places(server: str) -> tuple[str, ...]:
-    """Return the endpoints of a gRPC server, ``host:port``."""
-    host, _, port = server.rpartition(":")
-    return tcp_endpoints(host.strip("[]"), int(port))
-
-
 class NidaqSupply(PressureSupply):
     """Regulators on NI-DAQ devices: one task for all outputs, one for all inputs."""
 
@@ -213,44 +198,28 @@ class NidaqSupply(PressureSupply):
         self._highest = np.array([max(output.volts) for output in outputs])
         self._read_backs = [i for i, output in enumerate(outputs) if output.read_back is not None]
         self._vented = np.array([output.volts_for(0.0) for output in outputs])
+        self.has_watchdog = settings.watchdog is not None  # which opens the dump valve
+        self.has_dump_valve = settings.dump_valve is not None
+        self.patience = 3 * settings.timeout  # outputs, valve and inputs have a deadline each
 
     @property
     def endpoints(self) -> tuple[str, ...]:
         """The devices whose outputs it has, on this machine or behind a server."""
-        address = self._settings.grpc
         names = sorted({c.output.channel.split("/")[0].lower() for c in self._settings.channels})
-        places = ("ni-daq",) if address is None else _places(address)
+        places: tuple[str, ...] = ("ni-daq",)
+        if self._settings.grpc is not None:
+            host, _, port = self._settings.grpc.rpartition(":")
+            places = tcp_endpoints(host.strip("[]"), int(port))
         return tuple(f"{place} {name}" for place in places for name in names)
-
-    @property
-    def has_watchdog(self) -> bool:
-        """Whether the device opens the dump valve by itself."""
-        return self._settings.watchdog is not None
-
-    @property
-    def patience(self) -> float:
-        """Outputs, valve and inputs have a deadline each."""
-        return 3 * self._settings.timeout
-
-    @property
-    def has_dump_valve(self) -> bool:
-        """Whether there is one."""
-        return self._settings.dump_valve is not None
 
     def _open(self) -> None:
         settings = self._settings
         with ExitStack() as stack:
             daq = Daqmx(settings.grpc, settings.timeout, settings.extra)
             stack.callback(daq.close)
-            self._outputs = AnalogueOutput(
-                daq,
-                [
-                    (channel.output.channel, low, high)
-                    for channel, low, high in zip(
-                        settings.channels, self._lowest, self._highest, strict=True
-                    )
-                ],
-            )
+            names = [channel.output.channel for channel in settings.channels]
+            ranges = list(zip(names, self._lowest, self._highest, strict=True))
+            self._outputs = AnalogueOutput(daq, ranges)
             stack.callback(self._outputs.close)
             try:
                 self._open_rest(daq, stack)
@@ -338,10 +307,7 @@ class NidaqSupply(PressureSupply):
 
     def _dump(self, *, open_valve: bool) -> None:
         if self._valve is not None:
-            if open_valve:
-                self._valve.open()
-            else:
-                self._valve.shut()
+            (self._valve.open if open_valve else self._valve.shut)()
 
 
 class _Valve:

@@ -18,8 +18,6 @@ from stiffopt.rig.device import library
 from stiffopt.rig.interface import Clock, StreamedSettings, StreamedTracker
 from stiffopt.units import Duration
 
-__all__ = ["OpenIGTLinkSettings", "OpenIGTLinkTracker", "SenderClock", "pyigtl_messages"]
-
 _HEADER = 58  # bytes before the body of a message
 _LONGEST = 64 * 2**20  # bytes of a body; a longer one means that the stream is not understood
 _BETWEEN_TRIES = 0.5  # s before a lost server is called again

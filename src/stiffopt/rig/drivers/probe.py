@@ -31,16 +31,6 @@ from stiffopt.rig.interface import Clock, ForceProbe, ForceSample, ProbeSettings
 from stiffopt.schema import BadKeyError, Schema
 from stiffopt.units import Duration, Force, ForcePerVoltage, Length, Speed, Voltage
 
-__all__ = [
-    "SPEED_FACTOR",
-    "ForceSensorSettings",
-    "ZaberProbe",
-    "ZaberProbeSettings",
-    "ZaberStage",
-    "ZaberStageSettings",
-    "ask_at_the_terminal",
-]
-
 SPEED_FACTOR = 1.6384
 """Zaber's native units of speed for one microstep per second."""
 
