@@ -27,7 +27,7 @@ import pytest
 from fake_bench import FakeBench
 from stiffopt.errors import DeviceError, InputError, MissingExtraError
 from stiffopt.lab.aurora_peer import AuroraPeer, crc16
-from stiffopt.rig.drivers import aurora, ndi_reader
+from stiffopt.rig.drivers import ndi_reader
 from stiffopt.rig.drivers.aurora import AuroraSettings, AuroraTracker
 from stiffopt.rig.interface import PoseSample, SystemClock
 
@@ -560,7 +560,7 @@ def test_the_port_is_found_by_its_maker(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_missing_library(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(aurora, "find_spec", lambda name: None)
+    monkeypatch.setattr("stiffopt.errors.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"ndicapi.*stiffopt\[aurora\]"):
         AuroraSettings(driver="aurora").device().open()
 

@@ -19,7 +19,7 @@ from pydantic import ValidationError
 
 from fake_bench import FakeBench
 from stiffopt.errors import CommandError, DeviceError, InputError, MissingExtraError
-from stiffopt.lab.nidaq_peer import DaqHardware, DaqServer, NidaqPeer
+from stiffopt.lab.nidaq_peer import DaqServer, NidaqPeer
 from stiffopt.rig.drivers.daqmx import (
     AnalogueInput,
     AnalogueOutput,
@@ -114,12 +114,10 @@ class Wires:
         self.out: dict[str, float] = {}
         self.into = {"Dev1/ai0": 0.5, "Dev1/ai1": 0.5}
         self.server = DaqServer(
-            DaqHardware(
-                outputs={f"Dev2/ao{i}": self._writer(f"Dev2/ao{i}") for i in range(2)},
-                inputs={name: self._reader(name) for name in self.into},
-            ),
             None,
             "nidaq",
+            outputs={f"Dev2/ao{i}": self._writer(f"Dev2/ao{i}") for i in range(2)},
+            inputs={name: self._reader(name) for name in self.into},
         )
 
     def _writer(self, name: str) -> Callable[[float], None]:
@@ -234,13 +232,11 @@ def test_the_level_of_the_line() -> None:
     levels: list[bool] = []
     for closed_when in ("high", "low"):
         server = DaqServer(
-            DaqHardware(
-                outputs={f"Dev2/ao{i}": lambda volts: None for i in range(2)},
-                inputs={f"Dev1/ai{i}": lambda: 0.5 for i in range(2)},
-                lines={VALVE["line"]: levels.append},
-            ),
             None,
             "nidaq",
+            outputs={f"Dev2/ao{i}": lambda volts: None for i in range(2)},
+            inputs={f"Dev1/ai{i}": lambda: 0.5 for i in range(2)},
+            lines={VALVE["line"]: levels.append},
         )
         valve = {**VALVE, "closed_when": closed_when}
         with settings(grpc=server.start(), dump_valve=valve).device(LIMITS) as supply:

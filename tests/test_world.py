@@ -343,10 +343,10 @@ def test_the_world_is_the_same_in_large_and_small_steps(dynamics: str) -> None:
             rig.command([4e4, 1e5, 0])
             rig.clock.sleep_until(0.3)
             probe.align([1, 0, 0])
-            rig.world.move_stage(0.004, 0.01)
+            rig.world.stage.move(0.004, 0.01)
             while rig.clock.now() < 1.0:
                 rig.clock.sleep_until(min(1.0, rig.clock.now() + every))
-            ends.append((rig.world.plant.tip_pose(), rig.tracker.latest, rig.world.force()))  # type: ignore[union-attr]
+            ends.append((rig.world.plant.tip_pose(), rig.tracker.latest, rig.world.stage.force()))  # type: ignore[union-attr]
     for tip, sample, force in ends[1:]:
         np.testing.assert_allclose(tip, ends[0][0], atol=1e-9)
         np.testing.assert_allclose(sample.position, ends[0][1].position, atol=1e-9)
@@ -427,15 +427,15 @@ def test_the_force_does_not_jump_when_the_stage_stops() -> None:
         assert probe is not None
         probe.align([1, 0, 0])
         probe.move_to(0.003, 0.02)
-        rig.world.move_stage(0.0050001, 0.02)
+        rig.world.stage.move(0.0050001, 0.02)
         forces = []
-        while rig.world.stage_moving:
+        while rig.world.stage.speed:
             rig.clock.sleep(0.001)
             forces.append(probe.sample().force)
         for _ in range(5):
             rig.clock.sleep(0.001)
             forces.append(probe.sample().force)
-        assert rig.world.stage_position == 0.0050001
+        assert rig.world.stage.position == 0.0050001
         assert np.abs(np.diff(forces, 2)).max() < 0.05 * max(forces)  # no kink but the stop itself
 
 

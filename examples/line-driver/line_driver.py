@@ -75,21 +75,13 @@ class LineSupply(PressureSupply):
         super().__init__(limits, clock)
         self._settings = settings
         self._connection: socket.socket | None = None
+        self.has_watchdog = settings.watchdog is not None
+        self.patience = (self.n + 3) * settings.timeout  # connect, watchdog, each channel, read
 
     @property
     def endpoints(self) -> tuple[str, ...]:
         """The device's address, by which only one program can claim it."""
         return tcp_endpoints(self._settings.host, self._settings.port)
-
-    @property
-    def has_watchdog(self) -> bool:
-        """Whether the rig file switches the device's watchdog on."""
-        return self._settings.watchdog is not None
-
-    @property
-    def patience(self) -> float:
-        """To connect, start the watchdog, set each channel and read."""
-        return (self.n + 3) * self._settings.timeout
 
     def _open(self) -> None:
         self._ask("VENT")

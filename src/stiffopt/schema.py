@@ -15,7 +15,7 @@ from pydantic_core import ErrorDetails
 
 from stiffopt.errors import InputError, Loc, dotted, shown
 
-__all__ = ["BadKeyError", "Items", "Schema", "Vector", "explain", "items_of"]
+__all__ = ["BadKeyError", "Items", "Pair", "Schema", "Vector", "explain", "items_of"]
 
 ItemT = TypeVar("ItemT")
 
@@ -72,6 +72,8 @@ Items = Annotated[tuple[ItemT, ...], BeforeValidator(_as_tuple)]
 """A list in the file, a tuple in code."""
 Vector = Annotated[tuple[ItemT, ItemT, ItemT], BeforeValidator(items_of(3))]
 """Three items: x, y, z."""
+Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
+"""Two items: low and high, or two points of a line."""
 
 
 # pydantic's errors to sentences ------------------------------------------------------------------

@@ -53,9 +53,9 @@ class TrackerFrame:
 class Bench:
     """The simulated arm and its devices, kept going by a thread between `start` and `close`.
 
-    Every method may be called by any thread. Peers carry the faults of their device over to the
-    wire: when `fault` is ``off`` they do not answer at all, when it is ``slow`` they answer late.
-    All other faults (``stuck``, ``garbage``, ``wrong``) show in what the methods return.
+    Every method may be called by any thread. Of the faults, a peer plays two itself: it does not
+    answer at all while `fault` is ``off``, and answers late while it is ``slow``. All others
+    (``stuck``, ``garbage``, ``wrong``) show in what the methods return.
 
     Parameters
     ----------
@@ -135,31 +135,31 @@ class Bench:
         with self.world.lock:
             self.world.catch_up()
             self._mounted_at = self.stage_position
-            self.world.mount_stage(tuple(direction))
+            self.world.stage.mount(tuple(direction))
 
     @property
     def stage_position(self) -> float:
         """Place of the probe's stage along its axis, in m."""
-        return self._mounted_at + self.world.stage_position
+        return self._mounted_at + self.world.stage.position
 
     @property
     def stage_moving(self) -> bool:
         """Whether the stage moves."""
-        return self.world.stage_moving
+        return self.world.stage.speed > 0
 
     def stage_move(self, position: float, speed: float) -> None:
         """Let the stage start to move, to a place in m at a speed in m/s."""
         with self.world.lock:
             self.world.catch_up()
-            self.world.move_stage(position - self._mounted_at, speed)
+            self.world.stage.move(position - self._mounted_at, speed)
 
     def stage_stop(self) -> None:
         """Stop the stage."""
-        self.world.stop_stage()
+        self.world.stage.stop()
 
     def force(self) -> float:
         """Force that the probe's sensor feels, in N."""
-        return self.world.force()
+        return self.world.stage.force()
 
 
 class DevicePeer(ABC, Generic[SettingsT]):
@@ -195,6 +195,11 @@ class DevicePeer(ABC, Generic[SettingsT]):
             It has no settings that go without saying.
         """
         raise InputError(f"{cls.__name__} needs settings in the rig file")
+
+    @staticmethod
+    def on_loopback(host: str | None) -> bool:
+        """Say whether a host is this machine's own address: the lab listens nowhere else."""
+        return host is not None and (host == "localhost" or host.startswith("127."))
 
     @abstractmethod
     def start(self) -> SettingsT:

@@ -80,7 +80,9 @@ class ModbusPeer(ServedPeer[ModbusSettings]):
             )
             await _begin(server, f"the pseudo-terminal {terminals.inner} cannot be opened")
             return server, line.model_copy(update={"port": terminals.outer})
-        host, port = _address(self.settings.tcp or ModbusTcp(host="localhost", port=0))
+        tcp = self.settings.tcp
+        port = tcp.port if tcp is not None and self.on_loopback(tcp.host) else 0
+        host = "127.0.0.1"
         server = servers.ModbusTcpServer(self._device(), address=(host, port), **options)
         await _begin(server, f"port {port} of {host} is in use; give another one or 0 for any")
         return server, ModbusTcp(host=host, port=server.transport.sockets[0].getsockname()[1])
@@ -226,12 +228,6 @@ async def _begin(server: Any, failure: str) -> None:
         await server.serve_forever(background=True)
     except RuntimeError:  # pymodbus has logged why and does not say it
         raise DeviceError(failure) from None
-
-
-def _address(asked: ModbusTcp) -> tuple[str, int]:
-    """Return where to listen: where asked, if that is on loopback, else on any free port there."""
-    local = asked.host == "localhost" or asked.host.startswith("127.")
-    return ("127.0.0.1", asked.port if local else 0)
 
 
 def _counts(point: PressureRegister, pressure: float) -> tuple[int, ...]:

@@ -36,25 +36,6 @@ _RESET_EXPIRED = (-200644, "Watchdog timer cannot be reset because it has expire
 _BAD_ATTRIBUTE = (-200233, "Specified property is not supported by the device.")
 _START, _STOP, _ABORT = 0, 1, 6
 _FEED, _CLEAR = 0, 1
-_LOOPBACK = ("127.0.0.1", "localhost")
-
-
-@dataclass(frozen=True)
-class DaqHardware:
-    """What is wired to an emulated NI-DAQ device.
-
-    Attributes
-    ----------
-    outputs : takes the volts of each analogue output.
-    inputs : gives those of each analogue input.
-    lines : takes the level of each digital line.
-    fault : of the device: ``ok``, ``off``, ``slow`` and others.
-    """
-
-    outputs: Mapping[str, Callable[[float], None]] = field(default_factory=dict)
-    inputs: Mapping[str, Callable[[], float]] = field(default_factory=dict)
-    lines: Mapping[str, Callable[[bool], None]] = field(default_factory=dict)
-    fault: Callable[[], str] = lambda: "ok"
 
 
 class _NiError(Exception):
@@ -107,20 +88,35 @@ class _Watchdog:
 
 
 class DaqServer:
-    """Serves the hardware until it is closed.
+    """An emulated NI-DAQ device behind NI's gRPC server, until it is closed.
 
     Parameters
     ----------
-    hardware :
-        What is wired.
     address :
         To listen on, on this machine; None: any free port.
+    extra :
+        Of stiffopt that brings nidaqmx, for the message when it is missing.
+    outputs, inputs, lines :
+        What takes the volts of each analogue output, gives those of each analogue input, and takes
+        the level of each digital line.
+    fault :
+        Returns the fault of the device: ``ok``, ``off``, ``slow`` and others.
     """
 
-    def __init__(self, hardware: DaqHardware, address: str | None, extra: str) -> None:
-        self._hardware = hardware
+    def __init__(
+        self,
+        address: str | None,
+        extra: str,
+        *,
+        outputs: Mapping[str, Callable[[float], None]] | None = None,
+        inputs: Mapping[str, Callable[[], float]] | None = None,
+        lines: Mapping[str, Callable[[bool], None]] | None = None,
+        fault: Callable[[], str] = lambda: "ok",
+    ) -> None:
         self._wanted = address
         self._extra = extra
+        self._outputs, self._inputs, self._lines = outputs or {}, inputs or {}, lines or {}
+        self._fault = fault
         self._sessions: dict[str, _Session] = {}
         self._locked = False  # by a watchdog that has expired: digital writes are refused
         self._lock = RLock()
@@ -212,7 +208,7 @@ class DaqServer:
 
     def _answers(self, context: Any) -> bool:
         """Say whether the call is answered; while the device is off, wait until nobody listens."""
-        fault = self._hardware.fault()
+        fault = self._fault()
         if fault == "slow":
             self._closing.wait(LATE)
         while fault == "off" and context.is_active() and not self._closing.wait(0.02):
@@ -247,9 +243,9 @@ class DaqServer:
 
     def _add(self, request: Any, kind: str, channel: str) -> dict[str, Any]:
         known: Mapping[str, Any] = {
-            "ao": self._hardware.outputs,
-            "ai": self._hardware.inputs,
-            "do": self._hardware.lines,
+            "ao": self._outputs,
+            "ai": self._inputs,
+            "do": self._lines,
         }[kind]
         session = self._session(request)
         if channel not in known or session.kind not in ("", kind):
@@ -285,13 +281,13 @@ class DaqServer:
             if not low <= volts <= high:
                 raise _NiError(*_OUT_OF_RANGE)
         for channel, volts in zip(session.channels, values, strict=True):
-            self._hardware.outputs[channel](volts)
+            self._outputs[channel](volts)
         return {"samps_per_chan_written": 1}
 
     def _read(self, request: Any) -> dict[str, Any]:
         session = self._session(request)
         self._must_be_free(session)
-        volts = [self._hardware.inputs[channel]() for channel in session.channels]
+        volts = [self._inputs[channel]() for channel in session.channels]
         pairs = zip(volts, session.ranges, strict=True)  # the converter saturates
         clipped = [min(max(value, low), high) for value, (low, high) in pairs]
         return {"read_array": clipped, "samps_per_chan_read": 1}
@@ -301,7 +297,7 @@ class DaqServer:
         if self._locked:
             raise _NiError(*_WRITE_EXPIRED)
         for line, level in zip(session.channels, request.write_array, strict=True):
-            self._hardware.lines[line](bool(level))
+            self._lines[line](bool(level))
         return {"samps_per_chan_written": 1}
 
     def _create_watchdog(self, request: Any) -> dict[str, Any]:
@@ -311,11 +307,11 @@ class DaqServer:
         with self._lock:
             self._locked = True
             for line, level in states.items():
-                self._hardware.lines[line](level)
+                self._lines[line](level)
 
     def _expiration(self, request: Any) -> dict[str, Any]:
         lines = [name.strip() for name in request.channel_names.split(",")]
-        if any(line not in self._hardware.lines for line in lines):
+        if any(line not in self._lines for line in lines):
             raise _NiError(*_CHANNEL_MISSING)
         levels = [state == _HIGH for state in request.expir_state_array]
         self._watchdog(request).states = dict(zip(lines, levels, strict=True))
@@ -372,13 +368,6 @@ class LastingThreads(Executor):
             job()
 
 
-def local(address: str | None) -> str | None:
-    """Return an address if it is on this machine: the lab listens nowhere else."""
-    if address is None or address.rpartition(":")[0] not in _LOOPBACK:
-        return None
-    return f"127.0.0.1:{address.rpartition(':')[2]}"
-
-
 class NidaqPeer(DevicePeer[NidaqSettings]):
     """An NI-DAQ device with regulators, and a dump valve where the settings name one.
 
@@ -388,7 +377,10 @@ class NidaqPeer(DevicePeer[NidaqSettings]):
     def __init__(self, settings: NidaqSettings, bench: Bench) -> None:
         super().__init__(settings, bench)
         self._volts = {c.output.channel: c.output.volts_for(0.0) for c in settings.channels}
-        hardware = DaqHardware(
+        host, _, port = (settings.grpc or "").rpartition(":")
+        self._server = DaqServer(
+            f"127.0.0.1:{port}" if self.on_loopback(host) else None,
+            settings.extra,
             outputs={
                 channel.output.channel: partial(self._set, index, channel.output)
                 for index, channel in enumerate(settings.channels)
@@ -397,7 +389,6 @@ class NidaqPeer(DevicePeer[NidaqSettings]):
             lines=self._lines(),
             fault=partial(bench.fault, "supply"),
         )
-        self._server = DaqServer(hardware, local(settings.grpc), settings.extra)
 
     @classmethod
     def stand_in(cls, simulated: Any, n: int) -> NidaqSettings:

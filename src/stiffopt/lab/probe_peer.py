@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 
 from stiffopt.errors import DeviceError
 from stiffopt.lab.bench import Bench, DevicePeer, ServedPeer
-from stiffopt.lab.nidaq_peer import DaqHardware, DaqServer
+from stiffopt.lab.nidaq_peer import DaqServer
 from stiffopt.rig.drivers.probe import SPEED_FACTOR, ZaberProbeSettings
 
 LATE = 0.3  # s after which a slow device answers
 
-_LOOPBACK = ("127.0.0.1", "localhost")
 _NOT_HOMED, _INTERRUPTED = "WR", "NI"
 _IDENTITY = {
     "device.id": "50081",
@@ -74,7 +73,7 @@ class ZaberPeer(ServedPeer[ZaberProbeSettings]):
 
     @asynccontextmanager
     async def _listening(self) -> AsyncIterator[ZaberProbeSettings]:
-        port = self._stage.port if self._stage.host in _LOOPBACK else 0
+        port = self._stage.port if self.on_loopback(self._stage.host) else 0
         try:
             server = await asyncio.start_server(self._attend, "127.0.0.1", port)
         except OSError:
@@ -223,10 +222,12 @@ class ProbePeer(DevicePeer[ZaberProbeSettings]):
     def __init__(self, settings: ZaberProbeSettings, bench: Bench, *, homed: bool = True) -> None:
         super().__init__(settings, bench)
         self._stage = ZaberPeer(settings, bench, homed=homed)
-        hardware = DaqHardware(
-            inputs={settings.force.channel: self._volts}, fault=partial(bench.fault, "probe")
+        self._sensor = DaqServer(
+            None,
+            settings.extra,
+            inputs={settings.force.channel: self._volts},
+            fault=partial(bench.fault, "probe"),
         )
-        self._sensor = DaqServer(hardware, None, settings.extra)
 
     @classmethod
     def stand_in(cls, simulated: Any, n: int) -> ZaberProbeSettings:

@@ -1,4 +1,4 @@
-"""From a robot file and the plant's settings to the arrays that the simulation works on."""
+"""Discretises the simulated arm: makes the arrays of its rod and material from a robot file."""
 
 from __future__ import annotations
 

@@ -122,8 +122,7 @@ class SimulatedProbe(ForceProbe):
         self._answer()
 
     def _close(self) -> None:
-        self._world.stop_stage()
-        self._world.mount_stage(None)
+        self._world.stage.mount(None)
 
     def _answer(self) -> None:
         self._world.catch_up()
@@ -137,13 +136,13 @@ class SimulatedProbe(ForceProbe):
         axis = np.array(tuple(direction), dtype=float)
         if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
             raise CommandError("expected a direction [x, y, z] to align the probe with")
-        self._world.mount_stage(axis)
+        self._world.stage.mount(axis)
 
     def withdraw(self) -> None:
         """Take the plate away."""
         self._must_be_open()
         self._answer()
-        self._world.mount_stage(None)
+        self._world.stage.mount(None)
 
     def move_to(self, position: float, speed: float) -> None:
         """Move the plate and return when it is there; see `ForceProbe.move_to`."""
@@ -151,20 +150,21 @@ class SimulatedProbe(ForceProbe):
         self._answer()
         if not (np.isfinite(position) and np.isfinite(speed) and speed > 0):
             raise CommandError("expected a finite position and a speed above 0")
-        self._world.move_stage(position, speed)
-        while self._world.stage_moving:
+        self._world.stage.move(position, speed)
+        while self._world.stage.speed:
             self.clock.sleep(_TICK)
             self._answer()
 
     def stop(self) -> None:
         """Stop the plate."""
-        self._world.stop_stage()
+        self._world.stage.stop()
 
     def sample(self) -> ForceSample:
         """Read force and position."""
         self._must_be_open()
         self._answer()
-        return ForceSample(self.clock.now(), self._world.force(), self._world.stage_position)
+        stage = self._world.stage
+        return ForceSample(self.clock.now(), stage.force(), stage.position)
 
 
 class SimulatedRig(Rig):
@@ -176,9 +176,7 @@ class SimulatedRig(Rig):
         What is true, which no controller may look at, and where faults are injected.
     """
 
-    def __init__(self, world: World, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        self.world = world
+    world: World
 
 
 def simulated_rig(
@@ -194,8 +192,7 @@ def simulated_rig(
     supply, tracker, probe = description.supply, description.tracker, description.probe
     world = World(robot, limits, plant, supply, tracker, probe, real_time=real_time)
     clock = WorldClock(world, real_time=real_time)
-    return SimulatedRig(
-        world,
+    rig = SimulatedRig(
         robot,
         SimulatedSupply(world, limits, clock),
         None if tracker is None else SimulatedTracker(world, tracker.registration, clock),
@@ -205,3 +202,5 @@ def simulated_rig(
         max_force=description.safety.max_force,
         settings=description,
     )
+    rig.world = world
+    return rig

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from threading import RLock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +26,9 @@ from stiffopt.plant.settings import (
 Array = NDArray[np.float64]
 Compiled = Any  # an array of floats in compiled code; numba infers the rest
 
+IMMOBILE = ("off", "stuck")
+"""Faults of a stage that does not move."""
 _KEPT = 4096  # frames that wait to be read
-_IMMOBILE = ("off", "stuck")  # faults of a stage that does not move
 _EMPTYING = 0.02  # s; time constant with which a chamber empties through the dump valve
 
 
@@ -205,7 +207,16 @@ class Camera:
 
 
 class SimulatedStage:
-    """A stage that can be mounted along any direction.
+    """A stage that can be mounted along any direction, and the force sensor on it.
+
+    Parameters
+    ----------
+    settings, plant, rng :
+        Of the probe, the arm that it pushes, and the source of the sensor's noise.
+    faults :
+        Present fault of each device; that of ``probe`` counts.
+    lock :
+        Held while the plant or the stage changes: any thread may call any method.
 
     Attributes
     ----------
@@ -214,40 +225,49 @@ class SimulatedStage:
     """
 
     def __init__(
-        self, settings: SimulatedProbeSettings, plant: Plant, rng: np.random.Generator
+        self,
+        settings: SimulatedProbeSettings,
+        plant: Plant,
+        rng: np.random.Generator,
+        faults: dict[str, str],
+        lock: RLock,
     ) -> None:
         self.settings = settings
         self.position = 0.0
         self.speed = 0.0
         self._plant = plant
         self._rng = rng
+        self._faults = faults
+        self._lock = lock
         self._axis: Array | None = None
         self._origin = 0.0
         self._target = 0.0
 
     def mount(self, direction: ArrayLike | None) -> None:
         """Mount the stage along a vector (3,) just clear of the tip, or take it away."""
-        self._axis = None
-        if direction is not None:
-            self._axis = np.array(direction, dtype=float)
-            self._axis /= np.linalg.norm(self._axis)
-            tip = self._plant.tip_pose()[:3, 3]
-            self._origin = float(self._axis @ tip) - self.settings.clearance
-        self.position = self._target = self.speed = 0.0
-        self.place_plate(0)
+        with self._lock:
+            self._axis = None
+            if direction is not None:
+                self._axis = np.array(direction, dtype=float)
+                self._axis /= np.linalg.norm(self._axis)
+                tip = self._plant.tip_pose()[:3, 3]
+                self._origin = float(self._axis @ tip) - self.settings.clearance
+            self.position = self._target = self.speed = 0.0
+            self.place_plate(0)
 
-    def move(self, position: float, speed: float, fault: str) -> None:
+    def move(self, position: float, speed: float) -> None:
         """Start to move to a place, m, at a speed, m/s."""
-        speed = min(speed, self.settings.speed)
-        if fault == "slow":
-            speed *= FAULT_SIZES.stage_speed
-        self._target = position
-        moves = position != self.position and fault not in _IMMOBILE
-        self.speed = speed if moves else 0.0
+        with self._lock:
+            speed = min(speed, self.settings.speed)
+            if self._faults["probe"] == "slow":
+                speed *= FAULT_SIZES.stage_speed
+            self._target = position
+            moves = position != self.position and self._faults["probe"] not in IMMOBILE
+            self.speed = speed if moves else 0.0
 
-    def stop_if(self, fault: str) -> None:
-        """Stop if this fault holds the stage."""
-        if fault in _IMMOBILE:
+    def stop(self) -> None:
+        """Stop at once."""
+        with self._lock:
             self.speed = 0.0
 
     def steps_left(self) -> int | None:
@@ -280,12 +300,13 @@ class SimulatedStage:
         far = self.speed * duration
         return float(np.clip(self._target - self.position, -far, far))
 
-    def force(self, fault: str) -> float:
+    def force(self) -> float:
         """Force that the sensor feels, N."""
-        noise = float(self.settings.noise * self._rng.standard_normal())
-        force = self._plant.contact_force() if self._axis is not None else 0.0
-        if fault == "garbage":
+        with self._lock:
+            noise = float(self.settings.noise * self._rng.standard_normal())
+            force = self._plant.contact_force() if self._axis is not None else 0.0
+        if self._faults["probe"] == "garbage":
             return float("nan") if noise > 0 else 1e6 * noise
-        if fault == "wrong":
+        if self._faults["probe"] == "wrong":
             force = FAULT_SIZES.force_gain * force + FAULT_SIZES.force_offset
         return force + noise

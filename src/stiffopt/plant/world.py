@@ -15,7 +15,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
-from stiffopt.plant.hardware import Camera, Frame, Regulators, SimulatedStage, regulate
+from stiffopt.plant.hardware import (
+    IMMOBILE,
+    Camera,
+    Frame,
+    Regulators,
+    SimulatedStage,
+    regulate,
+)
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import (
     FAULT_SIZES,
@@ -94,10 +101,13 @@ class World:
         streams = np.random.SeedSequence([plant.seed, 2]).spawn(4)
         self._ripple, self._gauge, optics, balance = map(np.random.default_rng, streams)
         self.camera = None if tracker is None else Camera(tracker, self.plant, optics)
-        self.stage = None if probe is None else SimulatedStage(probe, self.plant, balance)
+        self.stage = SimulatedStage(
+            probe or SimulatedProbeSettings(), self.plant, balance, self.faults, self.lock
+        )
         self._run(0)  # compiles what has not been compiled yet: no time for that later
         self.plant.contact_force()
-        self._epoch = time.monotonic()
+        self.epoch = time.monotonic()
+        """The moment 0 of the world on `time.monotonic`, in real time."""
 
     # Time ----------------------------------------------------------------------------------------
 
@@ -106,14 +116,9 @@ class World:
         """Time of the world, in s."""
         return self.plant.time
 
-    @property
-    def epoch(self) -> float:
-        """The moment 0 of the world on `time.monotonic`, in real time."""
-        return self._epoch
-
     def now(self) -> float:
         """Time on the rig's clock, in s."""
-        return time.monotonic() - self._epoch if self._real_time else self.time
+        return time.monotonic() - self.epoch if self._real_time else self.time
 
     def catch_up(self) -> None:
         """Let the world reach the present; does nothing unless it runs in real time."""
@@ -140,7 +145,7 @@ class World:
         events = [here + _LONG]
         if self.camera is not None:
             events.append(self.camera.next_step())
-        if self.stage is not None and (left := self.stage.steps_left()) is not None:
+        if (left := self.stage.steps_left()) is not None:
             events.append(here + left)
         if self.supply.watchdog is not None and self.set_point.any():
             runs_out = self._commanded_at + self.supply.watchdog
@@ -159,11 +164,9 @@ class World:
             ripple,
             trace,
         )
-        if self.stage is not None:
-            self.stage.place_plate(steps)
+        self.stage.place_plate(steps)
         self.plant.follow(trace)
-        if self.stage is not None:
-            self.stage.advance(steps)
+        self.stage.advance(steps)
         here = round(self.time / self.plant.step)
         if self.camera is not None and here >= self.camera.next_step():
             self.camera.capture(self.faults["tracker"])
@@ -213,45 +216,10 @@ class World:
         """Whether the dump valve is open."""
         return bool(self._regulators.dumped)
 
-    # Tracker and probe ---------------------------------------------------------------------------
-
     def frames(self) -> list[Frame]:
         """Return the tracker's frames that have been delivered since the last call."""
         with self.lock:
             return [] if self.camera is None else self.camera.delivered(self.now())
-
-    def mount_stage(self, direction: ArrayLike | None) -> None:
-        """Mount the stage along a vector (3,) just clear of the tip, or take it away."""
-        with self.lock:
-            if self.stage is not None:
-                self.stage.mount(direction)
-
-    def move_stage(self, position: float, speed: float) -> None:
-        """Let the stage start to move, m and m/s."""
-        with self.lock:
-            if self.stage is not None:
-                self.stage.move(position, speed, self.faults["probe"])
-
-    def stop_stage(self) -> None:
-        """Stop the stage."""
-        with self.lock:
-            if self.stage is not None:
-                self.stage.speed = 0.0
-
-    @property
-    def stage_position(self) -> float:
-        """Where the stage is, m."""
-        return 0.0 if self.stage is None else self.stage.position
-
-    @property
-    def stage_moving(self) -> bool:
-        """Whether the stage moves."""
-        return self.stage is not None and self.stage.speed > 0
-
-    def force(self) -> float:
-        """Force that the sensor at the stage feels, in N."""
-        with self.lock:
-            return 0.0 if self.stage is None else self.stage.force(self.faults["probe"])
 
     # Faults --------------------------------------------------------------------------------------
 
@@ -282,8 +250,8 @@ class World:
             self.faults[device] = fault
             if device == "supply":
                 self._set_faulty(fault, range(self._n) if channel is None else [channel])
-            if device == "probe" and self.stage is not None:
-                self.stage.stop_if(fault)
+            if device == "probe" and fault in IMMOBILE:
+                self.stage.stop()
 
     def _set_faulty(self, fault: str, channels: range | list[int]) -> None:
         regulators, settings = self._regulators, self.supply

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from importlib import import_module
-from types import TracebackType
 from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import Field, model_validator
@@ -46,7 +45,7 @@ class SystemClock(Clock):
 
 
 class Opened(ABC):
-    """Base of what is opened and closed, by `with` or by hand."""
+    """Base of rigs and devices: opened and closed, by `with` or by hand."""
 
     @abstractmethod
     def open(self) -> None:
@@ -60,12 +59,7 @@ class Opened(ABC):
         self.open()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

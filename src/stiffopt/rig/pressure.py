@@ -345,7 +345,7 @@ class PressureSupply(Supply):
         self._looked_at = 0.0  # when what the device holds was last compared
         self._lock = threading.RLock()  # what was checked is written before anything else happens
 
-    # what the hardware is -------------------------------------------------------------------------
+    # hardware -------------------------------------------------------------------------------------
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -377,7 +377,7 @@ class PressureSupply(Supply):
     def prepare(self) -> None:
         """Import what connecting needs, so that it takes no time when it is urgent."""
 
-    # what is done with it -------------------------------------------------------------------------
+    # commands -------------------------------------------------------------------------------------
 
     @property
     def commanded(self) -> Array:

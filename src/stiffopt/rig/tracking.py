@@ -98,9 +98,9 @@ class TrackerSettings(DeviceSettings):
 class PoseTracker(Device):
     """Base of trackers.
 
-    A driver calls `_deliver` with what the device sends, from whatever thread; registration, signs
-    and sense are seen to here. `read` never waits for the device: a silent device delivers
-    nothing, and only the age of the latest sample tells.
+    A driver calls `_deliver` with each sample of the device, from any thread; registration, sign of
+    the quaternion and plausibility are handled here. `read` never waits: a silent device delivers
+    nothing, which only the age of the latest sample shows.
 
     Attributes
     ----------
@@ -179,8 +179,8 @@ class StreamedSettings(TrackerSettings):
     Attributes
     ----------
     latency : the least time from the capture of a pose to its arrival here, in s.
-    range : what is farther from the tracker than this is not believed, in m.
-    connect_timeout : what does not answer for this long when it is opened is not there, in s.
+    range : poses farther from the tracker than this count as not seen, in m.
+    connect_timeout : longest wait for the first answer when the tracker is opened, in s.
     """
 
     latency: Annotated[Duration, Field(ge=0, le=1)] = 0.025
@@ -193,9 +193,9 @@ class StreamedTracker(PoseTracker):
 
     Attributes
     ----------
-    errors : bad or missing replies, lost connections; they are survived and counted.
+    errors : number of bad or missing replies and lost connections, all of which it survives.
     last_error : the last of them, as a sentence; empty before the first.
-    out_of_range : samples that were not believed.
+    out_of_range : number of samples beyond `StreamedSettings.range`.
     """
 
     def __init__(self, settings: StreamedSettings, clock: Clock | None = None) -> None:

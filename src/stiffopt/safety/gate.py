@@ -287,13 +287,7 @@ class SafetyGate:
             return True
 
     def read(self) -> PressureReading:
-        """Return the measured pressures.
-
-        Raises
-        ------
-        DeviceError
-            The supply does not answer.
-        """
+        """Return the measured pressures; raise `DeviceError` if the supply does not answer."""
         return self.supply.read()
 
     def apply(self, command: PressureCommand) -> Applied:

@@ -284,70 +284,34 @@ class GoalSupply(Supply):
         self._outlet.check_arming()
 
     def arm(self) -> None:
-        """Take commands from now on; all set-points are 0 then.
-
-        Raises
-        ------
-        CommandError
-            No rate of change is set, or the supply is unprotected; see `SafetyGate.arm`.
-        DeviceError
-            The device failed; the supply is not armed.
-        """
+        """Take commands from now on; all set-points are 0 then. See `SafetyGate.arm`."""
         self._must_be_open()
         self._outlet.arm_for_goals()
 
     def command(self, pressures: ArrayLike | PressureCommand) -> None:
-        """Let the pressures go to (n,), in Pa, and stay there until the command expires.
-
-        Raises
-        ------
-        CommandError
-            Wrong number, not finite, out of range, expired, or the supply is not armed: nothing
-            has changed.
-        DeviceError
-            The device or the guard does not answer.
-        """
+        """Let the pressures go to (n,), in Pa, and stay there until the command expires."""
         self._pursue(pressures)
 
     def exchange(self, pressures: ArrayLike | PressureCommand) -> PressureReading:
-        """Command as `command` does, and return the measured pressures.
-
-        Raises
-        ------
-        CommandError, DeviceError
-            As for `command`.
-        """
+        """Command as `command` does, and return the measured pressures."""
         return self._pursue(pressures).reading
 
     def read(self) -> PressureReading:
-        """Read the measured pressures.
-
-        Raises
-        ------
-        DeviceError
-            The device does not answer.
-        """
+        """Read the measured pressures (n,), in Pa."""
         self._must_be_open()
         return self._outlet.read()
 
     def vent(self) -> None:
-        """Let all pressure out at once.
-
-        Raises
-        ------
-        DeviceError
-            The device failed.
-        """
+        """Let all pressure out at once."""
         self._must_be_open()
         self._outlet.vent()
 
     def _pursue(self, pressures: ArrayLike | PressureCommand) -> Applied:
         self._must_be_open()
         now = self.clock.now()
-        if isinstance(pressures, PressureCommand):
-            goal = pressures
-        else:
-            goal = PressureCommand(pressures, now)
+        goal = pressures
+        if not isinstance(goal, PressureCommand):
+            goal = PressureCommand(goal, now)
         check_goal(goal, now, self.limits)  # an invalid goal does not leave this process
         applied = self._outlet.pursue(goal)
         if applied.refused:

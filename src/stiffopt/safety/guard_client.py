@@ -194,11 +194,10 @@ class Exchange:
         DeviceError
             The guard is gone, or does not answer.
         """
-        sequence, end = next(self._numbers), time.monotonic() + self.answer_within
+        sequence, now = next(self._numbers), time.monotonic()
         pressures = np.asarray(goal.pressures, dtype=float)
-        now = time.monotonic()
         frame = CommandFrame(sequence, now, goal.time, goal.valid_for, pressures, goal=True)
-        return self._answer_to(frame, "a command", end)
+        return self._answer_to(frame, "a command")
 
     def send(self, command: PressureCommand, wait: float) -> None:
         """Send a command of a stream and wait up to `wait` s for its answer.
@@ -229,14 +228,11 @@ class Exchange:
         DeviceError
             The guard is gone, or does not answer.
         """
-        sequence, end = next(self._numbers), time.monotonic() + self.answer_within
-        return self._answer_to(GuardRequest(sequence, do, about), f"'{do}'", end)
+        return self._answer_to(GuardRequest(next(self._numbers), do, about), f"'{do}'")
 
-    def _answer_to(
-        self, message: CommandFrame | GuardRequest, what: str, end: float
-    ) -> GuardAnswer:
+    def _answer_to(self, message: CommandFrame | GuardRequest, what: str) -> GuardAnswer:
         """Send a message and return its answer; raise `DeviceError` if none comes in time."""
-        sequence = message.sequence
+        sequence, end = message.sequence, time.monotonic() + self.answer_within
         self._waiting.add(sequence)
         try:
             while not self._channel.send(message):
@@ -556,12 +552,14 @@ class GuardLink:
         """
         exchange = self._open_exchange()
         exchange.send(command, CLIENT.fresh)
-        self._check_trip()
-        exchange.must_live()
         newest, silence = exchange.newest, exchange.silence()
+        if newest is not None:
+            self._check_trip(newest)
+        exchange.must_live()
         if newest is None or silence > max(CLIENT.silent, self._patience):
             raise DeviceError(f"the guard process has not answered for {silence:.2g} s")
-        return self._applied()
+        # the newest set-points and readings, with the outcome of the newest command
+        return _applied(newest, exchange.to_command or newest)
 
     def pursue(self, goal: PressureCommand) -> Applied:
         """Send a goal and return the answer to it.
@@ -574,24 +572,13 @@ class GuardLink:
             The guard is gone or does not answer, or the supply fails.
         """
         answer = self._open_exchange().send_goal(goal)
+        self._check_trip(answer)
+        return _applied(answer, answer)
+
+    def _check_trip(self, answer: GuardAnswer) -> None:
         if answer.tripped:
             self._told = answer.trips
             raise GuardTripped(f"the guard has vented: {answer.tripped}")
-        return _applied(answer, answer)
-
-    def _check_trip(self) -> None:
-        newest = self._open_exchange().newest
-        if newest is not None and newest.tripped:
-            self._told = newest.trips
-            raise GuardTripped(f"the guard has vented: {newest.tripped}")
-
-    def _applied(self) -> Applied:
-        """Return the newest set-points and readings, with the outcome of the newest command."""
-        exchange = self._open_exchange()
-        newest, to_command = exchange.newest, exchange.to_command
-        if newest is None:
-            raise DeviceError("the guard process has not answered yet")
-        return _applied(newest, to_command or newest)
 
     # simulated rigs ------------------------------------------------------------------------------
 
@@ -608,10 +595,6 @@ class GuardLink:
     def truth(self) -> Array:
         """Return the true tip pose (4, 4) of a simulated rig; no controller may use it."""
         return np.array(self._ask("truth").value)
-
-    def true_pressures(self) -> Array:
-        """Return the true chamber pressures (n,) of a simulated rig, in Pa."""
-        return np.array(self._ask("pressures").value)
 
     def ask_world(self, word: str, **about: Any) -> Any:
         """Send a request to the simulated rig in the guard process and return its result.

@@ -68,7 +68,7 @@ def owned(description: RigDescription, robot: RobotDescription) -> Owned:
     MissingExtraError
         A library is not installed.
     """
-    simulated = description.supply.driver == "simulated"
+    simulated = description.supply.simulated
     away = {} if simulated else {"probe": None, "tracker": None}
     rig = make_rig(description.model_copy(update=away), robot, real_time=True)
     safety, period = description.safety, 1 / description.rate
@@ -142,10 +142,10 @@ class HostedDevices:
                 probe.withdraw()
             case "probe-move":
                 probe.sample()  # a probe that does not answer does not move either
-                self.world.move_stage(about["position"], about["speed"])
+                self.world.stage.move(about["position"], about["speed"])
             case "probe-moving":
                 probe.sample()
-                return bool(self.world.stage_moving)
+                return bool(self.world.stage.speed)
             case "probe-stop":
                 probe.stop()
             case "probe-sample":

@@ -191,10 +191,14 @@ def unpack(packet: bytes) -> Message:
                 return _answer(packet)
             case b"R":
                 sequence, do, about = json.loads(packet[1:])
-                return GuardRequest(_sequence(sequence), _text(do), _arguments(about))
+                _require((sequence, int), (do, str), (about, dict))
+                if not 0 <= sequence < _SEQUENCE_END:  # it must fit into the answer
+                    raise ValueError("a sequence number is an unsigned integer of 64 bits")
+                return GuardRequest(sequence, do, about)
             case b"W":
                 kind, about = json.loads(packet[1:])
-                return GuardNotice(_text(kind), _arguments(about))
+                _require((kind, str), (about, dict))
+                return GuardNotice(kind, about)
             case b"P":
                 rows = _numbers(packet[1:]).reshape(-1, _POSE)
                 return TrackedPoses(tuple(_pose(row) for row in rows))
@@ -203,23 +207,11 @@ def unpack(packet: bytes) -> Message:
     raise ValueError(f"a packet of unknown kind: {packet[:1]!r}")
 
 
-def _sequence(given: Any) -> int:
-    """Check a sequence number: it must fit into the answer."""
-    if type(given) is not int or not 0 <= given < _SEQUENCE_END:
-        raise ValueError("a sequence number is an unsigned integer of 64 bits")
-    return given
-
-
-def _text(given: Any) -> str:
-    if not isinstance(given, str):
-        raise ValueError("expected a word")
-    return given
-
-
-def _arguments(given: Any) -> dict[str, Any]:
-    if not isinstance(given, dict):
-        raise ValueError("expected named arguments")
-    return given
+def _require(*given: tuple[Any, type]) -> None:
+    """Raise `ValueError` unless each value is of its type; True is no integer here."""
+    for value, kind in given:
+        if type(value) is not kind:
+            raise ValueError(f"expected {kind.__name__}, not {type(value).__name__}")
 
 
 def _numbers(packed: bytes) -> Array:

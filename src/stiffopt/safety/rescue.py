@@ -8,15 +8,12 @@ import select
 import threading
 import time
 from contextlib import ExitStack, suppress
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from stiffopt.errors import DeviceError
 from stiffopt.rig.interface import PressureSupply
 from stiffopt.safety.claim import Claim
 from stiffopt.safety.settings import CLIENT
-
-if TYPE_CHECKING:
-    from stiffopt.safety.guard_client import GuardLink
 
 _log = logging.getLogger(__name__)
 
@@ -45,6 +42,28 @@ def vent_directly(supply: PressureSupply) -> bool:
     return alone
 
 
+class WatchedGuard(Protocol):
+    """What a watch needs of a `stiffopt.safety.guard_client.GuardLink`."""
+
+    @property
+    def pid(self) -> int | None:
+        """Process id; None where it is not known."""
+
+    @property
+    def alive(self) -> bool:
+        """Whether the process runs."""
+
+    @property
+    def hung(self) -> bool:
+        """Whether it has not answered for too long."""
+
+    def ping(self) -> None:
+        """Ask for a sign of life."""
+
+    def kill(self) -> None:
+        """Kill the process."""
+
+
 class GuardWatch:
     """Watches a guard in a thread of its own and vents the supply when the guard is gone or hung.
 
@@ -64,7 +83,7 @@ class GuardWatch:
         Why venting has failed so far; empty if it has not.
     """
 
-    def __init__(self, guard: GuardLink, supply: PressureSupply | None) -> None:
+    def __init__(self, guard: WatchedGuard, supply: PressureSupply | None) -> None:
         self.rescued = threading.Event()
         self.error = ""
         self._guard, self._supply = guard, supply

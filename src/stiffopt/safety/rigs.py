@@ -55,7 +55,7 @@ def rig_for_programs(
     description: RigDescription, robot: RobotDescription, *, real_time: bool = False
 ) -> Rig:
     """Return the rig of a description; see `open_rig`."""
-    if real_time or description.supply.driver != "simulated":
+    if real_time or not description.supply.simulated:
         rig = guarded_rig(description, robot)[0]
         rig.slew = effective_slew(rig)
         return rig
@@ -126,7 +126,7 @@ def guarded_rig(
     clock: Clock = SystemClock()
     tracker: PoseTracker | None
     probe: ForceProbe | None
-    if description.supply.driver == "simulated":
+    if description.supply.simulated:
         link = GuardLink(description, robot, limits, json_lines=json_lines)
         link.has_dump_valve = bool(getattr(description.supply, "dump_valve", False))
         tracker = None if description.tracker is None else ForwardedTracker(link)

@@ -39,7 +39,7 @@ def vent_rig(path: str | os.PathLike[str]) -> str:
         It is not certain that the supply is vented.
     """
     description = load_rig_description(path)
-    if description.supply.driver == "simulated":
+    if description.supply.simulated:
         return _vent_simulated(description)
     robot = load_description(description.robot, base=Path(path).parent)
     supply = make_rig(description.model_copy(update={"tracker": None, "probe": None}), robot).supply
@@ -76,15 +76,11 @@ def _vent_directly(supply: PressureSupply, failed: list[str]) -> str:
     except DeviceError as error:
         raise DeviceError("; ".join([*failed, str(error)])) from None
     if not alone:
-        raise DeviceError(
-            "; ".join(
-                [
-                    *failed,
-                    "it was vented directly, but another program has claimed this "
-                    "supply and may raise the pressure again",
-                ]
-            )
+        claimed = (
+            "it was vented directly, but another program has claimed this supply and may raise "
+            "the pressure again"
         )
+        raise DeviceError("; ".join([*failed, claimed]))
     return "vented directly: no program commands this supply"
 
 

@@ -7,14 +7,13 @@ import subprocess
 import sys
 import threading
 import time
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from stiffopt.errors import DeviceError, MissingExtraError
+from stiffopt.errors import DeviceError, require_package
 from stiffopt.rig.interface import Clock, StreamedSettings, StreamedTracker
 from stiffopt.units import Duration, Frequency
 
@@ -39,8 +38,8 @@ class AuroraSettings(StreamedSettings):
     rate : frames that the device makes in a second.
     reply : ``binary`` is finer and faster; ``text`` (0.01 mm) is for old firmware, which ``auto``
         knows.
-    outside_volume : believe poses outside of the volume that NDI characterised.
-    reconnect_after : a device that is silent for this long is connected anew, in s.
+    outside_volume : accept poses outside of the volume that NDI characterised.
+    reconnect_after : silence after which the device is connected anew, in s.
     """
 
     extra: ClassVar[str] = "aurora"
@@ -84,9 +83,8 @@ class AuroraTracker(StreamedTracker):
         self._frames_before = 0  # in earlier sessions of the device
 
     def _open(self) -> None:
-        for module, package in (("ndicapy", "ndicapi"), ("serial", "pyserial")):
-            if find_spec(module) is None:
-                raise MissingExtraError(package, self.settings.extra)
+        require_package("ndicapi", self.settings.extra, "ndicapy")
+        require_package("pyserial", self.settings.extra, "serial")
         self._stopping.clear()
         self._settled.clear()
         self._refusal = self._lost = ""

@@ -13,21 +13,16 @@ import time
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Annotated, Any, Literal, NamedTuple, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, Field
 
 from stiffopt.errors import DeviceError, InputError, shown
 from stiffopt.rig.device import library
-from stiffopt.schema import items_of
 
 Array = NDArray[np.float64]
-ItemT = TypeVar("ItemT")
-
-Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
-"""Two items: low and high, or two points of a line."""
 Terminals = Literal["default", "rse", "nrse", "differential", "pseudo-differential"]
 
 _RESERVED = -50103

@@ -192,12 +192,7 @@ class ModbusSettings(SupplySettings):
         for index, point in (*enumerate(self.setpoints + self.read_backs), *self.readings.items()):
             if point.addresses[-1] > 0xFFFF:
                 reason = f"its registers go beyond 65535, the last one: {point.address} is too high"
-                raise BadKeyError(f"channels.{index % self.n}", reason)
-
-    @property
-    def n(self) -> int:
-        """Number of channels."""
-        return len(self.channels)
+                raise BadKeyError(f"channels.{index % len(self.channels)}", reason)
 
     @property
     def setpoints(self) -> tuple[PressureRegister, ...]:
@@ -305,7 +300,7 @@ class ModbusSupply(PressureSupply):
             self._line.connect()
             self._watch()
         except BaseException:
-            with suppress(DeviceError):  # what a watchdog has to say must not keep it from venting
+            with suppress(DeviceError):  # a watchdog that fails must not keep it from venting
                 self._write_once(self._encoded(np.zeros(self.n)), whatever_happens=True)
             self._line.close()
             raise
@@ -456,7 +451,7 @@ class ModbusSupply(PressureSupply):
 
 
 def _insist(act: Callable[[], object]) -> None:
-    """Do what makes the arm safe; where it fails, once more, on a new connection."""
+    """Send a request that makes the arm safe; if it fails, once more on a new connection."""
     try:
         act()
     except DeviceError:

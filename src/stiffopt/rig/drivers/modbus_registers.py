@@ -6,17 +6,15 @@ import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
 from stiffopt.errors import InputError
-from stiffopt.schema import BadKeyError, Items, Schema, items_of
+from stiffopt.schema import BadKeyError, Items, Pair, Schema
 from stiffopt.units import Duration, Number, Pressure, finite_number, parse_quantity, read_from_file
 
-ItemT = TypeVar("ItemT")
-Pair = Annotated[tuple[ItemT, ItemT], BeforeValidator(items_of(2))]
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
 RegisterType = Literal["int16", "uint16", "int32", "uint32", "float32"]
 WordOrder = Literal["big", "little"]

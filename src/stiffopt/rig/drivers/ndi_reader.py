@@ -1,11 +1,11 @@
-"""The program that reads an NDI tracker through ndicapi, in a process of its own.
+"""Program that reads an NDI tracker through ndicapi, run by `AuroraTracker` as its own process.
 
-It is run by its file name and imports nothing of the package, so that it starts at once. The
-library is C that trusts what comes over the wire and waits for seconds for what does not come; in
-here it can neither crash the process that holds the pressures nor keep it from closing.
+ndicapi is C code that does not check the length of replies and waits seconds for missing ones. In
+its own process it can neither crash the one that holds the pressures nor delay its end.
 
-It is given one argument, JSON, and writes one JSON object a line; it ends when its input ends, and
-when the device is lost: whoever started it starts it again.
+The settings are its one argument, in JSON; it writes one JSON object per line. It ends when its
+standard input ends, and when the device is lost. It is run by its file name and imports nothing of
+the package, so that it starts at once.
 """
 
 from __future__ import annotations

@@ -20,14 +20,13 @@ from stiffopt.rig.drivers.daqmx import (
     InputName,
     LineName,
     OutputName,
-    Pair,
     Terminals,
     WatchdogExpiredError,
     WatchdogTask,
 )
 from stiffopt.rig.endpoints import tcp_endpoints
 from stiffopt.rig.interface import Clock, PressureLimits, PressureSupply, SupplySettings
-from stiffopt.schema import BadKeyError, Items, Schema
+from stiffopt.schema import BadKeyError, Items, Pair, Schema
 from stiffopt.units import Duration, Pressure, Voltage
 
 Array = NDArray[np.float64]

@@ -34,8 +34,8 @@ class OpenIGTLinkSettings(StreamedSettings):
     ----------
     host, port : of the server.
     name : device name of the messages, such as ``TipToTracker``: sensor to tracker.
-    reconnect_after : a server that sends nothing at all for this long, as when no tool is seen, is
-        called anew, in s.
+    reconnect_after : silence after which the server is called anew, in s; PLUS is also silent
+        while it sees no tool.
     """
 
     extra: ClassVar[str] = "openigtlink"

@@ -1,8 +1,8 @@
 """The driver ``probe``: a force sensor on a linear stage of Zaber that pushes on the tip.
 
-A person mounts the rail along each direction; the stage then moves along it and nowhere else, and
-stops when the force is too high. zaber-motion speaks to the stage, over TCP or a serial line. Its
-conversion of units asks a database on the internet, so this converts by itself. The sensor is on an
+A person mounts the rail along each direction; the stage moves along the rail and stops when the
+force is too high. zaber-motion speaks to the stage, over TCP or a serial line. Native units are
+converted here, since zaber-motion would ask a database on the internet. The sensor is on an
 analogue input of an NI-DAQ device.
 """
 
@@ -24,11 +24,10 @@ from stiffopt.rig.drivers.daqmx import (
     Daqmx,
     InputChannel,
     InputName,
-    Pair,
     Terminals,
 )
 from stiffopt.rig.interface import Clock, ForceProbe, ForceSample, ProbeSettings
-from stiffopt.schema import BadKeyError, Schema
+from stiffopt.schema import BadKeyError, Pair, Schema
 from stiffopt.units import Duration, Force, ForcePerVoltage, Length, Speed, Voltage
 
 SPEED_FACTOR = 1.6384
