@@ -6,6 +6,7 @@ only `stiffopt.safety`, the virtual lab and tests make devices themselves.
 
 from __future__ import annotations
 
+from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.config import RigDescription, limits_of, registration_of, slew_of
 from stiffopt.rig.interface import Rig, SystemClock
@@ -19,6 +20,8 @@ def make_rig(
     limits, slew = limits_of(description, robot), slew_of(description, robot)
     supply, tracker, probe = description.supply, description.tracker, description.probe
     registration = None if tracker is None else registration_of(tracker, robot)
+    if any(device.simulated != supply.simulated for device in (tracker, probe) if device):
+        raise InputError("a real supply cannot be combined with simulated devices, nor vice versa")
     if supply.simulated:
         simulated_rig = load(supply.simulator)
         rig: Rig = simulated_rig(description, robot, limits, slew, real_time=real_time)

@@ -5,18 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import (
-    BeforeValidator,
-    Field,
-    SerializeAsAny,
-    ValidationError,
-    ValidationInfo,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails
 
 from stiffopt.errors import FileError, InputError, dotted
@@ -119,19 +112,6 @@ class RigDescription(Schema):
     plant: Annotated[SerializeAsAny[RigSection] | None, _section("plant")] = None
     lab: Annotated[SerializeAsAny[RigSection] | None, _section("lab")] = None
 
-    @model_validator(mode="after")
-    def _simulated_or_real(self) -> Self:
-        devices = {"supply": self.supply, "tracker": self.tracker, "probe": self.probe}
-        simulated = [name for name, device in devices.items() if device and device.simulated]
-        real = [name for name, device in devices.items() if device and not device.simulated]
-        if simulated and real:
-            raise BadKeyError(
-                simulated[0],
-                f"is simulated and the {real[0]} is not; a simulated arm has simulated devices "
-                "only ('stiffopt lab' puts a simulated arm behind real protocols)",
-            )
-        return self
-
 
 def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
     """Read a rig file and check it against its robot.
@@ -216,6 +196,15 @@ def _check_against(description: RigDescription, robot: RobotDescription) -> None
     for part in (tracker, description.probe, supply, description.plant, description.lab):
         if part is not None:
             part.check_against(description, robot)
+    devices = {"supply": supply, "tracker": tracker, "probe": description.probe}
+    simulated = [name for name, device in devices.items() if device and device.simulated]
+    real = [name for name, device in devices.items() if device and not device.simulated]
+    if simulated and real:
+        raise MisfitError(
+            f"is simulated and the {real[0]} is not; a simulated arm has simulated devices only "
+            "('stiffopt lab' puts a simulated arm behind real protocols)",
+            simulated[0],
+        )
 
 
 def limits_of(description: RigDescription, robot: RobotDescription) -> PressureLimits:
