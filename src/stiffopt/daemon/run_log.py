@@ -1,4 +1,4 @@
-"""Reads the recording of a run, and converts it to a log (log v1) for calibration."""
+"""Reads the recording of a run, and makes a log for calibration of it."""
 
 from __future__ import annotations
 
@@ -10,37 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.state import SeenPose, Snapshot
+from stiffopt.control.state import Event, SeenPose, Severity, Snapshot
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.topics import FORMAT, METADATA, STATES
 from stiffopt.errors import FileError
 from stiffopt.logs.log import Log
-from stiffopt.logs.mcap_log import LOG_METADATA
-from stiffopt.logs.mcap_reading import McapContents, read_mcap
-
-__all__ = [
-    "RecordedRun",
-    "RunEvent",
-    "RunSpan",
-    "is_of_experiment",
-    "log_of_run",
-    "read_run",
-]
+from stiffopt.logs.mcap_file import McapContents, read_mcap
+from stiffopt.logs.mcap_log import LOG_METADATA, log_of_contents
 
 Array = NDArray[np.float64]
 
-_FOREIGN = "is no recording of stiffopt; expected one (.mcap) of 'stiffopt run'"
 _HELD = ("/limits",)  # topics that are logged when they change, and hold until then
-
-
-@dataclass(frozen=True)
-class RunEvent:
-    """Something that happened; see `stiffopt.control.state.Event`. The time is that of the run."""
-
-    time: float
-    kind: str
-    text: str
-    severity: str
 
 
 @dataclass(frozen=True)
@@ -70,8 +50,7 @@ class RecordedRun:
     captured : when the tracker captured its frames (M,), in s, increasing.
     seen_position, seen_quaternion : where it saw the tip (M, 3) and (M, 4), w first.
     doubted : frames (M,) that no arm could have moved to, or that came with such a one.
-    states, alarms : in order of time.
-    events : in order of time.
+    states, alarms, events : in order of time, which is that of the run.
     timing : the last ``/timing`` message; empty if there is none.
     complete : whether the recording was ended properly, and nothing in it is damaged.
     """
@@ -86,7 +65,7 @@ class RecordedRun:
     doubted: NDArray[np.bool_]
     states: tuple[RunSpan, ...] = ()
     alarms: tuple[RunSpan, ...] = ()
-    events: tuple[RunEvent, ...] = ()
+    events: tuple[Event, ...] = ()
     timing: Mapping[str, Any] = field(default_factory=dict)
     complete: bool = True
 
@@ -115,29 +94,16 @@ def read_run(path: str | os.PathLike[str]) -> RecordedRun:
     MissingExtraError
         mcap is not installed.
     """
-    name = os.fspath(path)
     found = read_mcap(path)
-    about = found.metadata.get(METADATA, {})
-    if not about:
-        if LOG_METADATA in found.metadata:
-            raise FileError(
-                name, "is a recording of an experiment; expected one of a run of 'stiffopt run'"
-            )
-        raise FileError(name, _FOREIGN)
-    if about.get("format") != FORMAT:
+    if LOG_METADATA in found.metadata:
         raise FileError(
-            name, f"has the format '{about.get('format')}'; this stiffopt reads '{FORMAT}'"
+            path, "is a recording of an experiment; expected one of a run of 'stiffopt run'"
         )
-    if not found.of_topic("/pressure"):
-        raise FileError(name, "has no whole message of a run; it was cut short too early")
-    try:
-        return _run(about, found)
-    except (KeyError, ValueError, TypeError) as error:
-        raise FileError(name, f"is damaged: {error}") from None
+    return _run_of_contents(path, found)
 
 
-def is_of_experiment(path: str | os.PathLike[str]) -> bool:
-    """Whether a recording is one of an experiment, for `stiffopt.logs.read_mcap_log`.
+def read_log_of_recording(path: str | os.PathLike[str]) -> tuple[Log, bool]:
+    """Read the log of a run or of an experiment (.mcap); also whether the recording is whole.
 
     Raises
     ------
@@ -146,10 +112,27 @@ def is_of_experiment(path: str | os.PathLike[str]) -> bool:
     MissingExtraError
         mcap is not installed.
     """
-    metadata = read_mcap(path, metadata_only=True).metadata
-    if METADATA not in metadata and LOG_METADATA not in metadata:
-        raise FileError(path, _FOREIGN)
-    return LOG_METADATA in metadata
+    found = read_mcap(path)
+    if LOG_METADATA in found.metadata:
+        return log_of_contents(path, found), True
+    run = _run_of_contents(path, found)
+    return log_of_run(run), run.complete
+
+
+def _run_of_contents(path: str | os.PathLike[str], found: McapContents) -> RecordedRun:
+    about = found.metadata.get(METADATA, {})
+    if not about:
+        raise FileError(path, "is no recording of stiffopt; expected one (.mcap) of 'stiffopt run'")
+    if about.get("format") != FORMAT:
+        raise FileError(
+            path, f"has the format '{about.get('format')}'; this stiffopt reads '{FORMAT}'"
+        )
+    if not found.of_topic("/pressure"):
+        raise FileError(path, "has no whole message of a run; it was cut short too early")
+    try:
+        return _run(about, found)
+    except (KeyError, ValueError, TypeError) as error:
+        raise FileError(path, f"is damaged: {error}") from None
 
 
 def _run(about: Mapping[str, str], found: McapContents) -> RecordedRun:
@@ -172,7 +155,7 @@ def _run(about: Mapping[str, str], found: McapContents) -> RecordedRun:
         states=_states(states, begin, float(time[-1])),
         alarms=_alarms(states, begin, float(time[-1])),
         events=tuple(
-            RunEvent(float(e["time_s"]) - begin, e["kind"], e["text"], e["severity"])
+            Event(float(e["time_s"]) - begin, e["kind"], e["text"], Severity(e["severity"]))
             for e in found.of_topic("/event")
         ),
         timing=timing[-1] if timing else {},

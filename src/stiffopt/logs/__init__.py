@@ -4,7 +4,6 @@ from stiffopt.logs.csv_log import LogWriter, read_log, write_log
 from stiffopt.logs.layout import LogLayout
 from stiffopt.logs.log import Body, Log, LogRow
 from stiffopt.logs.mcap_log import McapLogWriter, read_mcap_log
-from stiffopt.logs.mcap_reading import require_mcap
 from stiffopt.logs.stiffness import (
     StiffnessTable,
     read_stiffness_table,
@@ -22,7 +21,6 @@ __all__ = [
     "read_log",
     "read_mcap_log",
     "read_stiffness_table",
-    "require_mcap",
     "write_log",
     "write_stiffness_table",
 ]

@@ -7,9 +7,13 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stiffopt.errors import FileError, shown
 
-__all__ = ["LogLayout"]
+Array = NDArray[np.float64]
+
 
 _TIME = "time_s"
 _AXES = ("x", "y", "z")
@@ -61,6 +65,14 @@ class LogLayout:
     def columns(self) -> tuple[str, ...]:
         """Names of the columns in the order in which they are written."""
         return tuple(name for names in self.parts.values() for name in names)
+
+    def split(self, values: Array) -> dict[str, Array]:
+        """Return the values (..., m) of each part, from all values in the order of the columns."""
+        found, end = {}, 0
+        for name, columns in self.parts.items():
+            found[name] = values[..., end : end + len(columns)]
+            end += len(columns)
+        return found
 
     @classmethod
     def of_columns(cls, path: str, columns: Sequence[str]) -> LogLayout:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
-from stiffopt.logs.layout import LogLayout
-
-__all__ = ["Array", "Body", "Log", "LogRow", "log_of_values"]
-
-Array = NDArray[np.float64]
+from stiffopt.logs.layout import Array, LogLayout
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +66,19 @@ class Log:
         count = len(self.time)
         if self.commanded.ndim != 2 or not self.commanded.shape[1]:
             raise InputError("a log needs commanded pressures (N, n)")
-        shapes: list[tuple[str, Array | None, tuple[int, ...]]] = [
-            ("time", self.time, (count,)),
-            ("commanded", self.commanded, (count, self.n)),
-            ("measured", self.measured, (count, self.n)),
-            ("tip_position", self.tip_position, (count, 3)),
-            ("tip_quaternion", self.tip_quaternion, (count, 4)),
-            ("force", self.force, (count,)),
-            ("stage", self.stage, (count,)),
-        ]
+        shapes: dict[str, tuple[Array | None, tuple[int, ...]]] = {
+            "time": (self.time, (count,)),
+            "commanded": (self.commanded, (count, self.n)),
+            "measured": (self.measured, (count, self.n)),
+            "tip_position": (self.tip_position, (count, 3)),
+            "tip_quaternion": (self.tip_quaternion, (count, 4)),
+            "force": (self.force, (count,)),
+            "stage": (self.stage, (count,)),
+        }
         for name, body in self.bodies.items():
-            shapes.append((f"{name}: position", body.position, (count, 3)))
-            shapes.append((f"{name}: quaternion", body.quaternion, (count, 4)))
-        for name, value, shape in shapes:
-            if value is not None and value.shape != shape:
-                raise InputError(f"{name} must have the shape {shape}, not {value.shape}")
+            shapes[f"{name}: position"] = (body.position, (count, 3))
+            shapes[f"{name}: quaternion"] = (body.quaternion, (count, 4))
+        check_shapes(shapes)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -113,7 +108,7 @@ class Log:
         )
 
     def rows(self) -> Iterator[LogRow]:
-        """Yield the recording row by row."""
+        """Yield the log row by row."""
         for i in range(len(self)):
             yield LogRow(
                 time=float(self.time[i]),
@@ -143,14 +138,16 @@ class LogRow:
     force: float = np.nan
     stage: float = np.nan
 
-    def values(self, layout: LogLayout) -> Array:
+    def values(self, layout: LogLayout, after: float | None = None) -> Array:
         """Return the row as numbers (m,) in the order of the columns of a layout.
 
         Raises
         ------
         InputError
-            It does not fit the layout.
+            It does not fit the layout, has no time, or is not later than `after`, to 1 us.
         """
+        if not np.isfinite(self.time) or (after is not None and round(self.time, 6) <= after):
+            raise InputError(f"a row at {self.time:g} s cannot follow one at {after} s")
         given: dict[str, ArrayLike | None] = {
             "time": self.time,
             "commanded": self.commanded,
@@ -161,16 +158,13 @@ class LogRow:
         for name, pose in {"tip": (self.position, self.quaternion), **self.bodies}.items():
             given[f"{name} position"], given[f"{name} quaternion"] = pose
         return np.concatenate(
-            [_numbers(name, given.get(name), len(c)) for name, c in layout.parts.items()]
+            [numbers_of(name, given.get(name), len(c)) for name, c in layout.parts.items()]
         )
 
 
 def log_of_values(values: Array, layout: LogLayout) -> Log:
     """Return the log whose columns (N, m) are in the order of a layout."""
-    parts, end = {}, 0
-    for name, columns in layout.parts.items():
-        parts[name] = np.ascontiguousarray(values[:, end : end + len(columns)])
-        end += len(columns)
+    parts = {name: np.ascontiguousarray(part) for name, part in layout.split(values).items()}
     return Log(
         time=parts["time"][:, 0],
         commanded=parts["commanded"],
@@ -186,11 +180,19 @@ def log_of_values(values: Array, layout: LogLayout) -> Log:
     )
 
 
+def check_shapes(shapes: Mapping[str, tuple[NDArray[Any] | None, tuple[int, ...]]]) -> None:
+    """Raise `InputError` unless each array, by its name, has the shape that stands beside it."""
+    for name, (value, shape) in shapes.items():
+        if value is not None and value.shape != shape:
+            raise InputError(f"{name} must have the shape {shape}, not {value.shape}")
+
+
 def _row(values: Array | None, i: int) -> Array | None:
     return values[i] if values is not None else None
 
 
-def _numbers(name: str, value: ArrayLike | None, count: int) -> Array:
+def numbers_of(name: str, value: ArrayLike | None, count: int) -> Array:
+    """Return what a row has for a part (count,): NaN for None and for what is not finite."""
     if value is None:
         return np.full(count, np.nan)
     numbers = np.asarray(value, dtype=float).reshape(-1)

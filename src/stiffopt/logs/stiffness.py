@@ -12,10 +12,9 @@ from math import isfinite, nan
 import numpy as np
 
 from stiffopt.errors import FileError, InputError, shown
-from stiffopt.logs.log import Array
-from stiffopt.logs.table import read_bytes
-
-__all__ = ["StiffnessTable", "read_stiffness_table", "write_stiffness_table"]
+from stiffopt.logs.layout import Array
+from stiffopt.logs.log import check_shapes
+from stiffopt.logs.table import read_bytes, replacing
 
 BOUNDARIES = ("free", "guided", "clamped")
 _DIRECTION = ("direction_x", "direction_y", "direction_z")
@@ -53,16 +52,15 @@ class StiffnessTable:
         count = len(self.stiffness)
         if self.pressures.ndim != 2 or not self.pressures.shape[1]:
             raise InputError("a table of stiffness needs pressures (N, n)")
-        shapes = {
-            "pressures": (self.pressures.shape, (count, self.pressures.shape[1])),
-            "directions": (self.directions.shape, (count, 3)),
-            "boundaries": ((len(self.boundaries),), (count,)),
-            "sigma": (self.sigma.shape, (count,)),
-            **{name: (values.shape, (count,)) for name, values in self.others.items()},
-        }
-        for name, (shape, wanted) in shapes.items():
-            if shape != wanted:
-                raise InputError(f"{name} must have the shape {wanted}, not {shape}")
+        check_shapes(
+            {
+                "boundaries": (np.array(self.boundaries), (count,)),
+                "pressures": (self.pressures, (count, self.n)),
+                "directions": (self.directions, (count, 3)),
+                "sigma": (self.sigma, (count,)),
+                **{name: (values, (count,)) for name, values in self.others.items()},
+            }
+        )
 
     def __len__(self) -> int:
         return len(self.stiffness)
@@ -85,19 +83,11 @@ def write_stiffness_table(path: str | os.PathLike[str], table: StiffnessTable) -
     writer = csv.writer(text, lineterminator="\n")
     pressures = [f"p{k + 1}_pa" for k in range(table.n)]
     writer.writerow([*pressures, *_DIRECTION, "boundary", *_VALUES, *table.others])
-    for i in range(len(table)):
-        numbers = [*table.pressures[i], *table.directions[i]]
-        values = [table.stiffness[i], table.sigma[i], *(v[i] for v in table.others.values())]
-        writer.writerow(
-            [*map(_text, numbers), table.boundaries[i], *(_text(value) for value in values)]
-        )
-    part = f"{os.fspath(path)}.part"
-    try:
-        with open(part, "w", encoding="utf-8", newline="") as stream:
-            stream.write(text.getvalue())
-        os.replace(part, path)
-    except OSError as error:
-        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None
+    columns = [*table.pressures.T, *table.directions.T, table.boundaries]
+    columns += [table.stiffness, table.sigma, *table.others.values()]
+    writer.writerows(map(_text, row) for row in zip(*columns, strict=True))
+    with replacing(path) as part, open(part, "w", encoding="utf-8", newline="") as stream:
+        stream.write(text.getvalue())
 
 
 def read_stiffness_table(path: str | os.PathLike[str]) -> StiffnessTable:
@@ -192,5 +182,7 @@ def _number(path: str, line: int, column: str, text: str, may_be_missing: bool) 
     return value
 
 
-def _text(value: float) -> str:
+def _text(value: float | str) -> str:
+    if isinstance(value, str):
+        return value
     return f"{value:.9g}" if isfinite(value) else ""
