@@ -9,7 +9,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -19,7 +18,7 @@ from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
-from stiffopt.daemon.calls import Part
+from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret, bracketed, check_exposure
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
@@ -33,10 +32,9 @@ from stiffopt.safety.realtime import real_time, tidy
 from stiffopt.safety.rigs import guarded_rig
 
 if TYPE_CHECKING:
-    from stiffopt.daemon.serving import Server
+    from stiffopt.daemon.server import Server
     from stiffopt.daemon.telemetry import Telemetry
 
-__all__ = ["TIMES", "ControlThread", "Daemon", "DaemonTimes"]
 
 Array = NDArray[np.float64]
 
@@ -291,8 +289,8 @@ class Daemon:
 
     def vent(self, reason: str = "asked to", patience: float = 0.5) -> None:
         """Let all pressure out at once, also when the control thread does not answer."""
-        if not Part("vent", lambda: self.loop.vent(reason)).ends_within(patience):
-            Part("vent-link", self.link.vent).ends_within(TIMES.vent)
+        if not ends_within(patience, call_in_thread("vent", lambda: self.loop.vent(reason))):
+            ends_within(TIMES.vent, call_in_thread("vent-link", self.link.vent))
 
     def stop(self) -> State:
         """End everything and return the last state.
@@ -309,15 +307,15 @@ class Daemon:
         self._end_control()
         self._keeper.stop(TIMES.keeper)
         state = self.loop.snapshot().state
-        closing = Part("supply", self.link.close)
+        closing = call_in_thread("supply", self.link.close)
         before = TIMES.control + TIMES.keeper + TIMES.vent
-        closing.ends_within(self._left(before + TIMES.supply, TIMES.supply))
+        ends_within(self._left(before + TIMES.supply, TIMES.supply), closing)
         self._end_the_rest()
-        if not closing.ends_within(self._left(before + TIMES.supply + TIMES.rest)):
+        if not ends_within(self._left(before + TIMES.supply + TIMES.rest), closing):
             self.trouble = "the guard does not end; whether the supply is vented is not known"
             self.hung = ("supply", *self.hung)
-        elif closing.error is not None:
-            self.trouble = str(closing.error)
+        elif closing.exception() is not None:
+            self.trouble = str(closing.exception())
         self._log.detach()
         self._manager.close()
         return state
@@ -346,14 +344,14 @@ class Daemon:
             works["telemetry"] = self._telemetry.stop
         if self._server is not None:
             works["service"] = self._end_service
-        parts = [Part(name, work) for name, work in works.items()]
+        calls = {name: call_in_thread(name, work) for name, work in works.items()}
         end = time.monotonic() + TIMES.rest
-        for part in parts:
-            if not part.ends_within(end - time.monotonic()):
-                self.hung = (*self.hung, part.name)
-                self._warn("stop", f"the {part.name} does not end and is left behind")
-            elif part.error is not None:
-                self._warn("stop", f"the {part.name} did not end well: {part.error}")
+        for name, call in calls.items():
+            if not ends_within(end - time.monotonic(), call):
+                self.hung = (*self.hung, name)
+                self._warn("stop", f"the {name} does not end and is left behind")
+            elif call.exception() is not None:
+                self._warn("stop", f"the {name} did not end well: {call.exception()}")
 
     def _end_service(self) -> None:
         if self._server is not None:
@@ -364,12 +362,7 @@ class Daemon:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     # the parts -----------------------------------------------------------------------------------
@@ -400,8 +393,8 @@ class Daemon:
 
     def _make_server(self) -> Server:
         from stiffopt.daemon.metrics import Metrics
+        from stiffopt.daemon.server import Server
         from stiffopt.daemon.service import create_app
-        from stiffopt.daemon.serving import Server
 
         settings, robot = self.description.service, self.robot.description
         app = create_app(
@@ -420,14 +413,14 @@ class Daemon:
         if self._telemetry is None:
             return
         self._recorded = True
-        starting = Part("telemetry", self._telemetry.start)
-        if not starting.ends_within(TIMES.telemetry):
+        starting = call_in_thread("telemetry", self._telemetry.start)
+        if not ends_within(TIMES.telemetry, starting):
             text = (
                 f"telemetry has not started within {TIMES.telemetry:g} s; control goes on without"
             )
             self.loop.add_alarm("telemetry", text)
-        elif starting.error is not None:
-            raise starting.error
+        elif (error := starting.exception()) is not None:
+            raise error
         if (port := self._telemetry.port) is not None:
             self._warn(
                 "foxglove",

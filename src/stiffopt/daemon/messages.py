@@ -47,23 +47,6 @@ from stiffopt.optimise.task import Task
 from stiffopt.schema import Schema
 from stiffopt.units import QuantityKind, unit_suffix
 
-__all__ = [
-    "MAX_MESSAGE",
-    "MAX_WAYPOINTS",
-    "ControlRequest",
-    "HoldRequest",
-    "SchemaMessage",
-    "TargetMessage",
-    "TaskMessage",
-    "TaskRequest",
-    "TaskText",
-    "TrajectoryMessage",
-    "message_of",
-    "sentence",
-    "task_of",
-    "trajectory_of",
-]
-
 MAX_MESSAGE = 16_384
 """Characters of the longest message to a stream."""
 _MAX_TEXT = 65_536  # characters of a task file; to read more would keep the control loop waiting

@@ -28,8 +28,6 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.device import Clock
 from stiffopt.rig.settings import ServiceSettings
 
-__all__ = ["ArmShape", "Telemetry", "TelemetryRates", "about_run"]
-
 Array = NDArray[np.float64]
 
 

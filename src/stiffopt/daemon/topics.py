@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -19,17 +18,8 @@ from numpy.typing import NDArray
 
 from stiffopt.control.state import Event, SeenPose, Severity, Snapshot, State, Timing
 from stiffopt.control.state_fields import Entry, Kind, entries
+from stiffopt.daemon.state_json import plain
 from stiffopt.rig.interface import PoseSample
-
-__all__ = [
-    "FORMAT",
-    "METADATA",
-    "STATES",
-    "TelemetryChannels",
-    "encoded",
-    "state_topics",
-    "topic_schemas",
-]
 
 METADATA = "stiffopt-run"
 """Name of the metadata record of a run."""
@@ -86,7 +76,7 @@ def encoded(topic: str, time: float, record: Any, **further: Any) -> bytes:
     """Return the message of a topic for a record of the state, at a time in s."""
     message: dict[str, Any] = {"time_s": round(time, _TIME_DECIMALS)}
     for entry in _logged(type(record), topic):
-        value = _rounded(getattr(record, entry.name), entry)
+        value = plain(getattr(record, entry.name), entry, rounded=True)
         if value is not None:
             message[entry.key] = value
     message.update(further)
@@ -104,30 +94,6 @@ def _schema(entry: Entry) -> dict[str, Any]:
         fields = {inner.key: _schema(inner) for inner in entries(entry.type)}
         item = {"type": "object", "properties": fields}
     return {"type": entry.kind.value} if item is None else {"type": "array", "items": item}
-
-
-def _rounded(value: Any, entry: Entry) -> Any:
-    """Return the value of a field, rounded, as it is logged; None if it is missing."""
-    if value is None:
-        return None
-    match entry.kind:
-        case Kind.NUMBER:
-            return round(value, entry.decimals) if isfinite(value) else None
-        case Kind.NUMBERS:
-            numbers = value.tolist() if entry.in_array else value
-            return [round(x, entry.decimals) if isfinite(x) else None for x in numbers]
-        case Kind.FLAGS if entry.in_array:
-            return value.tolist()
-        case Kind.COUNTS | Kind.FLAGS:
-            return list(value)
-        case Kind.TEXT:
-            return str(value)
-        case Kind.RECORDS:
-            return [
-                {e.key: _rounded(getattr(item, e.name), e) for e in entries(type(item))}
-                for item in value
-            ]
-    return value
 
 
 Array = NDArray[np.float64]
