@@ -31,7 +31,7 @@ def test_one_client_has_control_and_the_others_are_told_who(
     lease.renew(identity)
     holder = lease.holder
     assert holder is not None
-    assert (holder.client, holder.expires_in) == ("planner", 1.0)
+    assert (holder.client, holder.expires_in_s) == ("planner", 1.0)
     lease.release(identity)
     assert lease.holder is None
     assert lease.take("other") != identity

@@ -249,7 +249,7 @@ for tick in given[:1000]:
     made.put(tick)
 made.stop()
 print(loop.alarms["log"])
-print(made.waiting)
+print(len(made._queue))
 """
 
 

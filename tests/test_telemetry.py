@@ -237,7 +237,7 @@ def test_what_is_too_much_is_counted_and_said() -> None:
     assert made.dropped == 7
     made.work()
     assert "7 snapshots" in loop.alarms["telemetry-lost"]
-    assert made.waiting == 0
+    assert len(made._queue) == 0
     made.stop()
 
 

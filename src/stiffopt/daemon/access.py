@@ -69,14 +69,7 @@ class Access:
     - Any other method than GET and HEAD needs the token.
     - A body that is too long is refused before it is read whole.
 
-    Parameters
-    ----------
-    app :
-        The application behind it.
-    token :
-        Of those who may move the arm.
-    hosts :
-        Names of this machine, other than localhost.
+    `hosts` are names of this machine, other than localhost.
     """
 
     def __init__(self, app: ASGIApp, *, token: Token, hosts: Iterable[str] = ()) -> None:

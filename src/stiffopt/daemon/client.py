@@ -54,11 +54,11 @@ class Client:
             client.disarm()
 
     Control is lost, and the arm held, when the daemon does not hear from the client for a time.
-    With the heartbeat ``"automatic"``, a thread of the client sees to that as long as the thread
-    that took control lives. That proves that the process runs, not that the program in it makes
-    any progress: a planner that hangs keeps control. With ``"manual"``, only what the program does
-    counts: commands, `renew`, what it sends to a stream, `wait_until_settled`; take that for
-    anything that moves the arm without a person beside it.
+    With the heartbeat ``"automatic"``, a thread of the client renews control as long as the thread
+    that took it lives. That proves that the process runs, not that the program in it makes any
+    progress: a planner that hangs keeps control. With ``"manual"``, control is renewed only by what
+    the program does: commands, `renew`, targets of a stream, `wait_until_settled`. Use that where
+    no person watches the arm.
 
     A `with` block that ends by an exception holds the arm where it is; one that ends well gives
     control back and lets the arm go on with what it does. Methods may be called from any thread.
@@ -73,7 +73,7 @@ class Client:
     name :
         For the people who find that control is taken.
     heartbeat :
-        Who sees to it that the client is heard, see above.
+        How control is renewed, see above.
     timeout :
         Seconds after which an answer is given up.
 
@@ -136,7 +136,7 @@ class Client:
     # Reading ------------------------------------------------------------------------------------
 
     def state(self) -> Snapshot:
-        """Return how things stand."""
+        """Return the state of the control loop."""
         return record_of(Snapshot, self._ask("GET", "state"))
 
     def events(self, since: int = 0) -> tuple[list[Event], int]:
@@ -151,7 +151,7 @@ class Client:
     def wait_until_settled(
         self, position_tolerance: float, timeout: float, *, angle_tolerance: float = math.inf
     ) -> Snapshot:
-        """Wait until the tip is, and stays, where it shall be.
+        """Wait until the tip is at its target and stays there.
 
         Parameters
         ----------

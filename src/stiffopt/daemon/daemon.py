@@ -154,7 +154,7 @@ class Daemon:
             self.loop,
             self.link,
             self._manager,
-            None if self._server is None else self._is_serving,
+            None if (server := self._server) is None else lambda: server.alive,
         )
         self._stopping = threading.Event()
         self._control: ControlThread | None = None
@@ -163,7 +163,7 @@ class Daemon:
         self._started = self._stopped = self._recorded = False
         self._stop_begun = float("inf")
 
-    # what there is -------------------------------------------------------------------------------
+    # Reading -------------------------------------------------------------------------------------
 
     @property
     def url(self) -> str | None:
@@ -202,7 +202,7 @@ class Daemon:
             return TimeoutError("the control thread hangs")
         return None if self._control is None else self._control.failure
 
-    # life ----------------------------------------------------------------------------------------
+    # Start and end -------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Listen, start the guard, connect, check the rig, and begin to tick; it stays vented.
@@ -365,10 +365,10 @@ class Daemon:
     def __exit__(self, *_: object) -> None:
         self.stop()
 
-    # the parts -----------------------------------------------------------------------------------
+    # Parts ---------------------------------------------------------------------------------------
 
     def _make_telemetry(self, service: bool) -> Telemetry | None:
-        """Return what records; without ports it is no loss that stops anyone if it is missing."""
+        """Return the telemetry; without it, a daemon that opens no ports runs all the same."""
         settings = self.description.service
         if not service:
             settings = settings.model_copy(update={"foxglove_port": None})
@@ -433,11 +433,8 @@ class Daemon:
         """Append an event that is a warning."""
         self.loop.events.add(self._clock.now(), kind, text, Severity.WARNING)
 
-    def _is_serving(self) -> bool:
-        return self._server is not None and self._server.alive
-
     def _listen(self) -> None:
-        """Open the port, then keep the token: not in the place of that of one who has the port."""
+        """Open the port, then write the token: the daemon that has the port keeps its own."""
         if self._server is None:
             return
         given = self._secret.path is None
@@ -452,23 +449,10 @@ class Daemon:
 
 
 class ControlThread(threading.Thread):
-    """Ticks the control loop in real time until it is told to stop, then lets the pressures down.
+    """Ticks the control loop in real time until `stopping` is set, then lets the pressures down.
 
-    Parameters
-    ----------
-    loop, link :
-        The loop, and the link to its guard.
-    stopping :
-        Tells it to stop.
-    manager :
-        Is told in each tick that the loop lives.
-    telemetry :
-        Is handed the state after each tick.
-
-    Attributes
-    ----------
-    failure : BaseException or None
-        What ended it, if it was not told to stop; the loop has vented then.
+    In each tick, the service manager is told that the loop lives, and telemetry gets the state. The
+    loop has vented if a `failure` ended the thread.
     """
 
     def __init__(
@@ -498,7 +482,7 @@ class ControlThread(threading.Thread):
             self.failure = error
 
     def ticked(self, now: Snapshot) -> None:
-        """Pass on the state that a tick has left; in this thread."""
+        """Pass on the state at the end of a tick; in this thread."""
         self._manager.watchdog()
         if self._telemetry is not None:
             self._telemetry.put(now)
@@ -512,6 +496,6 @@ class ControlThread(threading.Thread):
 
 
 def _vibrates(description: RigDescription) -> bool:
-    """Return whether the arm has inertia: all have, but one that is simulated without."""
+    """Return whether the arm has inertia; only a quasi-static simulated one has none."""
     dynamics = getattr(description.plant, "dynamics", None)
     return not (description.supply.simulated and dynamics == "quasi-static")

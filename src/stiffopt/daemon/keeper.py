@@ -23,22 +23,13 @@ class ServiceManager:
     """Notifies systemd, if it started this process: ready, alive, state, stopping.
 
     The environment tells: ``NOTIFY_SOCKET``, and ``WATCHDOG_USEC`` if it wants signs of life.
-    Nothing here waits: what the manager does not take at once is lost.
-
-    Parameters
-    ----------
-    clock :
-        Time in s.
+    Nothing here waits: what the manager does not take at once is lost. Raises `MissingExtraError`
+    if there is a manager and sdnotify is not installed.
 
     Attributes
     ----------
     watchdog_interval : seconds after which the manager ends a process that has not called
-        `watchdog`; None: it does not look.
-
-    Raises
-    ------
-    MissingExtraError
-        There is a manager and sdnotify is not installed.
+        `watchdog`; None: it does not.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -56,10 +47,10 @@ class ServiceManager:
         self._say("STATUS=" + " ".join(text.split()))
 
     def watchdog(self) -> None:
-        """Say that all is well; for the control loop itself, in every tick, and nobody else.
+        """Say that the control loop lives; to be called by it alone, in every tick.
 
-        A timer or another thread would go on to say so after the loop hangs. It is passed on when
-        half of the interval is over.
+        (A timer or another thread would go on when the loop hangs.) One call in half an interval is
+        passed on.
         """
         if self.watchdog_interval is None:
             return
@@ -115,13 +106,6 @@ class LogEvents(logging.Handler):
     Clients without the token can provoke records. So that these do not push all else out of the
     events, one record per second is taken from each place in the code; those of libraries are never
     more than warnings.
-
-    Parameters
-    ----------
-    loop :
-        Whose events they become.
-    clock :
-        Time in s.
     """
 
     def __init__(self, loop: ControlLoop, clock: Callable[[], float] = time.monotonic) -> None:

@@ -9,22 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from stiffopt.daemon.reports import LEASE_HEADER, RefusalError
+from stiffopt.daemon.reports import LEASE_HEADER, LeaseReport, RefusalError
 from stiffopt.rig.interface import Clock
-
-
-@dataclass(frozen=True)
-class Holder:
-    """The client that has control.
-
-    Attributes
-    ----------
-    client : its name.
-    expires_in : time in s after which control is lost if nothing is heard; not negative.
-    """
-
-    client: str
-    expires_in: float
 
 
 @dataclass
@@ -58,10 +44,12 @@ class ControlLease:
         self._grant: _Grant | None = None
 
     @property
-    def holder(self) -> Holder | None:
+    def holder(self) -> LeaseReport | None:
         """Who has control, or None."""
         with self._lock:
-            return None if self._grant is None else self._seen(self._grant)
+            if self._grant is None:
+                return None
+            return LeaseReport(client=self._grant.client, expires_in_s=self._left(self._grant))
 
     def take(self, client: str) -> str:
         """Give control to a client and return what it must show with each command.
@@ -77,7 +65,7 @@ class ControlLease:
             if grant is not None:
                 raise _refused(
                     f"'{grant.client}' has control; it ends in "
-                    f"{self._seen(grant).expires_in:.2f} s unless it is renewed"
+                    f"{self._left(grant):.2f} s unless it is renewed"
                 )
             self._grant = _Grant(client, secrets.token_urlsafe(16), self._clock.now())
             return self._grant.identity
@@ -140,9 +128,10 @@ class ControlLease:
             grant.lost = True
         return grant.lost
 
-    def _seen(self, grant: _Grant) -> Holder:
+    def _left(self, grant: _Grant) -> float:
+        """Return the time in s after which control is lost if nothing is heard; not negative."""
         left = grant.heard + self.heartbeat - self._clock.now()
-        return Holder(grant.client, min(max(left, 0.0), self.heartbeat))
+        return min(max(left, 0.0), self.heartbeat)
 
 
 def _refused(message: str) -> RefusalError:

@@ -25,19 +25,7 @@ _SHARED = {"pressure_pascals": "Gauge pressures of the channels."}
 class Metrics:
     """The metrics of a control loop and its telemetry, as text for Prometheus.
 
-    Parameters
-    ----------
-    name :
-        Of the rig; a label.
-    loop :
-        What is watched.
-    telemetry :
-        Its recording is watched too.
-
-    Raises
-    ------
-    MissingExtraError
-        prometheus-client is not installed.
+    The name of the rig is a label of each. Raises `MissingExtraError` without prometheus-client.
     """
 
     def __init__(self, name: str, loop: ControlLoop, telemetry: Telemetry | None = None) -> None:

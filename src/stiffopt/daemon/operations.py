@@ -24,7 +24,6 @@ from stiffopt.daemon.messages import TargetMessage, TaskMessage, task_of
 from stiffopt.daemon.reports import (
     DoneReport,
     GrantReport,
-    LeaseReport,
     RefusalError,
     RobotReport,
     TaskReport,
@@ -48,10 +47,8 @@ class Operations:
 
     Parameters
     ----------
-    loop :
-        The control loop.
-    robot :
-        The arm that it steers.
+    loop, robot :
+        The control loop, and the arm that it steers.
     heartbeat :
         A client that was not heard for this long, in s, loses control, and the arm is held.
     clock :
@@ -82,13 +79,10 @@ class Operations:
     def state(self) -> dict[str, Any]:
         """Return the state of the loop and who has control, as `StateReport` describes it."""
         holder = self.lease.holder
-        lease = None
-        if holder is not None:
-            lease = LeaseReport(client=holder.client, expires_in_s=holder.expires_in).model_dump()
         now = self.loop.snapshot()
         if self._reported is None or self._reported[0] is not now:  # streams ask for the same one
             self._reported = (now, json_of(now))
-        return {**self._reported[1], "lease": lease}
+        return {**self._reported[1], "lease": None if holder is None else holder.model_dump()}
 
     def robot_report(self) -> RobotReport:
         """Return what arm this is."""

@@ -35,21 +35,21 @@ class RunSpan:
 
 @dataclass(frozen=True, eq=False)
 class RecordedRun:
-    """A run, in SI units; what is missing is NaN. Time 0 is when the recording began.
+    """A recorded run, in SI units; NaN is what is unknown. Time 0 is where the recording begins.
 
     Fields of `stiffopt.control.state.Snapshot` that are logged as numbers are attributes, with one
     row per tick: ``run.commanded`` is (N, n), ``run.position_error`` is (N,).
 
     Attributes
     ----------
-    about : what the recording says of itself: ``rig``, ``robot``, ``robot_file`` (its text),
-        ``stiffopt`` (version), ``start_ns`` (date of time 0, since 1970).
+    about : metadata: ``rig``, ``robot``, ``robot_file`` (its text), ``stiffopt`` (version),
+        ``start_ns`` (date of time 0, since 1970).
     channels : number of channels of each segment.
     time : of the ticks (N,), in s.
     fields : the state in each tick, by the names of `Snapshot`.
-    captured : when the tracker captured its frames (M,), in s, increasing.
-    seen_position, seen_quaternion : where it saw the tip (M, 3) and (M, 4), w first.
-    doubted : frames (M,) that no arm could have moved to, or that came with such a one.
+    captured : times of capture of the tracker's samples (M,), in s, increasing.
+    seen_position, seen_quaternion : of the tip in the samples (M, 3) and (M, 4), w first.
+    doubted : samples (M,) that no arm could have moved to, or that came with such a one.
     states, alarms, events : in order of time, which is that of the run.
     timing : the last ``/timing`` message; empty if there is none.
     complete : whether the recording was ended properly, and nothing in it is damaged.
@@ -257,18 +257,18 @@ def _alarms(messages: Sequence[Mapping[str, Any]], begin: float, end: float) -> 
     return tuple(sorted(spans, key=lambda span: span.begin))
 
 
-_GAP = 0.1  # s without a frame, which rows without a tip fill ...
+_GAP = 0.1  # s without a sample, which rows without a tip fill ...
 _STEP = 0.05  # ... s apart
-_NEAR = 0.1  # s between a frame and a reading that belongs to it
+_NEAR = 0.1  # s between a sample and a pressure reading that belongs to it
 _DIGITS = 6  # of a time in s, as log v1 writes it
 
 
 def log_of_run(run: RecordedRun) -> Log:
-    """Return the log of a run. Time 0 is when the recording began; N rows may be none.
+    """Return the log of a run, with a row for each sample of the tracker; there may be no rows.
 
-    A frame that no arm could have moved to, or in which the tip was not seen, gives a row without
-    a tip. Two frames of the same time give one row; of frames that were captured before the first
-    command it is not known what the pressures were, and they are left out.
+    A sample that no arm could have moved to, or without a tip, gives a row without a tip. Two
+    samples of the same time give one row. Samples from before the first command are left out, since
+    the pressures are not known.
     """
     within = (run.captured >= run.time[0]) & (run.captured <= run.time[-1] + _NEAR)
     captured = np.round(run.captured[within], _DIGITS)
@@ -300,7 +300,7 @@ def log_of_run(run: RecordedRun) -> Log:
 
 
 def _fillers(ticks: Array, captured: Array) -> Array:
-    """Return times of ticks, some way apart, in which no frame was captured."""
+    """Return times of ticks, `_STEP` apart, where no sample was captured for `_GAP`."""
     after = np.searchsorted(captured, ticks, side="right")
     edges = np.concatenate([[-np.inf], captured, [np.inf]])
     before, next_one = edges[after], edges[after + 1]

@@ -74,7 +74,7 @@ SI units stand in the names; null is what is not known. Gauge pressures; poses i
 _log = logging.getLogger(__name__)
 
 _UNREAD = WrapValidator(lambda given, _: given)
-"""Marks a body that may be long: it is read in a thread, not in that which hears all clients."""
+"""Leaves a body that may be long unread: `Operations` reads it in a thread of its own."""
 LeaseHeader = Annotated[
     str | None,
     Header(alias=LEASE_HEADER, description="from POST /v1/lease", max_length=100),
@@ -96,22 +96,14 @@ def create_app(
 
     Parameters
     ----------
-    loop :
-        A control loop.
-    robot :
-        The arm that it steers.
+    loop, robot, heartbeat, clock, patience :
+        As for `Operations`.
     token :
-        Secret of those who may move the arm.
-    heartbeat :
-        A client that was not heard for this long, in s, loses control, and the arm is held.
-    clock :
-        That of the rig.
+        That a client needs to move the arm.
     metrics :
-        Returns what Prometheus reads at ``/metrics``; None: there is nothing.
+        Returns what Prometheus reads at ``/metrics``; None: there is no such page.
     hosts :
-        Names of this machine by which clients may speak to it, beside localhost and addresses.
-    patience :
-        Seconds after which a command to the loop is given up.
+        Names of this machine, other than localhost, to which clients may send requests.
 
     Returns
     -------
@@ -193,7 +185,7 @@ def _reading(operations: Operations) -> APIRouter:
 
     @router.get("/state", response_model=StateReport)
     async def state() -> Response:
-        """How things stand."""
+        """The state of the control loop, and who has control."""
         return JSONResponse(operations.state())
 
     @router.get("/events", response_model=EventsReport, responses=_responses(422))

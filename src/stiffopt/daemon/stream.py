@@ -49,16 +49,7 @@ class Stream:
     Of targets that come faster than the control loop takes them, only the newest is passed on:
     a stale one would move the arm to where the client no longer wants it.
 
-    Parameters
-    ----------
-    websocket :
-        Not accepted yet; `Access` has looked at its headers.
-    operations :
-        Behind the interface.
-    token :
-        Of those who may move the arm.
-    limiter, connection :
-        All connections, and which of them this is.
+    The WebSocket is not accepted yet; `Access` has checked its headers.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Telemetry: sends the state of the loop to Foxglove and records it, in a thread of its own.
 
-The loop hands over a snapshot in each tick, which costs it a microsecond. Whatever fails here
-raises an alarm and does nothing else.
+The loop hands over a snapshot in each tick, which takes a microsecond. A failure here raises an
+alarm, and control goes on.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Alarm, Snapshot
 from stiffopt.daemon.recording import RunRecording
 from stiffopt.daemon.topics import FORMAT, TelemetryChannels
-from stiffopt.errors import MissingExtraError, StiffoptError
+from stiffopt.errors import StiffoptError, require_package
 from stiffopt.files import file_text
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
@@ -68,24 +68,20 @@ class Telemetry:
 
     Parameters
     ----------
-    robot :
-        What the arm is believed to be; kept in the recording.
-    name :
+    robot, name :
+        The model of the arm, which is kept in the recording, and the name of the rig.
+    loop, clock :
         Of the rig.
-    loop :
-        What is watched.
     folder :
         Where recordings go; None: nothing is recorded.
     settings :
         Where Foxglove may connect.
-    clock :
-        Of the rig.
     backbone :
         Gives poses (m, 4, 4) along the arm for pressures (n,), in Pa.
     about :
         Further metadata for the recording, such as the text of the rig file.
     wall :
-        Nanoseconds since 1970; asked once, so that no change of the wall clock is in the messages.
+        Nanoseconds since 1970; read once, so that messages do not jump with the wall clock.
 
     Raises
     ------
@@ -106,10 +102,8 @@ class Telemetry:
         about: Mapping[str, str] | None = None,
         wall: Callable[[], int] = time.time_ns,
     ) -> None:
-        try:
-            from foxglove import Context
-        except ImportError:
-            raise MissingExtraError("foxglove-sdk", "daemon") from None
+        require_package("foxglove-sdk", "daemon", "foxglove")
+        from foxglove import Context
 
         self.dropped = 0
         self._loop, self._name, self._settings = loop, name, settings
@@ -155,11 +149,6 @@ class Telemetry:
         """Bytes recorded so far."""
         return 0 if self._recording is None else self._recording.written
 
-    @property
-    def waiting(self) -> int:
-        """Snapshots that are not logged yet."""
-        return len(self._queue)
-
     def put(self, snapshot: Snapshot) -> None:
         """Hand over a snapshot; called by the control thread in each tick, and never waits."""
         if len(self._queue) == RATES.queue:
@@ -174,7 +163,7 @@ class Telemetry:
         self._thread.start()
 
     def stop(self, patience: float = 5.0) -> None:
-        """Log what is left, end the recording and listen no more; to stop twice does nothing.
+        """Log the rest, end the recording and stop the server; to stop twice does nothing.
 
         Raises
         ------
@@ -201,7 +190,7 @@ class Telemetry:
         self._channels.close()
 
     def work(self, *, last: bool = False) -> None:
-        """Log what has come since the last call; with `last`, see it onto the disk at once."""
+        """Log what has come since the last call; with `last`, write it to the disk at once."""
         with self._working:
             self._work(last)
 
@@ -221,7 +210,7 @@ class Telemetry:
         self._look_back(now)
 
     def _attempt(self, log: Callable[[Any], None], what: Any) -> None:
-        """Log something; that it fails is told, and no more comes of it."""
+        """Log something; a failure raises an alarm."""
         try:
             log(what)
         except Exception as error:
@@ -275,7 +264,7 @@ class Telemetry:
             return
         p = np.where(np.isfinite(now.measured), now.measured, now.commanded)
         if np.isfinite(p).all():
-            with suppress(StiffoptError):  # an arm whose shape nobody knows is not drawn
+            with suppress(StiffoptError):  # an arm without a known shape is not drawn
                 self._channels.log_arm(now, self._backbone(p))
 
     def _commit(self, now: float) -> None:
@@ -284,7 +273,7 @@ class Telemetry:
             self._tell("log", self._recording.trouble)
 
     def _look_back(self, now: float) -> None:
-        """Say what was lost, and that all is well when nothing has gone wrong for a while."""
+        """Raise an alarm for lost snapshots, and clear alarms after a while without a failure."""
         if now > self._failed_at + RATES.calm:
             self._tell("telemetry", "")
         if self.dropped > self._dropped_told:
@@ -295,7 +284,7 @@ class Telemetry:
             self._tell("telemetry-lost", "")
 
     def _tell(self, kind: str, text: str) -> None:
-        """Raise an alarm, or clear it where there is nothing to say; only what changes is told."""
+        """Raise an alarm, or clear it if the text is empty; if that changes anything."""
         if self._told.get(kind, "") == text:
             return
         self._told[kind] = text
@@ -306,7 +295,7 @@ class Telemetry:
 
 
 class ArmShape:
-    """Computes the arm's shape as often as its share of the interpreter's time permits."""
+    """The shape of the arm's model, computed as often as `TelemetryRates.shape_share` permits."""
 
     def __init__(self, robot: Manipulator) -> None:
         self._robot = robot
@@ -326,7 +315,7 @@ class ArmShape:
 def about_run(
     robot: RobotDescription, name: str, first: Snapshot, begin: float, offset: int
 ) -> dict[str, str]:
-    """Return the metadata of a recording: all that a reader needs beside the messages."""
+    """Return the metadata of a recording: all that a reader needs, other than the messages."""
     from stiffopt import __version__
 
     return {
