@@ -35,7 +35,7 @@ class LogWriter:
     Raises
     ------
     FileError
-        It cannot be written, or is there and has other columns.
+        It cannot be written, now or later, or is there and has other columns.
     """
 
     def __init__(self, path: str | os.PathLike[str], layout: LogLayout) -> None:
@@ -69,15 +69,7 @@ class LogWriter:
                 raise FileError(self.path, "has no time", line=len(lines)) from None
 
     def append(self, row: LogRow) -> None:
-        """Write a row.
-
-        Raises
-        ------
-        InputError
-            It does not fit the columns, or is not after the last one.
-        FileError
-            It cannot be written.
-        """
+        """Write a row; raise `InputError` if it does not fit or is not after the last one."""
         values = row.values(self.layout, after=self.last_time)
         fields = [
             "" if np.isnan(value) else form % value
@@ -92,13 +84,7 @@ class LogWriter:
                 data = data[self._stream.write(data) :]
 
     def close(self) -> None:
-        """See the rows onto the disk and close; to close twice does nothing.
-
-        Raises
-        ------
-        FileError
-            The disk does not take them.
-        """
+        """Write all rows to the disk and close; to close twice does nothing."""
         if self._stream.closed:
             return
         with writing(self.path), self._stream:
@@ -112,13 +98,7 @@ class LogWriter:
 
 
 def write_log(path: str | os.PathLike[str], log: Log) -> None:
-    """Write a whole log (log v1), in the place of what is there.
-
-    Raises
-    ------
-    FileError
-        It cannot be written.
-    """
+    """Write a whole log (log v1), in the place of what is there."""
     with replacing(path) as part, LogWriter(part, log.layout) as writer:
         for row in log.rows():
             writer.append(row)

@@ -6,6 +6,7 @@ import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,20 +79,16 @@ class LogLayout:
     def of_columns(cls, path: str, columns: Sequence[str]) -> LogLayout:
         """Return the layout of a file that has these columns, in any order.
 
-        Raises
-        ------
-        FileError
-            A column is missing, there twice or unknown.
+        It raises `FileError` if a column is missing, there twice or unknown.
         """
         names = set(columns)
         for name in columns:
             if columns.count(name) > 1:
                 raise FileError(path, f"the column {shown(name)} is there twice", line=1)
-        n = _count(names, "p")
+        n = next(k for k in count() if f"p{k + 1}_pa" not in names)
         bodies = {}
-        for name in columns:
-            found = _BODY.fullmatch(name)
-            if found is not None and found[1] != "tip":
+        for found in filter(None, map(_BODY.fullmatch, columns)):
+            if found[1] != "tip":
                 bodies[found[1]] = bool({f"{found[1]}_{part}" for part in _PARTS} & names)
         layout = cls(
             n=max(n, 1),
@@ -113,13 +110,6 @@ class LogLayout:
 
 def _pressures(prefix: str, n: int) -> list[str]:
     return [f"{prefix}{k + 1}_pa" for k in range(n)]
-
-
-def _count(names: set[str], prefix: str) -> int:
-    count = 0
-    while f"{prefix}{count + 1}_pa" in names:
-        count += 1
-    return count
 
 
 def _missing(name: str, unknown: Sequence[str]) -> str:

@@ -48,7 +48,7 @@ class McapLogWriter:
     Raises
     ------
     FileError
-        It cannot be written.
+        It cannot be written, now or later.
     MissingExtraError
         foxglove-sdk is not installed.
     """
@@ -84,15 +84,7 @@ class McapLogWriter:
             self._file = McapWriter(os.open(self.path, _REPLACE, 0o666), context, metadata)
 
     def append(self, row: LogRow) -> None:
-        """Write a row.
-
-        Raises
-        ------
-        InputError
-            It does not fit the layout, or is not after the last one.
-        FileError
-            It cannot be written.
-        """
+        """Write a row; raise `InputError` if it does not fit or is not after the last one."""
         values = row.values(self.layout, after=self._last_time)
         self._last_time = row.time
         parts = self.layout.split(values)
@@ -105,13 +97,7 @@ class McapLogWriter:
             self._file.commit()
 
     def close(self) -> None:
-        """Write the index and close; to close twice does nothing.
-
-        Raises
-        ------
-        FileError
-            The disk does not take it.
-        """
+        """Write the index and close; to close twice does nothing."""
         with writing(self.path):
             self._file.close()
 

@@ -36,10 +36,8 @@ class Table:
 def read_table(path: str | os.PathLike[str]) -> Table:
     """Read a table: a row of names, then numbers; an empty field is a missing value.
 
-    Raises
-    ------
-    FileError
-        It cannot be read; a row has too few or too many fields; a field is no finite number.
+    It raises `FileError` if the file cannot be read, a row has too few or too many fields, or a
+    field is no finite number.
     """
     name = os.fspath(path)
     text = read_bytes(name).removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n")
@@ -96,10 +94,7 @@ def writing(path: str | os.PathLike[str]) -> Iterator[None]:
 def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
     """Context that yields the path of a new file, which then takes the place of `path`.
 
-    Raises
-    ------
-    FileError
-        It cannot be written.
+    It raises `FileError` if that cannot be written.
     """
     part = f"{os.fspath(path)}.part"
     try:
@@ -112,13 +107,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
 
 
 def cut_torn_end(path: str) -> bool:
-    """Remove an unfinished last line, as a killed writer leaves it; return whether there was one.
-
-    Raises
-    ------
-    FileError
-        It cannot be read or written.
-    """
+    """Remove the unfinished last line that a killed writer leaves; return whether there was one."""
     text = read_bytes(path)
     end = text.rfind(b"\n") + 1
     if end == len(text):
