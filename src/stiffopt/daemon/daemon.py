@@ -188,7 +188,7 @@ class Daemon:
     @property
     def recording(self) -> str | None:
         """The file that is recorded to; None while there is none."""
-        return None if self._telemetry is None else self._telemetry.path
+        return None if self._telemetry is None else self._telemetry.recording.path
 
     @property
     def ended(self) -> bool:

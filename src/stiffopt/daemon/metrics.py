@@ -55,7 +55,7 @@ class Metrics:
         yield from self._of_fields(now)
         yield self._events()
         if self._telemetry is not None:
-            dropped, written = self._telemetry.dropped, self._telemetry.written
+            dropped, written = self._telemetry.dropped, self._telemetry.recording.written
             yield self._counter("telemetry_dropped", "Snapshots never logged.", dropped)
             yield self._counter("log_bytes", "Bytes recorded.", written)
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.state import Alarm, Snapshot
+from stiffopt.control.state import Snapshot
 from stiffopt.daemon.recording import RunRecording
 from stiffopt.daemon.topics import FORMAT, TelemetryChannels
 from stiffopt.errors import StiffoptError, require_package
@@ -73,7 +73,7 @@ class Telemetry:
     loop, clock :
         Of the rig.
     folder :
-        Where recordings go; None: nothing is recorded.
+        Where recordings go.
     settings :
         Where Foxglove may connect.
     backbone :
@@ -94,7 +94,7 @@ class Telemetry:
         robot: RobotDescription,
         name: str,
         loop: ControlLoop,
-        folder: str | None,
+        folder: str,
         settings: ServiceSettings,
         *,
         clock: Clock,
@@ -112,14 +112,11 @@ class Telemetry:
         self._context = Context()
         begin = clock.now()
         self._offset = wall() - round(begin * 1e9)
-        self._channels = TelemetryChannels(self._context, self._offset, 2 * _radius(robot))
+        thickness = 2 * max(segment.outer_radius for segment in robot.segments)
+        self._channels = TelemetryChannels(self._context, self._offset, thickness)
         first = loop.snapshot()
         facts = {**about_run(robot, name, first, begin, self._offset), **(about or {})}
-        self._recording = (
-            None
-            if folder is None
-            else RunRecording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
-        )
+        self.recording = RunRecording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
         self._server: Any = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
@@ -127,9 +124,8 @@ class Telemetry:
         self._next_event = 0
         self._last_state: object = None
         self._logged = np.inf  # nothing was handed over yet
-        self._due_tick = self._due_state = self._due_smooth = self._due_often = (
-            self._due_commit
-        ) = -np.inf
+        self._due_tick = self._due_state = self._due_frames = self._due_shape = -np.inf
+        self._due_commit = -np.inf
         self._told: dict[str, str] = {}
         self._dropped_told = 0
         self._dropped_at = self._failed_at = -np.inf
@@ -138,16 +134,6 @@ class Telemetry:
     def port(self) -> int | None:
         """Where Foxglove can connect; None while it cannot."""
         return None if self._server is None else int(self._server.port)
-
-    @property
-    def path(self) -> str | None:
-        """The file that is written, or was last."""
-        return None if self._recording is None else self._recording.path
-
-    @property
-    def written(self) -> int:
-        """Bytes recorded so far."""
-        return 0 if self._recording is None else self._recording.written
 
     def put(self, snapshot: Snapshot) -> None:
         """Hand over a snapshot; called by the control thread in each tick, and never waits."""
@@ -182,8 +168,7 @@ class Telemetry:
         if end.time > (self._queue[-1].time if self._queue else self._logged):
             self.put(end)  # what became of it after the last tick
         self.work(last=True)
-        if self._recording is not None:
-            self._recording.close()
+        self.recording.close()
         if self._server is not None:
             self._server.stop()
             self._server = None
@@ -192,22 +177,19 @@ class Telemetry:
     def work(self, *, last: bool = False) -> None:
         """Log what has come since the last call; with `last`, write it to the disk at once."""
         with self._working:
-            self._work(last)
-
-    def _work(self, last: bool) -> None:
-        if self._recording is not None and not self._recording.is_open:
-            self._commit(time.monotonic())  # to have it before anything is logged
-        while self._queue:
-            self._attempt(self._log, self._queue.popleft())
-            time.sleep(0)  # the control thread may want the interpreter
-        events, self._next_event = self._loop.events.since(self._next_event)
-        for event in events:
-            self._attempt(self._channels.log_event, event)
-        now = time.monotonic()
-        if last or now >= self._due_commit:
-            self._due_commit = now + RATES.commit
-            self._commit(now)
-        self._look_back(now)
+            if not self.recording.is_open:
+                self._commit(time.monotonic())  # to have it before anything is logged
+            while self._queue:
+                self._attempt(self._log, self._queue.popleft())
+                time.sleep(0)  # the control thread may want the interpreter
+            events, self._next_event = self._loop.events.since(self._next_event)
+            for event in events:
+                self._attempt(self._channels.log_event, event)
+            now = time.monotonic()
+            if last or now >= self._due_commit:
+                self._due_commit = now + RATES.commit
+                self._commit(now)
+            self._look_back(now)
 
     def _attempt(self, log: Callable[[Any], None], what: Any) -> None:
         """Log something; a failure raises an alarm."""
@@ -241,7 +223,7 @@ class Telemetry:
     def _log(self, now: Snapshot) -> None:
         self._logged = now.time
         due = on_time = now.time >= self._due_tick - RATES.tick / 2
-        state = (now.state, now.reason, now.task, _kinds(now.alarms))
+        state = (now.state, now.reason, now.task, {alarm.kind for alarm in now.alarms})
         if state != self._last_state or now.time >= self._due_state:
             self._channels.log_state(now)
             self._last_state, self._due_state = state, now.time + RATES.state
@@ -251,11 +233,11 @@ class Telemetry:
             self._due_tick = (self._due_tick if regular else now.time) + RATES.tick
             self._channels.log_tick(now)
         self._channels.log_samples(now)  # each of them
-        if now.time >= self._due_smooth:
-            self._due_smooth = now.time + RATES.frames
+        if now.time >= self._due_frames:
+            self._due_frames = now.time + RATES.frames
             self._channels.log_frames(now)
-        if now.time >= self._due_often:
-            self._due_often = now.time + RATES.shape
+        if now.time >= self._due_shape:
+            self._due_shape = now.time + RATES.shape
             self._channels.log_timing(now, self.dropped)
             self._log_arm(now)
 
@@ -268,9 +250,8 @@ class Telemetry:
                 self._channels.log_arm(now, self._backbone(p))
 
     def _commit(self, now: float) -> None:
-        if self._recording is not None:
-            self._recording.commit(now)
-            self._tell("log", self._recording.trouble)
+        self.recording.commit(now)
+        self._tell("log", self.recording.trouble)
 
     def _look_back(self, now: float) -> None:
         """Raise an alarm for lost snapshots, and clear alarms after a while without a failure."""
@@ -330,11 +311,3 @@ def about_run(
         "start_ns": str(offset + round(begin * 1e9)),
         "stiffopt": __version__,
     }
-
-
-def _radius(robot: RobotDescription) -> float:
-    return max(segment.outer_radius for segment in robot.segments)
-
-
-def _kinds(alarms: tuple[Alarm, ...]) -> frozenset[str]:
-    return frozenset(alarm.kind for alarm in alarms)
