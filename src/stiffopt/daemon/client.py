@@ -27,6 +27,7 @@ from stiffopt.errors import (
     MissingExtraError,
     ServiceError,
     StiffoptError,
+    require_package,
 )
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task, load_task
@@ -68,10 +69,10 @@ class Client:
     url :
         Of the daemon.
     token :
-        The token itself, or the path of the file that it stands in; None: that of the environment
-        variable STIFFOPT_TOKEN, which may be either too. Reading needs none.
+        The token, or the path of the file that it is in; None: that of the environment variable
+        STIFFOPT_TOKEN, which may be either too. Reading needs none.
     name :
-        For the people who find that control is taken.
+        That others see who find that control is taken.
     heartbeat :
         How control is renewed, see above.
     timeout :
@@ -96,10 +97,9 @@ class Client:
     ) -> None:
         if heartbeat not in ("automatic", "manual"):
             raise InputError(f"heartbeat must be 'automatic' or 'manual', not {heartbeat!r}")
-        try:
-            import httpx
-        except ModuleNotFoundError as error:
-            raise MissingExtraError("httpx", "daemon") from error
+        require_package("httpx", "daemon")
+        import httpx
+
         try:
             parts = urlsplit(url)
             good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0

@@ -76,7 +76,7 @@ TIMES = DaemonTimes()
 class Daemon:
     """The daemon of a rig: guard, control loop, telemetry and the HTTP interface.
 
-    Nothing is connected or started before `start`; it is vented and inactive then, until `arm` is
+    `start` connects and starts everything; the arm is vented and inactive then, until `arm` is
     called here or by a client. `stop`, or the end of a `with` block, lets the pressures down,
     vents, and ends everything.
 
@@ -89,20 +89,12 @@ class Daemon:
     log_folder :
         Where recordings go; None: where the rig file says.
     json_lines :
-        Whether the guard, too, speaks JSON on stderr.
+        Whether the guard writes JSON on stderr.
 
     Attributes
     ----------
-    description : RigDescription
-        What the rig file says.
-    robot : Manipulator
-        The model of the arm.
-    loop : ControlLoop
-        State, events and commands.
-    trouble : str
-        Why it is not certain that the arm is vented, after `stop`; empty if it is.
-    hung : tuple of str
-        Parts that had not ended when `stop` did. They are threads that keep no process from
+    trouble : why it is not certain that the arm is vented, after `stop`; empty if it is.
+    hung : parts that had not ended when `stop` did. Their threads do not keep the process from
         ending, but a library that they are in may: see `os._exit`.
 
     Raises
@@ -167,17 +159,17 @@ class Daemon:
 
     @property
     def url(self) -> str | None:
-        """Of the control interface; None where there is none."""
+        """URL of the control interface; None where there is none."""
         return None if self._server is None else self._server.url
 
     @property
     def token(self) -> str:
-        """Secret of those who may move the arm."""
+        """The token that a client needs to move the arm."""
         return self._secret.token
 
     @property
     def token_file(self) -> Path | None:
-        """Where it can be read; None where the environment has it, or nobody needs it."""
+        """The file of the token; None where it is in the environment, or nobody needs it."""
         return None if self._server is None else self._secret.path
 
     @property

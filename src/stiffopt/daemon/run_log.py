@@ -333,9 +333,8 @@ def _between(run: RecordedRun, time: Array) -> Array:
         if known.any():
             at = read[known]
             line = np.interp(time, at, values[known, channel])
-            after = np.searchsorted(at, time).clip(1, max(len(at) - 1, 1))
-            nearest = np.minimum(
-                np.abs(time - at[after - 1]), np.abs(time - at[np.minimum(after, len(at) - 1)])
-            )
+            after = np.searchsorted(at, time)
+            edges = np.concatenate([[-np.inf], at, [np.inf]])
+            nearest = np.minimum(time - edges[after], edges[after + 1] - time)
             measured[:, channel] = np.where(nearest <= _NEAR, line, np.nan)
     return measured

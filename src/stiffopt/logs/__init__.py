@@ -1,8 +1,7 @@
 """Logs of an arm over time (CSV "log v1" and MCAP), and tables of measured stiffness (CSV)."""
 
 from stiffopt.logs.csv_log import LogWriter, read_log, write_log
-from stiffopt.logs.layout import LogLayout
-from stiffopt.logs.log import Body, Log, LogRow
+from stiffopt.logs.log import Body, Log, LogLayout, LogRow
 from stiffopt.logs.mcap_log import McapLogWriter, read_mcap_log
 from stiffopt.logs.stiffness import (
     StiffnessTable,

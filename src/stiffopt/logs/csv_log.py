@@ -8,8 +8,7 @@ from typing import Self
 import numpy as np
 
 from stiffopt.errors import FileError
-from stiffopt.logs.layout import LogLayout
-from stiffopt.logs.log import Log, LogRow, log_of_values
+from stiffopt.logs.log import Log, LogLayout, LogRow, log_of_values
 from stiffopt.logs.table import cut_torn_end, read_bytes, read_table, replacing, writing
 
 

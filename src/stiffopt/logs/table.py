@@ -12,7 +12,7 @@ from io import BytesIO
 import numpy as np
 
 from stiffopt.errors import FileError, os_reason, shown
-from stiffopt.logs.layout import Array
+from stiffopt.logs.log import Array
 
 _ALLOWED = b"0123456789+-.eE,\n \t"
 _NUMBER = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\s*")
