@@ -102,7 +102,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
             yield part
             os.replace(part, path)
     finally:
-        with suppress(FileNotFoundError):
+        with suppress(OSError):
             os.remove(part)
 
 
