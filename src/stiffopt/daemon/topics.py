@@ -70,7 +70,8 @@ def topic_schemas() -> dict[str, dict[str, Any]]:
 def encoded(topic: str, time: float, record: Any, **further: Any) -> bytes:
     """Return the message of a topic for a record of the state, at a time in s."""
     message: dict[str, Any] = {"time_s": round(time, _TIME_DECIMALS)}
-    for entry in _logged(type(record), topic):
+    kind: type = type(record)
+    for entry in _logged(kind, topic):
         value = plain(getattr(record, entry.name), entry, rounded=True)
         if value is not None:
             message[entry.key] = value
