@@ -20,13 +20,7 @@ _READING = ("GET", "HEAD")
 
 
 class Token:
-    """The secret that a client shows to be allowed to move the arm.
-
-    Raises
-    ------
-    InputError
-        It is empty, or has characters that a header cannot carry.
-    """
+    """The secret that a client shows to be allowed to move the arm."""
 
     def __init__(self, text: str) -> None:
         if not text or not all("!" <= c <= "~" for c in text):

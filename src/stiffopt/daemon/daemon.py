@@ -230,13 +230,7 @@ class Daemon:
         self._manager.ready()
 
     def read_task(self, path: str | os.PathLike[str]) -> Task:
-        """Read a task file and see that it is for this arm.
-
-        Raises
-        ------
-        FileError
-            The file is wrong, or is for another robot.
-        """
+        """Read a task file; raise `FileError` if it is wrong or for another robot."""
         task = load_task(path)
         asked, there = task.resolve_robot().name, self.robot.description.name
         if asked != there:
@@ -248,10 +242,7 @@ class Daemon:
     def arm(self, task: Task | None = None) -> None:
         """Arm as soon as the vented arm has been seen for long enough, and pursue a task.
 
-        Raises
-        ------
-        InputError
-            It cannot be armed, or the task does not suit; it is inactive then.
+        If it cannot be armed, or the task does not suit, it is inactive and `InputError` is raised.
         """
         end = time.monotonic() + TIMES.arming
         while True:

@@ -28,13 +28,6 @@ class ControlLease:
     A client that is not heard for `heartbeat` seconds loses it, and the arm is to be held. `check`
     tells of the loss, and nobody else gets control until `settle` is called after that. What a
     client without control asks for is refused by `RefusalError`. Any thread may call any method.
-
-    Parameters
-    ----------
-    heartbeat :
-        In s.
-    clock :
-        That of the rig, which never jumps.
     """
 
     def __init__(self, heartbeat: float, clock: Clock) -> None:

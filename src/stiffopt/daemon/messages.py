@@ -121,11 +121,8 @@ class SchemaMessage(_Message):
     def of(cls, given: Schema, **more: Any) -> Self:
         """Return the message for a description, in which `more` keys are replaced.
 
-        Raises
-        ------
-        InputError
-            The description is of a subclass whose further keys have no place in the message, or
-            has values that no message may have; the text names the keys.
+        It raises `InputError` if the description is of a subclass whose further keys have no place
+        in the message, or has values that no message may have.
         """
         lost: list[Loc] = []
         message = {**_json_of(given, (), lost), **more}
@@ -137,13 +134,7 @@ class SchemaMessage(_Message):
         return _valid(TypeAdapter(cls), message, ())
 
     def read(self, **more: Any) -> Any:
-        """Return the description, in which `more` keys are replaced.
-
-        Raises
-        ------
-        InputError
-            It makes no sense.
-        """
+        """Return the description, in which `more` keys are replaced; `InputError` if it is wrong."""
         return self.schema_class(**{**_keys_of(self), **more})
 
 
@@ -180,14 +171,9 @@ _MADE: dict[type[Schema], type[SchemaMessage]] = {}
 
 
 def message_of(schema: type[Schema], base: type[SchemaMessage] = SchemaMessage) -> Any:
-    """Return the message class of a schema.
+    """Return the message class of a schema, which has its fields and those of the schemas in it.
 
-    Parameters
-    ----------
-    schema :
-        Its fields become those of the message, and so do those of the schemas in it.
-    base :
-        A message whose own fields take the place of those of the same name.
+    Fields that `base` has take the place of those of the same name.
     """
     if schema not in _MADE or base is not SchemaMessage:
         hints = get_type_hints(schema, include_extras=True)
@@ -310,12 +296,7 @@ def trajectory_of(given: Any) -> Trajectory:
     """Return the trajectory in the JSON of a `TrajectoryMessage`.
 
     Its waypoints are read one by one: ten thousand at once would block the interpreter, and so the
-    control thread, for too long.
-
-    Raises
-    ------
-    InputError
-        It makes no sense.
+    control thread, for too long. A mistake raises `InputError`.
     """
     waypoints = given.get("waypoints") if isinstance(given, dict) else None
     if not isinstance(waypoints, list) or not 1 <= len(waypoints) <= MAX_WAYPOINTS:
@@ -352,12 +333,8 @@ TaskRequest = Annotated[
 def task_of(given: Any, robot: str) -> Task:
     """Return the task in the JSON of a `TaskRequest`; `robot` is the name of the daemon's.
 
-    No file is read, whatever the text of a task file names.
-
-    Raises
-    ------
-    InputError
-        It makes no sense, or is for another robot.
+    No file is read, whatever the text of a task file names. A mistake, or another robot, raises
+    `InputError`.
     """
     request = _valid(_TASK, given, ())
     if isinstance(request, TaskText):

@@ -43,18 +43,8 @@ class Operations:
     """The daemon's interface without HTTP: reading, control and commands.
 
     All methods are for one event loop. The control loop is called in threads, and what it does not
-    answer in time is given up.
-
-    Parameters
-    ----------
-    loop, robot :
-        The control loop, and the arm that it steers.
-    heartbeat :
-        A client that was not heard for this long, in s, loses control, and the arm is held.
-    clock :
-        That of the rig.
-    patience :
-        Seconds after which a command to the loop is given up.
+    answer within `patience`, in s, is given up. A client that was not heard for `heartbeat`, in s,
+    loses control, and the arm is held.
     """
 
     def __init__(

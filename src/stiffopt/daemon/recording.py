@@ -53,14 +53,10 @@ class RunRecording:
 
     Parameters
     ----------
-    folder :
-        Where the files go; made, for this user alone, if it is not there.
-    name :
-        Of the rig; files are named after it and the time.
-    context :
-        Of foxglove.
-    about :
-        Kept in each file as metadata.
+    folder, name :
+        Where the files go, for this user alone, and the name of the rig that they are named after.
+    context, about :
+        Of foxglove, and the metadata of each file.
     wall, free :
         Give the date in s since 1970 and the bytes that are free in a folder.
     limits :

@@ -118,17 +118,7 @@ class ErrorReport(BaseModel):
 
 
 class RefusalError(StiffoptError):
-    """A request is refused.
-
-    Parameters
-    ----------
-    status :
-        The HTTP status.
-    code :
-        A word for programs.
-    message :
-        A sentence for people.
-    """
+    """A request is refused: an HTTP status, a word for programs, and a sentence for people."""
 
     def __init__(self, status: int, code: str, message: str) -> None:
         super().__init__(status, code, message)

@@ -105,12 +105,7 @@ def read_run(path: str | os.PathLike[str]) -> RecordedRun:
 def read_log_of_recording(path: str | os.PathLike[str]) -> tuple[Log, bool]:
     """Read the log of a run or of an experiment (.mcap); also whether the recording is whole.
 
-    Raises
-    ------
-    FileError
-        It cannot be read, or is no recording of stiffopt.
-    MissingExtraError
-        mcap is not installed.
+    It raises as `read_run`.
     """
     found = read_mcap(path)
     if LOG_METADATA in found.metadata:

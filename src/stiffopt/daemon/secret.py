@@ -95,20 +95,7 @@ class Secret:
     is kept out by a lock (flock) on another file, which the kernel releases however a process ends.
     The lock file is not removed, since another process may be about to lock it. No symbolic link is
     followed, and nothing is written where another user could exchange it.
-
-    Parameters
-    ----------
-    settings :
-        Of the rig's service.
-    folder, name :
-        Where the file is, and what its name begins with, unless the settings say.
-
-    Attributes
-    ----------
-    token : str
-        The token.
-    path : Path or None
-        The file; None where the environment has the token.
+    `path` is None where the token is in the environment.
     """
 
     def __init__(
@@ -214,21 +201,10 @@ def is_loopback(host: str) -> bool:
 
 
 def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
-    """Return the warnings due before the control interface listens: kinds and texts of events.
+    """Return the warnings for a control interface on a host: kinds and texts of events.
 
-    Parameters
-    ----------
-    host :
-        Where it will listen.
-    token :
-        Of those who may move the arm.
-    given :
-        Whether a person chose the token; else it was drawn.
-
-    Raises
-    ------
-    InputError
-        The token is too short for a host that other machines can reach.
+    `given` is whether a person chose the token; else it was drawn. A token that is too short for a
+    host which other machines can reach raises `InputError`.
     """
     beyond, short = not is_loopback(host), given and len(token) < MIN_TOKEN
     if beyond and short:

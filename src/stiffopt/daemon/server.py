@@ -165,12 +165,8 @@ class Server:
 class LimitedConnection:
     """One connection of a client, from when it is accepted until it is lost.
 
-    Parameters
-    ----------
-    drop :
-        Closes it at once.
-    waits_since :
-        Returns since when it waits for its client, in s; None while its client waits for it.
+    `drop` closes it at once; `waits_since` returns since when it waits for its client, in s, or
+    None while its client waits for it.
 
     Attributes
     ----------
@@ -193,14 +189,8 @@ class ConnectionLimiter:
 
     Where too many have not shown the token, the oldest of them is dropped. One that has shown it
     makes room only for others that have: the one that has waited longest for its client is dropped.
-    All methods are for one event loop.
-
-    Parameters
-    ----------
-    trusts :
-        Says whether the headers of a request show the token.
-    clock :
-        Time in s.
+    All methods are for one event loop. `trusts` says whether the headers of a request show the
+    token.
     """
 
     def __init__(

@@ -97,7 +97,7 @@ def create_app(
     Parameters
     ----------
     loop, robot, heartbeat, clock, patience :
-        As for `Operations`.
+        See `Operations`.
     token :
         That a client needs to move the arm.
     metrics :
@@ -105,16 +105,8 @@ def create_app(
     hosts :
         Names of this machine, other than localhost, to which clients may send requests.
 
-    Returns
-    -------
-    FastAPI
-        ``app.state.operations`` is the `Operations` behind it, ``app.state.limiter`` limits its
-        connections in a `Server`.
-
-    Raises
-    ------
-    InputError
-        The token is empty, or has characters that a header cannot carry.
+    Its ``state.limiter`` limits the connections in a `Server`. A token that a header cannot carry
+    raises `InputError`.
     """
     secret = Token(token)
     operations = Operations(loop, robot, heartbeat, clock or SystemClock(), patience)

@@ -70,12 +70,7 @@ def plain(value: Any, entry: Entry, *, rounded: bool = False) -> Any:
 def record_of(record: type[RecordT], given: Mapping[str, Any]) -> RecordT:
     """Return the record from which `json_of` made some JSON; null becomes NaN.
 
-    Unknown keys, as of a newer daemon, are ignored.
-
-    Raises
-    ------
-    ServiceError
-        Something is missing, or is none of the values that can be there.
+    Unknown keys, as of a newer daemon, are ignored; a wrong or missing value raises `ServiceError`.
     """
     try:
         return _record_of(record, given)

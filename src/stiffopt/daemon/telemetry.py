@@ -151,11 +151,8 @@ class Telemetry:
     def stop(self, patience: float = 5.0) -> None:
         """Log the rest, end the recording and stop the server; to stop twice does nothing.
 
-        Raises
-        ------
-        TimeoutError
-            What is being written, as to a disk that hangs, was not done after `patience`, in s;
-            nothing more is recorded then.
+        If what is being written, as to a disk that hangs, is not done after `patience`, in s,
+        nothing more is recorded, and it raises `TimeoutError`.
         """
         self._stop.set()
         if not self._working.acquire(timeout=patience):

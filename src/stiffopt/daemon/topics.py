@@ -103,16 +103,10 @@ _ARM_COLOUR, _TARGET_COLOUR = (0.31, 0.47, 0.65, 0.7), (0.84, 0.15, 0.16, 0.8)
 
 
 class TelemetryChannels:
-    """Writes snapshots, events and the shape of the arm to the topics of telemetry.
+    """Writes snapshots, events and the shape of the arm to the topics of a context of foxglove.
 
-    Parameters
-    ----------
-    context :
-        Of foxglove, whose server and recording get all that is logged.
-    offset :
-        Nanoseconds since 1970 at the time 0 of the rig's clock.
-    thickness :
-        Of the arm as it is drawn, in m.
+    `offset` is the date of time 0 on the rig's clock, in ns since 1970; `thickness` that of the arm
+    as it is drawn, in m.
     """
 
     def __init__(self, context: Any, offset: int, thickness: float) -> None:

@@ -19,17 +19,13 @@ class LogWriter:
 
     Parameters
     ----------
-    path :
-        The file; its folder must exist.
-    layout :
-        Which columns it has.
+    path, layout :
+        The file, whose folder must exist, and its columns.
 
     Attributes
     ----------
-    last_time : float or None
-        Time of the last row; None before the first.
-    was_torn : bool
-        Whether a last line without an end was found and cut off.
+    last_time : time of the last row; None before the first.
+    was_torn : whether a last line without an end was found and cut off.
 
     Raises
     ------

@@ -114,10 +114,8 @@ class Body:
 
     Attributes
     ----------
-    position : ndarray
-        (N, 3), in m; NaN where it is missing.
-    quaternion : ndarray or None
-        (N, 4), w first; None if no orientation was recorded.
+    position : (N, 3), in m; NaN where it is missing.
+    quaternion : (N, 4), w first; None if no orientation was recorded.
     """
 
     position: Array
@@ -130,22 +128,14 @@ class Log:
 
     Attributes
     ----------
-    time : ndarray
-        (N,), in s, increasing; the steps are uneven.
-    commanded : ndarray
-        Gauge pressures (N, n), in Pa.
-    measured : ndarray or None
-        Gauge pressures (N, n), in Pa.
-    tip_position : ndarray
-        (N, 3), in m, in the tracker's or the base frame.
-    tip_quaternion : ndarray or None
-        (N, 4), w first.
-    bodies : mapping of str to Body
-        Further tracked bodies.
-    force : ndarray or None
-        Force (N,) with which a probe pushes the tip along its axis, in N.
-    stage : ndarray or None
-        Place (N,) of the probe along its axis, in m.
+    time : (N,), in s, increasing; the steps are uneven.
+    commanded : gauge pressures (N, n), in Pa.
+    measured : gauge pressures (N, n), in Pa, or None.
+    tip_position : (N, 3), in m, in the tracker's or the base frame.
+    tip_quaternion : (N, 4), w first, or None.
+    bodies : further tracked bodies.
+    force : force (N,) with which a probe pushes the tip along its axis, in N, or None.
+    stage : place (N,) of the probe along its axis, in m, or None.
     """
 
     time: Array

@@ -37,10 +37,8 @@ class McapLogWriter:
 
     Parameters
     ----------
-    path :
-        The file; its folder must exist.
-    layout :
-        What is recorded.
+    path, layout :
+        The file, whose folder must exist, and what is recorded.
     about :
         Kept in the file as metadata.
 

@@ -27,18 +27,12 @@ class StiffnessTable:
 
     Attributes
     ----------
-    pressures : ndarray
-        Commanded gauge pressures (N, n), in Pa.
-    directions : ndarray
-        Unit vectors (N, 3) in the base frame.
-    boundaries : tuple of str
-        ``free``, ``guided`` or ``clamped``, for each row.
-    stiffness : ndarray
-        (N,), in N/m; NaN where none could be measured.
-    sigma : ndarray
-        Standard uncertainty (N,) of `stiffness`, in N/m.
-    others : mapping of str to ndarray
-        Further columns (N,), by name.
+    pressures : commanded gauge pressures (N, n), in Pa.
+    directions : unit vectors (N, 3) in the base frame.
+    boundaries : ``free``, ``guided`` or ``clamped``, for each row.
+    stiffness : (N,), in N/m; NaN where none could be measured.
+    sigma : standard uncertainty (N,) of `stiffness`, in N/m.
+    others : further columns (N,), by name.
     """
 
     pressures: Array
