@@ -134,7 +134,7 @@ class SchemaMessage(_Message):
         return _valid(TypeAdapter(cls), message, ())
 
     def read(self, **more: Any) -> Any:
-        """Return the description, in which `more` keys are replaced; `InputError` if it is wrong."""
+        """Return the description, in which `more` keys are replaced, or raise `InputError`."""
         return self.schema_class(**{**_keys_of(self), **more})
 
 
