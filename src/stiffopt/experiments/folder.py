@@ -17,19 +17,6 @@ from stiffopt.files import read_file, save_file
 from stiffopt.logs import LogLayout, LogWriter, McapLogWriter
 from stiffopt.schema import Schema
 
-__all__ = [
-    "SETTINGS",
-    "ExperimentSettings",
-    "Progress",
-    "RawRecording",
-    "alone_in",
-    "check_same",
-    "create_folder",
-    "open_folder",
-    "recorded",
-    "remove_folder",
-]
-
 SETTINGS = "experiment.yaml"
 
 SchemaT = TypeVar("SchemaT", bound=Schema)
