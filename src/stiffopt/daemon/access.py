@@ -55,7 +55,7 @@ class Token:
 
 
 class Access:
-    """ASGI middleware that refuses requests of strangers and of foreign web pages.
+    """ASGI middleware that refuses requests without the token and those of foreign web pages.
 
     - A web page in a browser on this machine can send requests here. So the header Host must be an
       IP address or a known name, which no foreign name server can resolve to this machine (DNS

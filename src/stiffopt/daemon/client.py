@@ -520,7 +520,7 @@ class ClientStream:
                     self._news.notify_all()
         except ConnectionClosed as error:
             reason = str(error)
-        except Exception as error:  # whatever it is, whoever waits must be told
+        except Exception as error:  # of any kind: the waiting thread must learn of it
             reason = f"{reason} ({type(error).__name__})"
         with self._news:
             self._ended = ServiceError(f"the stream has ended: {reason}")

@@ -169,7 +169,7 @@ class Daemon:
 
     @property
     def token_file(self) -> Path | None:
-        """The file of the token; None where it is in the environment, or nobody needs it."""
+        """The file of the token; None where it is in the environment, or no port is open."""
         return None if self._server is None else self._secret.path
 
     @property
@@ -434,7 +434,7 @@ class Daemon:
 class ControlThread(threading.Thread):
     """Ticks the control loop in real time until `stopping` is set, then lets the pressures down.
 
-    In each tick, the service manager is told that the loop lives, and telemetry gets the state. The
+    In each tick, the service manager hears that the loop lives, and telemetry gets the state. The
     loop has vented if a `failure` ended the thread.
     """
 
@@ -461,7 +461,7 @@ class ControlThread(threading.Thread):
                 notice = self._link.real_time
                 self._tell("guard", notice, well=not notice.startswith("not"))
                 self._loop.run(self._stopping)
-        except BaseException as error:  # `run` has vented; whoever waits is told
+        except BaseException as error:  # `run` has vented; `Daemon.failure` has it
             self.failure = error
 
     def ticked(self, now: Snapshot) -> None:

@@ -43,7 +43,7 @@ class ServiceManager:
         self._say("READY=1")
 
     def status(self, text: str) -> None:
-        """Say how things stand, for people."""
+        """Say what the daemon does, for people."""
         self._say("STATUS=" + " ".join(text.split()))
 
     def watchdog(self) -> None:
@@ -175,7 +175,7 @@ class Keeper:
       vented the supply by then, as far as that answers, and has ended a guard that hung.
     - When the control interface ends, the heartbeat of the client in control is no longer checked:
       the arm is held.
-    - The service manager is told the state.
+    - The service manager gets the state, for people.
 
     `serving` says whether the control interface serves; None where there is none.
     """
@@ -190,7 +190,7 @@ class Keeper:
     ) -> None:
         self._loop, self._link, self._manager = loop, link, manager
         self._serving, self._clock = serving, clock
-        self._told = ""
+        self._status = ""
         self._guard_at = -float("inf")
         self._held = False
         self._enough = threading.Event()
@@ -229,8 +229,8 @@ class Keeper:
     def _tell(self) -> None:
         now = self._loop.snapshot()
         text = f"{now.state}: {now.reason}" if now.reason else str(now.state)
-        if text != self._told:
-            self._told = text
+        if text != self._status:
+            self._status = text
             self._manager.status(text)
 
     def _replace_guard(self) -> None:

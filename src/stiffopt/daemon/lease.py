@@ -26,7 +26,7 @@ class ControlLease:
     """Control over the arm, granted to one client at a time.
 
     A client that is not heard for `heartbeat` seconds loses it, and the arm is to be held. `check`
-    tells of the loss, and nobody else gets control until `settle` is called after that. What a
+    tells of the loss, and no client gets control until `settle` is called after that. What a
     client without control asks for is refused by `RefusalError`. Any thread may call any method.
     """
 

@@ -93,13 +93,13 @@ def _valid(adapter: TypeAdapter[ModelT], given: Any, place: Loc) -> ModelT:
 
 def sentence(mistakes: Sequence[Any]) -> str:
     """Return pydantic's list of mistakes as one sentence."""
-    told = []
+    parts = []
     for mistake in mistakes[:_TOLD]:
         place = dotted([step for step in mistake["loc"] if not str(step).startswith("<")])
         reason = str(mistake["msg"])
-        told.append(f"{place}: {reason}" if place else reason)
+        parts.append(f"{place}: {reason}" if place else reason)
     more = f"; and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""
-    return "; also ".join(told) + more
+    return "; also ".join(parts) + more
 
 
 # Messages from schemas ---------------------------------------------------------------------------

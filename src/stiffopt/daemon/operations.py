@@ -107,7 +107,7 @@ class Operations:
 
     async def take(self, client: str) -> GrantReport:
         """Give a client control; raise `RefusalError` if another has it."""
-        await self.watch()  # who had it may be gone
+        await self.watch()  # the client that had it may be gone
         identity = self.lease.take(client)
         beat = self.lease.heartbeat
         return GrantReport(lease=identity, heartbeat_s=beat, renew_every_s=beat / 4)
@@ -122,7 +122,7 @@ class Operations:
         await asyncio.wait([self._holding], timeout=1.0)
 
     async def _hold_after(self, client: str) -> None:
-        """Hold; nobody else gets control before the loop has done so or has said why not."""
+        """Hold the arm; control is free after the loop has held it or has refused to."""
         reason = f"nothing was heard from '{client}', which had control"
         call = call_in_thread("command", partial(self.loop.hold, reason))
         await _ended(call)
@@ -166,7 +166,7 @@ class Operations:
         return self._done()
 
     async def vent(self) -> DoneReport:
-        """Vent at once, whoever has control; rather late than never."""
+        """Vent at once, whichever client has control; also after the patience has ended."""
         await self._call(
             partial(self.loop.vent, "a client asked for it"), urgent=True, lasting=True
         )
@@ -178,7 +178,7 @@ class Operations:
 
         def pursue() -> TaskMessage:
             task = task_of(given, self.robot.name)
-            message = TaskMessage.of(task, robot=self.robot.name)  # what clients are told later
+            message = TaskMessage.of(task, robot=self.robot.name)  # that clients can read later
             self.loop.set_task(task)
             return message
 
@@ -195,7 +195,7 @@ class Operations:
     ) -> Any:
         """Call a function that waits for the control loop, in a thread; return its result.
 
-        With `lasting`, it is done however late, also when nobody waits for it any more.
+        With `lasting`, the loop still does it after the patience has ended.
 
         Raises
         ------

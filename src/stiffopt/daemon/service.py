@@ -162,7 +162,7 @@ async def _watch(operations: Operations) -> None:
     while True:
         try:
             await operations.watch()
-        except Exception:  # whoever has control must be watched whatever happens
+        except Exception:  # the client in control must be watched whatever happens
             _log.exception("the watch over who has control failed; it goes on")
         await asyncio.sleep(period)
 
@@ -285,7 +285,7 @@ def _moving(operations: Operations) -> APIRouter:
     async def vent() -> DoneReport:
         """Let all pressure out at once.
 
-        Needs no control: whoever is trusted and sees that something goes wrong may stop the arm,
+        Needs no control: any client with the token that sees something go wrong may stop the arm,
         also while a planner that does not listen any more has control. A body is not looked at.
         """
         return await operations.vent()

@@ -178,8 +178,8 @@ class Stream:
         self._operations.loop.set_target(target.read())
 
     async def _answer(self, seq: int, refusal: RefusalError | None = None) -> None:
-        told = {} if refusal is None else refusal.body
-        await self._send({"type": "answer", "seq": seq, "accepted": refusal is None, **told})
+        error = {} if refusal is None else refusal.body
+        await self._send({"type": "answer", "seq": seq, "accepted": refusal is None, **error})
 
     async def _send(self, message: dict[str, Any]) -> None:
         text = json.dumps(message)

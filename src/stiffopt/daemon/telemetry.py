@@ -126,8 +126,8 @@ class Telemetry:
         self._logged = np.inf  # nothing was handed over yet
         self._due_tick = self._due_state = self._due_frames = self._due_shape = -np.inf
         self._due_commit = -np.inf
-        self._told: dict[str, str] = {}
-        self._dropped_told = 0
+        self._alarms: dict[str, str] = {}
+        self._dropped_before = 0
         self._dropped_at = self._failed_at = -np.inf
 
     @property
@@ -194,7 +194,7 @@ class Telemetry:
             log(what)
         except Exception as error:
             self._failed_at = time.monotonic()
-            self._tell("telemetry", f"something could not be logged: {error}")
+            self._set_alarm("telemetry", f"something could not be logged: {error}")
 
     def _run(self) -> None:
         while not self._stop.wait(RATES.wake):
@@ -215,7 +215,7 @@ class Telemetry:
             )
         except RuntimeError as error:
             where = f"{self._settings.host}:{port}"
-            self._tell("foxglove", f"Foxglove cannot connect: {where} is not free ({error})")
+            self._set_alarm("foxglove", f"Foxglove cannot connect: {where} is not free ({error})")
 
     def _log(self, now: Snapshot) -> None:
         self._logged = now.time
@@ -248,24 +248,24 @@ class Telemetry:
 
     def _commit(self, now: float) -> None:
         self.recording.commit(now)
-        self._tell("log", self.recording.trouble)
+        self._set_alarm("log", self.recording.trouble)
 
     def _look_back(self, now: float) -> None:
         """Raise an alarm for lost snapshots, and clear alarms after a while without a failure."""
         if now > self._failed_at + RATES.calm:
-            self._tell("telemetry", "")
-        if self.dropped > self._dropped_told:
-            self._dropped_told, self._dropped_at = self.dropped, now
+            self._set_alarm("telemetry", "")
+        if self.dropped > self._dropped_before:
+            self._dropped_before, self._dropped_at = self.dropped, now
             text = f"telemetry is too slow; {self.dropped} snapshots were never logged"
-            self._tell("telemetry-lost", text)
+            self._set_alarm("telemetry-lost", text)
         elif now > self._dropped_at + RATES.calm:
-            self._tell("telemetry-lost", "")
+            self._set_alarm("telemetry-lost", "")
 
-    def _tell(self, kind: str, text: str) -> None:
+    def _set_alarm(self, kind: str, text: str) -> None:
         """Raise an alarm, or clear it if the text is empty; if that changes anything."""
-        if self._told.get(kind, "") == text:
+        if self._alarms.get(kind, "") == text:
             return
-        self._told[kind] = text
+        self._alarms[kind] = text
         if text:
             self._loop.add_alarm(kind, text)
         else:

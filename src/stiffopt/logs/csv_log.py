@@ -15,7 +15,7 @@ from stiffopt.logs.table import cut_torn_end, read_bytes, read_table, replacing,
 class LogWriter:
     """Appends rows to a log (log v1); each is handed to the system when `append` returns.
 
-    A file that is there and has the same columns is continued; `last_time` then says where.
+    An existing file that has the same columns is continued after `last_time`.
 
     Parameters
     ----------
