@@ -31,7 +31,6 @@ from stiffopt.identify.setup import (
     Setup,
     TableSource,
     description_of,
-    placements,
     recordings_of,
     tables_of,
 )
@@ -51,8 +50,6 @@ from stiffopt.model.description import Recordings, RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.registration import Placement, Registration
-
-__all__ = ["CalibrationResult", "calibrate"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
@@ -296,22 +293,13 @@ def _result(
     teller: _Teller,
 ) -> CalibrationResult:
     listed = estimates(found)
-    settings = setup.settings
     robot = _robot(setup, found)
     teller.begin("comparing")
 
     def compared(
         description: RobotDescription, known: Mapping[str, float]
     ) -> tuple[Comparison, ...]:
-        return compare(
-            description,
-            setup.recordings,
-            sequence=settings.sequence,
-            rezero=settings.rezero,
-            settle=settings.settle,
-            known=known,
-            tell=teller,
-        )
+        return compare(Setup.of(description, setup.recordings, (), setup.settings), known, teller)
 
     remarks = [
         f"{recording.name}: {remark}"
@@ -343,8 +331,8 @@ def _result(
 def _robot(setup: Setup, found: Fit) -> RobotDescription:
     """Return the calibrated robot with its registration and its covariance."""
     problem, x = found.problem, found.x
-    given = placements(setup.description)
     recordings = setup.description.recordings
+    given = recordings or Recordings()
     if setup.recordings:
         base, sensors, _, _ = problem.unknowns.slices()
         moves = x * problem.scale

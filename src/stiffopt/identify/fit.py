@@ -20,8 +20,6 @@ from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted
 from stiffopt.identify.settings import FIT
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["Fit", "fit"]
-
 Array = NDArray[np.float64]
 
 

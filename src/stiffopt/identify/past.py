@@ -18,8 +18,6 @@ from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import compiling_at_once, library
 from stiffopt.model.history import NO_HISTORY, History
 
-__all__ = ["Effective", "Past", "Start"]
-
 Array = NDArray[np.float64]
 
 _CHUNKS = (1, 32, 128, 512, 2048)  # rows that may be run at once; fewer are filled up
@@ -73,21 +71,18 @@ class Effective:
     ----------
     pressures : ndarray
         (M, c), in Pa.
-    per_lag, per_lag_falling, per_dead_time, per_side, per_memory : ndarray
-        (M, c); by lags and dead time in s, and by side and memory of the same channel.
-    per_share : ndarray
-        (M, c, parts).
+    per_number : dict of str to ndarray
+        Their derivatives (M, c) by the numbers of the history, by their keys: ``lag``,
+        ``lag_falling``, ``dead_time``, ``memory[0]``, ``play[0].share``, ``creep[0].share``, ...
+    per_side : ndarray
+        Their derivatives (M, c) by the side on which the same channel begins.
     end : Start
         State in which another log of the sequence begins.
     """
 
     pressures: Array
-    per_lag: Array
-    per_lag_falling: Array
-    per_dead_time: Array
+    per_number: dict[str, Array]
     per_side: Array
-    per_memory: Array
-    per_share: Array
     end: Start
 
 
@@ -161,17 +156,20 @@ class Past:
         def mixed(states: Array) -> Array:
             return np.asarray(states[:, 0] + memory * slow(states))
 
-        end = self._start(state, pressures[-1])
-        return Effective(
-            pressures=mixed(values),
-            per_lag=mixed(by_lag),
-            per_lag_falling=mixed(by_falling),
-            per_dead_time=mixed(by_dead),
-            per_side=mixed(by_side),
-            per_memory=slow(values),
-            per_share=np.swapaxes(values[:, 1:] - values[:, :1], 1, 2) * memory[:, np.newaxis],
-            end=self._rested(end, history),
-        )
+        per_number = {
+            "lag": mixed(by_lag),
+            "lag_falling": mixed(by_falling),
+            "dead_time": mixed(by_dead),
+        }
+        slowly = slow(values)
+        for channel, own in enumerate(np.eye(c)):
+            per_number[f"memory[{channel}]"] = slowly * own
+        plays = len(history.play)
+        for j in range(len(history.parts)):
+            name = f"play[{j}]" if j < plays else f"creep[{j - plays}]"
+            per_number[f"{name}.share"] = (values[:, 1 + j] - values[:, 0]) * memory
+        end = self._rested(self._start(state, pressures[-1]), history)
+        return Effective(mixed(values), per_number, mixed(by_side), end)
 
     def _rested(self, end: Start, history: History) -> Start:
         """State a while later, at the last pressures."""

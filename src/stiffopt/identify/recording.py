@@ -31,8 +31,6 @@ from stiffopt.identify.tracker_faults import (
 from stiffopt.logs import Body, Log
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["Recording", "Track", "prepare"]
-
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 

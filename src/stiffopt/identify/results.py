@@ -15,10 +15,6 @@ from stiffopt.identify.settings import REPORT
 from stiffopt.identify.unknowns import BASE, SENSOR
 from stiffopt.model.parameters import Parameter
 
-__all__ = [
-    "TIED", "Comparison", "Errors", "FittedEstimate", "doubts", "estimates", "outliers", "together",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 TIED = "hardly told apart"

@@ -13,8 +13,6 @@ from stiffopt import lie
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
 
-__all__ = ["Readings", "readings", "turned_by"]
-
 Array = NDArray[np.float64]
 
 

@@ -22,10 +22,6 @@ from stiffopt.model.description import Compensation, Corrections, RobotDescripti
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.laws import law_class, strain_laws
 
-__all__ = [
-    "STRUCTURES", "Candidate", "ModelStructure", "best", "held_back_errors", "other_laws",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 

@@ -21,11 +21,6 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.identify.settings import TRACKER
 
-__all__ = [
-    "MEDIAN_NORM", "Unflipped", "aligned", "dropouts", "jumps", "mean_rotation", "norms", "repeats",
-    "rotations", "roughness", "unflipped", "unit_quaternions", "whole",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 

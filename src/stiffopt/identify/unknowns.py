@@ -18,11 +18,6 @@ from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.laws import law_class
 from stiffopt.model.parameters import Parameter
 
-__all__ = [
-    "BASE", "SENSOR", "Unknown", "Unknowns", "history_unknowns", "placement_unknowns",
-    "shape_unknowns", "side_unknowns", "zero_unknowns",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
@@ -49,10 +44,6 @@ class Unknown:
     low: float = -math.inf
     high: float = math.inf
     parameter: Parameter | None = None
-
-    def bounded(self, coordinate: float) -> float:
-        """Nearest coordinate within the bounds."""
-        return min(max(coordinate, self.low), self.high)
 
 
 @dataclass(frozen=True, eq=False)

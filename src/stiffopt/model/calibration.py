@@ -15,8 +15,6 @@ from stiffopt.errors import shown
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Angle, Length, Number, Pressure
 
-__all__ = ["Calibration", "FittedNumber", "FittedParameter", "SIUnit"]
-
 Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits

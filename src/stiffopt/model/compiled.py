@@ -28,23 +28,8 @@ import casadi as ca
 
 from stiffopt.errors import SlowWarning
 from stiffopt.model import compiler as build
-from stiffopt.model.batch import BatchFunction, CompiledFunction, InterpretedFunction
+from stiffopt.model.batch import CompiledFunction, InterpretedFunction
 from stiffopt.model.codegen import HEADER_NAME, Signature, c_code, dense, header
-
-__all__ = [
-    "BatchFunction",
-    "CodeReadyError",
-    "CompiledFunction",
-    "InterpretedFunction",
-    "Library",
-    "checkpoint",
-    "compilation_is_held_off",
-    "compiling_at_once",
-    "interpreted",
-    "library",
-    "make_in_background",
-    "until_ready",
-]
 
 Make = Callable[[], Sequence[ca.Function]]
 

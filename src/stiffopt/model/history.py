@@ -35,8 +35,6 @@ from stiffopt.errors import InputError
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Pressure, Ratio
 
-__all__ = ["Creep", "History", "Memory", "Play"]
-
 Array = NDArray[np.float64]
 
 _Share = Annotated[Ratio, Field(ge=0, lt=1)]

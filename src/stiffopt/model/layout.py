@@ -31,15 +31,6 @@ from stiffopt.model.parameters import explicit
 from stiffopt.model.shape import FreeShape
 from stiffopt.schema import Schema
 
-__all__ = [
-    "Layout",
-    "SymbolicArm",
-    "free_tip_function",
-    "layout_of",
-    "numbers_of",
-    "symbolic_arm",
-]
-
 Vector = NDArray[np.float64]
 
 _NOT_IN_FORMULAS = {"chambers", "channels", "density", "history", "inner_radius"}

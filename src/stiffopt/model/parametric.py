@@ -19,8 +19,6 @@ from stiffopt.model.parameters import Parameter, parametric
 from stiffopt.model.shape import FreeShape, Shape, stiffness_along
 from stiffopt.model.shooting import Shooting
 
-__all__ = ["ParametricArm", "Poses"]
-
 Vector = NDArray[np.float64]
 
 

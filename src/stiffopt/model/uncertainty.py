@@ -31,8 +31,6 @@ from stiffopt.model.history import NO_HISTORY, History
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 
-__all__ = ["Part", "TipUncertainty", "Uncertainty", "settled_range"]
-
 Vector = NDArray[np.float64]
 Part = Literal["parameters", "hysteresis", "residual"]
 

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.compiled import CompiledFunction, Library, compiling_at_once, library
+from stiffopt.model.batch import CompiledFunction
+from stiffopt.model.compiled import Library, compiling_at_once, library
 from stiffopt.model.layout import Layout
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.rod import rod_functions
