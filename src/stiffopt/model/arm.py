@@ -15,22 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError, PressureError, shown
-from stiffopt.model.arguments import dead_and_follower
-from stiffopt.model.batch import BatchFunction, InterpretedFunction
-from stiffopt.model.codegen import dense
-from stiffopt.model.compiled import checkpoint
-from stiffopt.model.compliance import Frame
-from stiffopt.model.description import RobotDescription
-from stiffopt.model.equilibrium import Equilibrium, EquilibriumState, Loads
-from stiffopt.model.kinematics import Actuation
-from stiffopt.model.laws import strain_law
-from stiffopt.model.layout import free_tip_function, layout_of, numbers_of
-from stiffopt.model.numeric import (
+from stiffopt.model.arguments import (
     checked_integer,
     checked_number,
     checked_vector,
     real_numbers,
 )
+from stiffopt.model.batch import BatchFunction, InterpretedFunction
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import checkpoint
+from stiffopt.model.compliance import Frame
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.equilibrium import Equilibrium, EquilibriumState, Loads, dead_and_follower
+from stiffopt.model.kinematics import Actuation
+from stiffopt.model.laws import strain_law
+from stiffopt.model.layout import free_tip_function, layout_of, numbers_of
 from stiffopt.model.shape import FreeShape, Shape
 from stiffopt.model.shooting import SAME_STATION, Shooting
 from stiffopt.model.tip_functions import TipFunctions

@@ -13,7 +13,7 @@ system is solved at the cost of single shooting by carrying the changes per turn
 the defects along (the lifted Newton method, J. Albersmeyer and M. Diehl, SIAM J. Optim. 20, 2010).
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.compliance import inverse_3x3
+from stiffopt.model.arguments import check_choice
+from stiffopt.model.compliance import Frame, inverse_3x3
 from stiffopt.model.shooting import SAME_STATION, Shooting
 
 Vector = NDArray[np.float64]
@@ -47,6 +48,13 @@ class Loads(NamedTuple):
     def are_conservative(self) -> bool:
         """Whether all are dead forces, which have a potential."""
         return not (self.tip[3:].any() or self.station[3:].any())
+
+
+def dead_and_follower(wrench: Vector, frame: Frame) -> Vector:
+    """Wrench (6,) as `Loads` has it (12,): dead where its frame is the base, else follower."""
+    check_choice("frame", frame, get_args(Frame))
+    none = np.zeros(6)
+    return np.concatenate([wrench, none] if frame == "base" else [none, wrench])
 
 
 class EquilibriumState(NamedTuple):

@@ -14,17 +14,16 @@ from stiffopt.errors import InputError
 from stiffopt.model.arguments import (
     DirectionalMeasure,
     check_choice,
+    checked_integer,
     checked_measure,
-    checked_wrench,
-    dead_and_follower,
 )
 from stiffopt.model.arm import Arm, Values
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import Compensation, RobotDescription
+from stiffopt.model.equilibrium import dead_and_follower
 from stiffopt.model.history import NO_HISTORY
-from stiffopt.model.numeric import checked_integer
 from stiffopt.model.robot_files import load_description
-from stiffopt.model.screws import Twist, Wrench
+from stiffopt.model.screws import Twist, Wrench, checked_wrench
 from stiffopt.model.shape import Shape, stiffness_along
 from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
 
