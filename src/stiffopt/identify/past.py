@@ -31,15 +31,11 @@ class Start:
 
     Attributes
     ----------
-    states : ndarray
-        Of the operators (m, c).
-    per_side : ndarray
-        Their derivatives (m, c) by the side of each channel, see `History.settled`.
-    before : ndarray
-        Pressures (c,) until the first row, in Pa.
-    per_time : ndarray or None
-        Derivatives (3, m, c) of the states by lag, falling lag and dead time, which a log that
-        went before leaves; None where there was none.
+    states : of the operators (m, c).
+    per_side : their derivatives (m, c) by the side of each channel, see `History.settled`.
+    before : pressures (c,) until the first row, in Pa.
+    per_time : derivatives (3, m, c) of the states by lag, falling lag and dead time, which a log
+        that went before leaves; None where there was none.
     """
 
     states: Array
@@ -69,15 +65,11 @@ class Effective:
 
     Attributes
     ----------
-    pressures : ndarray
-        (M, c), in Pa.
-    per_number : dict of str to ndarray
-        Their derivatives (M, c) by the numbers of the history, by their keys: ``lag``,
+    pressures : (M, c), in Pa.
+    per_number : their derivatives (M, c) by the numbers of the history, by their keys: ``lag``,
         ``lag_falling``, ``dead_time``, ``memory[0]``, ``play[0].share``, ``creep[0].share``, ...
-    per_side : ndarray
-        Their derivatives (M, c) by the side on which the same channel begins.
-    end : Start
-        State in which another log of the sequence begins.
+    per_side : their derivatives (M, c) by the side on which the same channel begins.
+    end : state in which another log of the sequence begins.
     """
 
     pressures: Array
@@ -91,10 +83,8 @@ class Past:
 
     Parameters
     ----------
-    history : History or None
-        Widths and times of its operators count; lag and shares are given for each run.
-    channels : int
-        Number of channels c.
+    history : widths and times of its operators count; lag and shares are given for each run.
+    channels : number of channels c.
     """
 
     def __init__(self, history: History | None, channels: int) -> None:
@@ -120,10 +110,8 @@ class Past:
             Commanded, in Pa; they run evenly from row to row.
         wanted : (M,)
             Rows whose effective pressures are returned, increasing.
-        start :
-            State before the first row.
-        history :
-            With the values to use; its operators are those of this object.
+        start : state before the first row.
+        history : with the values to use; its operators are those of this object.
         """
         delayed, slope = _delayed(time, pressures, start.before, history.dead_time)
         steps = np.diff(time, prepend=time[0] - np.median(np.diff(time)) if len(time) > 1 else 1.0)

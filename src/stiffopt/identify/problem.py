@@ -46,12 +46,9 @@ class Sample:
     Attributes
     ----------
     recording : Recording
-    rows : ndarray
-        (M,), increasing.
-    weight : ndarray
-        Factor (M,) on the residuals of each row.
-    begin : str
-        State of the arm when the recording begins.
+    rows : (M,), increasing.
+    weight : factor (M,) on the residuals of each row.
+    begin : state of the arm when the recording begins.
     """
 
     recording: Recording
@@ -92,14 +89,10 @@ class Predicted:
 
     Attributes
     ----------
-    effective : ndarray
-        Pressures (M, n) of the equilibria, in Pa.
-    poses : tuple of ndarray
-        Of each point in the base frame (M, 4, 4).
-    read : tuple of Readings
-        Of each point, in the frame of the recordings.
-    errors : tuple of ndarray
-        Measured less read (M, 3), of each point; NaN where nothing was measured.
+    effective : pressures (M, n) of the equilibria, in Pa.
+    poses : of each point in the base frame (M, 4, 4).
+    read : of each point, in the frame of the recordings.
+    errors : measured less read (M, 3), of each point; NaN where nothing was measured.
     """
 
     effective: Array
@@ -113,20 +106,13 @@ class CalibrationProblem:
 
     Parameters
     ----------
-    description : RobotDescription
-        Where all unknowns are zero.
-    unknowns : Unknowns
-        What may change.
-    samples : sequence of Sample
-        In the order in which they were recorded.
-    points : sequence of TrackedPoint
-        The tip first.
-    base_in_tracker : ndarray
-        Pose (4, 4) of the base where its unknown twist is zero.
-    tables : sequence of StiffnessTable
-        Fitted together with the samples.
-    noise : Noise
-        What the residuals are divided by.
+    description : where all unknowns are zero.
+    unknowns : what may change.
+    samples : in the order in which they were recorded.
+    points : the tip first.
+    base_in_tracker : pose (4, 4) of the base where its unknown twist is zero.
+    tables : fitted together with the samples.
+    noise : what the residuals are divided by.
     """
 
     def __init__(

@@ -124,15 +124,12 @@ class Setup:
 
     Attributes
     ----------
-    description : RobotDescription
-        As the robot file has it.
+    description : as the robot file has it.
     recordings : tuple of Recording
     tables : tuple of StiffnessTable
     settings : CalibrationSettings
-    base : ndarray
-        Pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
-    points : tuple of TrackedPoint
-        That are tracked.
+    base : pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
+    points : that are tracked.
     """
 
     description: RobotDescription

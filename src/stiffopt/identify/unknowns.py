@@ -90,14 +90,11 @@ def shape_unknowns(
 
     Parameters
     ----------
-    description : RobotDescription
-        The robot from which the fit begins.
-    names : sequence of str
-        Keys of a segment without indices, such as ``corrections.gain``. Of the material and the
+    description : the robot from which the fit begins.
+    names : keys of a segment without indices, such as ``corrections.gain``. Of the material and the
         compensation those count that the segment's strain law lets be fitted; the law's own numbers
         come after them.
-    tolerances : Tolerances
-        How well the robot file is known.
+    tolerances : how well the robot file is known.
     """
     found = []
     for s, segment in enumerate(description.segments):

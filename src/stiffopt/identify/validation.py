@@ -80,10 +80,8 @@ def compare(
     Parameters
     ----------
     setup : Setup
-    known : dict of str to float, optional
-        Scaled coordinates of zeros and states by name, where a fit has found them already.
-    tell : callable
-        Is called at every evaluation.
+    known : scaled coordinates of zeros and states by name, where a fit has found them already.
+    tell : is called at every evaluation.
     """
     description, recordings = setup.description, setup.recordings
     most = SAMPLING.loaded_rows if any(description.gravity) else SAMPLING.rows

@@ -31,10 +31,8 @@ class Section:
 
     Attributes
     ----------
-    strain : casadi.SX
-        Backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
-    compliance : casadi.SX
-        Section compliance (6, 6): extra strain per internal wrench, in section axes.
+    strain : backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
+    compliance : section compliance (6, 6): extra strain per internal wrench, in section axes.
     """
 
     strain: ca.SX
@@ -47,16 +45,12 @@ class SectionGeometry:
 
     Attributes
     ----------
-    area : float
-        Silicone area A, wall less core less chambers, in m^2.
-    centroid : ndarray
-        Centroid (2,) in section axes, in m; zero for symmetric layouts.
-    second_moment : ndarray
-        ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of eq. 10.
-    channel_force : ndarray
-        Chamber area of each channel (c,), in m^2: axial force per unit pressure.
-    channel_moment : ndarray
-        ``int r dA`` over each channel's chambers (c, 2), in m^3.
+    area : silicone area A, wall less core less chambers, in m^2.
+    centroid : centroid (2,) in section axes, in m; zero for symmetric layouts.
+    second_moment : ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of
+        eq. 10.
+    channel_force : chamber area of each channel (c,), in m^2: axial force per unit pressure.
+    channel_moment : ``int r dA`` over each channel's chambers (c, 2), in m^3.
 
     All may be symbols too, see `stiffopt.model.layout`.
     """
@@ -77,8 +71,7 @@ class SectionGeometry:
 
         Parameters
         ----------
-        azimuth :
-            Of each channel (c,), from x towards y, in rad; empty for none.
+        azimuth : of each channel (c,), from x towards y, in rad; empty for none.
         """
         if not azimuth.any():
             return self

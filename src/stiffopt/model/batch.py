@@ -175,9 +175,8 @@ class Buffer:
 
     Attributes
     ----------
-    targets, results : list of ndarray
-        Views (rows, r, c) of what goes in and comes out; no leading axis for one row, no last
-        one for a column that goes in.
+    targets, results : views (rows, r, c) of what goes in and comes out; no leading axis for one
+        row, no last one for a column that goes in.
     evaluate : callable
     """
 

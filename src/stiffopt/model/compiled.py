@@ -44,10 +44,8 @@ class Library:
 
     Attributes
     ----------
-    path : Path
-        Its file, for messages.
-    cdll : ctypes.CDLL
-        For what hand-written sources add; calls through it free the interpreter lock.
+    path : its file, for messages.
+    cdll : for what hand-written sources add; calls through it free the interpreter lock.
     """
 
     def __init__(self, path: Path, signatures: dict[str, Signature]) -> None:
@@ -180,16 +178,12 @@ def library(
     content : str or sequence
         What identifies the functions, beside stiffopt's own code: text, or values whose `repr`
         says it all.
-    make : callable
-        Makes the functions; called only if they are not in the cache.  Their names are the names
+    make : makes the functions; called only if they are not in the cache.  Their names are the names
         in C and must be told apart in capitals too.  What cannot be pickled is compiled at once.
-    sources : sequence of str, optional
-        Paths of C files compiled with them, which find prototypes and sizes in ``functions.h``
-        (see `codegen.header`) and their own headers beside them.
-    daqp : bool
-        Whether those need the DAQP that comes with CasADi.
-    build_missing : bool
-        False: only look into the cache.
+    sources : paths of C files compiled with them, which find prototypes and sizes in
+        ``functions.h`` (see `codegen.header`) and their own headers beside them.
+    daqp : whether those need the DAQP that comes with CasADi.
+    build_missing : false: only look into the cache.
 
     Returns
     -------

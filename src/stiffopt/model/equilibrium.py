@@ -13,6 +13,7 @@ system is solved at the cost of single shooting by carrying the changes per turn
 the defects along (the lifted Newton method, J. Albersmeyer and M. Diehl, SIAM J. Optim. 20, 2010).
 """
 
+from functools import cached_property
 from typing import NamedTuple, get_args
 
 import casadi as ca
@@ -75,12 +76,9 @@ class Path(NamedTuple):
 
     Attributes
     ----------
-    state : EquilibriumState
-        The last one that was found.
-    share : float
-        Of the way that it is at; 1.0 means arrived.
-    unstable : bool
-        Whether the path ends because stability is lost there.
+    state : the last one that was found.
+    share : of the way that it is at; 1.0 means arrived.
+    unstable : whether the path ends because stability is lost there.
     """
 
     state: EquilibriumState
@@ -89,41 +87,44 @@ class Path(NamedTuple):
 
 
 class Equilibrium:
-    """Numerical equilibria of one shooting problem."""
+    """Numerical equilibria of one shooting problem.
 
-    def __init__(self, shooting: Shooting) -> None:
+    Parameters
+    ----------
+    shooting : the arm.
+    at : arc length of the station that the loads of `Loads.station` act at; None is the tip.
+    """
+
+    def __init__(self, shooting: Shooting, at: float | None = None) -> None:
         self.shooting = shooting
-        self._functions: dict[tuple[str, float | None], ca.Function] = {}
-        self._rest: dict[tuple[bytes, float | None], Path] = {}
+        self.at = at
+        self._rest: dict[bytes, Path] = {}
 
     def arguments(self, state: EquilibriumState) -> tuple[Vector, ...]:
         """Numbers for the inputs of a `Chain` at an equilibrium."""
         x = np.concatenate([np.zeros(3), state.pressures, np.zeros(6)])
         return (state.quaternion, x, *state.loads)
 
-    def _function(self, name: str, at: float | None) -> ca.Function:
-        """Newton's step or the stability condition, for one station."""
-        if (name, at) not in self._functions:
-            if name == "newton":
-                function = newton_step(self.shooting, at)
-            else:
-                chain = self.shooting.chain(at)
-                function = ca.Function(
-                    name, chain.inputs, [chain.rotational_compliances, chain.base_turn]
-                )
-            self._functions[name, at] = function
-        return self._functions[name, at]
+    @cached_property
+    def _newton(self) -> ca.Function:
+        return newton_step(self.shooting, self.at)
 
-    def correct(self, guess: EquilibriumState, at: float | None = None) -> EquilibriumState | None:
+    @cached_property
+    def _stability(self) -> ca.Function:
+        chain = self.shooting.chain(self.at)
+        return ca.Function(
+            "stability", chain.inputs, [chain.rotational_compliances, chain.base_turn]
+        )
+
+    def correct(self, guess: EquilibriumState) -> EquilibriumState | None:
         """Newton's method from a nearby state; None if that is not near.
 
         "Near" means that the first correction turns no part of the arm by more than a radian
         and later ones shrink: then the path from the guess to the answer has no fold in between.
         """
-        newton = self._function("newton", at)
         state, previous = guess, _LARGEST_TURN
         for iteration in range(_MOST_ITERATIONS):
-            quaternion, states, largest = newton(
+            quaternion, states, largest = self._newton(
                 state.quaternion, state.states, state.pressures, *state.loads
             )
             size = float(largest)
@@ -136,16 +137,14 @@ class Equilibrium:
             previous = size
         return None
 
-    def is_stable(self, state: EquilibriumState, at: float | None = None) -> bool:
+    def is_stable(self, state: EquilibriumState) -> bool:
         """Whether an equilibrium is a minimum of the energy (Jacobi's condition).
 
         Follower loads and moments have no energy.  There what counts is that the arm has not
         passed a divergence, where turns of the tip leave the base unturned and beyond which they
         turn it the wrong way round.  Flutter is not looked for.
         """
-        blocks, base_turn = (
-            part.full() for part in self._function("stability", at)(*self.arguments(state))
-        )
+        blocks, base_turn = (part.full() for part in self._stability(*self.arguments(state)))
         if not (np.isfinite(blocks).all() and np.isfinite(base_turn).all()):
             return False
         compliances = blocks.T.reshape(-1, 3, 3)  # from the tip to the base
@@ -159,7 +158,6 @@ class Equilibrium:
         self,
         start: EquilibriumState,
         end: EquilibriumState,
-        at: float | None = None,
         shortest: float = _SHORTEST_STEP,
         stable: bool = True,
     ) -> "Path":
@@ -173,8 +171,8 @@ class Equilibrium:
         while share < 1.0:
             target = min(1.0, share + step)
             pressures, loads = _between(start, end, target)
-            corrected = self.correct(state._replace(pressures=pressures, loads=loads), at)
-            unstable = corrected is not None and stable and not self.is_stable(corrected, at)
+            corrected = self.correct(state._replace(pressures=pressures, loads=loads))
+            unstable = corrected is not None and stable and not self.is_stable(corrected)
             if corrected is None or unstable:
                 step, halved = step / 2, True
                 if step < shortest:
@@ -184,7 +182,7 @@ class Equilibrium:
                 step, halved = step if halved else 2 * step, False
         return Path(state, 1.0, False)
 
-    def settle(self, pressures: Vector, loads: Loads, at: float | None = None) -> EquilibriumState:
+    def settle(self, pressures: Vector, loads: Loads) -> EquilibriumState:
         """Equilibrium reached from rest: first the arm's weight, then pressures and loads.
 
         Raises
@@ -192,9 +190,9 @@ class Equilibrium:
         EquilibriumError
             If the arm buckles or falls over on the way; the message says where.
         """
-        hanging = self._at_rest(loads.gravity, at)
+        hanging = self._at_rest(loads.gravity)
         end = hanging._replace(pressures=pressures, loads=loads)
-        state, share, unstable = self.follow(hanging, end, at)
+        state, share, unstable = self.follow(hanging, end)
         what = "its pressures"
         if loads.tip.any() or loads.station.any():
             what += " and load"
@@ -207,18 +205,18 @@ class Equilibrium:
             raise EquilibriumError(_lost(share, what))
         return state
 
-    def _at_rest(self, gravity: Vector, at: float | None = None) -> EquilibriumState:
+    def _at_rest(self, gravity: Vector) -> EquilibriumState:
         """The unpressurised arm under its own weight and payload."""
-        key = (gravity.tobytes(), at)
+        key = gravity.tobytes()
         if key not in self._rest:
             none = Loads(np.zeros(3), np.zeros(12), np.zeros(12))
             upright = np.array([1.0, 0.0, 0.0, 0.0])
-            steps = self._function("newton", at).size2_in(1)
+            steps = self._newton.size2_in(1)
             states = np.repeat(np.concatenate([upright, np.zeros(3)])[:, np.newaxis], steps, 1)
             pressures = np.zeros(self.shooting.n_variables)
             straight = EquilibriumState(pressures, upright, states, none)
             weighted = straight._replace(loads=none._replace(gravity=gravity))
-            self._rest[key] = self.follow(straight, weighted, at)
+            self._rest[key] = self.follow(straight, weighted)
         path = self._rest[key]
         if path.unstable:
             raise EquilibriumError(
@@ -230,11 +228,11 @@ class Equilibrium:
             raise EquilibriumError(_lost(path.share, "its own weight and payload"))
         return path.state
 
-    def shape(self, state: EquilibriumState, stations: Vector, at: float | None = None) -> Vector:
-        """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium with its load at `at`."""
+    def shape(self, state: EquilibriumState, stations: Vector) -> Vector:
+        """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium."""
         sections = [np.asarray(part) for part in self.shooting.sections(state.pressures)]
         length = self.shooting.description.length
-        station_at = length if at is None else at
+        station_at = length if self.at is None else self.at
         tip, station = state.loads.tip, state.loads.station
         q, r = state.quaternion, np.zeros(3)
         R = lie.rotation_from_quaternion(q)

@@ -46,10 +46,8 @@ class Layout:
 
     Attributes
     ----------
-    skeleton : str
-        The arm's segments with their numbers left out; equal for arms of the same layout.
-    example : RobotDescription
-        Some arm of this layout.
+    skeleton : the arm's segments with their numbers left out; equal for arms of the same layout.
+    example : some arm of this layout.
     """
 
     skeleton: str
@@ -62,14 +60,10 @@ class SymbolicArm:
 
     Attributes
     ----------
-    numbers : casadi.SX
-        The arm's numbers (k,), see `numbers_of`.
-    actuation : Actuation
-        Sections and margins as functions of the pressures and these numbers.
-    centroids : tuple of casadi.SX
-        Of each segment's section (2,), in m; sparse where it lies on the axis.
-    tip : FreeShape
-        The unloaded arm up to its tip.
+    numbers : the arm's numbers (k,), see `numbers_of`.
+    actuation : sections and margins as functions of the pressures and these numbers.
+    centroids : of each segment's section (2,), in m; sparse where it lies on the axis.
+    tip : the unloaded arm up to its tip.
     """
 
     numbers: ca.SX
@@ -135,8 +129,7 @@ def free_tip_function(
 
     Parameters
     ----------
-    outputs :
-        Makes them from the shape of the tip and the symbols of the caller's own parameters.
+    outputs : makes them from the shape of the tip and the symbols of the caller's own parameters.
     """
     arm = symbolic_arm(layout)
     own = ca.SX.sym("own", n_parameters)

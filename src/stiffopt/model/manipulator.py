@@ -283,8 +283,8 @@ class Manipulator(Arm):
         self, p: Vector, wrench: Vector, at: float | None, frame: Frame
     ) -> Vector:
         loads = self._loads._replace(station=dead_and_follower(wrench, frame))
-        state = self._equilibrium.settle(p, loads, at)
-        (tip,) = self._equilibrium.shape(state, np.array([self.length]), at)
+        equilibrium = self._equilibrium(at)
+        (tip,) = equilibrium.shape(equilibrium.settle(p, loads), np.array([self.length]))
         return np.asarray(tip)
 
     def _elementwise(self, p: Vector, local: Vector, at: float) -> Vector:
@@ -305,7 +305,7 @@ class Manipulator(Arm):
         middles = (marks[1:] + marks[:-1]) / 2
         poses = self._shape(p, np.concatenate([marks, middles, [at]]))
         T_end, T_middle, T_at = poses[: len(marks)], poses[len(marks) : -1], poses[-1]
-        compliances = self._section_compliances(p)
+        compliances = [part.full() for part in self._section_parts(p)[self.n_segments :]]
         T = np.eye(4)
         for i, segment_index in enumerate(soft):
             near, middle, far = T_end[i], T_middle[i], T_end[i + 1]

@@ -180,8 +180,8 @@ class Stretch:
     Attributes
     ----------
     proximal, distal : float
-    towards_base : callable
-        Quaternion and position, from the tip, at a distance from its distal end towards the base.
+    towards_base : quaternion and position, from the tip, at a distance from its distal end towards
+        the base.
     """
 
     proximal: float
@@ -325,12 +325,9 @@ class Shooting:
 
     Parameters
     ----------
-    description : RobotDescription
-        The arm; its gravity and tip mass are part of every equilibrium.
-    actuation : Actuation
-        Its strain law, per segment.
-    resolution : int
-        Multiplies the number of integration steps.
+    description : the arm; its gravity and tip mass are part of every equilibrium.
+    actuation : its strain law, per segment.
+    resolution : multiplies the number of integration steps.
     """
 
     def __init__(
