@@ -188,7 +188,7 @@ def _candidate(
 
 
 class _Teller:
-    """Tells progress as evaluations go by, of which nobody knows how many there will be."""
+    """Progress of a calibration in phases, each of an unknown number of evaluations."""
 
     def __init__(self, progress: Progress | None, fits: int) -> None:
         self._progress = progress
@@ -338,14 +338,14 @@ def _robot(setup: Setup, found: Fit) -> RobotDescription:
         moves = x * problem.scale
         base_in_tracker = problem.base_in_tracker @ _motion(moves[base])
         places = {
-            point.name: _placement(np.linalg.inv(_motion(moves[own]) @ point.sensor))
+            point.name: _inverse_placement(_motion(moves[own]) @ point.sensor)
             for point, own in zip(problem.points, sensors, strict=True)
         }
         recordings = Recordings(
             channels=given.channels,
             frame=given.frame,
             registration=Registration(
-                tracker_in_base=_placement(np.linalg.inv(base_in_tracker)),
+                tracker_in_base=_inverse_placement(base_in_tracker),
                 tip_in_sensor=places["tip"],
             ),
             bodies={
@@ -426,8 +426,8 @@ def _record(setup: Setup, found: Fit) -> Calibration:
     kept = [i for i, each in enumerate(before.parameters) if each.key not in keys]
     blocks = [np.round(correlation, REPORT.correlation_digits), np.eye(len(unlearnt))]
     blocks.append(np.reshape(before.correlation, (len(before.parameters),) * 2)[np.ix_(kept, kept)])
-    pressures = [each.pressures for each in (*setup.recordings, *setup.tables)]
-    seen = np.concatenate(pressures)
+    pressures = [recording.pressures for recording in setup.recordings]
+    seen = np.concatenate([*pressures, *(table.pressures for table in setup.tables)])
     ends = np.cumsum([0, *(segment.n_channels for segment in setup.description.segments)])
     norms = [float(np.linalg.norm(seen[:, a:b], axis=1).max()) for a, b in itertools.pairwise(ends)]
     low, high = seen.min(axis=0), seen.max(axis=0)
@@ -469,9 +469,9 @@ def _motion(twist: Array) -> Array:
     return np.asarray(lie.exp(full))
 
 
-def _placement(transform: Array) -> Placement:
-    """Placement of a transform (4, 4), with as many digits as a robot file needs."""
-    found = Placement.of(transform)
+def _inverse_placement(transform: Array) -> Placement:
+    """Placement of the inverse of a transform (4, 4), with as many digits as a file needs."""
+    found = Placement.of(np.asarray(np.linalg.inv(transform), dtype=float))
     return Placement(
         position=tuple(round(x, 8) for x in found.position),
         orientation=tuple(round(q, 8) for q in found.orientation),

@@ -1,4 +1,4 @@
-"""Effective pressures along a recording, with their derivatives by the history's numbers.
+"""Effective pressures along a recording, with their derivatives by the numbers of the history.
 
 The operators are those of `stiffopt.model.history`.  Here they are run over a whole log at once,
 with derivatives by lag, dead time, shares and the state in which the log begins.

@@ -114,7 +114,7 @@ def prepare(
     Raises
     ------
     InputError
-        Columns or bodies are asked for that are not there; units are not SI; nothing moves; fewer
+        The log lacks a column or a body; units are not SI; nothing moves; fewer
         than 20 rows can be used.
     """
     columns = _columns(log.n, channels, description.n_pressures)

@@ -1,4 +1,4 @@
-"""What a tracker says of a point of the arm, and how that depends on where the tracker is."""
+"""Measurement model of a tracker: pose of a sensor on the arm, and its Jacobian by the frames."""
 
 from __future__ import annotations
 

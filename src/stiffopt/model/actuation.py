@@ -1,9 +1,9 @@
 """From channel pressures to the strain and the compliance of a section (eqs 8-10).
 
-A strain law says what a segment does without any load: the strain of its backbone and the
-compliance of its section, both constant along the segment.  Laws use different length
-conventions on paper; here both results are **per length at rest**, so that the rest of the model
-need not know.  The laws themselves stand in `stiffopt.model.laws`, one file each.
+A strain law maps the pressures of a segment to the strain of its unloaded backbone and to the
+compliance of its section, both constant along the segment.  Publications count them per length at
+rest or per deformed length; here both are **per length at rest**.  The laws themselves are in
+`stiffopt.model.laws`, one file each.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ NORM_SMOOTHING = 0.01
 
 @dataclass(frozen=True)
 class Section:
-    """What a strain law answers for one segment, per length at rest.
+    """Free strain and compliance of the section of one segment, per length at rest.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class SectionGeometry:
 
     @property
     def is_eccentric(self) -> bool:
-        """Whether the centroid may lie beside the axis."""
+        """Whether the centroid may lie off the axis."""
         return not ca.SX(self.centroid).is_zero()
 
     def turned(self, azimuth: NDArray[np.float64]) -> SectionGeometry:

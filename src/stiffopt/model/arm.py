@@ -1,7 +1,7 @@
-"""The numerical side of an arm: compiled functions, equilibria and checks.
+"""Evaluation of functions of an arm's shape, free or in equilibrium under loads.
 
-`Arm` knows how to evaluate any function of an arm's shape, without and with loads;
-`stiffopt.model.manipulator.Manipulator` builds on it what users call.
+`Arm` checks pressures, finds equilibria and keeps the functions that were made of the arm;
+`stiffopt.model.manipulator.Manipulator` adds pose, Jacobian, compliance and stiffness.
 """
 
 from collections.abc import Callable, Hashable
@@ -366,7 +366,7 @@ class Arm:
 
 
 class Evaluator:
-    """A compiled function of the tip's shape that stays close to where it was last asked.
+    """A function of the tip's shape that starts each equilibrium from the previous one.
 
     With loads the equilibrium at new pressures is found from the previous one; `restart`
     forgets it, and the next is found from rest.

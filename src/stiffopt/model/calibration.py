@@ -1,4 +1,4 @@
-"""How well the numbers of a robot file are known: before a calibration, and after one."""
+"""Covariance of the numbers of a calibrated robot file, and what a calibration may fit."""
 
 from __future__ import annotations
 

@@ -154,7 +154,7 @@ def until_ready(is_ready: Callable[[], bool]) -> Iterator[None]:
 
 
 def checkpoint() -> None:
-    """Be interrupted here if `until_ready` says so."""
+    """Raise `CodeReadyError` if code that `until_ready` waits for is there."""
     look = _watch.get()
     if look is not None:
         look()
@@ -176,12 +176,12 @@ def library(
     Parameters
     ----------
     content : str or sequence
-        What identifies the functions, beside stiffopt's own code: text, or values whose `repr`
-        says it all.
+        What identifies the functions, in addition to stiffopt's own code: text, or values
+        whose `repr` is complete.
     make : makes the functions; called only if they are not in the cache.  Their names are the names
         in C and must be told apart in capitals too.  What cannot be pickled is compiled at once.
     sources : paths of C files compiled with them, which find prototypes and sizes in
-        ``functions.h`` (see `codegen.header`) and their own headers beside them.
+        ``functions.h`` (see `codegen.header`) and headers in their own folders.
     daqp : whether those need the DAQP that comes with CasADi.
     build_missing : false: only look into the cache.
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError, shown
 from stiffopt.model.actuation import Section
-from stiffopt.model.calibration import FittedNumber, SIUnit
+from stiffopt.model.calibration import FittedNumber
 from stiffopt.model.description import (
     Compensation,
     Corrections,
@@ -155,16 +155,6 @@ class Parameter:
         return index
 
     @property
-    def unit(self) -> SIUnit:
-        """SI unit of its value; empty for a plain number."""
-        return self.number.unit
-
-    @property
-    def is_positive(self) -> bool:
-        """Whether its coordinate is the logarithm of its value over the nominal one."""
-        return self.number.positive
-
-    @property
     def is_history(self) -> bool:
         """Whether it concerns the way to an equilibrium only."""
         return self._path[2] == "history"
@@ -204,7 +194,7 @@ class Parameter:
 
     def at(self, nominal: float, coordinate: Any) -> Any:
         """Value of a coordinate, both numbers or both symbols."""
-        if self.is_positive:
+        if self.number.positive:
             factor = ca.exp(coordinate) if isinstance(coordinate, ca.SX) else np.exp(coordinate)
             return nominal * factor
         return nominal + coordinate
@@ -217,7 +207,7 @@ class Parameter:
         InputError
             Only what is positive has a logarithm.
         """
-        if not self.is_positive:
+        if not self.number.positive:
             return value - nominal
         return math.log(self._checked(value) / self._checked(nominal))
 
@@ -231,7 +221,7 @@ class Parameter:
 
     def per_coordinate(self, value: float) -> float:
         """Change of the value per change of the coordinate."""
-        return value if self.is_positive else 1.0
+        return value if self.number.positive else 1.0
 
 
 def explicit(description: RobotDescription) -> RobotDescription:
@@ -288,7 +278,7 @@ def varied(
     changes: dict[_Path, Any] = {}
     for index, parameter in enumerate(parameters):
         nominal = parameter._read(robot)
-        if parameter.is_positive:
+        if parameter.number.positive:
             parameter._checked(nominal)
         changes[parameter._path] = parameter.at(nominal, coordinates[index])
     return _replaced(robot, changes)

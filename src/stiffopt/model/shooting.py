@@ -150,18 +150,9 @@ def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
     return ca.Function("step", [start, strain, compliance, n, f, h], [end])
 
 
-def _soft_point(
-    step: ca.Function, start: ca.MX, strain: ca.MX, compliance: ca.MX, force: ca.MX, weight: ca.MX,
-    distance: float,
-) -> tuple[ca.MX, ca.MX]:  # fmt: skip
-    state = step(start, strain, compliance, force, weight, distance)
+def _turned_and_moved(step: Callable[[float], ca.MX], distance: float) -> tuple[ca.MX, ca.MX]:
+    state = step(distance)
     return state[:4], state[4:7]
-
-
-def _rigid_point(
-    quaternion: ca.MX, position: ca.MX, axis: ca.MX, distance: float
-) -> tuple[ca.MX, ca.MX]:
-    return quaternion, position - distance * axis
 
 
 def _turn_between(q: ca.MX, dq: ca.MX) -> ca.MX:
@@ -385,8 +376,13 @@ class Shooting:
                 station_quaternion, station_position = orientation, position
             if piece.rigid:
                 axis = lie.rotation_from_quaternion(orientation)[:, 2]
-                rigid = partial(_rigid_point, orientation, position, axis)
-                stretches.append(Stretch(distal - piece.length, distal, rigid))
+                stretches.append(
+                    Stretch(
+                        distal - piece.length,
+                        distal,
+                        lambda x, q=orientation, r=position, axis=axis: (q, r - x * axis),
+                    )
+                )
                 position = position - piece.length * axis
                 moment = moment + piece.length * ca.cross(axis, force)
                 continue
@@ -395,10 +391,10 @@ class Shooting:
             h = piece.length / piece.steps
             for _ in range(piece.steps):
                 start = ca.vertcat(orientation, position, moment)
-                given = (self.step[piece.segment], start, strain, compliance, force, weight)
-                stretches.append(Stretch(distal - h, distal, partial(_soft_point, *given)))
+                step = partial(self.step[piece.segment], start, strain, compliance, force, weight)
+                stretches.append(Stretch(distal - h, distal, partial(_turned_and_moved, step)))
                 distal -= h
-                state = self.step[piece.segment](*given[1:], h)
+                state = step(h)
                 orientation, position, moment = state[:4], state[4:7], state[7:]
                 force = force + h * weight
                 nodes.append(orientation)

@@ -39,8 +39,7 @@ _Ends = tuple[list[ca.SX], list[ca.SX]]  # symbols and expressions
 class TipFunctions:
     """Functions of an arm's tip by name (see the methods of `TipFormulas`).
 
-    Values from machine code and from the VM are the same to the last bit, so that nobody needs
-    to know which it was.
+    Values from machine code and from the VM are the same to the last bit.
     """
 
     def __init__(self, layout: Layout, numbers: Vector) -> None:
