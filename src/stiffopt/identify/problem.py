@@ -309,6 +309,11 @@ class CalibrationProblem:
             channels = slice(first, first + segment.n_channels)
             first += segment.n_channels
             history, prefix = segment.history or NO_HISTORY, f"segments[{s}].history."
+            varying = [
+                (i, each.key.removeprefix(prefix), each.per_coordinate(each.value(robot)))
+                for i, each in enumerate(self._parameters)
+                if each.key.startswith(prefix)
+            ]
             end: Start | None = None
             owner = slice(0, 0)  # the sides on which this and the logs before it depend
             for i, sample in enumerate(self.samples):
@@ -329,13 +334,8 @@ class CalibrationProblem:
                 end = found.end
                 rows = slice(starts[i], starts[i + 1])
                 effective[rows, channels] = found.pressures
-                for key, i in self._index.items():
-                    if key.startswith(prefix):
-                        per_value = found.per_number[key.removeprefix(prefix)]
-                        parameter = self._parameters[i]
-                        slopes[rows, channels, i] = per_value * parameter.per_coordinate(
-                            parameter.value(robot)
-                        )
+                for place, name, per_coordinate in varying:
+                    slopes[rows, channels, place] = found.per_number[name] * per_coordinate
                 if owner.stop > owner.start:
                     for c in range(channels.start, channels.stop):
                         local = c - channels.start
