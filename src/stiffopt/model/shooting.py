@@ -150,7 +150,13 @@ def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
     return ca.Function("step", [start, strain, compliance, n, f, h], [end])
 
 
-def _turned_and_moved(step: Callable[[float], ca.MX], distance: float) -> tuple[ca.MX, ca.MX]:
+def _rigid_point(
+    quaternion: ca.MX, position: ca.MX, axis: ca.MX, distance: float
+) -> tuple[ca.MX, ca.MX]:
+    return quaternion, position - distance * axis
+
+
+def _soft_point(step: Callable[[float], ca.MX], distance: float) -> tuple[ca.MX, ca.MX]:
     state = step(distance)
     return state[:4], state[4:7]
 
@@ -376,13 +382,8 @@ class Shooting:
                 station_quaternion, station_position = orientation, position
             if piece.rigid:
                 axis = lie.rotation_from_quaternion(orientation)[:, 2]
-                stretches.append(
-                    Stretch(
-                        distal - piece.length,
-                        distal,
-                        lambda x, q=orientation, r=position, axis=axis: (q, r - x * axis),
-                    )
-                )
+                rigid = partial(_rigid_point, orientation, position, axis)
+                stretches.append(Stretch(distal - piece.length, distal, rigid))
                 position = position - piece.length * axis
                 moment = moment + piece.length * ca.cross(axis, force)
                 continue
@@ -392,7 +393,7 @@ class Shooting:
             for _ in range(piece.steps):
                 start = ca.vertcat(orientation, position, moment)
                 step = partial(self.step[piece.segment], start, strain, compliance, force, weight)
-                stretches.append(Stretch(distal - h, distal, partial(_turned_and_moved, step)))
+                stretches.append(Stretch(distal - h, distal, partial(_soft_point, step)))
                 distal -= h
                 state = step(h)
                 orientation, position, moment = state[:4], state[4:7], state[7:]
