@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Quiet, Version
 
 HELP = """\
@@ -41,10 +42,11 @@ A task file:
 
 
 def examples(command: str) -> str:
-    """Return what stands at the end of the help."""
+    """Return the end of the help for a name of the command."""
     return _EXAMPLES.format(command=command)
 
 
+@with_exit_code
 def solve(
     tasks: Annotated[
         list[str], typer.Argument(metavar="TASK", help="Task files, or folders of them.")
@@ -88,12 +90,8 @@ def solve(
     ] = 0,
     quiet: Quiet = False,
     version: Version = False,
-) -> None:
+) -> int:
     """Solve task files."""
-    from stiffopt.cli.solve_run import (  # here, so that --help waits for no numerics
-        SolveOptions,
-        run,
-    )
+    from stiffopt.cli.solve_run import Batch  # here, so that --help waits for no numerics
 
-    options = SolveOptions(as_json, out, plot, pareto, seed, quiet)
-    raise typer.Exit(run(tasks, options))
+    return Batch(as_json, out, plot, pareto, seed, quiet).run(tasks)

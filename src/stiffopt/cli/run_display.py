@@ -1,12 +1,18 @@
-"""The live status of `stiffopt run` on a terminal."""
+"""Shows a run: as a live status on a terminal, or as lines, in JSON for programs."""
 
 from __future__ import annotations
 
 import math
+import os
+import select
+import sys
 import time
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from datetime import UTC, datetime
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group, RenderableType
@@ -15,15 +21,17 @@ from rich.table import Table
 from rich.text import Text
 
 from stiffopt.cli.console import console_on
+from stiffopt.cli.tables import labelled
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
+from stiffopt.daemon.reports import plain
 from stiffopt.errors import printable
+from stiffopt.safety.messages import json_line
 
 if TYPE_CHECKING:
     from stiffopt.daemon.daemon import Daemon
 
-__all__ = ["LiveStatus", "status"]
-
+_LONGEST = 500  # characters of a text: a pipe takes 4096 bytes at once or not at all
 _COLOURS = {
     State.UNCONFIGURED: "bold white",
     State.INACTIVE: "bold cyan",
@@ -36,6 +44,78 @@ _BAR = 24  # characters of a pressure's bar
 _EVENTS = 6
 _UNKNOWN = "-"
 _FACTORS = {"": (1.0, 3), "mm": (1e3, 1), "deg": (180 / math.pi, 1)}  # and decimals of a vector
+
+
+class Lines:
+    """Writes a line to stdout for each event and each change of state.
+
+    Writing never waits and never fails: a line is left out if its reader has stopped or is gone,
+    for the arm is more important.
+
+    Parameters
+    ----------
+    as_json :
+        As an object with ``time`` (of day, UTC), ``level``, ``kind`` and ``text``; else for people.
+    now :
+        Time on the rig's clock, in s.
+    """
+
+    period = 0.05  # s, between two updates
+
+    def __init__(self, *, as_json: bool, now: Callable[[], float] = time.monotonic) -> None:
+        self._as_json, self._now = as_json, now
+        self._told: dict[str, Any] = {}
+
+    def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
+        """Write a line about this moment."""
+        self._line(self._now(), str(severity), kind, text)
+
+    def begin(self, daemon: Daemon) -> None:
+        """Write where everything is."""
+        found: dict[str, Any] = {
+            "url": daemon.url,
+            "token_file": None if daemon.token_file is None else str(daemon.token_file),
+            "recording": daemon.recording,
+            "foxglove_port": daemon.foxglove_port,
+        }
+        told = {key: value for key, value in found.items() if value is not None}
+        words = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in told.items())
+        self._line(self._now(), "info", "started", f"runs; {words or 'no ports'}", **told)
+
+    def update(self, now: Snapshot, events: list[Event]) -> None:
+        """Write what is new."""
+        for event in events:
+            self._line(event.time, str(event.severity), event.kind, event.text)
+        shown = [entry for entry in entries(type(now)) if entry.shown.line]
+        told = {entry.json[0]: plain(getattr(now, entry.name), entry) for entry in shown}
+        if told != self._told:
+            self._told = told
+            text = f"{now.state}: {now.reason}" if now.reason else str(now.state)
+            level = "error" if now.state is State.FAULT else "info"
+            self._line(now.time, level, "state", text, **told)
+
+    def end(self) -> None:
+        """Nothing is left to be done."""
+
+    def _line(self, moment: float, level: str, kind: str, text: str, **more: Any) -> None:
+        text = text[:_LONGEST]
+        stamp = datetime.fromtimestamp(time.time() - (self._now() - moment), UTC)
+        if self._as_json:
+            line = json_line(level, kind, text, stamp, **more)
+        else:
+            mark = "" if level == "info" else f"{level.upper()}: "
+            clock = stamp.astimezone().strftime("%H:%M:%S")
+            line = f"{clock} {mark}{printable(text)} [{kind}]"
+        self._write(line)
+
+    def _write(self, line: str) -> None:
+        data = f"{line}\n".encode(errors="backslashreplace")
+        with suppress(OSError, ValueError, AttributeError):  # gone, closed, or never there
+            stream = sys.stdout.fileno()
+            ready = select.poll()
+            ready.register(stream, select.POLLOUT)
+            if ready.poll(0):
+                os.write(stream, data)
 
 
 class LiveStatus:
@@ -51,21 +131,14 @@ class LiveStatus:
         Names (n,) of the channels.
     console :
         Where it is shown.
-    now :
-        Time on the rig's clock, in s.
     """
 
-    period = 0.25
+    period = 0.25  # s, between two updates
 
     def __init__(
-        self,
-        name: str,
-        channels: Sequence[str],
-        *,
-        console: Console | None = None,
-        now: Callable[[], float] = time.monotonic,
+        self, name: str, channels: Sequence[str], *, console: Console | None = None
     ) -> None:
-        self._name, self._channels, self._now = name, channels, now
+        self._name, self._channels = name, channels
         self._live = Live(
             console=console or console_on(), auto_refresh=False, vertical_overflow="crop"
         )
@@ -77,7 +150,7 @@ class LiveStatus:
 
     def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Show something as an event of this moment."""
-        self._events.append(Event(self._now(), kind, text, severity))
+        self._events.append(Event(time.monotonic(), kind, text, severity))
         if not self._live.is_started:
             self._attempt(lambda: self._live.console.print(Text(text, _LEVELS[severity])))
 
@@ -137,13 +210,17 @@ def status(
         Where everything is.
     """
     armed = now.state in (State.ACTIVE, State.HOLDING)
-    parts: list[RenderableType] = [_headline(now, name), _table(_fields(now, armed))]
-    parts.append(_pressures(now, channels))
-    stiffness = _stiffness(now) if armed else []
-    parts.append(_table([*stiffness, *_loop(now, rate), *_alarms(now)]))
-    parts += [_event(event) for event in events]
+    rows: list[tuple[str, RenderableType]] = [*_stiffness(now)] if armed else []
+    rows += _loop(now, rate)
+    for alarm in now.alarms:
+        rows.append(("ALARM", Text(f"{printable(alarm.text)} [{alarm.kind}]", "bold red")))
+    parts: list[RenderableType] = [_headline(now, name), labelled(_fields(now, armed))]
+    parts += [_pressures(now, channels), labelled(rows)]
+    for event in events:
+        line = f"  {printable(event.text)} [{event.kind}]"
+        parts.append(Text(line, _LEVELS[event.severity]))
     if daemon is not None:
-        parts.append(_table(_places(daemon)))
+        parts.append(labelled(_places(daemon)))
     return Group(*parts)
 
 
@@ -188,15 +265,12 @@ def _pressures(now: Snapshot, channels: Sequence[str]) -> Table:
     for k, name in enumerate(channels):
         commanded, high = float(now.commanded[k]), float(now.high[k])
         measured = float(now.measured[k])
-        marks = []
-        if now.saturated[k]:
-            marks.append("saturated")
         table.add_row(
             f"  {name}",
             _bar(measured if math.isfinite(measured) else commanded, commanded, high),
             f"{commanded * 1e-5:.3f} bar",
             "not measured" if math.isnan(measured) else f"is {measured * 1e-5:.3f}",
-            Text(" ".join(marks), "yellow"),
+            Text("saturated" if now.saturated[k] else "", "yellow"),
         )
     return table
 
@@ -243,25 +317,11 @@ def _loop(now: Snapshot, rate: float) -> list[tuple[str, RenderableType]]:
 def _percentile(lateness: tuple[tuple[float, ...], tuple[int, ...]], share: float) -> str:
     """Return the edge of the histogram below which a share of all ticks began."""
     edges, counts = lateness
-    total, so_far = sum(counts), 0
-    if not total:
+    so_far = list(accumulate(counts))
+    if not so_far or not so_far[-1]:
         return ""
-    for edge, count in zip(edges, counts, strict=False):
-        so_far += count
-        if so_far >= share * total:
-            return f"{edge * 1e3:g} ms"
-    return "more than 0.5 s"
-
-
-def _alarms(now: Snapshot) -> list[tuple[str, RenderableType]]:
-    return [
-        ("ALARM", Text(f"{printable(alarm.text)} [{alarm.kind}]", "bold red"))
-        for alarm in now.alarms
-    ]
-
-
-def _event(event: Event) -> Text:
-    return Text(f"  {printable(event.text)} [{event.kind}]", _LEVELS[event.severity])
+    at = bisect_left(so_far, share * so_far[-1])
+    return f"{edges[at] * 1e3:g} ms" if at < len(edges) else "more than 0.5 s"
 
 
 def _places(daemon: Daemon) -> list[tuple[str, RenderableType]]:
@@ -275,15 +335,6 @@ def _places(daemon: Daemon) -> list[tuple[str, RenderableType]]:
         rows.append(("recording", daemon.recording))
     rows.append(("", Text("Ctrl-C lets the pressures down and ends; twice vents at once", "dim")))
     return rows
-
-
-def _table(rows: Sequence[tuple[str, RenderableType]]) -> Table:
-    table = Table.grid(padding=(0, 2, 0, 0))
-    table.add_column(style="dim", no_wrap=True)
-    table.add_column()
-    for name, value in rows:
-        table.add_row(f"  {name}", value)
-    return table
 
 
 def _triple(
