@@ -28,7 +28,6 @@ from stiffopt.plots.style import (
     make_logarithmic,
     stacked_panels,
     thinned,
-    tidy,
 )
 from stiffopt.plots.wording import BAR, MM, vector_text
 
@@ -303,7 +302,6 @@ def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "m
     axes.set_xlim(left=0)
     axes.set_xlabel("mean error of the tip (mm)")
     legend_beside(axes, title="held back", alignment="left")
-    tidy(axes)
     draw_head(figure, title, f"bars: mean over what was held back      chosen: {chosen}")
     return figure
 
@@ -341,7 +339,6 @@ def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiff
         axes.set_xlim(left=0)
     axes.grid(axis="x", alpha=0.25, which="both")
     legend_beside(axes)
-    tidy(axes)
     draw_head(figure, title, "measured, and predicted at the same pressures")
     return figure
 

@@ -24,7 +24,6 @@ from stiffopt.plots.style import (
     make_logarithmic,
     stacked_panels,
     thinned,
-    tidy,
 )
 from stiffopt.plots.wording import BAR, MM
 
@@ -124,7 +123,6 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
         axes.set_ylim(middle - _SMALLEST_RANGE / 2, middle + _SMALLEST_RANGE / 2)
     axes.set_ylabel(f"tip {'xyz'[axis]} (mm)")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _draw_error(axes: Any, run: RecordedRun) -> None:
@@ -140,7 +138,6 @@ def _draw_error(axes: Any, run: RecordedRun) -> None:
     else:
         axes.set_yticks([])
         axes.text(0.5, 0.5, "no target was set", transform=axes.transAxes, ha="center", color=GREY)
-    tidy(axes)
 
 
 def _draw_angle(axes: Any, run: RecordedRun) -> None:
@@ -152,7 +149,6 @@ def _draw_angle(axes: Any, run: RecordedRun) -> None:
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) -> None:
@@ -182,7 +178,6 @@ def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) 
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, -0.03), high + 0.02 * (high - low))
     legend_beside(axes, handles=handles)
-    tidy(axes)
 
 
 def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
@@ -197,7 +192,6 @@ def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
     axes.set_ylabel("stiffness\n(N/m, N m/rad)")
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _shade(panels: Any, run: RecordedRun) -> None:
