@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import os
-import select
 import sys
 import threading
 import time
@@ -20,7 +19,7 @@ from typing import TYPE_CHECKING, Self
 from stiffopt.cli.console import report_error, showing_slow_warnings
 from stiffopt.cli.exits import BAD_INPUT, ENDING_SIGNALS, FAULT, SOLVED, handled
 from stiffopt.cli.quantities import quantity
-from stiffopt.cli.run_display import Lines, LiveStatus
+from stiffopt.cli.run_display import Lines, LiveStatus, write_at_once
 from stiffopt.control.state import State
 from stiffopt.daemon.calls import Part
 from stiffopt.errors import InputError, StiffoptError
@@ -33,7 +32,7 @@ _CHECK = 0.2  # s, between two checks of whether the end has begun
 _LOOK = 0.05  # s, between two checks of whether it is over
 _LAST_OUTPUT = 1.0  # s, for what is shown at the end
 _FLUSH = 0.3  # s
-_LATE = b"error: the daemon did not end in time and is left as it is; its guard vents\n"
+_LATE = "error: the daemon did not end in time and is left as it is; its guard vents"
 _PRIORITY = -10  # niceness, where permitted: see `_raise_priority`
 _log = logging.getLogger(__name__)
 
@@ -333,7 +332,7 @@ class Backstop:
             if self._over.wait(_CHECK):
                 return
         if not self._over.wait(self._seconds):
-            _tell(_LATE)
+            write_at_once(sys.stderr, _LATE)
             leave(FAULT)
 
 
@@ -347,12 +346,3 @@ def _flush() -> None:
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError, AttributeError):
             stream.flush()
-
-
-def _tell(line: bytes) -> None:
-    """Write to stderr unless that would block."""
-    with suppress(OSError, ValueError, AttributeError):
-        ready = select.poll()
-        ready.register(sys.stderr.fileno(), select.POLLOUT)
-        if ready.poll(0):
-            os.write(sys.stderr.fileno(), line)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -46,6 +46,17 @@ _UNKNOWN = "-"
 _FACTORS = {"": (1.0, 3), "mm": (1e3, 1), "deg": (180 / math.pi, 1)}  # and decimals of a vector
 
 
+def write_at_once(stream: TextIO, line: str) -> None:
+    """Write a line unless that would block, or the stream is closed or absent."""
+    data = f"{line}\n".encode(errors="backslashreplace")
+    with suppress(OSError, ValueError, AttributeError):
+        number = stream.fileno()
+        ready = select.poll()
+        ready.register(number, select.POLLOUT)
+        if ready.poll(0):
+            os.write(number, data)
+
+
 class Lines:
     """Writes a line to stdout for each event and each change of state.
 
@@ -64,38 +75,38 @@ class Lines:
 
     def __init__(self, *, as_json: bool, now: Callable[[], float] = time.monotonic) -> None:
         self._as_json, self._now = as_json, now
-        self._told: dict[str, Any] = {}
+        self._last: dict[str, Any] = {}
 
     def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Write a line about this moment."""
         self._line(self._now(), str(severity), kind, text)
 
     def begin(self, daemon: Daemon) -> None:
-        """Write where everything is."""
+        """Write where the daemon is reached and what it records."""
         found: dict[str, Any] = {
             "url": daemon.url,
             "token_file": None if daemon.token_file is None else str(daemon.token_file),
             "recording": daemon.recording,
             "foxglove_port": daemon.foxglove_port,
         }
-        told = {key: value for key, value in found.items() if value is not None}
-        words = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in told.items())
-        self._line(self._now(), "info", "started", f"runs; {words or 'no ports'}", **told)
+        known = {key: value for key, value in found.items() if value is not None}
+        words = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in known.items())
+        self._line(self._now(), "info", "started", f"runs; {words or 'no ports'}", **known)
 
     def update(self, now: Snapshot, events: list[Event]) -> None:
-        """Write what is new."""
+        """Write the new events, and the state if it has changed."""
         for event in events:
             self._line(event.time, str(event.severity), event.kind, event.text)
         shown = [entry for entry in entries(type(now)) if entry.shown.line]
-        told = {entry.json[0]: plain(getattr(now, entry.name), entry) for entry in shown}
-        if told != self._told:
-            self._told = told
+        fields = {entry.json[0]: plain(getattr(now, entry.name), entry) for entry in shown}
+        if fields != self._last:
+            self._last = fields
             text = f"{now.state}: {now.reason}" if now.reason else str(now.state)
             level = "error" if now.state is State.FAULT else "info"
-            self._line(now.time, level, "state", text, **told)
+            self._line(now.time, level, "state", text, **fields)
 
     def end(self) -> None:
-        """Nothing is left to be done."""
+        """Do nothing; see `LiveStatus`."""
 
     def _line(self, moment: float, level: str, kind: str, text: str, **more: Any) -> None:
         text = text[:_LONGEST]
@@ -106,16 +117,7 @@ class Lines:
             mark = "" if level == "info" else f"{level.upper()}: "
             clock = stamp.astimezone().strftime("%H:%M:%S")
             line = f"{clock} {mark}{printable(text)} [{kind}]"
-        self._write(line)
-
-    def _write(self, line: str) -> None:
-        data = f"{line}\n".encode(errors="backslashreplace")
-        with suppress(OSError, ValueError, AttributeError):  # gone, closed, or never there
-            stream = sys.stdout.fileno()
-            ready = select.poll()
-            ready.register(stream, select.POLLOUT)
-            if ready.poll(0):
-                os.write(stream, data)
+        write_at_once(sys.stdout, line)
 
 
 class LiveStatus:

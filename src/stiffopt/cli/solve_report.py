@@ -23,6 +23,7 @@ from stiffopt.plots.wording import (
     figures,
     gain_text,
     least_maximised,
+    limit_of,
     unit_text,
     vector_text,
 )
@@ -80,7 +81,6 @@ def _robot(solved: SolvedTask) -> str:
 def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
     """Pressures in bar, a row for each segment; those at a limit say so."""
     description = solved.robot.description
-    active = solved.solution.active_bounds
     table = Table.grid(padding=(0, 2), pad_edge=False)
     widest = max(segment.n_channels for segment in description.segments)
     table.add_row("", *(Text(f"channel {k + 1}", "dim") for k in range(widest)))
@@ -88,18 +88,16 @@ def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
     for number, segment in enumerate(description.segments, start=1):
         cells = []
         for _ in range(segment.n_channels):
-            name = description.channel_name(index)
-            at = next((side for side in ("min", "max") if f"{name} {side}" in active), "")
-            cells.append(_pressure(pressures[index], at))
+            limit = limit_of(solved.solution, description.channel_name(index))
+            cells.append(
+                Text.assemble(
+                    (f"{pressures[index] * BAR + 0.0:.3f} bar", "bold"),
+                    (f" {limit}".rstrip(), "yellow"),
+                )
+            )
             index += 1
         table.add_row(Text(f"segment {number}", "dim"), *cells)
     return table
-
-
-def _pressure(value: float, at: str) -> Text:
-    return Text.assemble(
-        (f"{value * BAR + 0.0:.3f} bar", "bold"), (f" {at}" if at else "", "yellow")
-    )
 
 
 def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:

@@ -169,7 +169,8 @@ class _Scene:
             self.axes.plot(*ends.T, color=style.TARGET, linestyle=":", linewidth=1.6, zorder=9)
             self.corners.append(ends)
         names = ", ".join("xyz"[k] for k in free)
-        self._marker(f"target ({names} free)" if free else "target")
+        label = f"target ({names} free)" if free else "target"
+        self._line(style.TARGET, label, "none", marker="X", markersize=9, markeredgecolor="white")
         miss = np.linalg.norm(point - self.tip)
         if miss > 0.01 * self.size:
             self.axes.plot(
@@ -221,22 +222,11 @@ class _Scene:
 
         self.handles.append(Patch(color=colour, alpha=0.6, label=label))
 
-    def _line(self, colour: str, label: str, linestyle: Any = "-") -> None:
+    def _line(self, colour: str, label: str, linestyle: Any = "-", **look: Any) -> None:
         from matplotlib.lines import Line2D
 
-        self.handles.append(
-            Line2D([], [], color=colour, label=label, linestyle=linestyle, linewidth=2)
-        )
-
-    def _marker(self, label: str) -> None:
-        from matplotlib.lines import Line2D
-
-        self.handles.append(
-            Line2D(
-                [], [], color=style.TARGET, marker="X", markersize=9, markeredgecolor="white",
-                linestyle="none", label=label,
-            )
-        )  # fmt: skip
+        look = {"color": colour, "linestyle": linestyle, "linewidth": 2, **look}
+        self.handles.append(Line2D([], [], label=label, **look))
 
     def finish(self) -> None:
         """One scale for all axes, a view across the arm's bend, labels and legend."""

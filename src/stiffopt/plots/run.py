@@ -30,8 +30,6 @@ from stiffopt.plots.wording import BAR, MM
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["plot_run"]
-
 Array = NDArray[np.float64]
 
 _WIDE = 11.5  # inches
@@ -277,8 +275,8 @@ def _draw_timeline(axes: Any, run: RecordedRun, listed: list[RunEvent]) -> None:
             _band(axes, span, 1 + kinds.index(span.kind), _ALARM)
     if run.events:
         _draw_events(axes, run, listed, len(labels) - 1, width)
-    names = [literal(_short(label)) for label in labels]
-    axes.set_yticks(range(len(labels)), names)
+    names = [label if len(label) <= _LONGEST else f"{label[: _LONGEST - 3]}..." for label in labels]
+    axes.set_yticks(range(len(labels)), [literal(name) for name in names])
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0, labelsize=8)
     axes.tick_params(axis="x", labelsize=9)
@@ -304,10 +302,6 @@ def _draw_events(
                 str(number), (event.time, row), xytext=(2, 0), textcoords="offset points",
                 va="center", fontsize=8, color=colour, weight="bold",
             )  # fmt: skip
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 3]}..."
 
 
 def _alarm_kinds(run: RecordedRun) -> list[str]:

@@ -22,6 +22,7 @@ from stiffopt.plots.wording import (
     figures,
     gain_text,
     least_maximised,
+    limit_of,
     unit_text,
 )
 
@@ -166,7 +167,7 @@ def _draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -
     description = robot.description
     lower, upper = (bound * BAR for bound in solution.task.pressure_bounds(description))
     values = np.asarray(solution.pressures) * BAR
-    at_limit = [_active_side(solution, description.channel_name(k)) for k in range(len(values))]
+    at_limit = [limit_of(solution, description.channel_name(k)) for k in range(len(values))]
     places = _places(robot)
     axes.bar(places, upper - lower, bottom=lower, width=0.8, color=style.RANGE, zorder=1)
     for side, bounds in (("min", lower), ("max", upper)):
@@ -219,12 +220,6 @@ def _draw_pareto(axes: Any, front: Sequence[PressureSolution], plain: float | No
     axes.set_ylabel(f"stiffness ({unit_text(front[0].stiffness_unit)})")
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", fontsize=9, frameon=False)
-
-
-def _active_side(solution: PressureSolution, channel: str) -> str:
-    """At which limit a channel is: ``min``, ``max`` or neither."""
-    sides = (s for s in ("min", "max") if f"{channel} {s}" in solution.active_bounds)
-    return next(sides, "")
 
 
 def _places(robot: Manipulator) -> Any:
