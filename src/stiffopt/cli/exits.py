@@ -89,58 +89,52 @@ def handled(handlers: Mapping[int, Handler]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-class Interruptible:
+@contextmanager
+def interruptible() -> Iterator[Callable[[], None]]:
     """Context in which Ctrl-C raises KeyboardInterrupt for certain.
 
     CasADi clears Python errors while it converts its arguments, a KeyboardInterrupt among them: the
     work would go on, or fail for a value that is missing. So the interrupt is repeated until the
-    context is left.
+    context is left. The function that it gives raises KeyboardInterrupt if Ctrl-C was pressed.
     """
+    is_pressed, over = False, threading.Event()
 
-    def __init__(self) -> None:
-        self._pressed = False
-        self._over = threading.Event()
-        self._handling = handled({})
-
-    def __enter__(self) -> Interruptible:
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self._handling = handled({signal.SIGINT: self._handle})
-        self._handling.__enter__()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._over.set()
-        self._handling.__exit__(None, None, None)
-
-    def check(self) -> None:
-        """Raise KeyboardInterrupt if Ctrl-C was pressed."""
-        if self._pressed:
+    def check() -> None:
+        if is_pressed:
             raise KeyboardInterrupt
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._over.is_set():
+    def repeat() -> None:
+        while not over.wait(_REPEAT):
+            _thread.interrupt_main()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal is_pressed
+        if over.is_set():
             return
-        if not self._pressed:
-            self._pressed = True
-            threading.Thread(target=self._repeat, daemon=True).start()
+        if not is_pressed:
+            is_pressed = True
+            threading.Thread(target=repeat, daemon=True).start()
         raise KeyboardInterrupt
 
-    def _repeat(self) -> None:
-        while not self._over.wait(_REPEAT):
-            _thread.interrupt_main()
+    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with handled({signal.SIGINT: handle} if is_default else {}):
+        try:
+            yield check
+        finally:
+            over.set()
 
 
 @contextmanager
 def interruptible_work(*, quiet: bool) -> Iterator[Progress]:
     """Context of work that Ctrl-C ends, with warnings as notes; gives a function for progress."""
     with (
-        Interruptible() as interruptible,
+        interruptible() as check,
         ProgressBar(quiet=quiet) as bar,
         warnings_as_notes(quiet=quiet),
     ):
 
         def progress(done: float, total: float, text: str) -> None:
-            interruptible.check()
+            check()
             bar.report(done, total, text)
 
         yield progress

@@ -19,8 +19,8 @@ from stiffopt.cli.console import (
 )
 from stiffopt.cli.exits import (
     InterruptBetweenSteps,
-    Interruptible,
     RigFaultError,
+    interruptible,
 )
 from stiffopt.errors import DeviceError, InputError, StiffoptError
 from stiffopt.experiments import (
@@ -101,12 +101,12 @@ def run(
     if resume is not None and out is not None:
         raise InputError("give --out for a new experiment or --resume for an old one, not both")
     given = {key: value for key, value in given.items() if value is not None}
-    with Interruptible(), warnings_as_notes(quiet=quiet):
+    with interruptible(), warnings_as_notes(quiet=quiet):
         plan = _planned(experiment, rig, given, out, resume, model)
     try:
         with warnings_as_notes(quiet=quiet):
             _do(plan, quiet=quiet)
-            with Interruptible():
+            with interruptible():
                 settings = plan.settings
                 if isinstance(settings, KinematicsSettings):
                     _report_kinematics(plan, settings, plot=plot, as_json=as_json, quiet=quiet)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.console import report_note, write_line
-from stiffopt.cli.exits import Interruptible, with_exit_code
+from stiffopt.cli.exits import interruptible, with_exit_code
 from stiffopt.cli.options import command_group
 from stiffopt.cli.outputs import check_new_file, check_picture
 from stiffopt.errors import FileError
@@ -66,7 +66,7 @@ def export(
     quiet: Quiet = False,
 ) -> None:
     """Write a recording as log v1."""
-    with Interruptible() as interruptible:
+    with interruptible() as check:
         import numpy as np  # here, so that --help waits for no numerics
 
         from stiffopt.daemon.run_log import is_of_experiment, log_of_run, read_run
@@ -83,7 +83,7 @@ def export(
         if not len(log):
             raise FileError(run, "has no row to export; it was cut short too early")
         write_log(path, log)
-        interruptible.check()
+        check()
     if quiet:
         return
     if not whole:
@@ -106,7 +106,7 @@ def plot(
     quiet: Quiet = False,
 ) -> None:
     """Draw a recording."""
-    with Interruptible() as interruptible:
+    with interruptible() as check:
         from stiffopt.daemon.run_log import read_run
         from stiffopt.plots import save_figure
         from stiffopt.plots.run import plot_run
@@ -117,6 +117,6 @@ def plot(
         if not recorded.complete and not quiet:
             report_note(f"{run} was cut short or damaged; what is whole was drawn")
         save_figure(plot_run(recorded), path)
-        interruptible.check()
+        check()
     if not quiet:
         write_line(path)

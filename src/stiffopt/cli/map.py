@@ -147,7 +147,7 @@ def workspace(
         show(map_report.workspace_summary(found, out, seconds))
     if plot is not None:
         from stiffopt.plots import save_figure
-        from stiffopt.plots.workspace import plot_workspace
+        from stiffopt.plots.maps import plot_workspace
 
         save_figure(plot_workspace(found), plot)
 
@@ -250,7 +250,7 @@ def arm(
         map_report.write_csv(csv, found)
     if plot is not None:
         from stiffopt.plots import save_figure
-        from stiffopt.plots.arm_map import plot_arm_map, plot_tip_map
+        from stiffopt.plots.maps import plot_arm_map, plot_tip_map
 
         drawn = plot_arm_map(found) if isinstance(found, ArmMap) else plot_tip_map(found)
         save_figure(drawn, plot)

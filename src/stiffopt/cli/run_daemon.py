@@ -49,15 +49,8 @@ def run(
 ) -> int:
     """Run the daemon of a rig until it is ended; return the exit code.
 
-    Parameters
-    ----------
-    rig : path of a rig file.
-    task : path of a task file.
-    arm : whether to arm at once.
-    duration : as text with a unit.
-    service : whether ports are opened.
-    log_folder : instead of the rig file's.
-    style : ``live``, ``plain`` or ``json``.
+    `rig` and `task` are paths of files, `duration` is text with a unit, `service` says whether
+    ports are opened, `style` is ``live``, ``plain`` or ``json``.
     """
     if task is not None and not arm:
         raise InputError("--task needs --arm: a task is pursued once the arm is armed")
@@ -212,12 +205,7 @@ class _Watch:
 
 
 class _Signals:
-    """Counts the signals that ask the program to end, without interrupting it.
-
-    Attributes
-    ----------
-    count : how many have come.
-    """
+    """Counts the signals that ask the program to end, without interrupting it."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -305,14 +293,9 @@ class Screen:
 
 
 class Backstop:
-    """A watchdog that ends the process if it does not end in time by itself.
+    """A watchdog that ends the process some seconds after `has_begun` says that the end has begun.
 
-    Parameters
-    ----------
-    seconds :
-        From the beginning of the end.
-    has_begun :
-        Whether the end has begun; called again and again.
+    It does nothing if the context is left before.
     """
 
     def __init__(self, seconds: float, has_begun: Callable[[], bool]) -> None:

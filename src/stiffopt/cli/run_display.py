@@ -123,16 +123,8 @@ class Lines:
 class LiveStatus:
     """Shows the state of the loop in one place of the terminal.
 
-    A terminal that is gone or fails is no reason to end: nothing is shown then.
-
-    Parameters
-    ----------
-    name :
-        Of the rig.
-    channels :
-        Names (n,) of the channels.
-    console :
-        Where it is shown.
+    A terminal that is gone or fails is no reason to end: nothing is shown then. `name` is that of
+    the rig, `channels` are those of its channels (n,).
     """
 
     period = 0.25  # s, between two updates
@@ -157,12 +149,12 @@ class LiveStatus:
             self._attempt(lambda: self._live.console.print(Text(text, _LEVELS[severity])))
 
     def begin(self, daemon: Daemon) -> None:
-        """Start to show."""
+        """Start to show, with the addresses of a daemon."""
         self._daemon = daemon
         self._attempt(self._live.start)
 
     def update(self, now: Snapshot, events: list[Event]) -> None:
-        """Show how things stand now."""
+        """Show the state, and events with the last ones before them."""
         self._events.extend(events)
         if self._before is not None and now.time > self._before[0]:
             self._rate = (now.timing.ticks - self._before[1]) / (now.time - self._before[0])
@@ -196,20 +188,10 @@ def status(
     events: Sequence[Event] = (),
     daemon: Daemon | None = None,
 ) -> RenderableType:
-    """Return the state of the loop as something that rich can print.
+    """Return the state of the loop for the terminal.
 
-    Parameters
-    ----------
-    now :
-        What is shown.
-    name, channels :
-        Of the rig and of its channels (n,).
-    rate :
-        Of the loop, in Hz; NaN where unknown.
-    events :
-        The latest.
-    daemon :
-        Where everything is.
+    `name` is that of the rig, `channels` are those of its channels (n,), `rate` is the loop's in
+    Hz, NaN where unknown; the addresses and files of the daemon come last.
     """
     armed = now.state in (State.ACTIVE, State.HOLDING)
     rows: list[tuple[str, RenderableType]] = [*_stiffness(now)] if armed else []

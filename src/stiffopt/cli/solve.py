@@ -15,7 +15,7 @@ names. Subfolders are left alone; files in a folder that say they are something 
 files, are skipped with a note. A wrong file is reported on stderr, and the others are still solved.
 """
 
-_EXAMPLES = """\
+EXAMPLES = """\
 \b
 Examples:
   {command} problems/two_segment_stiff_x.yaml
@@ -39,11 +39,6 @@ A task file:
   target: {{position: [-30 mm, 10 mm, 190 mm]}}
   stiffness: {{maximise: {{direction: [1, 0, 0]}}}}
 """
-
-
-def examples(command: str) -> str:
-    """Return the end of the help for a name of the command."""
-    return _EXAMPLES.format(command=command)
 
 
 @with_exit_code

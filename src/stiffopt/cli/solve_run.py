@@ -20,7 +20,7 @@ from stiffopt.cli.console import (
     warnings_as_notes,
     write_json,
 )
-from stiffopt.cli.exits import Interruptible
+from stiffopt.cli.exits import interruptible
 from stiffopt.cli.solved_task import SolvedTask, solve_file
 from stiffopt.errors import StiffoptError
 
@@ -51,7 +51,7 @@ class Batch:
         if self.out is not None:
             solve_files.check_result_file(self.out, files)
         pictures = solve_files.picture_names(self.plot, files)
-        with Interruptible() as interrupts, warnings_as_notes(quiet=self.quiet):
+        with interruptible() as check, warnings_as_notes(quiet=self.quiet):
             for bad in found.errors:
                 self._refuse(bad.path, str(bad))
             for note in found.skipped if not self.quiet else ():
@@ -62,7 +62,7 @@ class Batch:
                         bar.report(number, len(files), f"{file} ({number + 1} of {len(files)})")
                     else:
                         bar.report(0, None, file)
-                    self._solve(file, picture, interrupts, bar)
+                    self._solve(file, picture, check, bar)
             self._summarise()
         if self.out is not None:
             try:
@@ -73,20 +73,20 @@ class Batch:
         return exits.CLOSED_PIPE if self.stdout_is_closed else exits.most_serious(self.codes)
 
     def _solve(
-        self, file: str, picture: str | None, interrupts: Interruptible, bar: ProgressBar
+        self, file: str, picture: str | None, check: Callable[[], None], bar: ProgressBar
     ) -> None:
         """Solve one file, or report what is wrong with it."""
         begin = perf_counter()
         try:
             solved = solve_file(file, seed=self.seed, pareto=self.pareto)
-            interrupts.check()
+            check()
         except StiffoptError as error:
-            interrupts.check()
+            check()
             self._refuse(file, str(error))
         except OSError:
             raise
         except Exception as error:  # a mistake of ours must not leave the other files unsolved
-            interrupts.check()
+            check()
             self._refuse(file, f"{file}: {_bug(error)}", exits.FAILED)
         else:
             bar.hide()

@@ -61,12 +61,7 @@ def plot_errors_over_time(
 ) -> Figure:
     """Draw the error of the tip over time, a panel for each log.
 
-    Parameters
-    ----------
-    found : sequence of Comparison
-    before : sequence of Comparison
-        The same logs, compared with the robot file as it was before; may be empty.
-    title : str
+    `before` may hold the same logs, compared with the robot file as it was before.
     """
     shown = _worst(found)
     figure, panels = _rows(len(shown), _ROW if len(shown) > 2 else 2 * _ROW)

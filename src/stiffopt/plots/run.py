@@ -56,15 +56,7 @@ _APART = 0.012  # of the panel's width, between two numbers of events
 
 
 def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
-    """Draw a run.
-
-    Parameters
-    ----------
-    run :
-        At least one tick.
-    title :
-        By default the name of the rig.
-    """
+    """Draw a run of at least one tick; the title is by default the name of the rig."""
     listed = _listed(run.events)
     stiff = bool(np.isfinite(run.stiffness).any())
     angles = bool(np.isfinite(run.angle_error).any())

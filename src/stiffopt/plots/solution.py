@@ -56,10 +56,6 @@ def plot_solution(
     title : str, optional
         By default the name of the task's file.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-
     Raises
     ------
     InputError
@@ -81,7 +77,14 @@ def plot_solution(
     _draw_pressures(figure.add_subplot(grid[0, 2]), arm, solution)
     if front is not None:
         _draw_pareto(figure.add_subplot(grid[1, 2]), front, plain)
-    _head(figure, solution, title or _name(solution), plain)
+    source = solution.task.source
+    name = solution.task.robot if source is None else source.stem
+    message = shorten(printable(solution.message), _LONGEST_NOTE, placeholder=" ...")
+    style.draw_head(figure, title or name, _key_numbers(solution, plain), message)
+    figure.text(
+        0.975, 1 - 0.34 / figure.get_figheight(), solution.status, fontsize=13, weight="bold",
+        va="center", ha="right", color=_STATUS[solution.status],
+    )  # fmt: skip
     return figure
 
 
@@ -98,10 +101,6 @@ def plot_pareto(
         First stiffness of a stiffness-blind solution, to compare with.
     title : str, optional
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-
     Raises
     ------
     MissingExtraError
@@ -113,24 +112,6 @@ def plot_pareto(
     if title:
         axes.set_title(literal(title))
     return figure
-
-
-def _name(solution: PressureSolution) -> str:
-    source = solution.task.source
-    return solution.task.robot if source is None else source.stem
-
-
-def _head(figure: Figure, solution: PressureSolution, title: str, plain: float | None) -> None:
-    """Title, and below it the numbers that matter."""
-    figure.text(0.03, 0.945, literal(title), fontsize=15, weight="bold", va="center")
-    figure.text(
-        0.975, 0.945, solution.status, fontsize=13, weight="bold", va="center", ha="right",
-        color=_STATUS[solution.status],
-    )  # fmt: skip
-    figure.text(0.03, 0.895, _key_numbers(solution, plain), fontsize=10.5, va="center")
-    if solution.message:
-        message = shorten(printable(solution.message), _LONGEST_NOTE, placeholder=" ...")
-        figure.text(0.03, 0.858, literal(message), fontsize=9.5, va="center", style="italic")
 
 
 def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
