@@ -6,7 +6,7 @@ import _thread
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import wraps
 from types import FrameType
 from typing import Any, ParamSpec
@@ -153,11 +153,9 @@ class InterruptBetweenSteps:
         self._at_once = False
         self._held = False
 
-    @contextmanager
-    def handled(self) -> Iterator[None]:
+    def handled(self) -> AbstractContextManager[None]:
         """Context in which the signals are handled."""
-        with handled(dict.fromkeys(self._signals, self._handle)):
-            yield
+        return handled(dict.fromkeys(self._signals, self._handle))
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a signal has come."""

@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
-from stiffopt.cli.tables import labelled, number_table, title
+from stiffopt.cli.tables import TextTable, labelled, title
 from stiffopt.directions import direction_name
 from stiffopt.documents import write_whole
 from stiffopt.errors import printable
@@ -61,25 +61,23 @@ def _facts(found: WorkspaceMap, seconds: float) -> list[tuple[str, RenderableTyp
 
 
 def _stiffnesses(found: WorkspaceMap) -> RenderableType:
-    plan = found.plan
-    first = plan.measures[0]
-    unit = unit_text(plan.unit)
-    table = number_table(unit, "stiffest", "at (mm)", "softest", "at (mm)", "ratio")
+    first = found.plan.measures[0]
+    rows = []
     for number, name in enumerate(found.direction_names):
         best, worst = found.best_in(number), found.worst_in(number)
         if best is None or worst is None:
             continue
-        table.add_row(
-            name,
-            figures(best.stiffness),
-            vector_text(best.cell_centre * MM),
-            figures(worst.stiffness),
-            vector_text(worst.cell_centre * MM),
-            f"{np.median(found.ratio[number]):.2f}",
-        )
+        cells = []
+        for extreme in (best, worst):
+            cells += [figures(extreme.stiffness), vector_text(extreme.cell_centre * MM)]
+        rows.append((name, *cells, f"{np.median(found.ratio[number]):.2f}"))
     way = "along" if first.kind == "translation" else "about"
-    note = f"{first.kind} {way} {first.frame} axes, {first.boundary}; ratio: in the median cell"
-    return Group(table, Text(f"  {note}", "dim"))
+    return TextTable(
+        "",
+        (unit_text(found.plan.unit), "stiffest", "at (mm)", "softest", "at (mm)", "ratio"),
+        tuple(rows),
+        f"{first.kind} {way} {first.frame} axes, {first.boundary}; ratio: in the median cell",
+    ).renderable()
 
 
 def workspace_record(found: WorkspaceMap, out: str | None, seconds: float) -> dict[str, Any]:
@@ -135,35 +133,35 @@ def summary(found: ArmMap | TipMap) -> RenderableType:
 def _arm_summary(found: ArmMap) -> RenderableType:
     names = [direction_name(tuple(direction)) for direction in found.directions]
     headings = [f"{name}: {what}" for name in names for what in ("tip", "middle")]
-    table = number_table("channels", "bar", *headings)
     middle = found.middle
+    rows = []
     for group, stiffness in zip(found.groups, found.stiffness, strict=True):
         for level, values in zip(found.pressures, stiffness, strict=True):
-            cells = [figures(values[at, k]) for k in range(len(names)) for at in (-1, middle)]
-            table.add_row(",".join(map(str, group)), f"{level * BAR:.3g}", *cells)
+            cells = [figures(values[place, k]) for k in range(len(names)) for place in (-1, middle)]
+            rows.append((",".join(map(str, group)), f"{level * BAR:.3g}", *cells))
     note = (
         f"N/m, {found.boundary}, axes of the {found.frame}; middle: at {found.at[middle] * MM:g} mm"
     )
-    heading = title(f"{found.robot}: stiffness along the arm")
-    return Group(heading, table, Text(f"  {note}", "dim"))
+    table = TextTable("", ("channels", "bar", *headings), tuple(rows), note)
+    return Group(title(f"{found.robot}: stiffness along the arm"), table.renderable())
 
 
 def _tip_summary(found: TipMap) -> RenderableType:
     a, b = found.channels
-    table = number_table(
-        "direction", "least", f"at p{a}, p{b} (bar)", "greatest", f"at p{a}, p{b} (bar)"
-    )
+    at = f"at p{a}, p{b} (bar)"
+    rows = []
     for k, direction in enumerate(found.directions):
         values = found.stiffness[:, :, k]
         cells = []
         for place in (np.argmin(values), np.argmax(values)):
             i, j = np.unravel_index(place, values.shape)
-            at = f"{found.first[i] * BAR:.3g}, {found.second[j] * BAR:.3g}"
-            cells += [figures(values[i, j]), at]
-        table.add_row(direction_name(tuple(direction)), *cells)
+            pressures = f"{found.first[i] * BAR:.3g}, {found.second[j] * BAR:.3g}"
+            cells += [figures(values[i, j]), pressures]
+        rows.append((direction_name(tuple(direction)), *cells))
     note = f"N/m, {found.boundary}, axes of the {found.frame}"
+    table = TextTable("", ("direction", "least", at, "greatest", at), tuple(rows), note)
     heading = title(f"{found.robot}: stiffness of the tip over channels {a} and {b}")
-    return Group(heading, table, Text(f"  {note}", "dim"))
+    return Group(heading, table.renderable())
 
 
 def record(found: ArmMap | TipMap) -> dict[str, Any]:

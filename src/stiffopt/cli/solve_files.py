@@ -143,6 +143,6 @@ def draw(solved: SolvedTask, path: str) -> None:
         solved.solution,
         front=solved.front,
         plain=solved.plain[0] if solved.plain else None,
-        title=solved.name,
+        title=Path(solved.file).stem,
     )
     save_figure(figure, path)

@@ -1,6 +1,5 @@
 """A solved task: its solution with everything else that is printed, written and drawn."""
 
-import os
 from dataclasses import dataclass, replace
 
 from stiffopt.errors import EquilibriumError, FileError, InputError
@@ -38,11 +37,6 @@ class SolvedTask:
     intervals: tuple[tuple[float, float], ...] = ()
     front: tuple[PressureSolution, ...] | None = None
     no_front: str = ""
-
-    @property
-    def name(self) -> str:
-        """The name of the task file without folder and ending."""
-        return os.path.splitext(os.path.basename(self.file))[0]
 
 
 def solve_file(file: str, *, seed: int, pareto: int | None) -> SolvedTask:
