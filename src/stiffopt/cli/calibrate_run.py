@@ -17,7 +17,7 @@ from stiffopt.cli import quantities
 from stiffopt.cli.console import show, write_json
 from stiffopt.cli.exits import Progress, interruptible_work
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
-from stiffopt.errors import FileError, InputError, shown
+from stiffopt.errors import FileError, InputError, require_package, shown
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
@@ -32,7 +32,6 @@ from stiffopt.logs import (
     read_log,
     read_mcap_log,
     read_stiffness_table,
-    require_mcap,
 )
 from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
@@ -167,7 +166,7 @@ class RecordingOptions:
         """Return the logs with their names, see `log_names`."""
         names = log_names(self.logs)
         if any(path.lower().endswith(".mcap") for path in self.logs):
-            require_mcap()
+            require_package("mcap", "log")
         found = []
         for i, (name, path) in enumerate(zip(names, self.logs, strict=True)):
             progress(i, len(names), f"reading {name}")

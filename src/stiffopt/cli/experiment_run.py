@@ -22,7 +22,7 @@ from stiffopt.cli.exits import (
     RigFaultError,
     interruptible,
 )
-from stiffopt.errors import DeviceError, InputError, StiffoptError
+from stiffopt.errors import DeviceError, InputError, StiffoptError, require_package
 from stiffopt.experiments import (
     KinematicsSettings,
     StiffnessSettings,
@@ -48,7 +48,7 @@ from stiffopt.experiments.kinematics import (
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
-from stiffopt.logs import require_mcap, write_stiffness_table
+from stiffopt.logs import write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
 
@@ -97,7 +97,7 @@ def run(
         from stiffopt.plots import require_matplotlib
 
         require_matplotlib()
-    require_mcap()
+    require_package("foxglove-sdk", "log", "foxglove")
     if resume is not None and out is not None:
         raise InputError("give --out for a new experiment or --resume for an old one, not both")
     given = {key: value for key, value in given.items() if value is not None}

@@ -69,17 +69,12 @@ def export(
     with interruptible() as check:
         import numpy as np  # here, so that --help waits for no numerics
 
-        from stiffopt.daemon.run_log import is_of_experiment, log_of_run, read_run
-        from stiffopt.logs import Log, read_mcap_log, write_log
+        from stiffopt.daemon.run_log import read_log_of_recording
+        from stiffopt.logs import write_log
 
         path = str(Path(run).with_suffix(".csv")) if out is None else out
         check_new_file(path, (".csv",))
-        log: Log
-        if is_of_experiment(run):
-            log, whole = read_mcap_log(run), True
-        else:
-            recorded = read_run(run)
-            log, whole = log_of_run(recorded), recorded.complete
+        log, whole = read_log_of_recording(run)
         if not len(log):
             raise FileError(run, "has no row to export; it was cut short too early")
         write_log(path, log)

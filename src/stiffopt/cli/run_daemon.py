@@ -21,7 +21,7 @@ from stiffopt.cli.exits import BAD_INPUT, ENDING_SIGNALS, FAULT, SOLVED, handled
 from stiffopt.cli.quantities import quantity
 from stiffopt.cli.run_display import Lines, LiveStatus, write_at_once
 from stiffopt.control.state import State
-from stiffopt.daemon.calls import Part
+from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.errors import InputError, StiffoptError
 from stiffopt.rig.config import load_rig_description
 
@@ -321,7 +321,7 @@ class Backstop:
 
 def leave(code: int) -> None:
     """End this process at once, without waiting for any thread; what was printed is flushed."""
-    Part("flush", _flush).ends_within(_FLUSH)
+    ends_within(_FLUSH, call_in_thread("flush", _flush))
     os._exit(code)
 
 

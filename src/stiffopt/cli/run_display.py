@@ -24,7 +24,7 @@ from stiffopt.cli.console import console_on
 from stiffopt.cli.tables import labelled
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
-from stiffopt.daemon.reports import plain
+from stiffopt.daemon.state_json import plain
 from stiffopt.errors import printable
 from stiffopt.safety.messages import json_line
 
