@@ -13,10 +13,9 @@ import pytest
 from fake_control import Hang
 from simulated_loop import PERIOD, TASK, Lab
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
-from stiffopt.control.loop import ControlLoop
+from stiffopt.control.loop import ControlLoop, TickTiming
 from stiffopt.control.request_queue import Requester, requested_by
 from stiffopt.control.state import Severity, State
-from stiffopt.control.timing import TickTiming
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.rig.settings import Safety

@@ -10,8 +10,13 @@ from typing import Any
 import pytest
 
 from simulated_loop import TASK, Lab
-from stiffopt.control.checks import check_target, check_task, check_trajectory
-from stiffopt.control.contents import contents, differences
+from stiffopt.control.checks import (
+    check_target,
+    check_task,
+    check_trajectory,
+    contents,
+    differences,
+)
 from stiffopt.control.state import State
 from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.daemon.messages import (

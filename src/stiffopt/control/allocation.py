@@ -32,8 +32,6 @@ from stiffopt.control.feedback import TrackingRows
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import FeedbackTuning
 
-__all__ = ["SOLVERS", "Allocation", "QuadraticSolver"]
-
 Array = NDArray[np.float64]
 
 _BAR = 1e5
@@ -102,8 +100,7 @@ class OsqpSolver(QuadraticSolver):
         if x is None or not np.isfinite(x).all():
             self._make()  # the workspace keeps NaN otherwise
             return None
-        result: Array = np.array(x)
-        return result
+        return np.array(x)
 
 
 SOLVERS: dict[str, type[QuadraticSolver]] = {"daqp": DaqpSolver, "osqp": OsqpSolver}

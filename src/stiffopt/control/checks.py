@@ -1,51 +1,42 @@
 """Checks of requests before they reach the control thread, and of the rig before it is armed.
 
-A request is refused by them whoever makes it: a program in Python, a client of the daemon or the
-command line. When one is refused nothing has changed.
+They refuse a request whoever makes it: a program in Python, a client of the daemon or the command
+line. `InputError` says why, with the key and, for a pressure, the channel; nothing has changed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
-from stiffopt.control.contents import understood
 from stiffopt.control.interface import Controller
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.control.trajectory import Trajectory, Waypoint
-from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.rig.interface import PressureLimits, PressureReading, Rig
 from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
-
-__all__ = [
-    "check_rig",
-    "check_target",
-    "check_task",
-    "check_trajectory",
-    "check_vented_arm",
-    "highest_pressures",
-    "limited_range",
-    "refusing",
-]
+from stiffopt.schema import Schema
 
 Array = NDArray[np.float64]
+ModelT = TypeVar("ModelT", bound=Schema)
+
+_NOT_CONTENT = frozenset({"source"})  # the file that a description was read from
+_LISTED = 5  # keys that an error names
 
 
 @contextmanager
 def refusing(what: str) -> Iterator[None]:
-    """Raise any error of the body as `InputError`, a refusal: nothing has changed.
+    """Raise any error of the body, which checks or prepares something, as a refusal of that.
 
-    Parameters
-    ----------
-    what :
-        What the body checks or prepares, for the message.
+    A refusal is an `InputError`, and nothing has changed.
     """
     try:
         yield
@@ -61,37 +52,19 @@ def refusing(what: str) -> Iterator[None]:
 
 
 def check_task(task: Task, limits: PressureLimits) -> None:
-    """Refuse a task that is not valid or needs pressures beyond the limits.
-
-    Raises
-    ------
-    InputError
-        It names the key and, for a pressure, the channel.
-    """
+    """Refuse a task that is not valid or needs pressures beyond the limits."""
     with refusing("task"):
         limited_range(understood(task, Task).pressure, limits)
 
 
 def check_target(target: Target) -> None:
-    """Refuse a target that is not valid.
-
-    Raises
-    ------
-    InputError
-        It names the key.
-    """
+    """Refuse a target that is not valid."""
     with refusing("target"):
         understood(target, Target)
 
 
 def check_trajectory(trajectory: Trajectory) -> None:
-    """Refuse a trajectory that is not valid.
-
-    Raises
-    ------
-    InputError
-        It names the key.
-    """
+    """Refuse a trajectory that is not valid."""
     with refusing("trajectory"):
         if not isinstance(trajectory, Trajectory):
             raise InputError(f"expected a Trajectory, not {type(trajectory).__name__}")
@@ -109,12 +82,8 @@ def highest_pressures(task: Task, limits: PressureLimits) -> Array:
 def limited_range(pressure: PressureRange, limits: PressureLimits) -> PressureRange:
     """Return a task's limits of pressure for each channel, completed by those of a rig.
 
-    A limit beyond the rig's by no more than `PressureLimits.slack`, by rounding, becomes the rig's.
-
-    Raises
-    ------
-    InputError
-        A limit is beyond the rig's, or a channel is left no pressure; it names the channel.
+    A limit beyond the rig's by no more than `PressureLimits.slack`, by rounding, becomes the rig's;
+    one that is farther beyond, and a channel that is left no pressure, is an `InputError`.
     """
     lower = _bound("min", pressure.min, limits.low, limits)
     upper = _bound("max", pressure.max, limits.high, limits)
@@ -142,8 +111,7 @@ def _bound(
             f"pressure.{key}: {values[index] * 1e-5:g} bar is beyond the limits of channel "
             f"{index + 1}, {limits.low[index] * 1e-5:g} to {limits.high[index] * 1e-5:g} bar"
         )
-    clipped: Array = np.clip(values, limits.low, limits.high)
-    return clipped
+    return np.asarray(np.clip(values, limits.low, limits.high))
 
 
 def check_rig(rig: Rig, outlet: Outlet, controller: Controller) -> Iterator[str]:
@@ -188,9 +156,12 @@ def check_vented_arm(
     pressures: PressureMonitor,
     reading: PressureReading,
     tracker: TrackerWatch,
-    tuning: SupervisionTuning,
+    max_offset: float,
 ) -> Iterator[str]:
-    """Yield the problems of a vented arm's measurements; each begins with the name of its check."""
+    """Yield the problems of a vented arm's measurements; each begins with the name of its check.
+
+    `max_offset` of the tip is a share of the arm's length.
+    """
     trouble = pressures.implausible(now, reading)
     if trouble is not None:
         yield f"pressures: {trouble.text}"
@@ -210,10 +181,62 @@ def check_vented_arm(
     if modelled is None:
         modelled = status.tip_position - status.disturbance
     off = float(np.linalg.norm(tracker.position - modelled))
-    if not off <= tuning.vented_offset * rig.robot.length:  # NaN is too far as well
+    if not off <= max_offset * rig.robot.length:  # NaN is too far as well
         seen, model = (", ".join(f"{1e3 * x:.1f}" for x in p) for p in (tracker.position, modelled))
         yield (
             f"calibration: the vented tip is seen at ({seen}) mm, {1e3 * off:.0f} mm from where "
             f"the model has it, ({model}) mm; check the tracker's registration and the robot file "
             "('stiffopt calibrate' makes one)"
         )
+
+
+# what a request holds ---------------------------------------------------------------------------
+
+
+def contents(value: Any) -> Any:
+    """Return a schema's fields as plain data, also those of a subclass, but for those of None."""
+    if isinstance(value, BaseModel):
+        fields = {name: getattr(value, name) for name in type(value).model_fields}
+        fields |= value.model_extra or {}
+        given = {name: field for name, field in fields.items() if field is not None}
+        return {name: contents(field) for name, field in given.items() if name not in _NOT_CONTENT}
+    if isinstance(value, list | tuple):
+        return [contents(item) for item in value]
+    return value
+
+
+def differences(one: Any, other: Any, place: str = "") -> list[str]:
+    """Return the keys at which two contents differ, dotted."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        return [
+            found
+            for key in {**one, **other}
+            for found in differences(one.get(key), other.get(key), f"{place}.{key}".lstrip("."))
+        ]
+    if isinstance(one, list) and isinstance(other, list) and len(one) == len(other):
+        return [
+            found
+            for index, (a, b) in enumerate(zip(one, other, strict=True))
+            for found in differences(a, b, f"{place}[{index}]")
+        ]
+    return [] if one is other or bool(one == other) else [place]
+
+
+def listed(places: list[str]) -> str:
+    """Return keys as an error names them, a few of them at most."""
+    more = f" and {len(places) - _LISTED} more" if len(places) > _LISTED else ""
+    return ", ".join(places[:_LISTED]) + more
+
+
+def understood(given: object, model: type[ModelT]) -> ModelT:
+    """Return a description as an instance of exactly this model.
+
+    It is refused if it is no such description, a value is not valid, or a key would be lost.
+    """
+    if not isinstance(given, model):
+        raise InputError(f"expected a {model.__name__}, not {type(given).__name__}")
+    plain = contents(given)
+    made = model(**plain)
+    if different := differences(plain, contents(made)):
+        raise InputError(f"{model.__name__}: {listed(different)}: not a value that can be had")
+    return made

@@ -10,7 +10,7 @@ all limits.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -38,8 +38,6 @@ from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
-
-__all__ = ["TipController"]
 
 Array = NDArray[np.float64]
 
@@ -90,7 +88,6 @@ class TipController:
         if control.vibration != "auto":
             vibrates = control.vibration == "modelled"
         mode = BendingMode.of(robot.description) if vibrates else None
-        self._vibrates = vibrates
         self._pressures = PressureEstimator(
             robot.description, control, period, slew, tuning.regulators
         )
@@ -105,9 +102,8 @@ class TipController:
         self._reference = Reference(
             period, slew, lag, control.damping, 6, tuning.reference.slew_share
         )
-        self._gains: GainSchedule | None = None
-        if mode is not None:
-            self._gains = GainSchedule(period, lag, control.damping, tuning.feedback.effort)
+        effort = tuning.feedback.effort
+        self._gains = GainSchedule(period, lag, control.damping, effort) if vibrates else None
         self._allocation = Allocation(
             tracking_rows(n, mode, control.damping, dead_time, tuning.feedback),
             limits.low,
@@ -158,42 +154,33 @@ class TipController:
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
         with refusing("task"):
-            pursue = self._prepared_task(task)
-        pursue()
+            self._pursue_task(task)
 
     def set_target(self, target: Target) -> None:
         """Go to another target; see `Controller.set_target`."""
         with refusing("target"):
-            pursue = self._prepared_target(target)
-        pursue()
+            self._pursue_target(target)
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory; see `Controller.follow`."""
         with refusing("trajectory"):
             estimate = self._estimator.estimate
             course = Course(trajectory, now, estimate.position, estimate.rotation)
-            pursue = self._prepared_target(course.at(now), course)
-        pursue()
+            self._pursue_target(course.at(now), course)
 
-    def _prepared_task(self, task: Task, course: Course | None = None) -> Callable[[], None]:
-        """Return what begins to pursue a task when it is called; until then nothing changes."""
+    def _pursue_task(self, task: Task, course: Course | None = None) -> None:
         limited = _within_limits(task, self.robot, self.limits)
         lower, upper = limited.pressure_bounds(self.robot.description)
-        begin = self.replanner.prepared(replace(Pursuit.of(task, limited), course=course))
+        self.replanner.pursue(Pursuit.of(task, limited, course))
+        self._allocation.limit(lower, upper)  # does not fail: what follows a change must not
 
-        def pursue() -> None:
-            self._allocation.limit(lower, upper)
-            begin()
-
-        return pursue
-
-    def _prepared_target(self, target: Target, course: Course | None = None) -> Callable[[], None]:
-        """Return what begins to go to a target, with goal and limits of the task, if any."""
+    def _pursue_target(self, target: Target, course: Course | None = None) -> None:
+        """Go to a target, with goal and limits of the task, if there is one."""
         pursuit = self.replanner.pursuit
         if pursuit.task is None:
-            task = Task(robot=self.robot.description.name, target=target)
-            return self._prepared_task(task, course)
-        return self.replanner.prepared(pursuit.to(target, course))
+            self._pursue_task(Task(robot=self.robot.description.name, target=target), course)
+        else:
+            self.replanner.pursue(pursuit.to(target, course))
 
     def resume(self, now: float) -> None:
         """Control again from where the pressures are."""
@@ -237,7 +224,7 @@ class TipController:
             return ControlOutput(last.copy(), False, self._saturated.copy())
         tuning = self._tuning.reference
         reference.rate = tuning.rigid_rate
-        if self._vibrates:
+        if self._gains is not None:
             reference.rate = min(reference.rate, tuning.vibrating_rate * omega)
         reference.omega = omega
         reference.advance(plan)
@@ -348,13 +335,7 @@ class TipController:
 
 
 def _within_limits(task: Task, robot: Manipulator, limits: PressureLimits) -> Task:
-    """Return a task with the rig's limits of pressure as well.
-
-    Raises
-    ------
-    InputError
-        It needs more than the rig permits (see `limited_range`), or leaves a channel no pressure.
-    """
+    """Return a task with the rig's limits of pressure as well; see `limited_range`."""
     on_rig = task.model_copy(update={"pressure": limited_range(task.pressure, limits)})
     lower, upper = on_rig.pressure_bounds(robot.description)
     pressure = PressureRange(min=tuple(lower.tolist()), max=tuple(upper.tolist()))

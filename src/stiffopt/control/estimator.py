@@ -36,8 +36,6 @@ from stiffopt.control.vibration import BendingMode, transition
 from stiffopt.optimise.tip import TipAt
 from stiffopt.rig.interface import PoseSample
 
-__all__ = ["TipEstimate", "TipEstimator"]
-
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
@@ -56,30 +54,20 @@ class _PastTip(NamedTuple):
 
 @dataclass(frozen=True)
 class TipEstimate:
-    """Estimated tip, in the base frame.
+    """Estimated tip, in the base frame."""
 
-    Attributes
-    ----------
-    static : position (3,) of the model, in m.
-    offset : d (3,), in m.
-    turn : offset of the orientation (3,), as a rotation vector in base axes.
-    vibration, speed : xi and w (3,), in m and m/s.
-    rotation, quaternion : orientation (3, 3) and (4,), w first.
-    """
-
-    static: Array
-    offset: Array
-    turn: Array
-    vibration: Array
-    speed: Array
-    rotation: Array
-    quaternion: Array
+    static: Array  # position (3,) of the model, in m
+    offset: Array  # d (3,), in m
+    turn: Array  # offset of the orientation (3,), as a rotation vector in base axes
+    vibration: Array  # xi (3,), in m
+    speed: Array  # w (3,), in m/s
+    rotation: Array  # (3, 3)
+    quaternion: Array  # (4,), w first
 
     @property
     def position(self) -> Array:
         """Position (3,), in m."""
-        result: Array = self.static + self.offset + self.vibration
-        return result
+        return self.static + self.offset + self.vibration
 
 
 class TipEstimator:
@@ -153,8 +141,7 @@ class TipEstimator:
     @property
     def vibration(self) -> Array:
         """Vibration and its speed (2, 3), in m and m/s."""
-        result: Array = self._past[-1].driven + self._free
-        return result
+        return self._past[-1].driven + self._free
 
     @property
     def turn_known(self) -> bool:
@@ -234,8 +221,7 @@ class TipEstimator:
         """Transition matrix (2, 2) of the free vibration over a duration in s."""
         if not math.isfinite(self.omega):
             return np.eye(2)
-        F: Array = np.array(transition(self.omega, self._tuning.damping, duration))
-        return F
+        return np.array(transition(self.omega, self._tuning.damping, duration))
 
     def _past_at(self, time: float) -> _PastTip | None:
         """Interpolate the past at a moment; None if it is older than the memory."""

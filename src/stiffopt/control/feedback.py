@@ -29,8 +29,6 @@ from stiffopt.control.tuning import FeedbackTuning
 from stiffopt.control.vibration import BendingMode, transition
 from stiffopt.optimise.target import Target
 
-__all__ = ["GainSchedule", "TrackingRows", "lqr_gains", "prescribed_components", "tracking_rows"]
-
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
@@ -42,25 +40,14 @@ class TrackingRows:
     """Rows J and values v, in m, of a system J (p - r) = v in pressures p near the reference r.
 
     They are symbolic, for `Allocation` to make one formula of them and its own terms.
-
-    Attributes
-    ----------
-    inputs : list
-        Symbols; see `tracking_rows`.
-    matrices : list
-        Those of them that have one column per channel.
-    rows, values : J (t, n), v (t,)
-    task_rows : int
-        Number of the first rows, which are the task's.
-    linear : Jacobian (3, n) of the tip's position, base axes, in m/Pa.
     """
 
-    inputs: list[Symbols]
-    matrices: list[Symbols]
-    rows: Symbols
-    values: Symbols
-    linear: Symbols
-    task_rows: int
+    inputs: list[Symbols]  # see `tracking_rows`
+    matrices: list[Symbols]  # those of them that have one column per channel
+    rows: Symbols  # J (t, n)
+    values: Symbols  # v (t,)
+    linear: Symbols  # Jacobian (3, n) of the tip's position, base axes, in m/Pa
+    task_rows: int  # number of the first rows, which are the task's
 
 
 def prescribed_components(target: Target) -> Array:
@@ -171,5 +158,4 @@ def lqr_gains(omega: float, damping: float, lag: float, period: float, effort: f
     F, G = sampled[:3, :3], sampled[:3, 3:]
     Q, R = np.diag([0.0, 1.0, 0.0]), np.array([[effort]])
     S = solve_discrete_are(F, G, Q, R)
-    gains: Array = np.linalg.solve(R + G.T @ S @ G, G.T @ S @ F)[0]
-    return gains
+    return np.asarray(np.linalg.solve(R + G.T @ S @ G, G.T @ S @ F)[0])

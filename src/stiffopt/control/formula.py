@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from stiffopt.model.batch import Buffer
 
-__all__ = ["Formula"]
-
 Array = NDArray[np.float64]
 
 

@@ -20,62 +20,35 @@ from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.rig.interface import PoseSample, PressureReading
 
-__all__ = ["ControlOutput", "Controller", "Notice", "SampleCounts"]
-
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """How many of a tick's tracker samples were used.
+    """How many of a tick's tracker samples were used."""
 
-    Attributes
-    ----------
-    used : plausible samples, late ones included.
-    rejected : samples to which no arm could have moved.
-    latest : capture time of the newest sample that was used so far, in s; minus infinity before it.
-    """
-
-    used: int
-    rejected: int
-    latest: float
+    used: int  # plausible samples, late ones included
+    rejected: int  # samples to which no arm could have moved
+    latest: float  # capture time of the newest used so far, in s; minus infinity before it
 
 
 @dataclass(frozen=True)
 class ControlOutput:
-    """The command that a controller computes in a tick.
+    """The command that a controller computes in a tick."""
 
-    Attributes
-    ----------
-    pressures : ndarray
-        (n,), in Pa.
-    valid : bool
-        Whether they are a solution; if not, the solver failed and they are those of the last tick.
-    saturated : ndarray
-        Channels (n,) at a limit that keeps the tip from its target.
-    """
-
-    pressures: Array
-    valid: bool
-    saturated: NDArray[np.bool_]
+    pressures: Array  # (n,), in Pa
+    valid: bool  # whether they are a solution; else the solver failed and they are the last ones
+    saturated: NDArray[np.bool_]  # channels (n,) at a limit that keeps the tip from its target
 
 
 @dataclass(frozen=True)
 class Notice:
-    """A message of the controller, which becomes an alarm or an event.
+    """A message of the controller, which becomes an alarm or an event."""
 
-    Attributes
-    ----------
-    kind : a word for programs.
-    text : a sentence for people.
-    severity : how bad it is.
-    standing : an alarm while the controller repeats it; otherwise an event.
-    """
-
-    kind: str
-    text: str
-    severity: Severity = Severity.WARNING
-    standing: bool = False
+    kind: str  # a word for programs
+    text: str  # a sentence for people
+    severity: Severity = Severity.WARNING  # how bad it is
+    standing: bool = False  # an alarm while the controller repeats it; otherwise an event
 
 
 class Controller(Protocol):

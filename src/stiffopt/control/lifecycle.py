@@ -1,4 +1,4 @@
-"""The state of a control loop: which transitions it has, and the events and alarms on its way."""
+"""The life of a control loop: its states and transitions, and its record of events and alarms."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ from contextlib import ExitStack
 from stiffopt.control.state import Alarm, Event, Severity, State
 from stiffopt.errors import CommandError
 from stiffopt.model.compiler import held_off
-
-__all__ = ["ARMED", "Alarms", "EventBuffer", "Lifecycle"]
 
 ARMED = frozenset({State.ACTIVE, State.HOLDING})
 """States in which there may be pressure."""
@@ -46,23 +44,14 @@ _ADVICE = {
 class Lifecycle:
     """The state of a control loop.
 
-    Parameters
-    ----------
-    in_real_time :
-        Whether ticks have deadlines: then no code is compiled in the background while it is armed.
-
-    Attributes
-    ----------
-    state : State
-        Now.
-    reason : str
-        Why, where nobody requested it.
+    `in_real_time`: ticks have deadlines, so no code is compiled in the background while it is
+    armed.
     """
 
     def __init__(self, *, in_real_time: bool = False) -> None:
         self._in_real_time = in_real_time
         self.state = State.UNCONFIGURED
-        self.reason = ""
+        self.reason = ""  # for the state, where nobody requested it
         self._no_compiler = ExitStack()  # begins in the background while the arm is armed
 
     @property
@@ -71,13 +60,7 @@ class Lifecycle:
         return self.state in ARMED
 
     def change(self, state: State, reason: str = "") -> None:
-        """Go to another state.
-
-        Raises
-        ------
-        CommandError
-            There is no such transition.
-        """
+        """Go to another state; `CommandError` if there is no such transition."""
         if state not in _TRANSITIONS[self.state]:
             raise CommandError(f"{state} cannot follow {self.state}")
         was_armed = self.armed
@@ -88,13 +71,7 @@ class Lifecycle:
             self._no_compiler.close()
 
     def permit(self, request: str) -> None:
-        """Refuse a request that the state does not permit.
-
-        Raises
-        ------
-        CommandError
-            It says what to do instead.
-        """
+        """Refuse a request that the state does not permit, and say what to do instead."""
         if self.state not in _REQUESTS[request]:
             advice = _ADVICE[self.state] if request != "reset" else "there is no fault"
             why = f" ({self.reason})" if self.state is State.FAULT else ""
@@ -102,13 +79,7 @@ class Lifecycle:
 
 
 class EventBuffer:
-    """The latest events, in the order in which they happened; for all threads.
-
-    Parameters
-    ----------
-    size :
-        Number of events; the oldest are dropped.
-    """
+    """The latest `size` events, in the order in which they happened; for all threads."""
 
     def __init__(self, size: int = 10_000) -> None:
         self._events: deque[Event] = deque(maxlen=size)
@@ -122,17 +93,9 @@ class EventBuffer:
             self._count += 1
 
     def since(self, index: int) -> tuple[list[Event], int]:
-        """Return the events from an index on, as far as the buffer has them.
+        """Return the events from an index on, as far as the buffer has them, and the next index.
 
-        Parameters
-        ----------
-        index :
-            0 at first, then the `next_index` of the last call.
-
-        Returns
-        -------
-        events : list of Event
-        next_index : int
+        The index is 0 at first, and then that which the last call has returned.
         """
         with self._lock:
             new = min(max(self._count - index, 0), len(self._events))
@@ -141,13 +104,9 @@ class EventBuffer:
 
 
 class Alarms:
-    """The alarms that stand now, one of each kind; for all threads.
+    """The alarms that stand `now`, one of each kind; setting or clearing one is an event.
 
-    Setting and clearing one is an event.
-
-    Attributes
-    ----------
-    now : tuple of Alarm
+    For all threads.
     """
 
     def __init__(self, events: EventBuffer) -> None:

@@ -15,8 +15,6 @@ from stiffopt.errors import EquilibriumError, PressureError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.tip import TipAt, TipModel
 
-__all__ = ["LinearisedTip"]
-
 Array = NDArray[np.float64]
 
 

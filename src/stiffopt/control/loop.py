@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 import time
+from bisect import bisect_left
 from collections.abc import Callable
 
 import numpy as np
@@ -13,9 +14,8 @@ from stiffopt.control.checks import check_target, check_task, check_trajectory
 from stiffopt.control.interface import Controller
 from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.request_queue import RequestQueue, current_requester
-from stiffopt.control.state import ControllerStatus, Snapshot, State
+from stiffopt.control.state import ControllerStatus, Snapshot, State, Timing
 from stiffopt.control.supervisor import Supervisor
-from stiffopt.control.timing import TickTiming
 from stiffopt.control.trajectory import Trajectory
 from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.errors import CommandError, InputError
@@ -24,8 +24,6 @@ from stiffopt.optimise.task import Task
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import Outlet
-
-__all__ = ["ControlLoop"]
 
 _STARTING = (
     "not while unconfigured: it is still starting, connects to the rig and checks it, which takes "
@@ -41,9 +39,10 @@ class ControlLoop:
     vents and lasts until `reset`.
 
     Requests may come from any thread: the control thread carries them out in its next tick, or the
-    caller at once while the loop does not run. They return when that is done, or raise `InputError`
-    with the reason; nothing has changed then. During the first configuration, which may take long,
-    requests are refused at once, except for `vent`, which is carried out.
+    caller at once while the loop does not run. They return when that is done. A request that is
+    refused raises `InputError` with the reason, and nothing has changed. During the first
+    configuration, which may take long, requests are refused at once, except for `vent`, which is
+    carried out.
 
     Parameters
     ----------
@@ -59,11 +58,6 @@ class ControlLoop:
         Between ticks, in s.
     tuning :
         Of the supervision.
-
-    Attributes
-    ----------
-    events : EventBuffer
-        The latest events.
     """
 
     def __init__(
@@ -86,7 +80,7 @@ class ControlLoop:
         self._configuring = False
         self._timing = TickTiming(period)
         self._stop_time = safety.ramp_time + tuning.stop_margin
-        self.events: EventBuffer = self._supervisor.events
+        self.events: EventBuffer = self._supervisor.events  # the latest
         self._unknown = ControllerStatus(plan=np.full(outlet.limits.n, np.nan))
         self._snapshot = self._current_snapshot(rig.clock.now())
         self._listeners: list[Callable[[Snapshot], None]] = []
@@ -96,10 +90,7 @@ class ControlLoop:
     def configure(self) -> None:
         """Connect supply and tracker, which vents, and check the rig; it is inactive then.
 
-        Raises
-        ------
-        InputError
-            A check failed; the text begins with its name. There may be several.
+        The reason of a refusal begins with the name of the check that failed; there may be several.
         """
         self._check_started()
         self._configuring = True
@@ -111,80 +102,43 @@ class ControlLoop:
     def arm(self) -> None:
         """Check the vented arm and activate the controller; pressures stay until there is a task.
 
-        The loop must have ticked for some time before, to learn the rhythm of the tracker.
-
-        Raises
-        ------
-        InputError
-            A check failed; the text begins with its name. There may be several.
+        The loop must have ticked for some time before, to learn the rhythm of the tracker. Refused
+        as by `configure`.
         """
         requester = current_requester()  # checks may take long
         self._request(lambda now: self._supervisor.arm(now, lambda: requester.gone))
 
     def disarm(self) -> None:
-        """Begin to let the pressures down; after `Safety.ramp_time` it is vented and inactive.
-
-        Raises
-        ------
-        InputError
-            It is in fault, and vented.
-        """
+        """Begin to let the pressures down; after `Safety.ramp_time` it is vented and inactive."""
         self._request(self._supervisor.disarm)
 
     def set_task(self, task: Task) -> None:
-        """Pursue a task.
-
-        Raises
-        ------
-        InputError
-            It is not armed, or the task is not valid on this rig.
-        """
+        """Pursue a task; refused unless the loop is armed and the task valid on this rig."""
         self._check_started()
         check_task(task, self._supervisor.outlet.limits)
         self._carry_out(lambda now: self._supervisor.set_task(now, task))
 
     def set_target(self, target: Target) -> None:
-        """Go to another target, with the stiffness goal and limits of the task.
-
-        Raises
-        ------
-        InputError
-            It is not armed, or the target is not valid.
-        """
+        """Go to another target, with the stiffness goal and limits of the task, if there is one."""
         self._check_started()
         check_target(target)
         self._carry_out(lambda now: self._supervisor.set_target(now, target))
 
     def follow_trajectory(self, trajectory: Trajectory) -> None:
-        """Follow a trajectory that begins now.
-
-        Raises
-        ------
-        InputError
-            It is not armed, or the trajectory is not valid.
-        """
+        """Follow a trajectory that begins now."""
         self._check_started()
         check_trajectory(trajectory)  # in this thread: the control thread has to tick
         self._carry_out(lambda now: self._supervisor.follow_trajectory(now, trajectory))
 
     def hold(self, reason: str = "asked to") -> None:
-        """Keep the pressures as they are until the next task, target or trajectory.
-
-        Raises
-        ------
-        InputError
-            It is not armed: there is nothing to hold.
-        """
+        """Keep the pressures as they are until the next task, target or trajectory."""
         self._request(lambda now: self._supervisor.hold(now, reason))
 
     def vent(self, reason: str = "asked to") -> None:
         """Vent at once; it is inactive then, or still in fault.
 
-        Raises
-        ------
-        InputError
-            The supply does not accept it, or is not connected yet; connecting vents it. If it was
-            configured it is in fault then, and venting is repeated in every tick.
+        If the supply does not accept that, `InputError` says so. The loop is then in fault and
+        repeats it in every tick, or still unconfigured; connecting the supply vents it.
         """
         if self._starting:  # directly: nothing else commands the supply yet
             self._supervisor.vent_while_starting()
@@ -192,13 +146,7 @@ class ControlLoop:
         self._request(lambda now: self._supervisor.vent(now, reason))
 
     def reset(self) -> None:
-        """Leave the fault; it is inactive then.
-
-        Raises
-        ------
-        InputError
-            The reason for the fault is still there, or there is no fault.
-        """
+        """Leave the fault; it is inactive then. Refused while the reason for it is still there."""
         self._request(self._supervisor.reset)
 
     def add_alarm(self, kind: str, text: str) -> None:
@@ -269,18 +217,14 @@ class ControlLoop:
     def close(self) -> None:
         """Vent, disconnect supply and tracker, and end the controller.
 
-        Raises
-        ------
-        DeviceError
-            The supply does not accept the command to vent.
+        `DeviceError`: the supply does not accept the command to vent.
         """
-        supervisor = self._supervisor
         try:
-            supervisor.outlet.close()
+            self._supervisor.outlet.close()
         finally:
-            if supervisor.rig.tracker is not None:
-                supervisor.rig.tracker.close()
-            supervisor.controller.close()
+            if self.rig.tracker is not None:
+                self.rig.tracker.close()
+            self._supervisor.controller.close()
 
     def _ticked(self, due: float) -> float:
         """Tick when it is due; return when the next tick is."""
@@ -357,3 +301,48 @@ class ControlLoop:
             timing=self._timing.statistics(),
             **vars(status),
         )
+
+
+_EDGES = tuple(float(f"{m}e{e}") for e in range(-6, 0) for m in (1, 2, 5))
+"""Upper edges of the histogram of lateness, from 1 us to 0.5 s, three per decade."""
+
+
+class TickTiming:
+    """When ticks of a period, in s, are due, and how late and how long they were."""
+
+    def __init__(self, period: float) -> None:
+        self._period = period
+        self._lateness = [0] * (len(_EDGES) + 1)  # the last bin has no upper edge
+        self._ticks = self._overruns = 0
+        self._tick_time = 0.0
+        self.overruns_in_a_row = 0  # the last ticks that ended after the next one was due
+        self.missed = 0  # ticks that were skipped because they were overdue
+
+    def begin(self, due: float | None, now: float) -> None:
+        """Note when a tick begins, and when it was due, if it was."""
+        if due is not None:
+            self._lateness[bisect_left(_EDGES, now - due)] += 1
+
+    def end(self, due: float, now: float, tick_time: float) -> None:
+        """Note when a tick ends, when it was due, and how long it took, in s."""
+        self._ticks += 1
+        self._tick_time = tick_time
+        if now > due + self._period * (1 + 1e-9):
+            self._overruns += 1
+            self.overruns_in_a_row += 1
+        else:
+            self.overruns_in_a_row = 0
+
+    def next_due(self, due: float, now: float) -> float:
+        """Return when the next tick is due that is not overdue already; count those that are."""
+        due += self._period
+        if due < now:
+            late = int((now - due) / self._period) + 1
+            self.missed += late
+            due += late * self._period
+        return due
+
+    def statistics(self) -> Timing:
+        """Return the statistics so far."""
+        counts = tuple(self._lateness)
+        return Timing(self._ticks, self._overruns, self._tick_time, _EDGES, counts)

@@ -1,12 +1,10 @@
-"""Planners: whoever makes plans, at once or in a process of its own.
+"""Where plans are made: at once, on a simulated clock, or in a process of its own, in real time.
 
-The control loop hands over requests and takes the newest plan. On a simulated clock `InlinePlanner`
-plans at once. In real time `ProcessPlanner` plans in another process, so that neither its computing
-time nor Python's lock delays a tick; when the process dies it is started again.
-
-A tick waits for whatever goes to that process, so that no more is sent than is new: of a request
-the fields that differ from the request before (writing a task takes longer than all the rest), of a
-plan what is not in its request.
+The control loop hands requests to an `InlinePlanner` or a `ProcessPlanner` and takes the newest
+plan. The process keeps computing time and Python's lock from delaying a tick; when it dies it is
+started again. Writing to it is part of a tick, so only what is new is sent: of a request the fields
+that differ from the one before (a task takes longer than all the rest), of a plan what its request
+does not have.
 """
 
 from __future__ import annotations
@@ -23,7 +21,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -33,30 +31,12 @@ from stiffopt.control.state import Severity
 from stiffopt.errors import StiffoptError
 from stiffopt.model.manipulator import Manipulator
 
-__all__ = ["InlinePlanner", "Planner", "PlannerEnd", "PlanningEnd", "ProcessPlanner", "main"]
-
 _RESTART_AFTER = 1.0  # s between two starts of the process
 _PREPARATION = 0.5  # s; a new task that takes longer is reported
 _NICE = 5  # of the process: the control loop comes first
 _IDLE = 1.0  # s without a request, after which compiled code is asked for
 _ARRAYS = ("offset", "pressure_offset")  # of a request: compared and sent by value, every time
 _OBJECTS = ("serial", "task", "target", "search")  # immutable: compared by identity
-
-
-class Planner(Protocol):
-    """Makes the plans of a control loop."""
-
-    def request(self, request: PlanRequest) -> None:
-        """Have a plan made; it replaces a request that waits."""
-
-    def latest(self) -> Plan | None:
-        """Return the newest plan."""
-
-    def notices(self) -> tuple[Notice, ...]:
-        """Return what is wrong with the planner; see `Controller.notices`."""
-
-    def close(self) -> None:
-        """End the planner."""
 
 
 class InlinePlanner:
@@ -114,13 +94,7 @@ class ProcessPlanner:
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-P",
-                    "-m",
-                    "stiffopt.control.planner",
-                    str(theirs.fileno()),
-                ],
+                [sys.executable, "-P", "-m", "stiffopt.control.planner", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),),
                 start_new_session=True,  # a terminal's Ctrl-C is not for it
             )
@@ -131,7 +105,7 @@ class ProcessPlanner:
         self._end.begin(self._robot)
 
     def request(self, request: PlanRequest) -> None:
-        """Have a plan made as soon as the process is free."""
+        """Have a plan made as soon as the process is free; it replaces a request that waits."""
         if self._waiting is not None and self._waiting.serial == request.serial:
             request = replace(request, search=self._waiting.search or request.search)
         self._waiting = request
@@ -211,15 +185,8 @@ def _set_batch_policy(process: int) -> None:
 class PlannerEnd:
     """The control loop's end of the connection; a call raises `OSError` if the other is closed.
 
-    Parameters
-    ----------
-    handle :
-        File descriptor of the connection, which belongs to this end from now on.
-
-    Attributes
-    ----------
-    has_answer :
-        Returns whether there is something to receive, if only that the other end is closed.
+    It is made from a file descriptor, which it closes. `has_answer` returns whether there is
+    something to receive, if only that the other end is closed.
     """
 
     def __init__(self, handle: int) -> None:
@@ -245,13 +212,7 @@ class PlannerEnd:
         self._sent = request
 
     def receive(self) -> Plan | str | None:
-        """Receive a plan, or why there is none; None when the process is ready.
-
-        Raises
-        ------
-        EOFError
-            The other end is closed.
-        """
+        """Receive a plan, or why there is none; None when the process is ready."""
         answer: dict[str, Any] | str | None = self._connection.recv()
         request = self._sent
         if request is None or answer is None or isinstance(answer, str):
@@ -270,13 +231,7 @@ class PlannerEnd:
 
 
 class PlanningEnd:
-    """The process's end of the connection; `EOFError` and `OSError`: the other end is closed.
-
-    Parameters
-    ----------
-    handle :
-        File descriptor of the connection.
-    """
+    """The process's end of the connection; `EOFError` and `OSError`: the other end is closed."""
 
     def __init__(self, handle: int) -> None:
         self._connection = Connection(handle)

@@ -1,4 +1,4 @@
-"""Plans: the best pressures for a target, given by how much the tip is off the model.
+"""Plans: the stiffest pressures for a target, given the tip's offset from the model.
 
 The target, moved back by the tip's offset, is what the model has to reach. The optimiser then finds
 the pressures that are stiffest on the arm as it is, but for errors of the modelled stiffness. A
@@ -25,73 +25,45 @@ from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Task
 from stiffopt.optimise.tip import TipModel
 
-__all__ = ["NearestSearch", "Plan", "PlanRequest", "Planning", "model_target"]
-
 Array = NDArray[np.float64]
 
 _BAR = 1e5
+_EXACT = Tolerance(
+    position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance
+)  # with which plans are made
 
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """Everything that a plan is made for.
+    """Everything that a plan is made for."""
 
-    Attributes
-    ----------
-    serial : number of the task; a plan for an earlier one is discarded.
-    task : stiffness goal and limits.
-    target : takes the place of the task's own.
-    offset : tip pose relative to the model's (6,), in m and rad (rotation vector), base axes.
-    pressure_offset : effective pressures relative to commands (n,), in Pa.
-    search : whether all configurations are to be searched, as for a new target.
-    """
-
-    serial: int
-    task: Task
-    target: Target
-    offset: Array
-    pressure_offset: Array
-    search: bool = False
+    serial: int  # number of the task; a plan for an earlier one is discarded
+    task: Task  # stiffness goal and limits
+    target: Target  # takes the place of the task's own
+    offset: Array  # tip pose relative to the model's (6,), m and rad (rotation vector), base axes
+    pressure_offset: Array  # effective pressures relative to commands (n,), in Pa
+    search: bool = False  # whether all configurations are to be searched, as for a new target
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Pressures for a target.
-
-    Attributes
-    ----------
-    serial : of the request.
-    pressures : effective (n,), in Pa.
-    offset : of the tip (6,), for which the plan was made.
-    target : of the request.
-    reached : whether the model reaches it.
-    stiffness : along the task's first direction; NaN where it names none.
-    message : why it is not reached.
-    """
+    """Pressures for a target; serial, offset and target are those of the request."""
 
     serial: int
-    pressures: Array
-    offset: Array
+    pressures: Array  # effective (n,), in Pa
+    offset: Array  # of the tip (6,), for which the plan was made
     target: Target
-    reached: bool
-    stiffness: float
-    message: str
+    reached: bool  # whether the model reaches it
+    stiffness: float  # along the task's first direction; NaN where it names none
+    message: str  # why it is not reached
 
 
 class Planning:
-    """Makes plans, each from the last one.
+    """Makes plans for an arm, each from the last one."""
 
-    Parameters
-    ----------
-    robot :
-        The arm.
-    tuning :
-        When a plan may change to another configuration.
-    """
-
-    def __init__(self, robot: Manipulator, tuning: PlanningTuning | None = None) -> None:
-        self._robot, self._tuning = robot, tuning or PlanningTuning()
-        self._search = NearestSearch(TipModel(robot), FeedbackTuning().lever)
+    def __init__(self, robot: Manipulator) -> None:
+        self._robot, self._tuning = robot, PlanningTuning()
+        self._search = NearestSearch(TipModel(robot), FeedbackTuning().lever, NearestTuning())
         self._serial, self._is_compiled = -1, False
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
@@ -103,21 +75,15 @@ class Planning:
             self._is_compiled = self._solver.is_compiled
 
     def plan(self, request: PlanRequest) -> Plan:
-        """Return the plan for a request.
-
-        Raises
-        ------
-        StiffoptError
-            The optimiser could not be run.
-        """
+        """Return the plan for a request; `StiffoptError`: the optimiser could not be run."""
         if request.serial != self._serial or self._last is None:
-            exact = request.target.model_copy(update={"tolerance": _tolerance(self._tuning)})
+            exact = request.target.model_copy(update={"tolerance": _EXACT})
             self._solver = PressureSolver(
                 self._robot, request.task.model_copy(update={"target": exact})
             )
             self._is_compiled = self._solver.compile()
             self._serial, self._last = request.serial, None
-        target = model_target(request.target, request.offset, self._tuning)
+        target = model_target(request.target, request.offset)
         self._limits = self._effective_limits(request.pressure_offset)
         last = self._last
         if last is None or request.search:
@@ -211,70 +177,39 @@ class Planning:
 
     def _displacement(self, last: Plan, target: Target) -> Array:
         """Displacement (3,) of the model's target from that of the last plan, in m."""
-        before = model_target(last.target, last.offset, self._tuning).position
+        before = model_target(last.target, last.offset).position
         if before is None or target.position is None:
             return np.zeros(3)
         pairs = zip(before, target.position, strict=True)
         return np.array([0.0 if a is None or b is None else b - a for a, b in pairs])
 
 
-def model_target(target: Target, offset: Array, tuning: PlanningTuning | None = None) -> Target:
-    """Return the target that the model has to reach for the arm to reach a target.
+def model_target(target: Target, offset: Array) -> Target:
+    """Return what the model has to reach for the arm, whose tip is off by (6,), to reach a target.
 
-    Parameters
-    ----------
-    target :
-        Of the arm.
-    offset :
-        Tip pose of the arm relative to the model's (6,), in m and rad (rotation vector), base axes.
-    tuning :
-        Its tolerances.
+    The offset is that of `PlanRequest`.
     """
-    update = {"tolerance": _tolerance(tuning or PlanningTuning())}
-    return target.moved_back(offset).model_copy(update=update)
-
-
-def _tolerance(tuning: PlanningTuning) -> Tolerance:
-    return Tolerance(position=tuning.position_tolerance, angle=tuning.angle_tolerance)
+    return target.moved_back(offset).model_copy(update={"tolerance": _EXACT})
 
 
 class NearestSearch:
     """Finds the pressures nearest to a target that is out of reach, soon enough for a loop.
 
-    Gauss-Newton on the squared pose error with the weight of angles that feedback uses, within the
-    limits of pressure.
-
-    Parameters
-    ----------
-    tip :
-        The model.
-    lever :
-        Weight of angles, in m/rad.
-    tuning :
-        Of the search.
+    Gauss-Newton on the squared pose error, within the limits of pressure. Angles count by a lever,
+    in m/rad, as in feedback.
     """
 
-    def __init__(self, tip: TipModel, lever: float, tuning: NearestTuning | None = None) -> None:
-        self._tip, self._lever, self._tuning = tip, lever, tuning or NearestTuning()
+    def __init__(self, tip: TipModel, lever: float, tuning: NearestTuning) -> None:
+        self._tip, self._lever, self._tuning = tip, lever, tuning
         self._errors = TipErrors()
 
     def find(
         self, target: Target, bounds: tuple[Array, Array], start: Array
     ) -> tuple[Array, float, float]:
-        """Return the local optimum next to some pressures.
+        """Return the optimum within lower and upper bounds (n,) next to pressures (n,), in Pa.
 
-        Parameters
-        ----------
-        target :
-            Of the model.
-        bounds :
-            Lower and upper limits (n,), in Pa.
-        start :
-            Pressures (n,), in Pa.
-
-        Returns
-        -------
-        Pressures (n,) in Pa, and the position and angle errors there, in m and rad.
+        With the pressures come the position and angle errors there, in m and rad. The target is the
+        model's.
         """
         tuning = self._tuning
         low, high = bounds[0] / _BAR, bounds[1] / _BAR

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 
 from stiffopt.control.formula import Formula
 
-__all__ = ["Reference"]
-
 Array = NDArray[np.float64]
 
 _LAGS = 4
@@ -33,33 +31,10 @@ _DIFFERENCES = np.array(
 
 
 class Reference:
-    """The path to the plan, of n pressures and m numbers that go with them.
+    """The path to the plan, of n pressures and `extra` = m numbers that go with them.
 
-    Parameters
-    ----------
-    period :
-        Of the steps, in s.
-    slew :
-        Greatest rates of change (n,), in Pa/s.
-    lag :
-        Of the regulators, in s.
-    damping :
-        Damping ratio of the vibration.
-    extra :
-        m.
-    slew_share :
-        Share of the slew that the reference may take; the rest is for feedback.
-
-    Attributes
-    ----------
-    rate : float
-        a of the four lags, in 1/s.
-    omega : float
-        Angular frequency of the vibration, in rad/s; infinite where there is none.
-    motion : ndarray
-        The path now and its first three derivatives by time (4, n + m), in s.
-    command, chamber : ndarray
-        Pressures (n,) to be commanded, and those in the chambers when the command acts, in Pa.
+    Steps take a period, in s. The pressures change by at most a share of the slew (n,), in Pa/s.
+    The regulators have a lag, in s, the vibration a damping ratio.
     """
 
     def __init__(
@@ -75,12 +50,14 @@ class Reference:
         self._step = _step(slew * period, extra, slew_share)
         self._filter_of: tuple[float, float] | None = None  # rate and omega
         self._filter: tuple[Array, ...] = ()
-        self.rate, self.omega = 1.0, math.inf
+        self.rate = 1.0  # a of the four lags, in 1/s
+        self.omega = math.inf  # of the vibration, in rad/s; infinite where there is none
         self.begin(np.zeros(len(slew) + extra))
 
     def begin(self, values: Array) -> None:
         """Start anew, at rest at pressures and what goes with them (n + m,)."""
         self._states = np.tile(values, (_LAGS + 1, 1))
+        # the path now and its first three derivatives by time, in s
         self.motion = np.concatenate([self._states[-1:], np.zeros((_LAGS - 1, len(values)))])
 
     @property
@@ -95,7 +72,10 @@ class Reference:
         return value
 
     def advance(self, plan: Array) -> None:
-        """Take a step towards a plan (n + m,)."""
+        """Take a step towards a plan (n + m,).
+
+        It sets the pressures (n,) to be commanded, and those in the chambers when that acts, in Pa.
+        """
         if self._filter_of != (self.rate, self.omega):
             self._filter_of, self._filter = (self.rate, self.omega), self._matrices()
         self._states, self.motion, self.command, self.chamber = self._step(

@@ -29,8 +29,6 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.history import History, Memory
 from stiffopt.rig.settings import ControlSettings
 
-__all__ = ["PressureEstimator", "RegulatorModel"]
-
 Array = NDArray[np.float64]
 
 
@@ -154,8 +152,7 @@ class PressureEstimator:
     @property
     def history_offset(self) -> Array:
         """Effective pressures relative to those in the chambers (n,), in Pa."""
-        result: Array = self.effective - self.chamber
-        return result
+        return self.effective - self.chamber
 
     @property
     def command_offset(self) -> Array:
@@ -165,14 +162,12 @@ class PressureEstimator:
         """
         most = self._max_compensation
         regulators = np.minimum(np.maximum(self._regulators.offset, -most), most)
-        result: Array = self.history_offset + regulators
-        return result
+        return self.history_offset + regulators
 
     @property
     def effective_ahead(self) -> Array:
         """Effective pressures a dead time from now (n,), in Pa."""
-        result: Array = self._regulators.ahead + self.history_offset
-        return result
+        return self._regulators.ahead + self.history_offset
 
 
 def _step(

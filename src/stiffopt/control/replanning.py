@@ -1,4 +1,4 @@
-"""The task being pursued, and when a plan is made anew: for which target, and for which offset."""
+"""What the controller pursues, and when it has a new plan made, for which target and offset."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stiffopt.control.feedback import prescribed_components
 from stiffopt.control.interface import Notice
-from stiffopt.control.planner import Planner
+from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Plan, PlanRequest
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
 from stiffopt.control.trajectory import Course
@@ -19,38 +19,26 @@ from stiffopt.control.tuning import ReplanningTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 
-__all__ = ["Pursuit", "Replanner"]
-
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Pursuit:
-    """What the controller pursues.
+    """What the controller pursues."""
 
-    Attributes
-    ----------
-    task : its limits are those of the rig as well; None: nothing is pursued.
-    target : takes the place of the task's own.
-    course : the trajectory under way, which takes the place of the target; None: there is none.
-    prescribed : components of the pose (5,) that the target prescribes.
-    stiffness : along the task's first direction; None where it names none.
-    unit : of that stiffness.
-    """
-
-    task: Task | None = None
-    target: Target | None = None
-    course: Course | None = None
-    prescribed: Array = field(default_factory=lambda: np.zeros(5))
-    stiffness: Callable[[Array, Array], float] | None = None
-    unit: str = "N/m"
+    task: Task | None = None  # within the limits of the rig; None: nothing is pursued
+    target: Target | None = None  # takes the place of the task's own
+    course: Course | None = None  # a trajectory under way, which takes the place of the target
+    prescribed: Array = field(default_factory=lambda: np.zeros(5))  # see `prescribed_components`
+    stiffness: Callable[[Array, Array], float] | None = None  # in the task's first direction
+    unit: str = "N/m"  # of that stiffness
 
     @classmethod
-    def of(cls, task: Task, limited: Task) -> Pursuit:
+    def of(cls, task: Task, limited: Task, course: Course | None = None) -> Pursuit:
         """Return the pursuit of a task, given with the limits of the rig as well."""
         prescribed = prescribed_components(task.target)
         unit = task.measures[0].unit if task.measures else "N/m"
-        return cls(limited, task.target, None, prescribed, stiffness_function(task), unit)
+        return cls(limited, task.target, course, prescribed, stiffness_function(task), unit)
 
     def to(self, target: Target, course: Course | None = None) -> Pursuit:
         """Return the pursuit of another target, or course that begins there."""
@@ -92,12 +80,15 @@ class Replanner:
     """
 
     def __init__(
-        self, planner: Planner, tuning: ReplanningTuning, period: float, dead_time: float
+        self,
+        planner: InlinePlanner | ProcessPlanner,
+        tuning: ReplanningTuning,
+        period: float,
+        dead_time: float,
     ) -> None:
         self._planner, self._tuning = planner, tuning
         self._lead = dead_time + 0.5 * period
-        self._serial = 0
-        self._search, self._requested_at = True, -math.inf
+        self._serial, self._search = 0, True
         self.begin()
 
     def begin(self) -> None:
@@ -107,21 +98,17 @@ class Replanner:
         self._offset = np.zeros(6)
         self._renew()
 
-    def prepared(self, pursuit: Pursuit) -> Callable[[], None]:
-        """Return what begins a pursuit when it is called; until then nothing changes."""
+    def pursue(self, pursuit: Pursuit) -> None:
+        """Pursue something else from now on; an error changes nothing."""
         before = self.pursuit
         new = pursuit.task is not before.task or before.target is None
         new = new or bool((pursuit.prescribed != before.prescribed).any())
         far = _is_far(before.target, pursuit.target, self._tuning)
-
-        def begin() -> None:
-            self.pursuit = pursuit
-            if new:
-                self._renew()
-            self._search = self._search or far
-            self._requested_at = -math.inf
-
-        return begin
+        self.pursuit = pursuit
+        if new:
+            self._renew()
+        self._search = self._search or far
+        self._requested_at = -math.inf
 
     def _renew(self) -> None:
         self._serial += 1
@@ -137,17 +124,16 @@ class Replanner:
         ----------
         now :
             In s.
-        offset :
-            Of the tip from the model (6,), in m and rad.
-        pressure_offset :
-            Effective pressures relative to commands (n,), in Pa.
+        offset, pressure_offset :
+            See `PlanRequest`.
         omega :
             Angular frequency of the vibration, in rad/s.
         delay :
             Of the reference behind the plan, in s.
 
-        Returns ------- Effective pressures of the plan and the offset it was made for (n + 6,);
-        None without a plan.
+        Returns
+        -------
+        Effective pressures of the plan and the offset it was made for (n + 6,); None without one.
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
@@ -168,7 +154,7 @@ class Replanner:
         return self.latest()
 
     def latest(self) -> Array | None:
-        """Return the newest plan's pressures and offset (n + 6,); see `update`."""
+        """Take the newest plan; see `update`."""
         plan = self._planner.latest()
         if plan is not None and plan.serial == self._serial:
             self.plan = plan

@@ -10,8 +10,6 @@ from contextvars import ContextVar
 
 from stiffopt.errors import CommandError
 
-__all__ = ["RequestQueue", "Requester", "current_requester", "requested_by"]
-
 Action = Callable[[], None]
 
 _CHECK_EVERY = 0.1  # s after which a waiting thread looks whether its request can still be served
@@ -19,7 +17,7 @@ _GIVEN_UP = "nobody waits for this any more; it is not done"
 
 
 class Requester:
-    """Whoever waits for a request, and may give it up. Any thread may call any method."""
+    """A client that waits for a request and may give it up. Any thread may call any method."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -37,13 +35,7 @@ class Requester:
             return not self._begun
 
     def begin(self) -> None:
-        """Note that the request is being carried out.
-
-        Raises
-        ------
-        CommandError
-            It was given up.
-        """
+        """Note that the request is being carried out; `CommandError` if it was given up."""
         with self._lock:
             if self._gone:
                 raise CommandError(_GIVEN_UP)
@@ -78,27 +70,15 @@ class _QueuedRequest:
 
 
 class RequestQueue:
-    """Has requests carried out by the thread that serves them, or at once where none does.
-
-    Attributes
-    ----------
-    turn : RLock
-        Held while something works on what requests change.
-    """
+    """Has requests carried out by the thread that serves them, or at once where none does."""
 
     def __init__(self) -> None:
-        self.turn = threading.RLock()
+        self.turn = threading.RLock()  # held by whatever works on what requests change
         self._queue: deque[_QueuedRequest] = deque()
         self._server: threading.Thread | None = None
 
     def begin(self) -> None:
-        """Serve from now on, in this thread.
-
-        Raises
-        ------
-        CommandError
-            Another one does already.
-        """
+        """Serve from now on, in this thread; `CommandError` if another one does already."""
         with self.turn:
             if self._served():
                 raise CommandError("the loop runs already")
@@ -128,11 +108,8 @@ class RequestQueue:
     def submit(self, action: Action) -> None:
         """Have a request carried out, wait for it, and raise what it raises.
 
-        Raises
-        ------
-        CommandError
-            The loop has ended, or the request was given up before it was begun (see
-            `requested_by`).
+        `CommandError`: the loop has ended, or the request was given up before it was begun (see
+        `requested_by`).
         """
         requester = current_requester()
 

@@ -20,12 +20,16 @@ from numpy.typing import NDArray
 from stiffopt.control.state_fields import Shown
 from stiffopt.rig.interface import PoseSample
 
-__all__ = [
-    *("Alarm", "Event", "SeenPose", "Severity", "Snapshot", "State", "ControllerStatus", "Timing"),
-]
-
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
+
+
+# definitions of fields that share a topic, and what goes with it
+_event, _tracker, _timing, _tip, _state = (
+    partial(Shown, topic=topic) for topic in ("/event", "/tracker", "/timing", "/tip", "/state")
+)
+_pressure = partial(Shown, unit="Pa", metric="pressure_pascals")
+_stiffness = partial(_tip, unit=("N/m", "N*m/rad"), unit_field="stiffness_unit")
 
 
 class State(StrEnum):
@@ -56,9 +60,9 @@ class Event:
     """Something that happened."""
 
     time: Annotated[float, Shown("when, on the rig's clock", "s")]
-    kind: Annotated[str, Shown("a word for programs, such as `tracker-missing`", topic="/event")]
-    text: Annotated[str, Shown("a sentence for people", topic="/event")]
-    severity: Annotated[Severity, Shown("how bad it is", topic="/event")] = Severity.INFO
+    kind: Annotated[str, _event("a word for programs, such as `tracker-missing`")]
+    text: Annotated[str, _event("a sentence for people")]
+    severity: Annotated[Severity, _event("how bad it is")] = Severity.INFO
 
 
 @dataclass(frozen=True)
@@ -75,17 +79,13 @@ class SeenPose:
     """A sample of the tracker, used or not, as it is logged."""
 
     time: Annotated[float, Shown("when it was captured, on the rig's clock", "s")]
-    received: Annotated[float, Shown("when it arrived, on the rig's clock", "s", topic="/tracker")]
-    frame: Annotated[int, Shown("the tracker's number of it", topic="/tracker")]
-    position: Annotated[
-        Array, Shown("of the tip, in the base frame", "m", size=3, topic="/tracker")
-    ]
+    received: Annotated[float, _tracker("when it arrived, on the rig's clock", "s")]
+    frame: Annotated[int, _tracker("the tracker's number of it")]
+    position: Annotated[Array, _tracker("of the tip, in the base frame", "m", size=3)]
     quaternion: Annotated[
-        Array | None, Shown("of the tip, w first", size=4, json="quaternion_wxyz", topic="/tracker")
+        Array | None, _tracker("of the tip, w first", size=4, json="quaternion_wxyz")
     ]
-    doubted: Annotated[
-        bool, Shown("no arm could have moved there, or it came with such a one", topic="/tracker")
-    ]
+    doubted: Annotated[bool, _tracker("no arm could have moved there, or it came with such a one")]
 
 
 @dataclass(frozen=True)
@@ -95,33 +95,19 @@ class Timing:
     The histogram of how late ticks begin has k upper edges and k + 1 counts.
     """
 
-    ticks: Annotated[int, Shown("ticks of the loop so far", topic="/timing", metric="ticks")] = 0
+    ticks: Annotated[int, _timing("ticks of the loop so far", metric="ticks")] = 0
     overruns: Annotated[
-        int,
-        Shown("ticks that ended after the next one was due", topic="/timing", metric="overruns"),
+        int, _timing("ticks that ended after the next one was due", metric="overruns")
     ] = 0
     tick_time: Annotated[
-        float,
-        Shown(
-            "duration of the last tick",
-            "s",
-            topic="/timing",
-            decimals=7,
-            metric="tick_time_seconds",
-        ),
+        float, _timing("duration of the last tick", "s", decimals=7, metric="tick_time_seconds")
     ] = 0.0
     lateness_edges: Annotated[
         tuple[float, ...],
-        Shown(
-            "upper edges (k,) of a histogram of how late ticks begin",
-            "s",
-            topic="/timing",
-            decimals=9,
-        ),
+        _timing("upper edges (k,) of a histogram of how late ticks begin", "s", decimals=9),
     ] = ()
     lateness_counts: Annotated[
-        tuple[int, ...],
-        Shown("counts (k + 1,) of that histogram; the last are later", topic="/timing"),
+        tuple[int, ...], _timing("counts (k + 1,) of that histogram; the last are later")
     ] = (0,)
 
     @property
@@ -139,21 +125,16 @@ class ControllerStatus:
 
     plan: Annotated[
         Array,
-        Shown(
-            "pressures that the optimiser found for the target",
-            "Pa",
-            topic="/pressure",
-            metric="pressure_pascals",
-            label="plan",
+        _pressure(
+            "pressures that the optimiser found for the target", topic="/pressure", label="plan"
         ),
     ]
     tip_position: Annotated[
         Array,
-        Shown(
+        _tip(
             "estimate of the tip's position",
             "m",
             size=3,
-            topic="/tip",
             key="position_m",
             row="tip",
             row_unit="mm",
@@ -162,11 +143,10 @@ class ControllerStatus:
     ] = field(default_factory=_nan3)
     tip_quaternion: Annotated[
         Array,
-        Shown(
+        _tip(
             "estimate of the tip's orientation, w first",
             size=4,
             json="tip_quaternion_wxyz",
-            topic="/tip",
             key="quaternion_wxyz",
         ),
     ] = field(default_factory=_nan4)
@@ -174,40 +154,30 @@ class ControllerStatus:
         Array, Shown("the tip's position in the tracker's latest sample that was used", "m", size=3)
     ] = field(default_factory=_nan3)
     seen_age: Annotated[
-        float,
-        Shown(
-            "age of the latest sample that was used",
-            "s",
-            topic="/tip",
-            metric="tracker_age_seconds",
-        ),
+        float, _tip("age of the latest sample that was used", "s", metric="tracker_age_seconds")
     ] = math.inf
     target_position: Annotated[
         Array | None,
-        Shown(
+        _tip(
             "target now; null for a free axis",
             "m",
             size=3,
-            topic="/tip",
             row="target",
             row_unit="mm",
             unknown="free",
         ),
     ] = None
     target_quaternion: Annotated[
-        Array | None,
-        Shown("target orientation, w first", size=4, json="target_quaternion_wxyz", topic="/tip"),
+        Array | None, _tip("target orientation, w first", size=4, json="target_quaternion_wxyz")
     ] = None
     target_pointing: Annotated[
-        Array | None,
-        Shown("direction in which the tip is to point", size=3, topic="/tip", row="pointing"),
+        Array | None, _tip("direction in which the tip is to point", size=3, row="pointing")
     ] = None
     position_error: Annotated[
         float,
-        Shown(
+        _tip(
             "distance of the estimate from the target",
             "m",
-            topic="/tip",
             metric="position_error_meters",
             row="error",
             row_unit="mm",
@@ -215,10 +185,9 @@ class ControllerStatus:
     ] = math.nan
     angle_error: Annotated[
         float,
-        Shown(
+        _tip(
             "angle between the estimate and the target",
             "rad",
-            topic="/tip",
             metric="angle_error_radians",
             row="error",
             row_unit="deg",
@@ -226,42 +195,35 @@ class ControllerStatus:
     ] = math.nan
     stiffness: Annotated[
         float,
-        Shown(
+        _stiffness(
             "stiffness along the task's direction, at the pressures now",
-            ("N/m", "N*m/rad"),
-            "stiffness_unit",
-            topic="/tip",
             key="stiffness",
             metric="stiffness",
         ),
     ] = math.nan
     best_stiffness: Annotated[
         float,
-        Shown(
+        _stiffness(
             "stiffness of the plan, in the same direction",
-            ("N/m", "N*m/rad"),
-            "stiffness_unit",
-            topic="/tip",
             key="best_stiffness",
             metric="best_stiffness",
         ),
     ] = math.nan
     stiffness_unit: Annotated[str, Shown("N/m, or N*m/rad for a rotation", json=())] = "N/m"
-    disturbance: Annotated[
-        Array, Shown("offset of the tip from the model", "m", size=3, topic="/tip")
-    ] = field(default_factory=_nan3)
+    disturbance: Annotated[Array, _tip("offset of the tip from the model", "m", size=3)] = field(
+        default_factory=_nan3
+    )
     wrench: Annotated[
         Array,
-        Shown(
+        _tip(
             "force and moment at the tip that would explain the offset",
             "N",
             size=6,
             json=("wrench_force_n", "wrench_moment_nm"),
-            topic="/tip",
             key="wrench",
         ),
     ] = field(default_factory=_nan6)
-    task: Annotated[str, Shown("what is being done, in a word or two", topic="/state")] = ""
+    task: Annotated[str, _state("what is being done, in a word or two")] = ""
     model_position: Annotated[
         Array | None, Shown("where the model alone has the tip", "m", size=3, json=())
     ] = None
@@ -277,52 +239,24 @@ class Snapshot(ControllerStatus):
     """
 
     time: Annotated[float, Shown("on the rig's clock", "s")]
-    state: Annotated[State, Shown("where in its life the loop is", topic="/state", line=True)]
-    reason: Annotated[
-        str, Shown("why, where the state is not as requested", topic="/state", line=True)
-    ]
+    state: Annotated[State, _state("where in its life the loop is", line=True)]
+    reason: Annotated[str, _state("why, where the state is not as requested", line=True)]
     commanded: Annotated[
-        Array,
-        Shown(
-            "set-points of the channels",
-            "Pa",
-            topic="/pressure",
-            metric="pressure_pascals",
-            label="commanded",
-        ),
+        Array, _pressure("set-points of the channels", topic="/pressure", label="commanded")
     ]
-    measured: Annotated[
-        Array,
-        Shown(
-            "measured pressures",
-            "Pa",
-            topic="/pressure",
-            metric="pressure_pascals",
-            label="measured",
-        ),
-    ]
+    measured: Annotated[Array, _pressure("measured pressures", topic="/pressure", label="measured")]
     measured_time: Annotated[
         float, Shown("when the pressures were read, on the rig's clock", "s", topic="/pressure")
     ] = math.nan
     low: Annotated[Array, Shown("least that may be commanded", "Pa", topic="/limits")]
-    high: Annotated[
-        Array,
-        Shown(
-            "most that may be commanded",
-            "Pa",
-            topic="/limits",
-            metric="pressure_pascals",
-            label="limit",
-        ),
-    ]
+    high: Annotated[Array, _pressure("most that may be commanded", topic="/limits", label="limit")]
     saturated: Annotated[
-        Flags,
-        Shown("channels at a limit that keeps the tip from its target", topic="/pressure"),
+        Flags, Shown("channels at a limit that keeps the tip from its target", topic="/pressure")
     ]
     rejected: Annotated[
         int,
         Shown("samples of the last tick that no arm could have moved to", json="rejected_samples"),
     ] = 0
-    alarms: Annotated[tuple[Alarm, ...], Shown("what is wrong now", topic="/state")] = ()
+    alarms: Annotated[tuple[Alarm, ...], _state("what is wrong now")] = ()
     timing: Annotated[Timing, Shown("how punctual the loop is")] = Timing()
     samples: tuple[PoseSample, ...] = ()

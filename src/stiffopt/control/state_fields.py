@@ -17,50 +17,35 @@ from numpy.typing import NDArray
 
 from stiffopt.units import unit_suffix
 
-__all__ = ["Entry", "Kind", "Shown", "entries"]
-
 _DECIMALS = {"s": 6, "Pa": 1, "m": 7, "rad": 7, "": 7, "N/m": 4, "N": 5}
 """How finely quantities are logged: finer than any sensor."""
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a field of the state means, and how it is shown in each place.
+    """What a field of the state means, and how it is shown in each place."""
 
-    Attributes
-    ----------
-    about : what it is.
-    unit : SI unit; the JSON name ends in it. Of several, the field `unit_field` says which holds,
-        and each has a JSON name of its own.
-    size : of an array; 0: one value per channel.
-    json : its name in the HTTP interface if that is not the field's name with the unit. Several
-        names share the elements of an array; no name: the interface does not have it.
-    topic : of telemetry, live and recorded; empty: it is not logged.
-    key : its name in the messages of the topic, by default the one in the interface.
-    decimals : that are logged; by default those of the unit.
-    metric : name for Prometheus after ``stiffopt_``; a counter for a whole number, else a gauge.
-    label : value of the metric's label ``kind``, which tells fields that share a metric apart.
-    row : in the status on the terminal: the row that it is shown in, in the unit `row_unit`.
-    armed_only : whether that row is left out while the arm is vented.
-    unknown : what the row says for NaN.
-    line : whether a change of it makes a line of ``stiffopt run --json``, which then has it.
-    """
-
-    about: str
+    about: str  # what it is
+    # SI unit; the JSON name ends in it. Of several, the field `unit_field` says which holds, and
+    # each has a JSON name of its own
     unit: str | tuple[str, ...] = ""
     unit_field: str = ""
-    size: int = 0
+    size: int = 0  # of an array; 0: one value per channel
+    # name in the HTTP interface if that is not the field's name with the unit. Several names share
+    # the elements of an array; no name: the interface does not have it
     json: str | tuple[str, ...] | None = None
-    topic: str = ""
-    key: str = ""
-    decimals: int | None = None
+    topic: str = ""  # of telemetry, live and recorded; empty: it is not logged
+    key: str = ""  # its name in the messages of the topic, by default the one in the interface
+    decimals: int | None = None  # that are logged; by default those of the unit
+    # name for Prometheus after ``stiffopt_``; a counter for a whole number, else a gauge
     metric: str = ""
+    # value of the metric's label ``kind``, which tells fields that share a metric apart
     label: str = ""
-    row: str = ""
-    row_unit: Literal["", "mm", "deg"] = ""
-    armed_only: bool = True
-    unknown: str = "-"
-    line: bool = False
+    row: str = ""  # of the status on the terminal in which it is shown
+    row_unit: Literal["", "mm", "deg"] = ""  # in which that row shows it
+    armed_only: bool = True  # whether that row is left out while the arm is vented
+    unknown: str = "-"  # what the row says for NaN
+    line: bool = False  # whether a change of it makes a line of ``stiffopt run --json``
 
 
 class Kind(Enum):
@@ -79,31 +64,20 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Entry:
-    """A field as its definition has it, with the defaults filled in.
+    """A field as its definition has it, with the defaults filled in."""
 
-    Attributes
-    ----------
-    name : of the field.
-    kind : of its value.
-    type : of the value; of a record, or the items of `RECORDS`, the dataclass.
-    optional : whether the value may be None.
-    in_array : whether its values are in an array; else in a tuple.
-    shown : its definition.
-    units : of which one holds at a time, as `Shown.unit_field` says; empty if there is no choice.
-    json : names in the HTTP interface, in the order of `units` or of the array's parts.
-    key, decimals : in the messages of the topic.
-    """
-
-    name: str
-    kind: Kind
-    type: Any
-    optional: bool
-    in_array: bool
-    shown: Shown
+    name: str  # of the field
+    kind: Kind  # of its value
+    type: Any  # of the value; of a record, or the items of `RECORDS`, the dataclass
+    optional: bool  # whether the value may be None
+    in_array: bool  # whether its values are in an array; else in a tuple
+    shown: Shown  # its definition
+    # of which one holds at a time, as `Shown.unit_field` says; empty if there is no choice
     units: tuple[str, ...]
+    # names in the HTTP interface, in the order of `units` or of the array's parts
     json: tuple[str, ...]
-    key: str
-    decimals: int
+    key: str  # in the messages of the topic
+    decimals: int  # likewise
 
 
 _READ: dict[type, tuple[Entry, ...]] = {}

@@ -1,4 +1,4 @@
-"""The state machine of the control loop: what happens in a tick, and what requests do to it.
+"""The state machine of the control loop: what a tick does in each state, and what requests change.
 
 It has no threads and no time of its own: `ControlLoop` calls it, one call at a time.
 """
@@ -27,8 +27,6 @@ from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.gate import Outlet, let_down
 from stiffopt.safety.monitors import PressureMonitor, Trouble
 
-__all__ = ["Supervisor"]
-
 Array = NDArray[np.float64]
 
 
@@ -55,19 +53,6 @@ class Supervisor:
     Requests raise `InputError` with the reason when they are refused; nothing has changed then.
     Whatever fails while something changes is a fault. `ControlLoop` has checked their arguments.
     `now` is the time on the rig's clock, in s.
-
-    Attributes
-    ----------
-    lifecycle, events, alarms :
-        State and history.
-    commanded : ndarray
-        Set-points (n,) that the supply has, in Pa.
-    reading : PressureReading
-        The latest; NaN before the first, and where it is impossible.
-    samples : tuple of PoseSample
-        Delivered since the last tick; of these `rejected` were rejected.
-    saturated : ndarray
-        Channels (n,) at a limit that keeps them from what they should do.
     """
 
     def __init__(
@@ -94,27 +79,23 @@ class Supervisor:
         self._stuck_low = self._monitor.saturated
         self._unsupervised: tuple[int, ...] = ()
         self._zero: Array = np.zeros(n)
-        self.commanded: Array = self._zero
+        self.commanded: Array = self._zero  # set-points (n,) that the supply has, in Pa
         self._requested: Array = self._zero  # before the outlet limited it
         self._held: Array | None = None
+        # the latest; NaN before the first, and where it is impossible
         self.reading = PressureReading(float("nan"), np.full(n, np.nan))
-        self.samples: tuple[PoseSample, ...] = ()
-        self.rejected = 0
-        self.saturated = self._no_channels
+        self.samples: tuple[PoseSample, ...] = ()  # delivered since the last tick
+        self.rejected = 0  # of these
+        self.saturated = self._no_channels  # (n,) at a limit that keeps them from their goal
         self._exchanged: PressureReading | None = None  # with the last command
         self._holds: dict[str, str] = {}  # reason of each kind
         self._ramp: _Ramp | None = None
-        self._vented = True
+        self.vented = True  # the supply has accepted the command to vent, and no pressure since
         self._trouble: Trouble | None = None
         self._failures = 0  # of the controller, in a row
         self._force_limited_at = -np.inf
         self._alarm_kinds: frozenset[str] = frozenset()
         self._ticked_at = self._clock.now()
-
-    @property
-    def vented(self) -> bool:
-        """Whether the supply has accepted the command to vent, and no pressure since."""
-        return self._vented
 
     # -- a tick ---------------------------------------------------------------------------------
 
@@ -139,9 +120,9 @@ class Supervisor:
             self.lifecycle.change(State.FAULT, text)
             self._holds.clear()
             self._ramp = None
-            self._vented = False
+            self.vented = False
             self.events.add(now, kind, text, Severity.ERROR)
-        if not self._vented:
+        if not self.vented:
             self._try_to_vent(now)
 
     def _guarded(self, action: Callable[[float], None], now: float) -> None:
@@ -158,7 +139,7 @@ class Supervisor:
         try:
             self.outlet.vent()
         except Exception as error:  # of any kind: the next tick tries again
-            self._vented = False
+            self.vented = False
             self.alarms.set(
                 now,
                 "not-vented",
@@ -167,7 +148,7 @@ class Supervisor:
                 Severity.ERROR,
             )
         else:
-            self._vented = True
+            self.vented = True
             self._note_commanded(now, self._zero)
             self.alarms.clear(now, "not-vented")
             self.alarms.clear(now, "force-limit")
@@ -229,7 +210,7 @@ class Supervisor:
 
     def _actuate(self, now: float) -> None:
         """Command the pressures that the state requires."""
-        if self.lifecycle.state is State.FAULT and not self._vented:
+        if self.lifecycle.state is State.FAULT and not self.vented:
             self._try_to_vent(now)
         if self.lifecycle.armed:
             self._check_tracker(now)
@@ -370,7 +351,7 @@ class Supervisor:
         self._holds.clear()
         self._ramp = None
         self._try_to_vent(now)
-        if not self._vented:
+        if not self.vented:
             self.fault(now, "device", "the supply does not take the command to vent")
             return
         if self.lifecycle.armed:
@@ -417,42 +398,27 @@ class Supervisor:
             self.events.add(now, "configured", "everything answers; vented")
 
     def arm(self, now: float, unwanted: Callable[[], bool] = lambda: False) -> None:
-        """Check the arm and arm it; see `ControlLoop.arm`.
-
-        Parameters
-        ----------
-        now :
-            In s.
-        unwanted :
-            Returns whether the request was given up meanwhile.
-        """
+        """Check the arm and arm it, unless that is unwanted by then; see `ControlLoop.arm`."""
         self.lifecycle.permit("arm")
         with refusing("arming"):
             reading = self.outlet.read()
-            problems = [
-                *check_rig(self.rig, self.outlet, self.controller),
-                *check_vented_arm(
-                    now,
-                    self.rig,
-                    self.controller,
-                    self._monitor,
-                    reading,
-                    self._tracker,
-                    self._tuning,
-                ),
-            ]
+            problems = list(check_rig(self.rig, self.outlet, self.controller))
+            problems += check_vented_arm(
+                now, self.rig, self.controller, self._monitor, reading, self._tracker,
+                self._tuning.vented_offset,
+            )  # fmt: skip
         if problems:
             raise CommandError("; ".join(problems))
         if unwanted():
             raise CommandError("the checks took longer than anybody waited; arm again")
         now = self._clock.now()  # checks take time
-        self._vented = False
+        self.vented = False
         try:
             self.outlet.arm()
             self.controller.begin(now)
         except BaseException as error:
             self._try_to_vent(now)
-            if not self._vented:
+            if not self.vented:
                 self.fault(now, "device", f"the supply could not be armed: {error}")
             raise
         self._note_commanded(now, self._zero)
@@ -522,7 +488,7 @@ class Supervisor:
             self.outlet.vent()
         else:
             self._stop(now, reason)
-            if not self._vented:
+            if not self.vented:
                 raise CommandError(self.lifecycle.reason)
 
     def vent_while_starting(self) -> None:
@@ -538,7 +504,7 @@ class Supervisor:
     def finish(self, now: float) -> None:
         """Vent for good, with several attempts."""
         for _ in range(self._tuning.vent_attempts):
-            if self.lifecycle.armed or not self._vented:
+            if self.lifecycle.armed or not self.vented:
                 self._stop(now, "stopped")
 
     def reset(self, now: float) -> None:
@@ -547,7 +513,7 @@ class Supervisor:
         left = ""
         try:
             self.outlet.vent()
-            self._vented = True
+            self.vented = True
             self._note_commanded(now, self._zero)
             self.alarms.clear(now, "not-vented")
             self._measure(now)

@@ -23,8 +23,6 @@ from stiffopt.optimise.task import Task
 from stiffopt.optimise.term import Term
 from stiffopt.optimise.tip import TipAt
 
-__all__ = ["TipErrors", "stiffness_function", "target_arrays", "wrench_at"]
-
 Array = NDArray[np.float64]
 
 _KEPT = 30.0

@@ -14,8 +14,6 @@ from stiffopt.control.tuning import TrackerTuning
 from stiffopt.rig.interface import PoseSample
 from stiffopt.rig.settings import Safety
 
-__all__ = ["Sight", "TrackerWatch"]
-
 Array = NDArray[np.float64]
 
 
@@ -41,32 +39,17 @@ class TrackerWatch:
 
     With a tracker so slow that the frames which may be missing take longer than the timeout, the
     tip is missing at the timeout, and lost shortly after. With an interval longer than the timeout
-    it is never seen.
-
-    Parameters
-    ----------
-    safety :
-        How many frames may be missing, and the timeout.
-    period :
-        Of the loop, in s, which is the resolution of these times.
-    tuning :
-        Learning and return of the tracker.
-
-    Attributes
-    ----------
-    jumps : int
-        Samples in a row that were rejected.
-    usual : tuple of float
-        Interval between samples, and their age on arrival, in s; a guess before they are learned.
+    it is never seen. The period of the loop, in s, is the resolution of these times.
     """
 
     def __init__(self, safety: Safety, period: float, tuning: TrackerTuning | None = None) -> None:
         self._safety, self._period = safety, period
         self.tuning = tuning = tuning or TrackerTuning()
-        self.jumps = 0
+        self.jumps = 0  # samples in a row that were rejected
         self._back = tuning.back  # ticks with new samples since the tip was missing
         self._frame: int | None = None
         self._reported = self._latest = -np.inf
+        # interval between samples, and their age on arrival, in s; a guess before they are learned
         self.usual = safety.tracker_timeout / safety.tracker_frames, 0.0
         self._before = -np.inf
         self._intervals: deque[float] = deque(maxlen=tuning.window)

@@ -18,8 +18,6 @@ from stiffopt.optimise.target import Target
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
-__all__ = ["MAX_WAYPOINTS", "Course", "Trajectory", "Waypoint"]
-
 Array = NDArray[np.float64]
 
 MAX_WAYPOINTS = 2_000

@@ -9,228 +9,149 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-__all__ = [
-    "ControlTuning",
-    "EstimatorTuning",
-    "FeedbackTuning",
-    "NearestTuning",
-    "PlanningTuning",
-    "ReferenceTuning",
-    "RegulatorTuning",
-    "ReplanningTuning",
-    "SupervisionTuning",
-    "TrackerTuning",
-]
-
 
 @dataclass(frozen=True)
 class EstimatorTuning:
-    """Noise and outlier rejection of the tip's Kalman filter (`TipEstimator`).
+    """Noise and outlier rejection of the tip's Kalman filter (`TipEstimator`)."""
 
-    Attributes
-    ----------
-    noise : standard deviation of a tracked position in each axis, in m.
-    angular_noise : of a tracked orientation, in rad.
-    max_speed : fastest that a tip moves, in m/s; samples that would need more are rejected.
-    model_error : error of the model's displacement, as a share of that displacement.
-    drift : growth of the offset's standard deviation at rest, in m / sqrt(s).
-    angular_drift : the same of the orientation's offset, in rad / sqrt(s).
-    agitation : growth of the standard deviation of the vibration's speed, in m/s / sqrt(s).
-    frequency_error : relative error of the square of the vibration's frequency.
-    damping : damping ratio of the vibration.
-    memory : age beyond which a sample is dropped, in s.
-    soft_share : compliance, as a share of the largest, below which a direction vibrates less.
-    least_frequency : lower bound of the vibration's angular frequency, in rad/s; that of an arm
-        about to buckle would be 0.
-    frozen : displacement of the model, in m, after which a pose that has not changed in one digit
-        is a frozen reading.
-    patience : rejected samples in a row after which the filter starts from the new position.
-    longest_gap : time since the last sample, in s, for which `max_speed` allows a displacement; a
-        tip that jumped and stays there is thus never accepted.
-    """
-
-    noise: float = 5e-5
-    angular_noise: float = 2e-3
+    noise: float = 5e-5  # standard deviation of a tracked position in each axis, in m
+    angular_noise: float = 2e-3  # of a tracked orientation, in rad
+    # fastest that a tip moves, in m/s; samples that would need more are rejected
     max_speed: float = 1.0
-    model_error: float = 0.2
-    drift: float = 3e-4
-    angular_drift: float = 3e-3
+    model_error: float = 0.2  # error of the model's displacement, as a share of that displacement
+    drift: float = 3e-4  # growth of the offset's standard deviation at rest, in m / sqrt(s)
+    angular_drift: float = 3e-3  # the same of the orientation's offset, in rad / sqrt(s)
+    # growth of the standard deviation of the vibration's speed, in m/s / sqrt(s)
     agitation: float = 2e-3
-    frequency_error: float = 0.2
-    damping: float = 0.04
-    memory: float = 0.4
+    frequency_error: float = 0.2  # relative error of the square of the vibration's frequency
+    damping: float = 0.04  # damping ratio of the vibration
+    memory: float = 0.4  # age beyond which a sample is dropped, in s
+    # compliance, as a share of the largest, below which a direction vibrates less
     soft_share: float = 0.15
+    # lower bound of the vibration's angular frequency, in rad/s; that of an arm about to buckle
+    # would be 0
     least_frequency: float = 0.5
+    # displacement of the model, in m, after which a pose that has not changed in one digit is a
+    # frozen reading
     frozen: float = 2e-3
-    patience: int = 40
+    patience: int = 40  # rejected samples in a row after which the filter starts anew from them
+    # time since the last sample, in s, for which `max_speed` allows a displacement; a tip that
+    # jumped and stays there is thus never accepted
     longest_gap: float = 0.05
 
 
 @dataclass(frozen=True)
 class RegulatorTuning:
-    """Observer gains of the regulators' model, and how much of its offset is compensated.
+    """Observer gains of the regulators' model, and how much of its offset is compensated."""
 
-    Attributes
-    ----------
-    pressure_gain : rate at which a reading corrects the pressure, in 1/s.
-    offset_gain : rate at which it corrects the offset, in 1/s^2.
-    max_compensation : largest offset of a regulator that commands make up for, in Pa.
-    """
-
-    pressure_gain: float = 30.0
-    offset_gain: float = 225.0
-    max_compensation: float = 3e3
+    pressure_gain: float = 30.0  # rate at which a reading corrects the pressure, in 1/s
+    offset_gain: float = 225.0  # rate at which it corrects the offset, in 1/s^2
+    max_compensation: float = 3e3  # largest offset of a regulator that commands make up for, in Pa
 
 
 @dataclass(frozen=True)
 class ReferenceTuning:
-    """Bandwidth of the reference filter.
+    """Bandwidth of the reference filter."""
 
-    Attributes
-    ----------
-    vibrating_rate : rate of its lags over the angular frequency of an arm that vibrates.
-    rigid_rate : largest rate of its lags, and that of an arm that does not vibrate, in 1/s.
-    slew_share : share of the slew that the reference may take; the rest is for feedback.
-    model_range : change of pressure (norm over all channels) over which the model's derivatives
-        along the reference are not evaluated again, in Pa.
-    """
-
+    # rate of its lags over the angular frequency of an arm that vibrates
     vibrating_rate: float = 1.2
+    # largest rate of its lags, and that of an arm that does not vibrate, in 1/s
     rigid_rate: float = 100.0
+    # share of the slew that the reference may take; the rest is for feedback
     slew_share: float = 0.9
+    # change of pressure (norm over all channels) over which the model's derivatives along the
+    # reference are not evaluated again, in Pa
     model_range: float = 3e3
 
 
 @dataclass(frozen=True)
 class FeedbackTuning:
-    """Feedback at the tip.
+    """Feedback at the tip."""
 
-    Attributes
-    ----------
-    lever : weight of an angle against a length, in m/rad.
-    mode_weight : weight of the vibration's part of the tip's motion against the motion itself.
-    effort : weight of effort against error in the linear-quadratic regulator.
-    offset_rate : rate with which the offset of a vibrating arm is corrected, over its angular
-        frequency; part of each vibration is mistaken for an offset.
-    posture_weight : change of the tip's position below which a change of pressure is left to the
-        plan, in m/bar: the square root of epsilon of the quadratic program.
-    unreported_error : error that a limit may cause at the tip without a channel being reported as
-        saturated, in m.
-    max_offset : offset of the tip beyond which the model is not that of the arm, as a share of the
-        arm's length.
-    """
-
-    lever: float = 0.05
+    lever: float = 0.05  # weight of an angle against a length, in m/rad
+    # weight of the vibration's part of the tip's motion against the motion itself
     mode_weight: float = 3.0
-    effort: float = 1.0
+    effort: float = 1.0  # weight of effort against error in the linear-quadratic regulator
+    # rate with which the offset of a vibrating arm is corrected, over its angular frequency; part
+    # of each vibration is mistaken for an offset
     offset_rate: float = 0.6
+    # change of the tip's position below which a change of pressure is left to the plan, in m/bar:
+    # the square root of epsilon of the quadratic program
     posture_weight: float = 0.3e-3
+    # error that a limit may cause at the tip without a channel being reported as saturated, in m
     unreported_error: float = 2e-4
+    # share of the arm's length beyond which the tip's offset is no error of this arm's model
     max_offset: float = 0.5
 
 
 @dataclass(frozen=True)
 class ReplanningTuning:
-    """When plans are made anew, and how quickly they follow the estimated offset.
+    """When plans are made anew, and how quickly they follow the estimated offset."""
 
-    Attributes
-    ----------
-    interval : between plans, in s.
-    offset_time : time constant with which the plan's offset follows the estimate, in s.
-    offset_periods : least such time constant of an arm that vibrates, in rad of its vibration.
-    far_position : change of a target, in m, after which all configurations are searched.
-    far_angle : the same of its orientation or pointing, in rad.
-    """
-
-    interval: float = 0.05
+    interval: float = 0.05  # between plans, in s
+    # time constant with which the plan's offset follows the estimate, in s
     offset_time: float = 1.0
+    # least such time constant of an arm that vibrates, in rad of its vibration
     offset_periods: float = 3.0
+    # change of a target, in m, after which all configurations are searched
     far_position: float = 5e-3
-    far_angle: float = math.radians(5)
+    far_angle: float = math.radians(5)  # the same of its orientation or pointing, in rad
 
 
 @dataclass(frozen=True)
 class PlanningTuning:
-    """When a plan may change to another configuration of the arm.
+    """When a plan may change to another configuration of the arm."""
 
-    Attributes
-    ----------
-    advantage : relative stiffness by which another configuration must be better; it doubles with
-        each change.
-    search_offset : change of the offset, in m, after which all configurations are searched.
-    at_rest : change of the offset from plan to plan below which the arm is at rest, in m.
-    neighbourhood : distance in pressure beyond which an optimum is another configuration, in Pa.
-    neighbourhood_per_metre : what each metre of a target's displacement adds to it, in Pa/m.
-    patience : plans for which an optimum in another configuration is refused before it is taken.
-    position_tolerance, angle_tolerance : tolerances with which plans are made, in m and rad.
-    """
-
+    # relative stiffness by which another configuration must be better; it doubles with each change
     advantage: float = 0.02
+    # change of the offset, in m, after which all configurations are searched
     search_offset: float = 2e-3
+    # change of the offset from plan to plan below which the arm is at rest, in m
     at_rest: float = 5e-5
+    # distance in pressure beyond which an optimum is another configuration, in Pa
     neighbourhood: float = 2e4
+    # what each metre of a target's displacement adds to it, in Pa/m
     neighbourhood_per_metre: float = 2e7
+    # plans for which an optimum in another configuration is refused before it is taken
     patience: int = 20
-    position_tolerance: float = 1e-5
-    angle_tolerance: float = 1e-3
+    position_tolerance: float = 1e-5  # with which plans are made, in m
+    angle_tolerance: float = 1e-3  # likewise, in rad
 
 
 @dataclass(frozen=True)
 class NearestTuning:
-    """Gauss-Newton search for the configuration nearest to a target that is out of reach.
+    """Gauss-Newton search for the configuration nearest to a target that is out of reach."""
 
-    Attributes
-    ----------
-    iterations : at most.
-    max_step : largest change of a pressure in an iteration, in Pa.
-    progress : of the error, in m, below which the search ends.
-    regularisation : of the normal equations, in m/bar.
-    """
-
-    iterations: int = 40
-    max_step: float = 0.3e5
-    progress: float = 1e-7
-    regularisation: float = 1e-4
+    iterations: int = 40  # at most
+    max_step: float = 0.3e5  # largest change of a pressure in an iteration, in Pa
+    progress: float = 1e-7  # of the error, in m, below which the search ends
+    regularisation: float = 1e-4  # of the normal equations, in m/bar
 
 
 @dataclass(frozen=True)
 class SupervisionTuning:
-    """Patience of the state machine; what is a fault is decided by `Safety` of the rig file.
+    """Patience of the state machine; what is a fault is decided by `Safety` of the rig file."""
 
-    Attributes
-    ----------
-    force_alarm : time for which the alarm of the total force outlasts the last command that was
-        shortened, in s.
-    max_failures : failures of the controller in a row after which pressures are held.
-    vent_attempts : to vent when the loop ends.
-    stop_margin : time after the ramp in which the ending loop goes on trying to vent, in s.
-    vented_offset : distance of the vented tip from the model's, as a share of the arm's length,
-        beyond which the arm is not armed.
-    """
-
+    # time for which the alarm of the total force outlasts the last command that was shortened, in s
     force_alarm: float = 0.5
-    max_failures: int = 3
-    vent_attempts: int = 3
+    max_failures: int = 3  # failures of the controller in a row after which pressures are held
+    vent_attempts: int = 3  # to vent when the loop ends
+    # time after the ramp in which the ending loop goes on trying to vent, in s
     stop_margin: float = 0.5
+    # distance of the vented tip from the model's, as a share of the arm's length, beyond which the
+    # arm is not armed
     vented_offset: float = 0.1
 
 
 @dataclass(frozen=True)
 class TrackerTuning:
-    """What is known of a tracker's rhythm, and when it is trusted again.
+    """What is known of a tracker's rhythm, and when it is trusted again."""
 
-    Attributes
-    ----------
-    window : samples from which interval and latency are learned.
-    enough : samples without which neither is known.
-    back : ticks with new samples, none overdue, after which a tip that was missing is seen again.
-    jitter : share of an interval by which a sample may be late.
-    """
-
-    window: int = 24
-    enough: int = 8
+    window: int = 24  # samples from which interval and latency are learned
+    enough: int = 8  # samples without which neither is known
+    # ticks with new samples, none overdue, after which a tip that was missing is seen again
     back: int = 8
-    jitter: float = 0.25
+    jitter: float = 0.25  # share of an interval by which a sample may be late
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,6 @@ from numpy.typing import NDArray
 from stiffopt.model.actuation import SectionGeometry
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["BendingMode", "transition"]
-
 Array = NDArray[np.float64]
 Symbols = Any  # of CasADi
 
@@ -38,17 +36,10 @@ _SILICONE = 1070.0  # kg/m^3, where the robot file gives no density
 
 @dataclass(frozen=True)
 class BendingMode:
-    """The first bending mode of an arm.
+    """The first bending mode of an arm."""
 
-    Attributes
-    ----------
-    mass : float
-        Modal mass, in kg, of a mode shape that is 1 at the tip.
-    participation : ndarray
-        Share (n,) of the tip's displacement by each channel that the mode takes part in.
-    """
-
-    mass: float
+    mass: float  # modal mass, in kg, of a mode shape that is 1 at the tip
+    # share (n,) of the tip's displacement by each channel that the mode takes part in
     participation: Array
 
     @classmethod
@@ -118,5 +109,4 @@ def _deflection(station: Array, curvature: Array) -> Array:
     steps = np.diff(station, prepend=station[0])
     slope = np.cumsum(curvature * steps)
     x = np.cumsum((slope - curvature * steps / 2) * steps)
-    result: Array = x / x[-1]
-    return result
+    return np.asarray(x / x[-1])

@@ -37,7 +37,7 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
-from stiffopt.control.contents import listed
+from stiffopt.control.checks import listed
 from stiffopt.control.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
 from stiffopt.documents import document_of
 from stiffopt.errors import InputError, Loc, dotted, shown

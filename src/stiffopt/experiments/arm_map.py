@@ -13,8 +13,6 @@ from stiffopt.model.compliance import Boundary, Frame
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer
 
-__all__ = ["ArmMap", "TipMap", "first_channels", "map_arm", "map_tip"]
-
 Array = NDArray[np.float64]
 
 NEAREST_BASE = 0.2

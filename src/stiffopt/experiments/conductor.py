@@ -23,15 +23,6 @@ from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.goal import GoalSupply
 from stiffopt.safety.monitors import PressureMonitor
 
-__all__ = [
-    "CONDUCTOR",
-    "Conductor",
-    "ConductorTuning",
-    "TrackedFrame",
-    "at_rest",
-    "check_pressures",
-]
-
 Array = NDArray[np.float64]
 
 _KEPT = 4096  # frames and ticks that are kept

@@ -19,8 +19,6 @@ from stiffopt.experiments.folder import recorded
 from stiffopt.rig.interface import Rig
 from stiffopt.safety.gate import effective_slew
 
-__all__ = ["Coverage", "coverage_for", "round_count", "round_name", "spread_pressures"]
-
 ROUND = 6
 """Poses, at most, after which the arm returns to no pressure."""
 _BEFORE = 3.0  # s that the arm usually takes to come to rest before a round
@@ -51,8 +49,7 @@ def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
     ).reshape(count, len(low))
     share = np.argsort(np.argsort(sequence, axis=0), axis=0) / max(count - 1, 1)
     mixed = np.argsort(np.array(numbers) ** 2 * np.sqrt(2.0) % 1.0)  # the sequence rises in steps
-    found: Array = np.clip(low + share[mixed] * (high - low), low, high)
-    return found
+    return np.asarray(np.clip(low + share[mixed] * (high - low), low, high))
 
 
 def _mirrored(number: int, base: int) -> float:

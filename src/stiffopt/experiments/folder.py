@@ -18,20 +18,6 @@ from stiffopt.files import read_file, save_file
 from stiffopt.logs import LogLayout, LogRow, LogWriter, McapLogWriter
 from stiffopt.schema import Schema
 
-__all__ = [
-    "SETTINGS",
-    "ExperimentRecording",
-    "ExperimentSettings",
-    "Progress",
-    "RawRecording",
-    "alone_in",
-    "check_same",
-    "create_folder",
-    "open_folder",
-    "recorded",
-    "remove_folder",
-]
-
 SETTINGS = "experiment.yaml"
 
 SchemaT = TypeVar("SchemaT", bound=Schema)

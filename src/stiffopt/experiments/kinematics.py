@@ -36,8 +36,6 @@ from stiffopt.safety.gate import effective_slew
 from stiffopt.schema import Items
 from stiffopt.units import Duration, Pressure
 
-__all__ = ["KinematicsSettings", "PressureSequence", "recording_name", "run_kinematics"]
-
 SETTLE = 20.0
 """Time, in s, that the arm may take to come to rest before a repetition."""
 _TAIL = 1.0  # s that the last frames may take to arrive

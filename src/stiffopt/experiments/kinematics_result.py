@@ -19,16 +19,6 @@ from stiffopt.experiments.kinematics import KinematicsSettings, recording_name
 from stiffopt.logs import Log, read_log
 from stiffopt.model.manipulator import Manipulator
 
-__all__ = [
-    "CoverageResult",
-    "KinematicsResult",
-    "doubts",
-    "evaluate_coverage",
-    "evaluate_kinematics",
-    "read_recordings",
-    "read_rounds",
-]
-
 _GRID = 0.05  # s
 _EVERY = 2  # points of the grid at which a loaded arm is evaluated
 
@@ -235,8 +225,7 @@ class CoverageResult:
     @property
     def errors(self) -> Array:
         """Distances (M,) between measured and modelled tip, in m."""
-        found: Array = np.linalg.norm(self.model - self.tip, axis=1)
-        return found
+        return np.asarray(np.linalg.norm(self.model - self.tip, axis=1))
 
     @property
     def mean(self) -> float:

@@ -18,16 +18,6 @@ from stiffopt.experiments.conductor import Array, Conductor, TrackedFrame, split
 from stiffopt.logs.table import cut_torn_end, read_table
 from stiffopt.rig.interface import ForceProbe
 
-__all__ = [
-    "PointsFile",
-    "ProbePoint",
-    "ProbeTuning",
-    "Probing",
-    "Series",
-    "SeriesKey",
-    "SeriesPoints",
-]
-
 NAME = "points.csv"
 _DIRECTION = ("direction_x", "direction_y", "direction_z")
 _KEY = ("repetition", "pressure_pa", *_DIRECTION)

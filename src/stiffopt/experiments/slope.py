@@ -16,8 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["LineFit", "SlopeEstimate", "combine", "fit_line", "fit_lines", "student_t"]
-
 Array = NDArray[np.float64]
 
 _FEWEST = 3  # points; a line through two has no residual

@@ -26,8 +26,6 @@ from stiffopt.rig.interface import Rig
 from stiffopt.schema import Items
 from stiffopt.units import Duration, Force, Length, Pressure
 
-__all__ = ["StiffnessSettings", "run_stiffness"]
-
 HARD_STOP = 5.0
 """Multiple of `StiffnessSettings.force` at which a series ends."""
 _REST_WINDOW = 4.0  # s over which the tip must not move before a series

@@ -15,8 +15,6 @@ from stiffopt.experiments.stiffness import StiffnessSettings
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.manipulator import Manipulator
 
-__all__ = ["StiffnessCell", "StiffnessResult", "evaluate_stiffness"]
-
 
 @dataclass(frozen=True)
 class StiffnessCell:
