@@ -30,8 +30,6 @@ from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import Force, Moment, Pressure, read_from_file, within
 
-__all__ = ["Load", "PressureRange", "Task", "load_task"]
-
 
 class Load(Schema):
     """A load at the tip.
