@@ -62,13 +62,12 @@ import numpy as np
 from rich.console import Console
 from made_runs import BEGIN, FakeLoop as FakeRun, ticks
 from fake_loop import FakeLoop
-from stiffopt.cli.run_lines import Lines
-from stiffopt.cli.run_status import status
+from stiffopt.cli.run_display import Lines, status
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.metrics import Metrics
 from stiffopt.daemon.run_log import read_run
 from stiffopt.daemon.service import create_app
-from stiffopt.daemon.serving import Server
+from stiffopt.daemon.server import Server
 from stiffopt.daemon.topics import topic_schemas
 from stiffopt.model.robot_files import load_description
 from test_state_fields import table
@@ -80,7 +79,7 @@ assert "mood_m" in app.openapi()["components"]["schemas"]["StateReport"]["proper
 server = Server(app)
 server.start()
 with Client(server.url) as client, client.stream(rate=50) as stream:
-    assert client._wire.ask("GET", "state")["mood_m"] == 0.25
+    assert client._ask("GET", "state")["mood_m"] == 0.25
     assert client.state().mood == 0.25
     assert stream.state().mood == 0.25
 server.stop()

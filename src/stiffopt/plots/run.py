@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.daemon.run_log import RecordedRun, RunEvent, RunSpan
+from stiffopt.control.state import Event
+from stiffopt.daemon.run_log import RecordedRun, RunSpan
 from stiffopt.errors import printable
 from stiffopt.plots.style import (
     AXES,
@@ -24,14 +25,11 @@ from stiffopt.plots.style import (
     make_logarithmic,
     stacked_panels,
     thinned,
-    tidy,
 )
 from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = ["plot_run"]
 
 Array = NDArray[np.float64]
 
@@ -59,15 +57,7 @@ _APART = 0.012  # of the panel's width, between two numbers of events
 
 
 def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
-    """Draw a run.
-
-    Parameters
-    ----------
-    run :
-        At least one tick.
-    title :
-        By default the name of the rig.
-    """
+    """Draw a run of at least one tick; the title is by default the name of the rig."""
     listed = _listed(run.events)
     stiff = bool(np.isfinite(run.stiffness).any())
     angles = bool(np.isfinite(run.angle_error).any())
@@ -124,7 +114,6 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
         axes.set_ylim(middle - _SMALLEST_RANGE / 2, middle + _SMALLEST_RANGE / 2)
     axes.set_ylabel(f"tip {'xyz'[axis]} (mm)")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _draw_error(axes: Any, run: RecordedRun) -> None:
@@ -140,7 +129,6 @@ def _draw_error(axes: Any, run: RecordedRun) -> None:
     else:
         axes.set_yticks([])
         axes.text(0.5, 0.5, "no target was set", transform=axes.transAxes, ha="center", color=GREY)
-    tidy(axes)
 
 
 def _draw_angle(axes: Any, run: RecordedRun) -> None:
@@ -152,7 +140,6 @@ def _draw_angle(axes: Any, run: RecordedRun) -> None:
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) -> None:
@@ -182,7 +169,6 @@ def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) 
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, -0.03), high + 0.02 * (high - low))
     legend_beside(axes, handles=handles)
-    tidy(axes)
 
 
 def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
@@ -197,7 +183,6 @@ def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
     axes.set_ylabel("stiffness\n(N/m, N m/rad)")
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _shade(panels: Any, run: RecordedRun) -> None:
@@ -215,7 +200,7 @@ def _shade(panels: Any, run: RecordedRun) -> None:
                 )
 
 
-def _list_events(figure: Any, listed: list[RunEvent], below: float) -> None:
+def _list_events(figure: Any, listed: list[Event], below: float) -> None:
     height = figure.get_figheight()
     for line, event in enumerate(listed):
         text = shorten(printable(event.text), 120, placeholder=" ...")
@@ -226,7 +211,7 @@ def _list_events(figure: Any, listed: list[RunEvent], below: float) -> None:
         figure.text(0.28, y, literal(text), fontsize=8.5, va="center")
 
 
-def _listed(events: tuple[RunEvent, ...]) -> list[RunEvent]:
+def _listed(events: tuple[Event, ...]) -> list[Event]:
     """The events that are listed in words: the gravest where there are too many."""
 
     def rank(index: int) -> tuple[int, int]:
@@ -268,7 +253,7 @@ def _figures(run: RecordedRun) -> str:
 # -- states, alarms and events over time ----------------------------------------------------------
 
 
-def _draw_timeline(axes: Any, run: RecordedRun, listed: list[RunEvent]) -> None:
+def _draw_timeline(axes: Any, run: RecordedRun, listed: list[Event]) -> None:
     """Draw bands for states and alarms, and marks for events; those that are listed by number."""
     kinds = _alarm_kinds(run)
     labels = ["state", *kinds, *(["events"] if run.events else [])]
@@ -283,8 +268,8 @@ def _draw_timeline(axes: Any, run: RecordedRun, listed: list[RunEvent]) -> None:
             _band(axes, span, 1 + kinds.index(span.kind), _ALARM)
     if run.events:
         _draw_events(axes, run, listed, len(labels) - 1, width)
-    names = [literal(_short(label)) for label in labels]
-    axes.set_yticks(range(len(labels)), names)
+    names = [label if len(label) <= _LONGEST else f"{label[: _LONGEST - 3]}..." for label in labels]
+    axes.set_yticks(range(len(labels)), [literal(name) for name in names])
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0, labelsize=8)
     axes.tick_params(axis="x", labelsize=9)
@@ -295,9 +280,7 @@ def _band(axes: Any, span: RunSpan, row: int, colour: str) -> None:
     axes.fill_between([span.begin, span.end], row - _HALF, row + _HALF, color=colour, linewidth=0.6)
 
 
-def _draw_events(
-    axes: Any, run: RecordedRun, listed: list[RunEvent], row: int, width: float
-) -> None:
+def _draw_events(axes: Any, run: RecordedRun, listed: list[Event], row: int, width: float) -> None:
     numbers = {id(event): number for number, event in enumerate(listed, start=1)}
     last = -float("inf")
     for event in run.events:
@@ -310,10 +293,6 @@ def _draw_events(
                 str(number), (event.time, row), xytext=(2, 0), textcoords="offset points",
                 va="center", fontsize=8, color=colour, weight="bold",
             )  # fmt: skip
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 3]}..."
 
 
 def _alarm_kinds(run: RecordedRun) -> list[str]:
