@@ -384,7 +384,7 @@ def test_a_clock_that_was_held_up_does_not_go_back(monkeypatch: pytest.MonkeyPat
     rig = simulated_rig(description, ROBOT, limits_of(description, ROBOT), real_time=True)
     with rig:
         rig.supply.arm()
-        rig.world._epoch -= 100.0  # the machine slept
+        rig.world.epoch -= 100.0  # the machine slept
         before = rig.clock.now()
         monkeypatch.setattr("stiffopt.plant.world._LONGEST", 0.2)
         poses = rig.observe().poses
