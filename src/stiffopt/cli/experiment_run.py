@@ -33,7 +33,7 @@ from stiffopt.experiments import (
     run_kinematics,
     run_stiffness,
 )
-from stiffopt.experiments.coverage import round_count
+from stiffopt.experiments.coverage import coverage_for, round_count
 from stiffopt.experiments.folder import (
     alone_in,
     check_same,
@@ -44,7 +44,6 @@ from stiffopt.experiments.folder import (
 from stiffopt.experiments.kinematics import (
     missing_repetitions,
     missing_rounds,
-    poses_for,
     sequence_for,
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
@@ -145,7 +144,7 @@ def _planned(experiment: str, options: ExperimentOptions) -> _Plan:
     rig.supply.check_arming()
     if isinstance(settings, KinematicsSettings):
         sequence_for(rig, settings)
-        poses_for(rig, settings)
+        coverage_for(rig, settings.poses, settings.settle, settings.max)
     else:
         check_stiffness(rig, settings)
         _check_that_somebody_is_there(rig)

@@ -17,18 +17,8 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from stiffopt.errors import FileError
-from stiffopt.experiments.conductor import (
-    Array,
-    Conductor,
-    at_rest,
-    check_pressures,
-)
-from stiffopt.experiments.coverage import (
-    Coverage,
-    coverage_for,
-    round_count,
-    round_name,
-)
+from stiffopt.experiments.conductor import Array, Conductor, at_rest, check_pressures
+from stiffopt.experiments.coverage import coverage_for, round_count, round_name
 from stiffopt.experiments.folder import ExperimentSettings, Progress, recorded
 from stiffopt.logs import read_log
 from stiffopt.rig.interface import Rig
@@ -69,18 +59,10 @@ class KinematicsSettings(ExperimentSettings):
 
 @dataclass(frozen=True, eq=False)
 class PressureSequence:
-    """Pressures that change linearly between moments.
+    """Pressures that change linearly between moments."""
 
-    Attributes
-    ----------
-    times : ndarray
-        (K,), in s, increasing from 0.
-    pressures : ndarray
-        (K, n), in Pa.
-    """
-
-    times: Array
-    pressures: Array
+    times: Array  # (K,), in s, increasing from 0
+    pressures: Array  # (K, n), in Pa
 
     @classmethod
     def sawtooth(
@@ -124,28 +106,11 @@ class PressureSequence:
 
 
 def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
-    """Return the sequence within the limits and slew of a rig.
-
-    Raises
-    ------
-    InputError
-        A pressure is beyond the rig's limits.
-    """
+    """Return the sequence on a rig; `InputError` if a pressure is beyond its limits."""
     limits = rig.supply.limits
     check_pressures(rig, settings.pressures, range(limits.n))
     base = limits.clamp(np.clip(0.0, limits.low, limits.high))
     return PressureSequence.sawtooth(base, settings.pressures, settings.period, effective_slew(rig))
-
-
-def poses_for(rig: Rig, settings: KinematicsSettings) -> Coverage:
-    """Return the combined poses within the limits of a rig.
-
-    Raises
-    ------
-    InputError
-        A channel cannot be as low as the settings want it.
-    """
-    return coverage_for(rig, settings.poses, settings.settle, settings.max)
 
 
 def recording_name(repetition: int) -> str:
@@ -212,7 +177,8 @@ def run_kinematics(
     DeviceError
         A device fails; what was recorded is kept.
     """
-    sequence, coverage = sequence_for(rig, settings), poses_for(rig, settings)
+    sequence = sequence_for(rig, settings)
+    coverage = coverage_for(rig, settings.poses, settings.settle, settings.max)
     conductor = Conductor(rig, rate, check)
     todo, rounds = missing_repetitions(folder, settings), missing_rounds(folder, settings)
     total = sequence.duration * len(todo) + sum(map(coverage.duration, rounds))
