@@ -83,7 +83,7 @@ class Probing:
     def run(self, pressures: Array, series: Series) -> list[ProbePoint]:
         """Touch, displace in steps, return in the same steps, retreat; pressures (n,) are held.
 
-        The way back lets the creep of the arm, which never stops, be told from the effect of the
+        The way back separates the creep of the arm, which never stops, from the effect of the
         displacement. `DeviceError`: the probe meets nothing, or a device fails.
         """
         self._conductor.probing = True

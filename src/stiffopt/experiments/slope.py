@@ -70,7 +70,7 @@ def fit_line(
     columns = [np.ones_like(u), u / size]
     if curved and len(u) > len(columns) + 2:
         columns.append((u / size) ** 2)
-    if len(u) > len(columns) + 1 and _can_be_told(u, w):
+    if len(u) > len(columns) + 1 and _is_independent(u, w):
         columns.append((w - w.mean()) / np.ptp(w))
     design = np.stack(columns, axis=1)
     found, _, rank, _ = np.linalg.lstsq(design, v)
@@ -85,8 +85,8 @@ def fit_line(
     return LineFit(float(found[1]) / size, math.sqrt(spread[1, 1]) / size, freedom, len(u), bend)
 
 
-def _can_be_told(x: Array, trend: Array) -> bool:
-    """Return whether a trend differs enough from x for both to be fitted."""
+def _is_independent(x: Array, trend: Array) -> bool:
+    """Whether a trend correlates so little with x that both can be fitted."""
     dx, dt = x - x.mean(), trend - trend.mean()
     size = math.sqrt(float(dx @ dx) * float(dt @ dt))
     return size > 0 and abs(float(dx @ dt)) < _ALIKE * size

@@ -212,7 +212,7 @@ class _StiffnessRun:
             self._rest(np.zeros(settings.channels))
         self._rest(p)
         self._by_hand(partial(self._probing.probe.align, key.direction))
-        at_rest_then = self._rest(p)  # whoever aligned it may have taken long, or touched the arm
+        at_rest_then = self._rest(p)  # aligning may have taken long, or moved the arm
         points = self._probing.run(p, self._planned(p, key))
         self._restless += not at_rest_then
         self._unsettled += sum(not point.settled for point in points)

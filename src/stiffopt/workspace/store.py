@@ -181,7 +181,7 @@ class MapStore:
                 np.array(self.attributes[key], dtype=float) for key in ("tip_low_m", "tip_high_m")
             )
             lost = int(self.attributes["samples_without_equilibrium"])
-        except Exception as error:  # whatever a damaged file does to whichever decoder
+        except Exception as error:  # a damaged file may raise anything in zarr's decoders
             raise FileError(
                 self.path, f"is damaged: {type(error).__name__}: {error}; begin anew (--overwrite)"
             ) from None
