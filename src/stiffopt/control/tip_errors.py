@@ -26,7 +26,7 @@ from stiffopt.optimise.tip import TipAt
 Array = NDArray[np.float64]
 
 _INEQUALITY_WEIGHT = 30.0
-"""Of an inequality in least squares: it is missed by a thousandth, or so, of the error that is left."""
+"""Of an inequality, in least squares; it may be missed by about a thousandth of the error."""
 
 
 class TipErrors:
