@@ -6,7 +6,7 @@ DEMO ?= problems/two_segment_stiff_x.yaml
 
 BIN := $(VENV)/bin
 BENCH := $(VENV)/bench
-PEERS := scipy pin-pink soromox pyelastica
+PEERS := scipy pin-pink soromox
 PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check
 PICTURE := docs/images/two_segment_stiff_x.png
 

@@ -9,14 +9,13 @@ get: the nominal one; one that stiffopt's own calibration made of a recording of
 minutes an arm; ``--keep`` keeps it, so that a run can be taken up again); or one with the arm's
 true values, for what of them it has words. With ``--payload`` the tip carries more than it says,
 with ``--loop`` the whole control loop with its safety gate runs and not the controller alone, with
-``--paths`` figures-of-eight are followed instead of targets reached. ``--tune`` tries the gains of
-plain integral feedback (take other seeds for it).
+``--paths`` figures-of-eight are followed instead of targets reached.
 
 What the figures are: settling to 1 mm, for good, over the ideal: the settling time of an open-loop
-step with the arm's own pressures, without inertia, creep and hysteresis ("drawn": random ones;
-"stiffest": the stiffest). Steady: mean error of the last 2 of 10 s. Kept: (k - k_least) /
-(k_most - k_least) of the stiffness along the task's direction, over all pressures that hold the tip
-where it is at the end: by the true model (linear silicone), and by pushing the simulated arm.
+step to the arm's own stiffest pressures, without inertia, creep and hysteresis. Steady: mean error
+of the last 2 of 10 s. Kept: (k - k_least) / (k_most - k_least) of the stiffness along the task's
+direction, over all pressures that hold the tip where it is at the end: by the true model (linear
+silicone), and by pushing the simulated arm.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from control_baselines import CONTROLLERS, GRID, Gains, IntegralFeedback, MakeController
+from control_baselines import CONTROLLERS
 from control_cases import (
     DYNAMICS,
     Case,
@@ -122,11 +121,7 @@ def step_rows(steps: Sequence[Step], dynamics: str) -> list[tuple[str, str]]:
         ("settled within 3 s, 5 s", f"{_percent(settling <= 3)}, {_percent(settling <= 5)}"),
         ("settling, s, median / p90", _quantiles(settling, (0.5, 0.9), 2)),
         (
-            "settling over ideal (stiffest), median / p90",
-            _quantiles(settling / of("ideal_stiffest"), (0.5, 0.9), 2),
-        ),
-        (
-            "settling over ideal (drawn), median / p90",
+            "settling over ideal, median / p90",
             _quantiles(settling / of("ideal"), (0.5, 0.9), 2),
         ),
         ("overshoot, mm, median / p90", _quantiles(1e3 * of("overshoot"), (0.5, 0.9), 2)),
@@ -194,47 +189,6 @@ def tables(found: Sequence[Step | Follow]) -> str:
     return "\n".join(lines)
 
 
-# -- tuning ------------------------------------------------------------------------------------
-
-
-def tried(seed: int, *, dynamics: Sequence[str], targets: int) -> list[Step]:
-    """Plain integral feedback with all gains of the grid on one arm."""
-    case = draw_case(seed, targets)
-    found = []
-    for kind in dynamics:
-        for gains in GRID:
-
-            def make(rig: Any, robot: Any, _: str, gains: Gains = gains) -> Any:
-                return IntegralFeedback(rig, robot, gains)
-
-            controller: MakeController = make
-            found += run_case(case, f"{gains.gain:g} {gains.slew:g}", controller, kind)
-    return found
-
-
-def tuning_table(found: Sequence[Step]) -> str:
-    """Gains by what they are worth, the best first: settled, then by mean capped settling time."""
-    lines = []
-    for dynamics in DYNAMICS:
-        own = [step for step in found if step.dynamics == dynamics]
-        scored = []
-        for name in dict.fromkeys(step.controller for step in own):
-            mine = [step for step in own if step.controller == name]
-            settling = np.array([step.settling for step in mine])
-            steady = np.array([step.steady for step in mine])
-            unstable = np.mean([step.unstable for step in mine])
-            scored.append((
-                float(np.minimum(settling, 15).mean()), name, float(np.isfinite(settling).mean()),
-                float(1e3 * np.median(steady)), float(unstable),
-            ))  # fmt: skip
-        for score, name, settled, steady_mm, unstable in sorted(scored):
-            lines.append(
-                f"{dynamics:13} gain, slew {name:12} mean settling {score:6.2f} s (15 if never), "
-                f"settled {settled:.0%}, steady {steady_mm:.2f} mm, unstable {unstable:.0%}"
-            )
-    return "\n".join(lines)
-
-
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(
@@ -251,20 +205,16 @@ def main() -> int:
     parser.add_argument("--keep", type=Path, help="keep calibrated files here and use them again")
     parser.add_argument("--paths", action="store_true", help="figures-of-eight, not targets")
     parser.add_argument("--loop", action="store_true", help="in the whole control loop")
-    parser.add_argument("--tune", action="store_true", help="gains of plain integral feedback")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--out", type=Path, help="JSON file for all that was measured")
     given = parser.parse_args()
     begin = perf_counter()
     seeds = range(given.seed, given.seed + given.cases)
-    common: dict[str, Any] = {"dynamics": given.dynamics, "targets": given.targets}
-    if given.tune:
-        work: Any = partial(tried, **common)
-    else:
-        work = partial(
-            one_case, **common, controllers=given.controller, payload=given.payload,
-            robot_file=given.robot_file, keep=given.keep, paths=given.paths, in_loop=given.loop,
-        )  # fmt: skip
+    work = partial(
+        one_case, dynamics=given.dynamics, targets=given.targets, controllers=given.controller,
+        payload=given.payload, robot_file=given.robot_file, keep=given.keep, paths=given.paths,
+        in_loop=given.loop,
+    )  # fmt: skip
     found: list[Any] = []
     for part in in_processes(work, seeds, given.jobs):
         found += part
@@ -272,7 +222,7 @@ def main() -> int:
         if given.out is not None:
             given.out.parent.mkdir(parents=True, exist_ok=True)
             given.out.write_text(json.dumps([asdict(each) for each in found], default=float))
-    print(tuning_table(found) if given.tune else tables(found))
+    print(tables(found))
     return 0
 
 

@@ -7,27 +7,26 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from stiffopt.control.interface import Controller
-    from stiffopt.control.state import ControllerStatus
-    from stiffopt.control.trajectory import Trajectory
-    from stiffopt.model.description import RobotDescription
-    from stiffopt.optimise.target import Target
-    from stiffopt.optimise.task import Task
-    from stiffopt.rig.interface import PoseSample, PressureReading, Rig
+from stiffopt import PressureSolver, RobotDescription, Target, Task, load_robot
+from stiffopt.control.controller import TipController
+from stiffopt.control.interface import Controller, ControlOutput, SampleCounts
+from stiffopt.control.state import ControllerStatus
+from stiffopt.control.trajectory import Trajectory
+from stiffopt.optimise.tip import TipModel
+from stiffopt.rig.interface import PoseSample, PressureReading, Rig
 
 Array = NDArray[np.float64]
 
 PERIOD = 0.01  # s
 
 
-MakeController = Callable[["Rig", "RobotDescription", str], "Controller"]
-"""From a rig, the robot file to believe in and the dynamics."""
+MakeController = Callable[[Rig, RobotDescription, str], Controller]
+"""From a rig, the controller's robot file and the dynamics."""
 
 
 @dataclass(frozen=True)
@@ -45,18 +44,13 @@ class Gains:
 
 
 TUNED = {"quasi-static": Gains(4.5, 5e5), "full": Gains(0.4, 1e5)}
-"""The best of `control.py --tune`."""
-
-GRID = [Gains(g, s) for g in 0.1 * 2.0 ** np.arange(9) for s in (5e5, 2e5, 1e5, 3e4)]
+"""The best on a grid of gains from 0.1 to 26 and slews from 3e4 to 5e5, on other seeds."""
 
 
 class IntegralFeedback:
     """Pressures of the model, and ``dp = gain J^+ e dt`` at every frame of the tracker."""
 
     def __init__(self, rig: Rig, robot: RobotDescription, gains: Gains) -> None:
-        from stiffopt import load_robot
-        from stiffopt.optimise.tip import TipModel
-
         self._limits = rig.supply.limits
         self._model = load_robot(robot)
         self._tip = TipModel(self._model)
@@ -89,8 +83,6 @@ class IntegralFeedback:
         self._follow(times, [point.target for point in trajectory.waypoints])
 
     def _follow(self, times: Array, targets: Sequence[Target]) -> None:
-        from stiffopt import PressureSolver
-
         solver = PressureSolver(self._model, self._task)
         pressures: list[Array] = []
         for target in targets:
@@ -113,8 +105,6 @@ class IntegralFeedback:
         self, now: float, commanded: Array, reading: PressureReading, samples: Sequence[PoseSample]
     ) -> Any:
         """Add up what the frames say."""
-        from stiffopt.control.interface import SampleCounts
-
         self._commanded = commanded.copy()
         for sample in samples:
             if not sample.visible:
@@ -134,8 +124,6 @@ class IntegralFeedback:
 
     def compute(self, now: float) -> Any:
         """Ramp to the sum of both."""
-        from stiffopt.control.interface import ControlOutput
-
         wanted = self._commanded
         if self._way is not None:
             wanted = self._limits.clamp(self._on_way(now, self._way[1]) + self._added)
@@ -146,8 +134,6 @@ class IntegralFeedback:
 
     def status(self, now: float) -> ControllerStatus:
         """It knows of the tip what the model says."""
-        from stiffopt.control.state import ControllerStatus
-
         return ControllerStatus(
             plan=np.full(self._limits.n, np.nan), disturbance=np.zeros(3),
             tip_position=self._tip.at(self._commanded).pose[:3, 3], seen_age=now - self._seen,
@@ -163,9 +149,6 @@ class IntegralFeedback:
 
 def stiffopt_controller(rig: Rig, robot: RobotDescription, dynamics: str) -> Controller:
     """The controller that this is all about."""
-    from stiffopt import load_robot
-    from stiffopt.control.controller import TipController
-
     return TipController(
         load_robot(robot), rig.supply.limits, rig.slew, period=PERIOD,
         control=rig.settings.control, safety=rig.settings.safety, vibrates=dynamics == "full",

@@ -13,22 +13,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares, minimize
 
-from calibration import Sizes, places, recorded, settling_time, with_true_values
-
-if TYPE_CHECKING:
-    from stiffopt.model.description import RobotDescription
-    from stiffopt.optimise.target import Target
-    from stiffopt.optimise.task import Task
-    from stiffopt.plant.devices import SimulatedRig
-    from stiffopt.plant.settings import Mismatch, PlantSettings
-    from stiffopt.registration import Registration
-    from stiffopt.rig.config import RigDescription
+from calibration import Sizes, recorded, with_true_values
+from stiffopt import (
+    CalibrationSettings,
+    RobotDescription,
+    StiffnessGoal,
+    StiffnessMeasure,
+    Target,
+    Task,
+    calibrate,
+    lie,
+    load_robot,
+    save_robot,
+)
+from stiffopt.model.robot_files import load_description
+from stiffopt.optimise.tip import TipModel
+from stiffopt.plant.devices import SimulatedRig
+from stiffopt.plant.plant import Plant
+from stiffopt.plant.settings import Mismatch, PlantLoad, PlantSettings
+from stiffopt.registration import Placement, Registration
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription, load_rig_description
 
 Array = NDArray[np.float64]
 
@@ -37,7 +48,8 @@ DYNAMICS = ("quasi-static", "full")
 DIRECTIONS = {"axial": (0.0, 0.0, 1.0), "lateral": (1.0, 0.0, 0.0)}
 MODULUS, CHANNELS, SHIFT, TILT = 0.20, 0.05, 2e-3, np.deg2rad(2.0)
 UP_TO = 0.8  # of the highest pressures
-NEAR = 1e-3  # m
+STEPS = (0.010, 0.040)  # m between two targets
+NEAR = 1e-3  # m; nearer than that for good is settled
 CORRECTED = 1e-5  # m; how well the plant's own stiffest pressures reach a target
 MOST_CORRECTIONS = 8
 PUSH = 2e-4  # m
@@ -62,8 +74,8 @@ class Aim:
     kind : name of the direction to be stiff in, see `DIRECTIONS`.
     drawn, stiffest : the plant's own pressures (n,) for it: those it was drawn with, and the
         stiffest ones, in Pa.
-    ideal, ideal_stiffest : settling time of an open-loop step there from the aim before, with
-        the one and the other, on the plant without inertia, creep and hysteresis, in s.
+    ideal : settling time of an open-loop step to the stiffest pressures from the aim before, on the
+        plant without inertia, creep and hysteresis, in s.
     """
 
     position: Array
@@ -71,7 +83,6 @@ class Aim:
     drawn: Array
     stiffest: Array
     ideal: float
-    ideal_stiffest: float
 
 
 @dataclass(frozen=True)
@@ -98,8 +109,6 @@ class Case:
     @property
     def registration(self) -> Registration:
         """Where that file has the nominal base frame."""
-        from stiffopt.registration import Registration
-
         recordings = self.believed.recordings
         return Registration() if recordings is None else recordings.registration
 
@@ -114,8 +123,6 @@ class Case:
 
     def target(self, position: Array) -> Target:
         """A place in the nominal base frame as a target in the base frame of that file."""
-        from stiffopt import Target
-
         here = self.registration.tracker_in_base.transform() @ [*position, 1.0]
         return Target(position=tuple(here[:3].tolist()))
 
@@ -125,8 +132,6 @@ class Case:
 
     def task(self, position: Array, kind: str) -> Task:
         """To go there and be stiff in a direction of the nominal base frame."""
-        from stiffopt import StiffnessGoal, StiffnessMeasure, Task
-
         turn = self.registration.tracker_in_base.transform()[:3, :3]
         axis = turn @ DIRECTIONS[kind]
         goal = StiffnessGoal(maximise=StiffnessMeasure(direction=tuple(axis.tolist())))
@@ -134,8 +139,6 @@ class Case:
 
     def rig(self, dynamics: str) -> SimulatedRig:
         """The rig, not opened; its tracker is corrected as the controller's robot file says."""
-        from stiffopt.rig.assembly import make_rig
-
         plant = self.description.plant.model_copy(update={"dynamics": dynamics})
         rig: Any = make_rig(self.description.model_copy(update={"plant": plant}), self.robot)
         rig.tracker.registration = rig.tracker.registration.then(self.registration)
@@ -157,10 +160,6 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
     targets : how many; their directions take turns, the first one changes with the seed.
     payload : mass at the tip that nobody knows of, beside the 20 g of the robot file, in kg.
     """
-    from stiffopt.model.robot_files import load_description
-    from stiffopt.plant.settings import PlantSettings
-    from stiffopt.rig.config import load_rig_description
-
     rig = load_rig_description(RIG)
     robot = load_description(rig.robot)
     rng = np.random.default_rng([seed, 6])
@@ -171,25 +170,30 @@ def draw_case(seed: int, targets: int = 3, payload: float = 0.0) -> Case:
     arm = Arm(robot, plant, truth)
     kinds = list(DIRECTIONS)
     aims: list[Aim] = []
-    for k, (position, drawn) in enumerate(places(arm.settled, arm.high, targets, UP_TO, rng)):
+    for k, (position, drawn) in enumerate(places(arm, targets, rng)):
         kind = kinds[(seed + k) % len(kinds)]
         stiffest = arm.stiffest(position, DIRECTIONS[kind], drawn, rng)
-        aims.append(Aim(position, kind, drawn, stiffest, np.nan, np.nan))
+        aims.append(Aim(position, kind, drawn, stiffest, np.nan))
     case = Case(seed, rig, robot, truth, tuple(aims), robot)
-    drawn = ideal_times(case, [aim.drawn for aim in aims])
-    stiffest = ideal_times(case, [aim.stiffest for aim in aims])
-    timed = [
-        replace(aim, ideal=one, ideal_stiffest=other)
-        for aim, one, other in zip(aims, drawn, stiffest, strict=True)
-    ]
+    times = ideal_times(case, [aim.stiffest for aim in aims])
+    timed = [replace(aim, ideal=time) for aim, time in zip(aims, times, strict=True)]
     return replace(case, aims=tuple(timed))
 
 
-def _mismatch(robot: RobotDescription, rng: np.random.Generator) -> Any:
-    from stiffopt import lie
-    from stiffopt.plant.settings import Mismatch
-    from stiffopt.registration import Placement
+def places(arm: Arm, count: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+    """Positions (3,) at rest and their pressures, each a step from the last one."""
+    last = arm.settled(np.zeros(len(arm.high)))
+    found: list[tuple[Array, Array]] = []
+    while len(found) < count:
+        pressures = rng.uniform(0, UP_TO, len(arm.high)) * arm.high
+        place = arm.settled(pressures)
+        if STEPS[0] <= np.linalg.norm(place - last) <= STEPS[1]:
+            found.append((place, pressures))
+            last = place
+    return found
 
+
+def _mismatch(robot: RobotDescription, rng: np.random.Generator) -> Any:
     n, segments = robot.n_pressures, robot.n_segments
     axes = rng.standard_normal((2, 3))
     shift, turn = axes / np.linalg.norm(axes, axis=1)[:, None] * [[SHIFT], [TILT]]
@@ -209,8 +213,6 @@ class Arm:
     """The simulated arm beside any rig, at rest, without creep and hysteresis."""
 
     def __init__(self, robot: RobotDescription, plant: PlantSettings, truth: TrueModel) -> None:
-        from stiffopt.plant.plant import Plant
-
         self.high = np.array(robot.pressure_max)
         self._plant = Plant(robot, without_memory(plant))
         self._truth = truth
@@ -222,8 +224,6 @@ class Arm:
 
     def stiffness(self, pressures: Array, direction: tuple[float, ...]) -> float:
         """Of the tip along a unit vector, in N/m, from small pushes and pulls."""
-        from stiffopt.plant.settings import PlantLoad
-
         d = np.array(direction)
         push = PUSH * self._truth.stiffness(pressures, direction)
         ends = []
@@ -282,8 +282,6 @@ def without_memory(plant: PlantSettings) -> PlantSettings:
 
 def ideal_times(case: Case, pressures: list[Array]) -> list[float]:
     """Settling times of steps to these pressures, commanded at once, from rest at 0 Pa, in s."""
-    from stiffopt.rig.assembly import make_rig
-
     supply = case.description.supply.model_copy(update={"ripple": 0.0})
     update = {"plant": without_memory(case.description.plant), "supply": supply, "tracker": None}
     rig: Any = make_rig(case.description.model_copy(update=update), case.robot)
@@ -298,8 +296,20 @@ def ideal_times(case: Case, pressures: list[Array]) -> list[float]:
                 rig.clock.sleep(IDEAL_TICK)
                 tips.append(rig.world.plant.tip_pose()[:3, 3])
             errors = np.linalg.norm(np.array(tips) - tips[-1], axis=1)
-            times.append(settling_time(IDEAL_TICK * (1 + np.arange(ticks)), errors, NEAR, 0.1))
+            times.append(settling_time(IDEAL_TICK * (1 + np.arange(ticks)), errors, 0.1))
     return times
+
+
+def settling_time(times: Array, errors: Array, stays: float) -> float:
+    """When errors (T,) in m come below `NEAR` for good, in s; infinite if they do not.
+
+    `stays` is the time in s at the end in which they must not leave that again.
+    """
+    outside = np.flatnonzero(errors >= NEAR)
+    if not len(outside):
+        return 0.0
+    last = outside[-1]
+    return float(times[last]) if times[last] <= times[-1] - stays else np.inf
 
 
 @dataclass(frozen=True)
@@ -365,9 +375,6 @@ def calibrated_file(case: Case, folder: Path) -> RobotDescription:
     case : whose arm it is; what it carries beside the robot file's mass is put on afterwards.
     folder : gets the recording and the file, or has them from a run before.
     """
-    from stiffopt import CalibrationSettings, calibrate, save_robot
-    from stiffopt.model.robot_files import load_description
-
     path = folder / f"arm-{case.seed}.yaml"
     if not path.exists():
         plant = case.description.plant.model_copy(
@@ -419,14 +426,10 @@ class TrueModel:
     """
 
     def __init__(self, robot: RobotDescription, mismatch: Mismatch, payload: float = 0.0) -> None:
-        from stiffopt import load_robot
-        from stiffopt.optimise.tip import TipModel
-
         self.base: Array = mismatch.base.transform()
-        known: Any = SimpleNamespace(mismatch=mismatch)
         gravity = self.base[:3, :3].T @ np.array(robot.gravity)
         update = {"gravity": tuple(gravity.tolist()), "tip_mass": robot.tip_mass + payload}
-        self.model = load_robot(with_true_values(robot, known).model_copy(update=update))
+        self.model = load_robot(with_true_values(robot, mismatch).model_copy(update=update))
         with _passing_cache():  # nobody needs the code of this very arm again
             self._tip = TipModel(self.model)
 
@@ -448,8 +451,6 @@ class TrueModel:
 
     def reach(self, position: Array, start: Array, low: Array, high: Array) -> Array | None:
         """Pressures (n,) that bring the tip there, near to others; None where none were found."""
-        from scipy.optimize import least_squares
-
         x0 = np.clip(start, low + 1e-3 * (high - low), high - 1e-3 * (high - low)) / BAR
         found = least_squares(
             lambda x: 1e3 * (self._place(BAR * x)[0] - position),
@@ -500,8 +501,6 @@ class TrueModel:
         self, place: Array, direction: tuple[float, ...], start: Array, sign: float
     ) -> Array | None:
         """A local optimum (n,) of the stiffness at a place, for `STIFF` or `SOFT`."""
-        from scipy.optimize import minimize
-
         low, high = (np.array(v) / BAR for v in (self.model.pressure_min, self.model.pressure_max))
 
         def value(x: Array) -> float:

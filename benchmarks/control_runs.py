@@ -6,20 +6,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calibration import settling_time
 from control_baselines import PERIOD, MakeController
-from control_cases import DIRECTIONS, NEAR, Case, Path8
-
-if TYPE_CHECKING:
-    from stiffopt.control.interface import Controller
-    from stiffopt.control.trajectory import Trajectory
-    from stiffopt.optimise.task import Task
-    from stiffopt.plant.devices import SimulatedRig
+from control_cases import DIRECTIONS, Case, Path8, settling_time
+from stiffopt import Task
+from stiffopt.control.interface import Controller
+from stiffopt.control.loop import ControlLoop
+from stiffopt.control.state import State
+from stiffopt.control.trajectory import Trajectory, Waypoint
+from stiffopt.plant.devices import SimulatedRig
+from stiffopt.safety.gate import SafetyGate
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ class Step:
     seed, dynamics, controller, number, kind : which one.
     distance : of the targets.
     settling : until the tip stays within 1 mm; infinite if it does not.
-    ideal, ideal_stiffest : see `Aim`.
+    ideal : see `Aim`.
     steady : mean error at the end.
     swing : largest distance from the mean place at the end.
     motion : largest distance between two places (along an axis) from 6 s on.
@@ -69,7 +69,6 @@ class Step:
     distance: float
     settling: float
     ideal: float
-    ideal_stiffest: float
     steady: float
     swing: float
     motion: float
@@ -181,20 +180,22 @@ class Run:
         self.rig.close()
 
 
+def control_loop(rig: SimulatedRig, controller: Controller) -> ControlLoop:
+    """Control loop of a simulated rig, with a safety gate in front of its supply."""
+    safety = rig.settings.safety
+    gate = SafetyGate(
+        rig.supply, slew=rig.slew, safety=safety, force_per_pressure=None, clock=rig.clock,
+        period=PERIOD,
+    )  # fmt: skip
+    return ControlLoop(rig, controller, gate, safety=safety, period=PERIOD)
+
+
 class LoopRun(Run):
     """The same in the control loop, with the safety gate in front of the supply."""
 
     def __init__(self, rig: SimulatedRig, controller: Controller, point: Array) -> None:
-        from stiffopt.control.loop import ControlLoop
-        from stiffopt.safety.gate import SafetyGate
-
         super().__init__(rig, controller, point)
-        safety = rig.settings.safety
-        gate = SafetyGate(
-            rig.supply, slew=rig.slew, safety=safety, force_per_pressure=None, clock=rig.clock,
-            period=PERIOD,
-        )  # fmt: skip
-        self.loop = ControlLoop(rig, controller, gate, safety=safety, period=PERIOD)
+        self.loop = control_loop(rig, controller)
 
     def start(self) -> None:
         """Configure and arm."""
@@ -215,8 +216,6 @@ class LoopRun(Run):
         self.loop.follow_trajectory(trajectory)
 
     def _tick(self, now: float) -> tuple[NDArray[np.bool_], bool]:
-        from stiffopt.control.state import State
-
         self.loop.tick()
         now_is = self.loop.snapshot()
         return now_is.saturated, now_is.state is State.ACTIVE
@@ -295,9 +294,8 @@ def _judged(
         number=number,
         kind=aim.kind,
         distance=float(np.linalg.norm(way)),
-        settling=settling_time(trace.times, error, NEAR, STAYS),
+        settling=settling_time(trace.times, error, STAYS),
         ideal=aim.ideal,
-        ideal_stiffest=aim.ideal_stiffest,
         steady=float(error[end].mean()),
         swing=swing,
         motion=float(np.ptp(late, axis=0).max()),
@@ -324,8 +322,6 @@ def run_path(
     case: Case, path: Path8, name: str, make: MakeController, dynamics: str, in_loop: bool = False
 ) -> Follow:
     """Go to the beginning of a path and follow it."""
-    from stiffopt.control.trajectory import Trajectory, Waypoint
-
     points: Any = [
         Waypoint(time=time, target=case.target(place))
         for time, place in zip(path.times.tolist(), path.positions, strict=True)

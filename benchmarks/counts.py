@@ -30,6 +30,7 @@ from stiffopt import solve_pressure
 from stiffopt.model.compliance import directional_stiffness
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.shape import FreeShape
+from stiffopt.optimise.program import Program
 
 RECORD = Path(__file__).with_name("results") / "counts.json"
 TOLERANCE = {"instructions": 0.02, "c source": 0.05, "solutions": 0.10, "compiled code": 0.30}
@@ -78,7 +79,7 @@ def count() -> Counts:
     found: Counts = {"instructions": {}, "c source": {}}
     for segments in (1, 2, 3):
         for name, function in _functions(segments).items():
-            key = f"{name}, {segments} segment" + "s" * (segments > 1)
+            key = f"{name}, {tasks.arm_words(segments)}"
             found["instructions"][key] = function.n_instructions()
             found["c source"][key] = _c_bytes(function)
     if compiler() == "none":
@@ -86,7 +87,7 @@ def count() -> Counts:
     found["solutions"] = {}
     for kind, segments in SOLVED:
         for name, value in _solutions(kind, segments).items():
-            found["solutions"][f"{name}, {kind}, {segments} segment" + "s" * (segments > 1)] = value
+            found["solutions"][f"{name}, {kind}, {tasks.arm_words(segments)}"] = value
     return found
 
 
@@ -139,10 +140,6 @@ def _functions(segments: int) -> dict[str, ca.Function]:
 
 def _program(segments: int) -> dict[str, ca.Function]:
     """Functions of the optimiser's nonlinear program for a position and one stiffness."""
-    try:
-        from stiffopt.optimise.program import Program
-    except ImportError:
-        return {}
     robot, task = tasks.task_of("position", segments, SEED, 0)
     program = Program.of(task.target, task.stiffness, robot.description)
     return {
@@ -163,12 +160,8 @@ def _solutions(kind: str, segments: int) -> dict[str, int]:
     for number in range(TASKS):
         robot, task = tasks.task_of(kind, segments, SEED, number)
         solution = solve_pressure(robot, task)
-        counts: dict[str, Any] = dict(getattr(solution, "counts", None) or {})
-        if solution.confidence is not None:
-            counts.setdefault("starts", solution.confidence.starts)
-        for name, value in counts.items():
-            if isinstance(value, int) and not isinstance(value, bool):
-                sums[name] = sums.get(name, 0) + value
+        for name, value in solution.counts.items():
+            sums[name] = sums.get(name, 0) + value
     return sums
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 PACKAGES = (
     "stiffopt", "casadi", "numpy", "daqp", "scipy", "pin-pink", "pin", "qpsolvers", "soromox",
-    "jax", "jaxlib", "pyelastica", "numba",
+    "jax", "jaxlib", "numba",
 )  # fmt: skip
 
 

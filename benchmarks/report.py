@@ -28,8 +28,6 @@ LIMITATIONS = """\
   from one start.
 - soromox starts from strains, stiffopt from pressures. JAX may use all cores, as may stiffopt's
   batches.
-- PyElastica is a dynamic simulator put to a static use, which is not what it is best at; its
-  time is the one after which the tip stays put, which only hindsight knows.
 - Cold times are of tasks whose structure was seen before; the first task of a structure pays
   for building.
 - Loads are covered by two kinds of tasks on the two-segment arm."""

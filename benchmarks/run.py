@@ -2,9 +2,7 @@
 
     python benchmarks/run.py [--quick] [--seed N] [--only NAME ...] [--keep] [--update]
 
-`calibration` takes many minutes and is about errors, not speed; it runs only where it is named.
-
-Writes `results.md`, `results.json` and the plots to out/bench/; `--keep` copies them to
+Writes `results.md`, `results.json` and a plot to out/bench/; `--keep` copies them to
 benchmarks/results/ too, which is committed.  Exit code 1 if a count got worse (see `counts.py`);
 missed bars are told and do not fail, since times are of the machine.
 """
@@ -19,64 +17,42 @@ from dataclasses import asdict
 from pathlib import Path
 from time import perf_counter
 
-import calibration
 import counts
 import environment
 import plots
 import report
 from report import Section
-from sections import (
-    full_task,
-    kinds,
-    kinematics,
-    pose,
-    processes,
-    rates,
-    statics,
-)
+from sections import full_task, kinds, kinematics, pose, processes, rates
 from settings import Settings, quick
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE.parent / "out" / "bench"
 KEPT = HERE / "results"
-ASKED_FOR = ("calibration",)  # sections that run only where they are named
 
 
-def plan(sizes: Settings, done: dict[str, Section]) -> dict[str, Callable[[], Section]]:
-    """The sections by name, in their order."""
-
-    def growth_with_segments() -> Section:
-        if "full" not in done:
-            done["full"] = full_task.section(sizes)
-        return full_task.with_segments(sizes, done["full"])
-
-    return {
-        "full": lambda: full_task.section(sizes),
-        "kinds": lambda: kinds.section(sizes),
-        "without-compiler": lambda: processes.without_compiler(sizes),
-        "build": lambda: processes.build(sizes),
-        "command": lambda: processes.command(sizes),
-        "throughput": lambda: rates.batch(sizes),
-        "evaluations": lambda: kinematics.section(sizes),
-        "pose": lambda: pose.section(sizes),
-        "statics": lambda: statics.section(sizes),
-        "simulator": lambda: rates.simulated_arm(sizes),
-        "calibration": lambda: calibration.section(sizes),
-        "segments": growth_with_segments,
-        "starts": lambda: full_task.with_starts(sizes),
-    }
+SECTIONS: dict[str, Callable[[Settings], Section]] = {
+    "full": full_task.section,
+    "kinds": kinds.section,
+    "without-compiler": processes.without_compiler,
+    "build": processes.build,
+    "command": processes.command,
+    "throughput": rates.batch,
+    "evaluations": kinematics.section,
+    "pose": pose.section,
+    "simulator": rates.simulated_arm,
+}
 
 
 def run(sizes: Settings, only: list[str], out: Path, update: bool) -> bool:
     """Measure, write the report; whether no count got worse."""
     begin, before = perf_counter(), environment.load()
     done: dict[str, Section] = {}
-    for name, measure in plan(sizes, done).items():
-        if name not in only if only else name in ASKED_FOR:
+    for name, measure in SECTIONS.items():
+        if only and name not in only:
             continue
         started = perf_counter()
         print(f"{name} ...", end=" ", flush=True)
-        done[name] = measure()
+        done[name] = measure(sizes)
         print(f"{perf_counter() - started:.0f} s", flush=True)
     counted = counts.count()
     if "build" in done and not sizes.quick:
@@ -84,7 +60,7 @@ def run(sizes: Settings, only: list[str], out: Path, update: bool) -> bool:
     differences = counts.compare(counted)
     if update:
         counts.update(counted)
-    sections = [done[name] for name in plan(sizes, done) if name in done]
+    sections = list(done.values())
     loads = (before, environment.load())
     about = environment.environment()
     minutes = (perf_counter() - begin) / 60
@@ -101,9 +77,10 @@ def run(sizes: Settings, only: list[str], out: Path, update: bool) -> bool:
         "counts": counted,
     }
     (out / "results.json").write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-    made = plots.draw(data["sections"], out)
+    if "full" in done:
+        plots.draw(done["full"].data, out / "full_task.png")
     print(report.summary(sections, differences))
-    print(f"{minutes:.1f} minutes; {out / 'results.md'} and {len(made)} plots")
+    print(f"{minutes:.1f} minutes; {out / 'results.md'}")
     return update or not any(difference.fails for difference in differences)
 
 
@@ -129,7 +106,7 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=1, help="of the random tasks")
     parser.add_argument("--quick", action="store_true", help="under a minute; proves nothing")
-    parser.add_argument("--only", nargs="+", default=[], choices=list(plan(Settings(), {})))
+    parser.add_argument("--only", nargs="+", default=[], choices=list(SECTIONS))
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--keep", action="store_true", help="copy to benchmarks/results/ too")
     parser.add_argument("--update", action="store_true", help="put the counts on record")

@@ -14,14 +14,12 @@ class Settings:
     segments : arms of the full task.
     tasks : random tasks per arm, cold.
     warm_tasks : of these, warm too.
-    slow_tasks : of these, for peers that take a second.
     kind_tasks : tasks per kind.
     repetitions : of each timed call.
     reference_starts : random starts of IPOPT per task, for the best known answer.
     most_seconds : per solver and table; a solver that needs more is timed on fewer tasks.
     batch : rows of the batched evaluations.
     batch_tasks : tasks of `solve_batch`.
-    growth : arms whose growth of cost is measured beside `segments`.
     """
 
     seed: int = 1
@@ -29,14 +27,12 @@ class Settings:
     segments: tuple[int, ...] = (1, 2, 3, 5)
     tasks: int = 40
     warm_tasks: int = 20
-    slow_tasks: int = 4
     kind_tasks: int = 10
     repetitions: int = 5
     reference_starts: int = 4
     most_seconds: float = 3.0
     batch: int = 60_000
     batch_tasks: int = 2000
-    growth: tuple[int, ...] = (4, 6)
 
     @property
     def few_segments(self) -> tuple[int, ...]:
@@ -47,8 +43,8 @@ class Settings:
 def quick(seed: int) -> Settings:
     """Everything once, small."""
     return Settings(
-        seed=seed, quick=True, segments=(1, 2), tasks=3, warm_tasks=2, slow_tasks=1, kind_tasks=1,
-        repetitions=2, reference_starts=1, most_seconds=0.5, batch=2000, batch_tasks=10, growth=(),
+        seed=seed, quick=True, segments=(1, 2), tasks=3, warm_tasks=2, kind_tasks=1,
+        repetitions=2, reference_starts=1, most_seconds=0.5, batch=2000, batch_tasks=10,
     )  # fmt: skip
 
 

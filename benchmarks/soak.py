@@ -27,6 +27,13 @@ from typing import Any
 
 import numpy as np
 
+from control_baselines import PERIOD, stiffopt_controller
+from control_runs import control_loop
+from stiffopt import InputError, StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
+from stiffopt.control.state import State
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription, load_rig_description
+
 RIG = Path(__file__).parent.parent / "rig" / "sim-two-segment.yaml"
 BLOCK = 600.0  # s
 TARGET = 10.0  # s
@@ -45,13 +52,6 @@ class Soak:
     """One arm and its loop."""
 
     def __init__(self, seed: int) -> None:
-        from stiffopt import StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
-        from stiffopt.control.controller import TipController
-        from stiffopt.control.loop import ControlLoop
-        from stiffopt.rig.assembly import make_rig
-        from stiffopt.rig.config import RigDescription, load_rig_description
-        from stiffopt.safety.gate import SafetyGate
-
         told = load_rig_description(RIG).model_dump(exclude_unset=True)
         told["plant"].update(dynamics="quasi-static", faults=True, seed=seed, discretisation=COARSE)
         # what the tracker's registration is off by nobody could know
@@ -60,17 +60,9 @@ class Soak:
         robot = load_robot(description.robot)
         self.rng = np.random.default_rng([seed, 6])
         self.rig: Any = make_rig(description, robot.description)
-        self.period = 1 / description.rate
-        controller = TipController(
-            robot, self.rig.supply.limits, self.rig.slew, period=self.period,
-            control=description.control, safety=description.safety, vibrates=False,
-        )  # fmt: skip
-        gate = SafetyGate(
-            self.rig.supply, slew=self.rig.slew, safety=description.safety,
-            force_per_pressure=None, clock=self.rig.clock, period=self.period,
-        )  # fmt: skip
-        self.loop = ControlLoop(
-            self.rig, controller, gate, safety=description.safety, period=self.period
+        self.period = PERIOD
+        self.loop = control_loop(
+            self.rig, stiffopt_controller(self.rig, robot.description, "quasi-static")
         )
         self.noticed = NOTICED * float(np.max(description.safety.max_pressure_error))
         self.robot, self.high = robot, self.rig.supply.limits.high
@@ -82,8 +74,6 @@ class Soak:
 
     def target(self) -> Any:
         """A place that the model reaches, well within the limits."""
-        from stiffopt import Target
-
         p = self.rng.uniform(0.15, 0.7, len(self.high)) * self.high
         return Target(position=tuple(self.robot.tip_pose(p)[:3, 3].tolist()))
 
@@ -95,9 +85,6 @@ class Soak:
 
     def ready(self) -> None:
         """Reset and arm, as somebody would who has mended what was wrong."""
-        from stiffopt import InputError
-        from stiffopt.control.state import State
-
         for _ in range(3000):
             state = self.tick().state
             try:
@@ -114,8 +101,6 @@ class Soak:
 
     def block(self, duration: float) -> dict[str, Any]:
         """Run for a time in s; return what was found."""
-        from stiffopt.control.state import State
-
         rng, clock = self.rng, self.rig.clock
         self.ready()
         end, next_target = clock.now() + duration, clock.now()

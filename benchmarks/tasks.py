@@ -44,6 +44,11 @@ def arm(segments: int) -> Manipulator:
     )
 
 
+def arm_words(segments: int) -> str:
+    """Words for such an arm, in the names of figures."""
+    return f"{segments} segment" + "s" * (segments > 1)
+
+
 @cache
 def hanging_arm() -> Manipulator:
     """Two segments under gravity, with 20 g at the tip."""

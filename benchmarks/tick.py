@@ -7,8 +7,6 @@ costs is not in a tick; plans are made beside, as in the daemon. The quadratic p
 are recorded and solved again by both solvers in turns.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -17,6 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from stiffopt import StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
+from stiffopt.control.allocation import SOLVERS
+from stiffopt.control.controller import TipController
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import load_rig_description
+from stiffopt.rig.interface import PressureCommand
+from stiffopt.safety.gate import SafetyGate
 
 RIG = Path(__file__).parent.parent / "rig" / "sim-two-segment.yaml"
 TARGETS = ((0.01, 0.01, 0.195), (-0.015, 0.005, 0.2), (0.0, -0.02, 0.19), (0.01, 0.0, 0.205))
@@ -51,13 +57,6 @@ def wait_for_plan(controller: Any) -> None:
 
 def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.ndarray, ...]]]:
     """Times of ticks in us, and the quadratic programs."""
-    from stiffopt import StiffnessGoal, StiffnessMeasure, Target, Task, load_robot
-    from stiffopt.control.controller import TipController
-    from stiffopt.rig.assembly import make_rig
-    from stiffopt.rig.config import load_rig_description
-    from stiffopt.rig.interface import PressureCommand
-    from stiffopt.safety.gate import SafetyGate
-
     description = load_rig_description(RIG)
     robot = load_robot(description.robot)
     rig = make_rig(description, robot.description)
@@ -120,8 +119,6 @@ def run(seconds: float, solver: str) -> tuple[dict[str, float], list[tuple[np.nd
 
 def compare(problems: list[tuple[np.ndarray, ...]]) -> dict[str, float]:
     """Times in us of the solvers on the same problems, in turns, and how far apart they end."""
-    from stiffopt.control.allocation import SOLVERS
-
     n, m = problems[0][0].shape[0], problems[0][2].shape[0]
     solvers = {name: kind(n, m) for name, kind in SOLVERS.items()}
     times: dict[str, list[float]] = {name: [] for name in solvers}

@@ -9,7 +9,6 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -19,7 +18,6 @@ HERE = Path(__file__).parent
 BENCHMARKS = HERE.parent / "benchmarks"
 sys.path.insert(0, str(BENCHMARKS))
 
-import calibration  # noqa: E402
 import counts  # noqa: E402
 import environment  # noqa: E402
 import plots  # noqa: E402
@@ -31,10 +29,9 @@ from peers.base import Peer, PeerMissingError  # noqa: E402
 from peers.ipopt import Ipopt, IpoptEnergy  # noqa: E402
 from peers.own import Stiffopt  # noqa: E402
 from peers.pink_chain import Pink  # noqa: E402
+from peers.slsqp import Slsqp  # noqa: E402
 from report import Comparison, Section, at_least, at_most  # noqa: E402
-from stiffopt import PressureSolver, lie  # noqa: E402
-from stiffopt.identify.results import FittedEstimate  # noqa: E402
-from stiffopt.model.parameters import Parameter  # noqa: E402
+from stiffopt import PressureSolver  # noqa: E402
 
 # -- counts -----------------------------------------------------------------------------------
 
@@ -89,13 +86,10 @@ def test_the_peers_model_is_that_of_stiffopt(segments):
     for bar in np.random.default_rng(3).uniform(0, paper.PRESSURE_MAX, (4, 3 * segments)):
         pose, compliance = robot.tip_pose(bar * 1e5), robot.tip_compliance(bar * 1e5)
         size = np.abs(compliance).max()
-        for position, rotation, matrix in (
-            [value.full() for value in symbolic(bar)],
-            paper.numeric(bar),
-        ):
-            np.testing.assert_allclose(np.ravel(position), pose[:3, 3], atol=1e-7)
-            np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-6)
-            np.testing.assert_allclose(matrix, compliance, atol=1e-6 * size)
+        position, rotation, matrix = (value.full() for value in symbolic(bar))
+        np.testing.assert_allclose(position[:, 0], pose[:3, 3], atol=1e-7)
+        np.testing.assert_allclose(rotation, pose[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(matrix, compliance, atol=1e-6 * size)
         stiffness = robot.stiffness(bar * 1e5, d)
         assert float(energy(bar)) == pytest.approx(1 / stiffness, rel=1e-3)
 
@@ -132,11 +126,9 @@ def test_ipopt_solves_the_same_task(kind):
 
 
 def test_slsqp_solves_the_same_task():
-    slsqp = pytest.importorskip("peers.slsqp")
+    pytest.importorskip("scipy")
     robot, task = tasks.task_of("position", 1, 1, 0)
-    for kind in (slsqp.SlsqpGradients, slsqp.SlsqpDifferences):
-        p = kind.of(1).cold(task)
-        assert p.shape == (robot.n_pressures,)
+    assert Slsqp.of(1).cold(task).shape == (robot.n_pressures,)
 
 
 def test_a_peer_that_is_not_installed_is_named():
@@ -206,115 +198,6 @@ def test_ratios_are_paired_and_leave_out_what_was_not_timed():
     assert np.isnan(timing.ratio(np.full((1, 2), np.nan), own[:, :2]))
 
 
-# -- calibration ------------------------------------------------------------------------------
-
-
-def test_settling_ends_where_the_tip_comes_near_for_good():
-    times = np.arange(1, 101) * 0.1
-    errors = np.full(100, 0.5e-3)
-    assert calibration.settling_time(times, errors) == 0.0
-    errors[:20] = 5e-3
-    assert calibration.settling_time(times, errors) == pytest.approx(2.0)
-    errors[59] = 1.1e-3  # it leaves once more
-    assert calibration.settling_time(times, errors) == pytest.approx(6.0)
-    errors[95] = 1.1e-3  # so late that nobody knows whether it stays
-    assert calibration.settling_time(times, errors) == np.inf
-
-
-def test_a_step_that_never_settles_counts_in_median_and_quantile():
-    assert calibration.middle_and([1.0, 2.0, np.inf], 0.9) == (2.0, np.inf)
-    assert calibration.middle_and([1.0, np.inf, np.inf], 0.9) == (np.inf, np.inf)
-
-
-@pytest.fixture(scope="module")
-def exact():
-    """An arm that agrees with the model, with its file as drawn and as it is in truth."""
-    pytest.importorskip("numba")
-    description, robot = calibration.described(calibration.CASES["sim-agreeing"], 3)
-    truth = calibration.Truth(description, robot)
-    same = calibration.with_true_values(robot, truth)
-    return description, robot, truth, {"nominal": robot, "calibrated": same}
-
-
-def test_a_file_that_is_the_truth_has_no_error_and_reaches_its_targets(exact):
-    description, robot, truth, robots = exact
-    files = {name: calibration.Known.of(each) for name, each in robots.items()}
-    found = calibration.Found()
-    pressures = np.random.default_rng(1).uniform(0, 1, (6, 3)) * robot.pressure_max
-    calibration.held_out(truth, files, pressures, found)
-    assert np.max(found.values["settled"]["calibrated"]) < 0.1  # % of length
-    assert np.mean(found.values["settled"]["nominal"]) > 2
-
-    rng, loop = np.random.default_rng(2), calibration.Loop(0.05, slew=5e5, wait=0.5, hold=4.0)
-    calibration.to_targets(description, robot, truth, files, 1, loop, rng, found)
-    assert (
-        found.values["open loop: steady"]["calibrated"][0] < 0.2
-    )  # mm; the solver's tolerance is 0.1
-    assert found.values["open loop: steady"]["nominal"][0] > 1
-    for name in calibration.FILES:
-        assert found.values["feedback: steady"][name][0] < 0.5
-    settling = found.values["feedback: settling"]
-    assert 0.1 < settling["calibrated"][0] < settling["nominal"][0]
-    assert "| steps that never settled | 0 of 1 | 0 of 1 | - |" in calibration.markdown(
-        "sim", found
-    )
-
-
-def test_a_file_that_is_the_truth_predicts_what_the_probe_measures(exact):
-    description, robot, _, robots = exact
-    files = {name: calibration.Known.of(each) for name, each in robots.items()}
-    found = calibration.Found()
-    calibration.probed(description, robot, files, np.array([[0.3e5, 0.6e5, 0.0]]), found)
-    assert not found.notes
-    for axis in calibration.DIRECTIONS:
-        (error,) = found.values[f"stiffness {axis}"]["calibrated"]
-        assert abs(error) < 4  # %
-
-
-def test_the_true_values_are_those_of_the_plant(exact):
-    _, robot, truth, robots = exact
-    true = calibration.true_values(robot, truth, agrees=True)
-    for key, (_, value) in true.items():
-        if key.startswith("segments"):
-            assert Parameter(key).value(robots["calibrated"]) == pytest.approx(value), key
-    # the base frame, as a tracker without noise would find it
-    base = [value for group, value in true.values() if group == "base"]
-    tracker = robots["calibrated"].recordings.registration.tracker_in_base
-    np.testing.assert_allclose(lie.exp(np.array(base)), tracker.inverse(), atol=1e-8)
-
-
-def test_intervals_are_counted_by_group():
-    def estimate(key, low, high):
-        return FittedEstimate("base, x", key, "", 0.0, 0.0, low, high, 1.0, 0.0)
-
-    listed = (estimate("a", 1.0, 3.0), estimate("b", 1.0, 1.5), estimate("", 0.0, 1.0))
-    true = {"a": ("gain", np.float64(2.0)), "b": ("gain", 2.0), "base, x": ("base", 0.5)}
-    found = calibration.Found()
-    calibration.judged(SimpleNamespace(estimates=listed), true, found)
-    assert found.inside == {"gain": [True, False], "base": [True]}
-    found.add("feedback: settling", "calibrated", [np.float64(1.5), np.inf])
-    data = json.loads(json.dumps(found.data(), allow_nan=False))
-    assert data["inside"] == found.inside
-    assert data["values"]["feedback: settling"]["calibrated"] == [1.5, None]
-    (verdict,) = [v for v in calibration.verdicts("sim", with_settled(found)) if "inside" in v.what]
-    assert verdict.measured == "66.7 % of 3"
-    assert not verdict.met
-
-
-def with_settled(found):
-    found.add("settled", "calibrated", [0.5])
-    return found
-
-
-@pytest.mark.long
-def test_the_quick_form_of_the_calibration_runs():
-    command = [sys.executable, str(BENCHMARKS / "calibration.py"), "--quick", "--arms", "sim"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "| settled tip, % of length, mean / p95 |" in done.stdout
-    assert "| stiffness z, %, mean / mean of size |" in done.stdout
-
-
 # -- report -----------------------------------------------------------------------------------
 
 
@@ -356,24 +239,11 @@ def test_the_environment_names_processor_and_versions():
     assert found["casadi"] != "not installed"
 
 
-def test_plots_are_drawn(tmp_path):
+def test_a_plot_is_drawn(tmp_path):
     record = {"cold_s": 1e-3, "warm_s": 1e-4}
-    line = {"segments": [1, 2], "cold_s": [1e-3, 2e-3], "warm_s": [1e-4, 2e-4]}
-    point = {"starts": 1, "seconds": 0.01, "best": 0.9}
-    data = {
-        "Full task: pose and stiffness": {"1": {"stiffopt": record}, "2": {"stiffopt": record}},
-        "Growth with segments": {"stiffopt": line},
-        "Growth with starts": {"stiffopt": [point, {**point, "seconds": 0.02}]},
-        "Evaluations": {
-            "pose, single 2": {"stiffopt": 1e-6, "CasADi VM": 1e-5},
-            "pose, batch 2": {"stiffopt": 1e-7, "CasADi VM": 1e-6},
-        },
-    }
-    made = plots.draw(data, tmp_path)
-    assert [path.name for path in made] == [
-        *("full_task.png", "growth.png", "starts.png", "evaluations.png")
-    ]
-    assert all(path.stat().st_size > 5000 for path in made)
+    path = tmp_path / "full_task.png"
+    plots.draw({"1": {"stiffopt": record}, "2": {"stiffopt": record}}, path)
+    assert path.stat().st_size > 5000
 
 
 @pytest.mark.long

@@ -1,5 +1,6 @@
-"""The benchmark of the closed loop: its cases, its judgement and its baselines, in short form."""
+"""The benchmarks of the closed loop and of calibration: cases, judgement, baselines; short."""
 
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,13 +14,14 @@ import stiffopt.plant.devices  # noqa: F401 - its code is kept where it always i
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "benchmarks"))
 
+import calibration
 import control
 import control_cases
 import control_runs
-from calibration import STEPS
 from control_baselines import CONTROLLERS, Gains, IntegralFeedback
-from control_cases import DIRECTIONS, draw_case, draw_path, with_true_file
+from control_cases import DIRECTIONS, STEPS, draw_case, draw_path, settling_time, with_true_file
 from stiffopt.model.description import Recordings
+from stiffopt.plant.plant import Plant
 from stiffopt.registration import Placement, Registration
 
 
@@ -127,7 +129,7 @@ def test_a_calibrated_file_comes_from_a_recording_without_the_run_s_noise_and_is
         return SimpleNamespace(robot=robot.model_copy(update={"tip_mass": 0.021}))
 
     monkeypatch.setattr(control_cases, "recorded", recorded)
-    monkeypatch.setattr("stiffopt.calibrate", calibrate)
+    monkeypatch.setattr(control_cases, "calibrate", calibrate)
     for _ in range(2):
         known = control.with_file(case, "calibrated", tmp_path)
         assert known.believed == case.robot.model_copy(update={"tip_mass": 0.021})
@@ -136,3 +138,47 @@ def test_a_calibrated_file_comes_from_a_recording_without_the_run_s_noise_and_is
     assert (plant.dynamics, plant.payload) == ("full", 0.0)
     assert plant.seed != case.description.plant.seed
     assert control.with_file(case, "nominal", None) is case
+
+
+def test_settling_ends_where_the_tip_comes_near_for_good():
+    times = np.arange(1, 101) * 0.1
+    errors = np.full(100, 0.5e-3)
+    assert settling_time(times, errors, 1.0) == 0.0
+    errors[:20] = 5e-3
+    assert settling_time(times, errors, 1.0) == pytest.approx(2.0)
+    errors[59] = 1.1e-3  # it leaves once more
+    assert settling_time(times, errors, 1.0) == pytest.approx(6.0)
+    errors[95] = 1.1e-3  # so late that nobody knows whether it stays
+    assert settling_time(times, errors, 1.0) == np.inf
+
+
+# -- calibration ------------------------------------------------------------------------------
+
+
+def test_a_file_with_the_true_values_has_no_error_and_predicts_what_the_probe_measures():
+    description, robot = calibration.described(calibration.CASES["sim-agreeing"], 3)
+    plant = Plant(robot, description.plant)
+    same = calibration.with_true_values(robot, plant.mismatch)
+    files = {"nominal": robot, "calibrated": same}
+    known = {name: calibration.Known.of(each) for name, each in files.items()}
+    found = calibration.Found()
+    pressures = np.random.default_rng(1).uniform(0, 1, (6, 3)) * robot.pressure_max
+    calibration.held_out(plant, known, pressures, found)
+    assert np.max(found.values["settled"]["calibrated"]) < 0.1  # % of length
+    assert np.mean(found.values["settled"]["nominal"]) > 2
+
+    calibration.probed(description, robot, known, np.array([[0.3e5, 0.6e5, 0.0]]), found)
+    assert not found.notes
+    for axis in calibration.DIRECTIONS:
+        (error,) = found.values[f"stiffness {axis}"]["calibrated"]
+        assert abs(error) < 4  # %
+    assert "| settled tip, % of length, mean / p95 |" in calibration.markdown("sim", found)
+
+
+@pytest.mark.long
+def test_the_quick_form_of_the_calibration_runs():
+    command = [sys.executable, calibration.__file__, "--quick", "--arms", "sim"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "| settled tip, % of length, mean / p95 |" in done.stdout
+    assert "| stiffness z, %, mean / mean of size |" in done.stdout

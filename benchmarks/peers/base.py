@@ -63,18 +63,6 @@ class TaskSolver(Peer):
         """Solve a task, untimed; what is returned solves for another target from there."""
 
 
-class PoseSolver(Peer):
-    """A peer that reaches a position, with no word on stiffness."""
-
-    @abstractmethod
-    def reach(self, position: Vector) -> tuple[bool, Vector]:
-        """Whether the position was reached within 0.1 mm, and the peer's own coordinates."""
-
-    def pressures(self, _coordinates: Vector) -> Vector | None:
-        """Pressures (n,) in Pa that give these coordinates, or None if there are none."""
-        return None
-
-
 def available(kinds: list[type[Peer]], segments: int) -> tuple[list[Peer], dict[str, str]]:
     """Peers that can be had, and why the others cannot, by name."""
     peers: list[Peer] = []

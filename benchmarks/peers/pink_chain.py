@@ -20,14 +20,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from peers import paper
-from peers.base import PoseSolver, Vector
+from peers.base import Peer, Vector
 
 TOLERANCE = 1e-4  # m
 _MOST_STEPS = 200
 _COORDINATES = 3  # per segment: phi, half of theta, chord
 
 
-class Pink(PoseSolver):
+class Pink(Peer):
     """One start, full steps of the differential inverse kinematics until within 0.1 mm."""
 
     name: ClassVar[str] = "pink (pinocchio, DAQP)"
@@ -47,7 +47,10 @@ class Pink(PoseSolver):
         self._start = np.tile([0.3, 0.2, 1.15 * paper.LENGTH], segments)
 
     def reach(self, position: Vector) -> tuple[bool, Vector]:
-        """Iterate `pink.solve_ik` with a time step of 1 s, so that each step is a full one."""
+        """Whether the position was reached within 0.1 mm, and the chain's coordinates.
+
+        `pink.solve_ik` is iterated with a time step of 1 s, so that each step is a full one.
+        """
         pink = self._pink
         configuration = pink.Configuration(self._model, self._data, self._start)
         self._task.set_target(self._pin.SE3(np.eye(3), position))
@@ -62,7 +65,7 @@ class Pink(PoseSolver):
         return False, configuration.q.copy()
 
     def pressures(self, coordinates: Vector) -> Vector | None:
-        """Invert eqs 8 to 10 (the modulus falls with |p|) for each segment."""
+        """Pressures (n,) in Pa for the coordinates, or None: eqs 8 to 10 inverted by segment."""
         found = []
         for phi, half, chord in coordinates.reshape(-1, _COORDINATES):
             length = chord / np.sinc(half / np.pi)

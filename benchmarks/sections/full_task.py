@@ -1,4 +1,4 @@
-"""The full task, cold and warm, side by side with other solvers; and how its cost grows."""
+"""The full task, cold and warm, side by side with other solvers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,9 +12,10 @@ import tasks
 from peers.base import TaskSolver, Vector, available
 from peers.ipopt import Ipopt, IpoptEnergy
 from peers.own import Stiffopt
+from peers.slsqp import Slsqp
 from report import Comparison, Section, at_least, at_most, milliseconds, percent, times
 from settings import Settings
-from stiffopt import Task, solve_pressure
+from stiffopt import Task
 from timing import Times, interleaved, median, ratio
 
 TEXT = """\
@@ -87,9 +88,7 @@ def stiffness_of(task: Task, p: Vector | None, segments: int) -> float:
     return float(robot.stiffness(p, task.stiffness.maximise[0].direction))
 
 
-def measure(
-    kinds: list[type[TaskSolver]], segments: int, sizes: Settings, slow: tuple[str, ...] = ()
-) -> Measured:
+def measure(kinds: list[type[TaskSolver]], segments: int, sizes: Settings) -> Measured:
     """Time solvers on the random tasks of one arm; the first of them is stiffopt."""
     peers, skipped = available(list(kinds), segments)
     solvers = {peer.name: peer for peer in peers if isinstance(peer, TaskSolver)}
@@ -98,8 +97,6 @@ def measure(
     for solver in solvers.values():
         solver.cold(cases[0])  # what is built once is built here
     values = {name: np.full(sizes.tasks, np.nan) for name in solvers}
-    most = {name: sizes.slow_tasks if name in slow else sizes.tasks for name in solvers}
-    answers: dict[tuple[str, int], Vector | None] = {}
 
     def cold_call(name: str) -> Callable[[int], None]:
         def call(item: int) -> None:
@@ -107,13 +104,16 @@ def measure(
 
         return call
 
-    cold = _limited(solvers, most, sizes.tasks, cold_call, sizes)
+    answers: dict[tuple[str, int], Vector | None] = {}
+    calls = {name: cold_call(name) for name in solvers}
+    cold = interleaved(calls, sizes.tasks, sizes.repetitions, sizes.most_seconds)
     for (name, item), p in answers.items():
         values[name][item] = stiffness_of(cases[item], p, segments)
-    warm, reached = _warm(solvers, own, cases, segments, sizes, slow)
+    some = cases[: sizes.warm_tasks]
+    warm, reached = _warm(solvers, some, segments, sizes)
     best = np.nanmax(np.stack(list(values.values())), axis=0)
     best = np.maximum(best, _reference(cases, segments, sizes))
-    in_a_row = _in_a_row(own, cases[: sizes.warm_tasks], segments)
+    in_a_row = _in_a_row(own, some, segments)
     return Measured(segments, cold, warm, values, reached, best, skipped, in_a_row)
 
 
@@ -139,51 +139,14 @@ def _repeated(call: Callable[[], object]) -> float:
     return float(np.median(times_taken))
 
 
-def _limited(
-    names: dict[str, TaskSolver],
-    most: dict[str, int],
-    items: int,
-    call: Callable[[str], Callable[[int], None]],
-    sizes: Settings,
-    prepare: Callable[[str, int], object] | None = None,
-) -> Times:
-    """Interleave all; those with fewer items than the rest leave out the others."""
-    few = min(most.values())
-    every = {name: call(name) for name in names}
-    some = {name: call(name) for name in names if most[name] > few}
-    budget = sizes.most_seconds / 2 if some else sizes.most_seconds
-    first = interleaved(every, few, sizes.repetitions, budget, prepare)
-    if not some:
-        return first
-
-    def shifted(name: str) -> Callable[[int], None]:
-        return lambda item: some[name](item + few)
-
-    def ready(name: str, item: int) -> None:
-        if prepare is not None:
-            prepare(name, item + few)
-
-    rest = interleaved(
-        {name: shifted(name) for name in some}, items - few, sizes.repetitions,
-        sizes.most_seconds, ready,
-    )  # fmt: skip
-    blank = np.full((sizes.repetitions, items - few), np.nan)
-    return {name: np.hstack([first[name], rest.get(name, blank)]) for name in names}
-
-
 def _warm(
-    solvers: dict[str, TaskSolver],
-    own: TaskSolver,
-    cases: list[Task],
-    segments: int,
-    sizes: Settings,
-    slow: tuple[str, ...],
+    solvers: dict[str, TaskSolver], cases: list[Task], segments: int, sizes: Settings
 ) -> tuple[Times, dict[str, float]]:
-    count = min(sizes.warm_tasks, len(cases))
+    """Times of solutions from the last one, and shares of the answers that reach the target."""
     robot = tasks.arm(segments)
     targets = []
-    for task in cases[:count]:
-        p = own.cold(task)
+    for task in cases:
+        p = solvers[Stiffopt.name].cold(task)
         targets.append(tasks.moved(robot, task, p) if p is not None else task.target)
     ready: dict[tuple[str, int], Callable[..., Vector | None]] = {}
     answers: dict[tuple[str, int], Vector | None] = {}
@@ -197,8 +160,8 @@ def _warm(
 
         return run
 
-    most = {name: min(sizes.slow_tasks, count) if name in slow else count for name in solvers}
-    warm = _limited(solvers, most, count, call, sizes, prepare)
+    calls = {name: call(name) for name in solvers}
+    warm = interleaved(calls, len(cases), sizes.repetitions, sizes.most_seconds, prepare)
     reached: dict[str, list[bool]] = {name: [] for name in solvers}
     for (name, item), p in answers.items():
         reached[name].append(tasks.holds(robot, cases[item], targets[item], p))
@@ -219,32 +182,14 @@ def _reference(cases: list[Task], segments: int, sizes: Settings) -> NDArray[np.
 
 def section(sizes: Settings) -> Section:
     """The table of the full task."""
-    try:  # SciPy may be missing
-        from peers.slsqp import SlsqpDifferences, SlsqpGradients
-
-        scipy: list[type[TaskSolver]] = [SlsqpGradients, SlsqpDifferences]
-        slow = (SlsqpDifferences.name,)
-        lacking = {}
-    except ImportError as error:
-        scipy, slow, lacking = [], (), {"SLSQP": str(error)}
     out = Section(
         "Full task: pose and stiffness",
         TEXT,
-        (
-            "segments",
-            "solver",
-            "cold, ms",
-            "ratio",
-            "best",
-            "warm, ms",
-            "ratio",
-            "reached",
-            "tasks",
-        ),
-        skipped=lacking,
-    )
+        ("segments", "solver", "cold, ms", "ratio", "best", "warm, ms", "ratio", "reached",
+         "tasks"),
+    )  # fmt: skip
     for segments in sizes.segments:
-        found = measure([Stiffopt, Ipopt, IpoptEnergy, *scipy], segments, sizes, slow)
+        found = measure([Stiffopt, Ipopt, IpoptEnergy, Slsqp], segments, sizes)
         out.skipped.update(found.skipped)
         record = found.record()
         out.data[str(segments)] = record
@@ -275,7 +220,7 @@ def _judge(
     out: Section, segments: int, record: dict[str, dict[str, float]], found: Measured
 ) -> None:
     own = record[Stiffopt.name]
-    arm = f"{segments} segment" + "s" * (segments > 1)
+    arm = tasks.arm_words(segments)
     if segments in bars.COLD_MS:
         cold, warm = found.in_a_row
         out.verdicts += [
@@ -303,106 +248,3 @@ def _judge(
             )
         share = found.share_beside(name)
         out.comparisons.append(Comparison(f"full task, {arm}", name, share, "share best"))
-
-
-# -- growth --------------------------------------------------------------------------------------
-
-SEGMENTS_TEXT = """\
-The full task on longer arms; *exponent*: slope of the logarithm of the time over that of the
-number of segments, from the shortest to the longest arm."""
-STARTS_TEXT = """\
-Two segments, cold. stiffopt's stopping rule decides how many local searches a task needs; its
-tasks are grouped by that number. IPOPT (energy form, which is the faster) is started from so
-many random points, the best answer taken. *Ratio*: time over that of stiffopt's median over all
-tasks in this table."""
-
-STARTS = (1, 2, 4, 8)
-
-
-def with_segments(sizes: Settings, full: Section) -> Section:
-    """Times for 1 to 6 segments; those of the full task are not taken again."""
-    out = Section(
-        "Growth with segments", SEGMENTS_TEXT, ("solver", "segments", "cold, ms", "warm, ms")
-    )
-    records = dict(full.data)
-    few = Settings(
-        **{
-            **vars(sizes), "tasks": max(2, sizes.tasks // 5),
-            "warm_tasks": max(2, sizes.warm_tasks // 5), "reference_starts": 0,
-        }
-    )  # fmt: skip
-    for segments in sizes.growth:
-        found = measure([Stiffopt, Ipopt, IpoptEnergy], segments, few)
-        records[str(segments)] = found.record()
-    arms = sorted(int(key) for key in records)
-    for name in (Stiffopt.name, Ipopt.name, IpoptEnergy.name):
-        cold = [records[str(n)][name]["cold_s"] for n in arms]
-        warm = [records[str(n)][name]["warm_s"] for n in arms]
-        out.rows += [
-            (name, str(n), milliseconds(c), milliseconds(w))
-            for n, c, w in zip(arms, cold, warm, strict=True)
-        ]
-        span = np.log(arms[-1] / arms[0])
-        exponents = [f"{np.log(t[-1] / t[0]) / span:.2f}" for t in (cold, warm)]
-        out.rows.append((name, "exponent", *exponents))
-        out.data[name] = {"segments": arms, "cold_s": cold, "warm_s": warm}
-    return out
-
-
-def with_starts(sizes: Settings) -> Section:
-    """Time and quality over the number of local searches."""
-    out = Section(
-        "Growth with starts",
-        STARTS_TEXT,
-        ("solver", "starts", "time, ms", "ratio", "within 0.5 % of the best", "tasks"),
-    )
-    segments, count = 2, sizes.tasks
-    robot = tasks.arm(segments)
-    cases = [tasks.task_of("position", segments, sizes.seed, i)[1] for i in range(count)]
-    ipopt = IpoptEnergy.of(segments)
-    rng = np.random.default_rng([sizes.seed, segments, 2])
-    solve_pressure(robot, cases[0])
-    ipopt.cold(cases[0])
-    own_time, own_value, own_starts = np.zeros(count), np.zeros(count), np.zeros(count, dtype=int)
-    time, value = np.zeros((count, STARTS[-1])), np.zeros((count, STARTS[-1]))
-    for item, task in enumerate(cases):
-        taken = []
-        for _ in range(sizes.repetitions):
-            begin = perf_counter()
-            solution = solve_pressure(robot, task)
-            taken.append(perf_counter() - begin)
-        own_time[item] = np.median(taken)
-        own_value[item] = stiffness_of(task, solution.pressures, segments)
-        counts = getattr(solution, "counts", None) or {}
-        sure = solution.confidence
-        own_starts[item] = counts.get("descents", sure.starts if sure else 0)
-        for start in range(STARTS[-1]):
-            x = 2 * ipopt.middle * rng.random(ipopt.n)
-            begin = perf_counter()
-            p = ipopt.from_start(task, x)
-            time[item, start] = perf_counter() - begin
-            value[item, start] = stiffness_of(task, p, segments)
-    best = np.maximum(value.max(axis=1), own_value) * (1 - bars.NEAR_BEST)
-    base = float(np.median(own_time))
-    own_data = []
-    for starts in np.unique(own_starts):
-        group = own_starts == starts
-        seconds = float(np.median(own_time[group]))
-        share = float(np.mean(own_value[group] >= best[group]))
-        own_data.append({"starts": int(starts), "seconds": seconds, "best": share})
-        out.rows.append(_row(Stiffopt.name, int(starts), seconds, base, share, int(group.sum())))
-    ipopt_data = []
-    for starts in STARTS:
-        seconds = float(np.median(time[:, :starts].sum(axis=1)))
-        share = float(np.mean(value[:, :starts].max(axis=1) >= best))
-        ipopt_data.append({"starts": starts, "seconds": seconds, "best": share})
-        out.rows.append(_row(ipopt.name, starts, seconds, base, share, count))
-    out.data = {Stiffopt.name: own_data, ipopt.name: ipopt_data}
-    return out
-
-
-def _row(
-    name: str, starts: int, seconds: float, base: float, share: float, count: int
-) -> tuple[str, ...]:
-    relative = times(seconds / base)
-    return name, str(starts), milliseconds(seconds), relative, percent(share), str(count)

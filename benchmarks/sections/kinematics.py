@@ -80,7 +80,7 @@ def _calls(
 ) -> dict[tuple[str, str], Callable[[], object]]:
     """What is timed, by work and by whom."""
     robot = tasks.arm(segments)
-    x, R, C, symbol = _symbols(segments)
+    symbol, x, R, C = paper.symbolic(segments)
     along = R.T @ ca.DM(DIRECTION)
     k = 1 / (along.T @ C[:3, :3] @ along)
     pose = ca.vertcat(ca.horzcat(R, x), ca.DM([[0, 0, 0, 1]]))
@@ -111,11 +111,6 @@ def _calls(
     return calls
 
 
-def _symbols(segments: int) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-    p, x, R, C = paper.symbolic(segments)
-    return x, R, C, p
-
-
 def _report(out: Section, segments: int, work: str, taken: Times, rows: int) -> None:
     others = [who for who in (VM, Soromox.name) if who in taken]
     ratios = {who: ratio(taken[who], taken[OWN]) for who in others}
@@ -129,7 +124,7 @@ def _report(out: Section, segments: int, work: str, taken: Times, rows: int) -> 
     )  # fmt: skip
     out.data[f"{work} {segments}"] = {who: median(taken[who]) / rows for who in taken}
     for who, value in ratios.items():
-        where = f"{work}, {segments} segment" + "s" * (segments > 1)
+        where = f"{work}, {tasks.arm_words(segments)}"
         out.comparisons.append(Comparison(where, who, value))
 
 

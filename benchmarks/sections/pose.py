@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 import tasks
-from peers.base import PeerMissingError, PoseSolver, Vector
+from peers.base import PeerMissingError, Vector
 from peers.own import Stiffopt
 from peers.pink_chain import Pink
 from report import Comparison, Section, milliseconds, percent, times
@@ -29,7 +29,7 @@ def section(sizes: Settings) -> Section:
     )
     for segments in sizes.segments:
         try:
-            pink: PoseSolver = Pink.of(segments)
+            pink = Pink.of(segments)
         except PeerMissingError as error:
             out.skipped[Pink.name] = str(error)
             return out
@@ -37,7 +37,7 @@ def section(sizes: Settings) -> Section:
     return out
 
 
-def _table(out: Section, pink: PoseSolver, segments: int, sizes: Settings) -> None:
+def _table(out: Section, pink: Pink, segments: int, sizes: Settings) -> None:
     own, robot = Stiffopt(segments), tasks.arm(segments)
     count = sizes.warm_tasks
     kind = "least-pressure"
@@ -73,7 +73,7 @@ def _table(out: Section, pink: PoseSolver, segments: int, sizes: Settings) -> No
     out.data[str(segments)] = {name: median(taken[name]) for name in calls}
     out.comparisons.append(
         Comparison(
-            f"pose alone, {segments} segment" + "s" * (segments > 1), pink.name,
+            f"pose alone, {tasks.arm_words(segments)}", pink.name,
             ratio(taken[pink.name], taken[own.name]),
             remark=f"its answer is within the pressure limits in {percent(possible[pink.name])}",
         )

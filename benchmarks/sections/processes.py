@@ -76,7 +76,7 @@ def build(sizes: Settings) -> Section:
         out.data[str(segments)] = {
             "waiting": first, "filled": second, "empty_s": empty, "no_compiler_s": without
         }  # fmt: skip
-        arms = f"first answer, {segments} segment" + "s" * (segments > 1)
+        arms = f"first answer, {tasks.arm_words(segments)}"
         out.verdicts.append(
             at_most(f"{arms}, empty cache over no compiler", bars.FIRST_ANSWER, relative, "times")
         )
@@ -117,7 +117,7 @@ def without_compiler(sizes: Settings) -> Section:
                 milliseconds(own["warm_s"]), times(ipopt["ratio_warm"]),
             )
         )  # fmt: skip
-        arm = f"no compiler, {segments} segment" + "s" * (segments > 1)
+        arm = f"no compiler, {tasks.arm_words(segments)}"
         cold, warm = bars.VM_COLD_MS[segments], bars.VM_WARM_MS[segments]
         out.verdicts += [
             at_most(f"cold, {arm}", cold, own["cold_s"] * 1e3, "ms"),

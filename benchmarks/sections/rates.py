@@ -9,7 +9,9 @@ import stiffopt
 import tasks
 from report import Section, at_least, times
 from settings import Settings
-from timing import median
+from stiffopt.model.robot_files import load_description
+from stiffopt.rig.assembly import make_rig
+from stiffopt.rig.config import RigDescription
 
 BATCH_TEXT = """\
 `solve_batch` on random two-segment tasks, cold, all cores, against `solve_pressure` in a loop
@@ -21,9 +23,7 @@ def batch(sizes: Settings) -> Section:
     """The table of throughput."""
     out = Section("Many tasks", BATCH_TEXT, ("how", "tasks", "per second", "ratio"))
     robot = tasks.arm(2)
-    few = max(5, sizes.batch_tasks // 20)
-    solve_batch = getattr(stiffopt, "solve_batch", None)
-    count = sizes.batch_tasks if solve_batch else few
+    count, few = sizes.batch_tasks, max(5, sizes.batch_tasks // 20)
     cases = [tasks.task_of("position", 2, sizes.seed, i)[1] for i in range(count)]
     stiffopt.solve_pressure(robot, cases[0])
     loops, batches, same = [], [], True
@@ -34,24 +34,18 @@ def batch(sizes: Settings) -> Section:
         begin = perf_counter()
         single = [stiffopt.solve_pressure(robot, task) for task in cases[:few]]
         loops.append((perf_counter() - begin) / few)
-        if solve_batch is None:
-            continue
         begin = perf_counter()
-        many = solve_batch(robot, cases)
+        many = stiffopt.solve_batch(robot, cases)
         batches.append((perf_counter() - begin) / count)
         pairs = zip(single, many, strict=False)
         same = same and all(np.array_equal(a.pressures, b.pressures) for a, b in pairs)
-    loop = median(np.array(loops)[:, np.newaxis])
-    out.rows.append(("solve_pressure in a loop", str(few), f"{1 / loop:.3g}", "1x"))
-    what = "solve_batch, 2 segments"
-    if not batches:
-        out.rows.append(("solve_batch", "-", "not in this version", "-"))
-        out.verdicts.append(at_least(what, bars.BATCH_SOLVES, float("nan"), "tasks/s"))
-        return out
-    seconds = median(np.array(batches)[:, np.newaxis])
-    out.rows.append(("solve_batch", str(count), f"{1 / seconds:.4g}", times(loop / seconds)))
+    loop, seconds = float(np.median(loops)), float(np.median(batches))
+    out.rows = [
+        ("solve_pressure in a loop", str(few), f"{1 / loop:.3g}", "1x"),
+        ("solve_batch", str(count), f"{1 / seconds:.4g}", times(loop / seconds)),
+    ]
     out.verdicts += [
-        at_least(what, bars.BATCH_SOLVES, 1 / seconds, "tasks/s"),
+        at_least("solve_batch, 2 segments", bars.BATCH_SOLVES, 1 / seconds, "tasks/s"),
         at_least("solve_batch, identical to one by one", 100, 100.0 * same, "%"),
     ]
     out.data = {"loop_per_s": 1 / loop, "batch_per_s": 1 / seconds, "identical": same}
@@ -79,10 +73,6 @@ def simulated_arm(sizes: Settings) -> Section:
 
 
 def _speed(name: str, dynamics: str, step: float, sizes: Settings) -> float:
-    from stiffopt.model.robot_files import load_description
-    from stiffopt.rig.assembly import make_rig
-    from stiffopt.rig.config import RigDescription
-
     description = RigDescription(
         robot=name,
         supply={"driver": "simulated"},
