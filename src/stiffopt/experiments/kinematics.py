@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -192,27 +193,25 @@ def run_kinematics(
             notes.append(f"before {what} the arm was not at rest within {SETTLE:g} s")
 
     done = 0.0
+
+    def tell(t: float, text: str) -> None:
+        progress(done + t, total, text)
+
     for repetition in todo:
         text = f"repetition {repetition} of {settings.repetitions}"
-
-        def tell(t: float, done: float = done, text: str = text) -> None:
-            progress(done + t, total, text)
-
-        tell(0.0)
+        tell(0.0, text)
         rest(sequence.at(0.0), f"repetition {repetition}")
         about = {"experiment": "kinematics", "repetition": str(repetition), "rig": settings.rig}
-        _record(conductor, sequence, folder, recording_name(repetition), about, tell)
+        name = recording_name(repetition)
+        _record(conductor, sequence, folder, name, about, partial(tell, text=text))
         done += sequence.duration
     restless = 0
     for number in rounds:
-
-        def say(t: float, text: str, done: float = done) -> None:
-            progress(done + t, total, text)
-
-        say(0.0, f"round {number} of combined poses")
-        rest(coverage.base, f"round {number} of combined poses")
+        text = f"round {number} of combined poses"
+        tell(0.0, text)
+        rest(coverage.base, text)
         about = {"experiment": "kinematics", "poses": str(number), "rig": settings.rig}
-        restless += coverage.record(conductor, folder, number, about, say)
+        restless += coverage.record(conductor, folder, number, about, tell)
         done += coverage.duration(number)
     if restless:
         notes.append(
