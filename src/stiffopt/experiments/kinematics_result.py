@@ -6,6 +6,7 @@ poses; `doubts` finds what is suspicious in a complete recording.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -118,8 +119,10 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
     each = [_compared(log, model, grid, tip) for log in logs]
     tips = np.stack([one.tip for one in each])
     models = np.stack([one.model for one in each])
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of moments at which no tip was seen
         distances = np.linalg.norm(models - tips, axis=2)
+        component_error = np.nanmean(models - tips, axis=0)
     return KinematicsResult(
         repetitions=len(logs),
         time=grid,
@@ -128,7 +131,7 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
         high=np.fmax.reduce(tips),
         model=models.mean(axis=0),
         error=np.fmax.reduce(distances),
-        component_error=_mean_of_known(models - tips),
+        component_error=component_error,
         errors=np.concatenate([one.errors for one in each]),
         length=model.length,
         doubts=doubts(logs),
@@ -171,14 +174,6 @@ def _on_grid(grid: Array, time: Array, values: Array, gap: float) -> Array:
     if after is not None:
         found[time[after] - time[after - 1] > gap] = np.nan
     return found
-
-
-def _mean_of_known(values: Array) -> Array:
-    """Mean over the first axis of what is not NaN."""
-    known = np.isfinite(values)
-    total = np.where(known, values, 0.0).sum(axis=0)
-    count = known.sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 # combined poses ----------------------------------------------------------------------------------

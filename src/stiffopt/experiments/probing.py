@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import DeviceError, FileError, InputError
+from stiffopt.errors import DeviceError, FileError, InputError, os_reason
 from stiffopt.experiments.conductor import Array, Conductor, TrackedFrame, split_window
 from stiffopt.logs.table import cut_torn_end, read_table
 from stiffopt.rig.interface import ForceProbe
@@ -291,6 +291,4 @@ class PointsFile:
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
-            raise FileError(
-                self.path, f"cannot be written: {(error.strerror or '').lower()}"
-            ) from None
+            raise FileError(self.path, f"cannot be written: {os_reason(error)}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +15,8 @@ from stiffopt.experiments.slope import LineFit, SlopeEstimate, combine, fit_line
 from stiffopt.experiments.stiffness import StiffnessSettings
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.manipulator import Manipulator
+
+_UNKNOWN = SlopeEstimate(math.nan, math.nan, math.nan, math.nan, 0)
 
 
 @dataclass(frozen=True)
@@ -48,25 +51,21 @@ class StiffnessResult:
     def table(self) -> StiffnessTable:
         """Return the results as a table, for `write_stiffness_table`."""
         cells = self.cells
-        estimates = [cell.estimate for cell in cells]
-        by_stage = [cell.by_stage for cell in cells]
-
-        def column(values: Sequence[float | None]) -> Array:
-            return np.array([np.nan if value is None else value for value in values], dtype=float)
-
+        estimates = [cell.estimate or _UNKNOWN for cell in cells]
+        by_stage = [cell.by_stage or _UNKNOWN for cell in cells]
         return StiffnessTable(
             pressures=np.stack([self.settings.pressures_at(cell.pressure) for cell in cells]),
             directions=np.array([cell.direction for cell in cells]),
             boundaries=("free",) * len(cells),
-            stiffness=column([None if e is None else e.value for e in estimates]),
-            sigma=column([None if e is None else e.sigma for e in estimates]),
+            stiffness=np.array([e.value for e in estimates]),
+            sigma=np.array([e.sigma for e in estimates]),
             others={
-                "ci95_n_per_m": column([None if e is None else e.half_width for e in estimates]),
-                "spread_n_per_m": column([None if e is None else e.spread for e in estimates]),
-                "repetitions": column([float(len(cell.slopes)) for cell in cells]),
-                "points": column([float(cell.points) for cell in cells]),
-                "by_stage_n_per_m": column([None if e is None else e.value for e in by_stage]),
-                "model_n_per_m": column([cell.model for cell in cells]),
+                "ci95_n_per_m": np.array([e.half_width for e in estimates]),
+                "spread_n_per_m": np.array([e.spread for e in estimates]),
+                "repetitions": np.array([float(len(cell.slopes)) for cell in cells]),
+                "points": np.array([float(cell.points) for cell in cells]),
+                "by_stage_n_per_m": np.array([e.value for e in by_stage]),
+                "model_n_per_m": np.array([cell.model for cell in cells]),
             },
         )
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import FileError, require_package, shown
+from stiffopt.errors import FileError, os_reason, require_package, shown
 from stiffopt.workspace.map import FILL, WorkspaceMap
 from stiffopt.workspace.table import CellTable, MapPart, cell_keys
 
@@ -63,7 +63,7 @@ class MapStore:
                     target.replace(old)
                 new.replace(target)
         except OSError as error:
-            raise FileError(path, f"cannot be written: {_reason(error)}") from None
+            raise FileError(path, f"cannot be written: {os_reason(error)}") from None
         return cls(target)
 
     @property
@@ -82,7 +82,7 @@ class MapStore:
         try:
             handle = os.open(self.path, os.O_RDONLY)
         except OSError as error:
-            raise FileError(self.path, f"cannot be opened: {_reason(error)}") from None
+            raise FileError(self.path, f"cannot be opened: {os_reason(error)}") from None
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -126,7 +126,7 @@ class MapStore:
                 os.fsync(stream.fileno())
             part.replace(self.path / _CHECKPOINT)
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {_reason(error)}") from None
+            raise FileError(self.path, f"cannot be written: {os_reason(error)}") from None
 
     def load(self) -> MapPart | None:
         """Return the checkpoint, or None if there is none yet."""
@@ -164,7 +164,7 @@ class MapStore:
             self.attributes = attributes
             self.tidy()
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {_reason(error)}") from None
+            raise FileError(self.path, f"cannot be written: {os_reason(error)}") from None
 
     def tidy(self) -> None:
         """Remove the files that a complete map does not need."""
@@ -271,7 +271,7 @@ def _read_attributes(path: Path) -> dict[str, Any]:
         reason = no_map if os.path.lexists(path) else "there is no such map"
         raise FileError(path, reason) from None
     except OSError as error:
-        raise FileError(path, f"cannot be read: {_reason(error)}") from None
+        raise FileError(path, f"cannot be read: {os_reason(error)}") from None
     except ValueError:
         raise FileError(path, no_map) from None
     attributes = data.get("attributes") if isinstance(data, dict) else None
@@ -297,7 +297,7 @@ def is_vacant(path: str | os.PathLike[str]) -> bool:
     try:
         return place.is_dir() and not place.is_symlink() and not any(place.iterdir())
     except OSError as error:
-        raise FileError(path, f"cannot be read: {_reason(error)}") from None
+        raise FileError(path, f"cannot be read: {os_reason(error)}") from None
 
 
 def _group(attributes: dict[str, Any]) -> dict[str, Any]:
@@ -320,7 +320,3 @@ def _plain(values: NDArray[np.float64]) -> list[float | None]:
 
 def _said(value: Any) -> str:
     return f"'{value}'" if isinstance(value, str) else f"{value}"
-
-
-def _reason(error: OSError) -> str:
-    return (error.strerror or str(error)).lower()
