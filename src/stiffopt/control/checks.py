@@ -34,9 +34,9 @@ _LISTED = 5  # keys that an error names
 
 @contextmanager
 def refusing(what: str) -> Iterator[None]:
-    """Raise any error of the body, which checks or prepares something, as a refusal of that.
+    """Context that checks or prepares a thing; any error in it becomes an `InputError`.
 
-    A refusal is an `InputError`, and nothing has changed.
+    Such a refusal means that nothing has changed.
     """
     try:
         yield

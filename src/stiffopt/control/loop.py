@@ -102,8 +102,8 @@ class ControlLoop:
     def arm(self) -> None:
         """Check the vented arm and activate the controller; pressures stay until there is a task.
 
-        The loop must have ticked for some time before, to learn the rhythm of the tracker. Refused
-        as by `configure`.
+        The loop must have ticked for some time before, to learn the rhythm of the tracker. A
+        refusal names the check that failed, as that of `configure`.
         """
         requester = current_requester()  # checks may take long
         self._request(lambda now: self._supervisor.arm(now, lambda: requester.gone))

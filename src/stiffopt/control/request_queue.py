@@ -65,7 +65,7 @@ class RequestQueue:
     """Has requests carried out by the thread that serves them, or at once where none does."""
 
     def __init__(self) -> None:
-        self.turn = threading.RLock()  # held by whatever works on what requests change
+        self.turn = threading.RLock()  # held during a tick, and while a request is carried out
         self._queue: deque[tuple[Future[None], Action]] = deque()
         self._server: threading.Thread | None = None
 
