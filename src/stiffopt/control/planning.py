@@ -28,9 +28,7 @@ from stiffopt.optimise.tip import TipModel
 Array = NDArray[np.float64]
 
 _BAR = 1e5
-_EXACT = Tolerance(
-    position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance
-)
+_EXACT = Tolerance(position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance)
 
 
 @dataclass(frozen=True)
