@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +22,18 @@ from websockets.sync.client import ClientConnection, connect
 from fake_loop import FakeLoop
 from stiffopt.control.state import Alarm, Severity, Snapshot, State, Timing
 from stiffopt.control.trajectory import Trajectory, Waypoint
-from stiffopt.daemon import connections
-from stiffopt.daemon.client import Client
-from stiffopt.daemon.client_wire import ClientStream
-from stiffopt.daemon.connections import MAX_CONNECTIONS, MAX_STREAMS, Crowd, Member
+from stiffopt.daemon import server as server_module
+from stiffopt.daemon.client import Client, ClientStream
 from stiffopt.daemon.messages import MAX_MESSAGE
-from stiffopt.daemon.reports import record_of
+from stiffopt.daemon.server import (
+    MAX_CONNECTIONS,
+    MAX_STREAMS,
+    ConnectionLimiter,
+    LimitedConnection,
+    Server,
+)
 from stiffopt.daemon.service import create_app
-from stiffopt.daemon.serving import Server
+from stiffopt.daemon.state_json import record_of
 from stiffopt.errors import CommandError, InputError, MissingExtraError, ServiceError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
@@ -97,7 +102,7 @@ def test_connections_that_idle_or_dribble_keep_nobody_away_and_use_up_nothing(
     eventually(lambda: open_files() <= before + 3)
 
 
-def test_streams_outlive_a_crowd(server: Server) -> None:
+def test_streams_outlive_many_connections(server: Server) -> None:
     with ExitStack() as stack, Client(server.url, TOKEN) as client:
         client.take_control()
         stream = stack.enter_context(client.stream(rate=50))
@@ -111,7 +116,7 @@ def test_streams_outlive_a_crowd(server: Server) -> None:
 def test_a_connection_on_which_nothing_is_answered_is_closed(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "PATIENCE", 0.2)
+    monkeypatch.setattr(server_module, "PATIENCE", 0.2)
     for said in (b"", b"GET /v1/sta"):
         with socket.create_connection(("127.0.0.1", server.port), 10) as silent:
             silent.sendall(said)
@@ -122,7 +127,7 @@ def test_a_connection_on_which_nothing_is_answered_is_closed(
 def test_where_all_with_the_token_are_being_answered_the_newest_has_to_go(
     loop: FakeLoop, server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(connections, "MAX_CONNECTIONS", 2)
+    monkeypatch.setattr(server_module, "MAX_CONNECTIONS", 2)
     free = threading.Event()
     waiting: list[str] = []
 
@@ -148,50 +153,50 @@ def test_where_all_with_the_token_are_being_answered_the_newest_has_to_go(
             assert each.recv(100).startswith(b"HTTP/1.1 200")
 
 
-def dropping(member: Member, dropped: list[Member]) -> Member:
+def dropping(member: LimitedConnection, dropped: list[LimitedConnection]) -> LimitedConnection:
     member.drop = lambda: dropped.append(member)
     return member
 
 
 def test_strangers_give_way_to_strangers_and_who_is_trusted_to_nobody() -> None:
-    everyone, dropped = Crowd(), list[Member]()
-    trusted = dropping(Member(), dropped)
-    everyone.join(trusted)
-    assert everyone.trust(trusted)
-    strangers = [dropping(Member(), dropped) for _ in range(MAX_CONNECTIONS + 3)]
+    limiter, dropped = ConnectionLimiter(), list[LimitedConnection]()
+    trusted = dropping(LimitedConnection(), dropped)
+    limiter.add(trusted)
+    assert limiter.trust(trusted)
+    strangers = [dropping(LimitedConnection(), dropped) for _ in range(MAX_CONNECTIONS + 3)]
     for stranger in strangers:
-        everyone.join(stranger)
+        limiter.add(stranger)
     assert dropped == strangers[:3]
-    everyone.distrust(trusted)
+    limiter.distrust(trusted)
     assert dropped == strangers[:4]
     assert not trusted.trusted
 
 
-def test_of_streams_strangers_and_trusted_have_seats_of_their_own() -> None:
-    everyone = Crowd()
-    members = [Member() for _ in range(2 * MAX_STREAMS + 2)]
+def test_streams_with_and_without_the_token_have_limits_of_their_own() -> None:
+    limiter = ConnectionLimiter()
+    members = [LimitedConnection() for _ in range(2 * MAX_STREAMS + 2)]
     for k, member in enumerate(members):
         member.is_stream = True
-        everyone.join(member)
-        assert everyone.seat(member) is (k < MAX_STREAMS)
+        limiter.add(member)
+        assert limiter.admit_stream(member) is (k < MAX_STREAMS)
     for k, member in enumerate(members[MAX_STREAMS:]):
-        everyone.trust(member)
-        assert everyone.seat(member) is (k < MAX_STREAMS)
-    assert not everyone.trust(members[0])  # there is no seat for it, and it keeps what it has
-    assert members[0].seated
-    everyone.leave(members[-3])
-    assert everyone.seat(members[-1])
-    everyone.leave(members[-2])
-    everyone.leave(members[-4])
-    assert everyone.trust(members[0])
+        limiter.trust(member)
+        assert limiter.admit_stream(member) is (k < MAX_STREAMS)
+    assert not limiter.trust(members[0])  # that would be one too many, and it stays as it is
+    assert members[0].served
+    limiter.remove(members[-3])
+    assert limiter.admit_stream(members[-1])
+    limiter.remove(members[-2])
+    limiter.remove(members[-4])
+    assert limiter.trust(members[0])
 
 
 def test_handshakes_of_strangers_come_at_a_limited_rate() -> None:
     now = [0.0]
-    everyone = Crowd(clock=lambda: now[0])
-    assert sum(everyone.permits_handshake() for _ in range(200)) == 50
+    limiter = ConnectionLimiter(clock=lambda: now[0])
+    assert sum(limiter.permits_handshake() for _ in range(200)) == 50
     now[0] = 0.5
-    assert sum(everyone.permits_handshake() for _ in range(200)) == 25
+    assert sum(limiter.permits_handshake() for _ in range(200)) == 25
 
 
 UPGRADE = (
@@ -431,7 +436,7 @@ def test_no_proxy_of_the_environment_sees_the_token(
 ) -> None:
     for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
         monkeypatch.setenv(name, "http://127.0.0.1:1")
-    with Client(client._wire.url, TOKEN) as another:
+    with Client(client.url, TOKEN) as another:
         another.vent()
         with another.stream() as stream:
             stream.state()
@@ -454,8 +459,9 @@ def test_a_missing_library_is_named(
     with pytest.raises(MissingExtraError, match="httpx"):
         Client(server.url)
     monkeypatch.setitem(sys.modules, "uvicorn", None)
+    monkeypatch.delitem(sys.modules, "stiffopt.daemon.server")
     with pytest.raises(MissingExtraError, match="uvicorn"):
-        Server(None).start()
+        import_module("stiffopt.daemon.server")
 
 
 # Settling -----------------------------------------------------------------------------------------
@@ -663,7 +669,7 @@ def test_malformed_messages_are_answered_and_change_nothing(
     loop: FakeLoop, client: Client, server: Server
 ) -> None:
     client.take_control()
-    lease = str(client._wire.lease)
+    lease = str(client._lease)
     with opened(server, Authorization=f"Bearer {TOKEN}", Stiffopt_Lease=lease) as socket:
         for message in MALFORMED:
             answer = told(socket, message)
@@ -691,7 +697,7 @@ def test_token_and_lease_may_come_in_a_message(
         assert told(socket, {"token": "x"})["error"]["code"] == "wrong-token"
         assert told(socket, {"token": TOKEN}) == {"type": "access", "trusted": True}
         assert told(socket, good)["error"]["code"] == "lease"
-        told(socket, {"lease": client._wire.lease})
+        told(socket, {"lease": client._lease})
         assert told(socket, good)["accepted"]
         assert told(socket, {"token": "x"})["error"]["code"] == "wrong-token"
         assert told(socket, good)["error"]["code"] == "no-token"  # a wrong one undoes a right one

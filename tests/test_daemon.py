@@ -33,10 +33,10 @@ from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon import secret as secret_module
 from stiffopt.daemon.client import Client
-from stiffopt.daemon.connections import MAX_CONNECTIONS
 from stiffopt.daemon.daemon import TIMES, Daemon
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret, check_exposure, is_loopback
+from stiffopt.daemon.server import MAX_CONNECTIONS
 from stiffopt.errors import CommandError, DeviceError, FileError, InputError
 from stiffopt.rig.settings import Safety, ServiceSettings
 
@@ -560,7 +560,7 @@ def test_a_link_that_comes_while_the_lock_is_opened_is_not_followed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("STIFFOPT_TOKEN", raising=False)
-    monkeypatch.setattr(secret_module, "check_mine", lambda *_: None)
+    monkeypatch.setattr(secret_module, "_check_mine", lambda *_: None)
     (tmp_path / ".my-rig.token.lock").symlink_to(tmp_path / "new")
     with pytest.raises(FileError, match="symbolic links"):
         _write(tmp_path)

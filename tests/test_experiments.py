@@ -1086,7 +1086,7 @@ def test_an_experiment_of_another_kind_or_robot_is_not_resumed(
     assert "begun with the robot stiff-flop-1, not stiff-flop-2" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("module", "extra"), [("matplotlib", "plot"), ("mcap", "log")])
+@pytest.mark.parametrize(("module", "extra"), [("matplotlib", "plot"), ("foxglove", "log")])
 def test_what_is_not_installed_is_said_before_anything_moves(
     use: Callable[[Rig], Rig],
     monkeypatch: pytest.MonkeyPatch,

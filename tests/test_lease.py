@@ -6,7 +6,7 @@ import pytest
 
 from fake_loop import ManualClock
 from stiffopt.daemon.lease import ControlLease
-from stiffopt.errors import CommandError
+from stiffopt.daemon.reports import RefusalError
 
 
 @pytest.fixture
@@ -24,14 +24,14 @@ def test_one_client_has_control_and_the_others_are_told_who(
 ) -> None:
     identity = lease.take("planner")
     clock.time += 0.25
-    with pytest.raises(CommandError, match=r"'planner' has control; it ends in 0\.75 s"):
+    with pytest.raises(RefusalError, match=r"'planner' has control; it ends in 0\.75 s"):
         lease.take("other")
-    with pytest.raises(CommandError, match="'planner' has it"):
+    with pytest.raises(RefusalError, match="'planner' has it"):
         lease.renew("made up")
     lease.renew(identity)
     holder = lease.holder
     assert holder is not None
-    assert (holder.client, holder.expires_in) == ("planner", 1.0)
+    assert (holder.client, holder.expires_in_s) == ("planner", 1.0)
     lease.release(identity)
     assert lease.holder is None
     assert lease.take("other") != identity
@@ -51,9 +51,9 @@ def test_what_is_not_renewed_is_lost_and_stays_lost(
     identity = lease.take("planner")
     assert lease.check(clock.time + 1.0) is None
     assert lease.check(clock.time + 1.001) == "planner"
-    with pytest.raises(CommandError, match="control was lost"):  # though its clock says otherwise
+    with pytest.raises(RefusalError, match="control was lost"):  # though its clock says otherwise
         lease.renew(identity)
-    with pytest.raises(CommandError, match="control was lost"), lease.used(identity):
+    with pytest.raises(RefusalError, match="control was lost"), lease.used(identity):
         pytest.fail("a lost lease was used")
 
 
@@ -62,7 +62,7 @@ def test_nobody_gets_lost_control_before_the_arm_is_held(
 ) -> None:
     lease.take("planner")
     clock.time += 2
-    with pytest.raises(CommandError, match="is being held"):  # also before `check` was called
+    with pytest.raises(RefusalError, match="is being held"):  # also before `check` was called
         lease.take("other")
     assert lease.check(clock.time) == "planner"
     assert lease.check(clock.time) == "planner"  # until it is settled
@@ -94,12 +94,12 @@ def test_release_while_a_command_runs_ends_the_lease(lease: ControlLease) -> Non
     identity = lease.take("planner")
     with lease.used(identity):
         lease.release(identity)
-    with pytest.raises(CommandError, match="take it first"):
+    with pytest.raises(RefusalError, match="take it first"):
         lease.renew(identity)
 
 
 def test_identities_that_are_no_text_of_ours_are_refused(lease: ControlLease) -> None:
     lease.take("planner")
     for made_up in ("", "é", "\U0001f512", "x" * 10_000):
-        with pytest.raises(CommandError):
+        with pytest.raises(RefusalError):
             lease.release(made_up)

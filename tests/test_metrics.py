@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ parser = pytest.importorskip("prometheus_client.parser")
 
 class FakeTelemetry:
     dropped = 3
-    written = 12345
+    recording = SimpleNamespace(written=12345)
 
 
 def read(metrics: Metrics) -> dict[tuple[str, tuple[str, ...]], float]:

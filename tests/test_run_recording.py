@@ -249,7 +249,7 @@ for tick in given[:1000]:
     made.put(tick)
 made.stop()
 print(loop.alarms["log"])
-print(made.waiting)
+print(len(made._queue))
 """
 
 
@@ -282,9 +282,7 @@ def test_an_alarm_comes_with_the_trouble_and_goes_with_it(tmp_path: Path) -> Non
     assert "cannot be written" in loop.alarms["log"]
     loop.events.all.append(event(0.1, "armed", "The arm is armed."))
     (tmp_path / "file").unlink()
-    recording = made._recording
-    assert recording is not None
-    recording._retry_at = 0.0
+    made.recording._retry_at = 0.0
     made.put(snapshot(BEGIN))
     made.work(last=True)
     made.stop()

@@ -68,7 +68,7 @@ from stiffopt.daemon.client import Client
 from stiffopt.daemon.metrics import Metrics
 from stiffopt.daemon.run_log import read_run
 from stiffopt.daemon.service import create_app
-from stiffopt.daemon.serving import Server
+from stiffopt.daemon.server import Server
 from stiffopt.daemon.topics import topic_schemas
 from stiffopt.model.robot_files import load_description
 from test_state_fields import table
@@ -80,7 +80,7 @@ assert "mood_m" in app.openapi()["components"]["schemas"]["StateReport"]["proper
 server = Server(app)
 server.start()
 with Client(server.url) as client, client.stream(rate=50) as stream:
-    assert client._wire.ask("GET", "state")["mood_m"] == 0.25
+    assert client._ask("GET", "state")["mood_m"] == 0.25
     assert client.state().mood == 0.25
     assert stream.state().mood == 0.25
 server.stop()

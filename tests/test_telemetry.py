@@ -44,11 +44,9 @@ NOWHERE = ServiceSettings(foxglove_port=None)
 WALL = 1_800_000_000_000_000_000  # ns since 1970
 
 
-def telemetry(loop: FakeLoop, folder: Path | None, **options: Any) -> Telemetry:
+def telemetry(loop: FakeLoop, folder: Path, **options: Any) -> Telemetry:
     given: dict[str, Any] = {"clock": StillClock(), "wall": lambda: WALL, "settings": NOWHERE}
-    return Telemetry(
-        ROBOT, "a rig", loop, None if folder is None else str(folder), **{**given, **options}
-    )
+    return Telemetry(ROBOT, "a rig", loop, str(folder), **{**given, **options})
 
 
 def recorded(folder: Path, loop: FakeLoop, snapshots: list[Any], **options: Any) -> Path:
@@ -60,7 +58,7 @@ def recorded(folder: Path, loop: FakeLoop, snapshots: list[Any], **options: Any)
             made.work(last=True)
     made.stop()
     (path,) = folder.glob("*.mcap")
-    assert made.path == str(path)
+    assert made.recording.path == str(path)
     return path
 
 
@@ -228,16 +226,16 @@ def test_a_run_without_a_tracker_has_rows_of_pressures(tmp_path: Path) -> None:
     assert not np.isfinite(log.tip_position).any()
 
 
-def test_what_is_too_much_is_counted_and_said() -> None:
+def test_what_is_too_much_is_counted_and_said(tmp_path: Path) -> None:
     loop = FakeLoop()
-    made = telemetry(loop, None)
+    made = telemetry(loop, tmp_path)
     tick = snapshot(BEGIN)
     for _ in range(4096 + 7):
         made.put(tick)
     assert made.dropped == 7
     made.work()
     assert "7 snapshots" in loop.alarms["telemetry-lost"]
-    assert made.waiting == 0
+    assert len(made._queue) == 0
     made.stop()
 
 
@@ -314,15 +312,15 @@ def test_two_instances_do_not_mix(tmp_path: Path) -> None:
     two.put(given[0])
     one.stop()
     two.stop()
-    assert one.path is not None
-    assert two.path is not None
-    assert (len(read_run(one.path)), len(read_run(two.path))) == (30, 1)
+    assert one.recording.path is not None
+    assert two.recording.path is not None
+    assert (len(read_run(one.recording.path)), len(read_run(two.recording.path))) == (30, 1)
 
 
 def test_foxglove_sees_the_topics_with_their_schemas(tmp_path: Path) -> None:
     from websockets.sync.client import connect
 
-    made = telemetry(FakeLoop(), None, settings=ServiceSettings(foxglove_port=0))
+    made = telemetry(FakeLoop(), tmp_path, settings=ServiceSettings(foxglove_port=0))
     made.start()
     over = threading.Event()
 
@@ -368,11 +366,13 @@ def test_foxglove_sees_the_topics_with_their_schemas(tmp_path: Path) -> None:
         assert channels[topic]["schemaName"] == name
 
 
-def test_whoever_connects_to_foxglove_may_look_and_not_touch_and_only_from_here() -> None:
+def test_whoever_connects_to_foxglove_may_look_and_not_touch_and_only_from_here(
+    tmp_path: Path,
+) -> None:
     """Pages of any site on this machine may look: that is how Foxglove itself connects."""
     from websockets.sync.client import connect
 
-    made = telemetry(FakeLoop(), None, settings=ServiceSettings(foxglove_port=0))
+    made = telemetry(FakeLoop(), tmp_path, settings=ServiceSettings(foxglove_port=0))
     made.start()
     try:
         listening = [line.split()[1] for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
@@ -410,8 +410,8 @@ def test_a_port_that_is_taken_is_an_alarm(tmp_path: Path) -> None:
         made.put(snapshot(BEGIN))
         made.stop()
     assert str(port) in loop.alarms["foxglove"]
-    assert made.path is not None
-    assert len(read_run(made.path)) == 1
+    assert made.recording.path is not None
+    assert len(read_run(made.recording.path)) == 1
 
 
 CHILD = """

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from stiffopt.cli import quantities
-from stiffopt.errors import FileError, InputError, shown
+from stiffopt.errors import FileError, InputError, require_package, shown
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.identify.unknowns import history_unknowns, shape_unknowns
@@ -19,7 +19,6 @@ from stiffopt.logs import (
     read_log,
     read_mcap_log,
     read_stiffness_table,
-    require_mcap,
 )
 from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
@@ -89,7 +88,7 @@ class RecordingOptions:
         """
         names = log_names(self.logs)
         if any(_is_mcap(path) for path in self.logs):
-            require_mcap()
+            require_package("mcap", "log")
         found = []
         for i, (name, path) in enumerate(zip(names, self.logs, strict=True)):
             progress(i, len(names), f"reading {name}")

@@ -23,7 +23,7 @@ from stiffopt.cli.exits import (
     RigFaultError,
     exit_code,
 )
-from stiffopt.errors import DeviceError, InputError, StiffoptError
+from stiffopt.errors import DeviceError, InputError, StiffoptError, require_package
 from stiffopt.experiments import (
     KinematicsSettings,
     StiffnessSettings,
@@ -48,7 +48,7 @@ from stiffopt.experiments.kinematics import (
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
-from stiffopt.logs import require_mcap, write_stiffness_table
+from stiffopt.logs import write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
 
@@ -128,7 +128,7 @@ def _planned(experiment: str, options: ExperimentOptions) -> _Plan:
         from stiffopt.plots import require_matplotlib
 
         require_matplotlib()
-    require_mcap()
+    require_package("foxglove-sdk", "log", "foxglove")
     if options.resume is not None and options.out is not None:
         raise InputError("give --out for a new experiment or --resume for an old one, not both")
     rig, name, rate, log_folder = _rig(options.rig)

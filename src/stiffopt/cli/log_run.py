@@ -20,17 +20,12 @@ def export(recording: str, out: str | None, *, quiet: bool) -> int:
     """Write a recording as log v1; return the exit code."""
 
     def work() -> None:
-        from stiffopt.daemon.run_log import is_of_experiment, log_of_run, read_run
-        from stiffopt.logs import Log, read_mcap_log, write_log
+        from stiffopt.daemon.run_log import read_log_of_recording
+        from stiffopt.logs import write_log
 
         path = _beside(recording, ".csv") if out is None else out
         check_new_file(path, (".csv",))
-        log: Log
-        if is_of_experiment(recording):
-            log, whole = read_mcap_log(recording), True
-        else:
-            run = read_run(recording)
-            log, whole = log_of_run(run), run.complete
+        log, whole = read_log_of_recording(recording)
         if not len(log):
             raise FileError(recording, "has no row to export; it was cut short too early")
         write_log(path, log)

@@ -13,7 +13,7 @@ from queue import SimpleQueue
 from typing import Self
 
 from stiffopt.cli.exits import FAULT
-from stiffopt.daemon.calls import Part
+from stiffopt.daemon.calls import call_in_thread, ends_within
 
 __all__ = ["Backstop", "Screen", "leave"]
 
@@ -88,7 +88,7 @@ class Backstop:
 
 def leave(code: int) -> None:
     """End this process at once, without waiting for any thread; what was printed is flushed."""
-    Part("flush", _flush).ends_within(_FLUSH)
+    ends_within(_FLUSH, call_in_thread("flush", _flush))
     os._exit(code)
 
 

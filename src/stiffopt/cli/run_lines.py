@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import entries
-from stiffopt.daemon.reports import plain
+from stiffopt.daemon.state_json import plain
 from stiffopt.errors import printable
 from stiffopt.safety.messages import json_line
 

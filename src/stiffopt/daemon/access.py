@@ -1,7 +1,4 @@
-"""Access control of the HTTP interface: the token and the allowed hosts.
-
-Requests that a stranger or a foreign web page may not make are refused before they are parsed.
-"""
+"""Access control of the HTTP interface, before a request is parsed: token, host, origin, length."""
 
 from __future__ import annotations
 
@@ -17,21 +14,13 @@ from stiffopt.daemon.reports import RefusalError
 from stiffopt.daemon.secret import is_address
 from stiffopt.errors import InputError
 
-__all__ = ["MAX_BODY", "Access", "Token"]
-
 MAX_BODY = 1_000_000
 """Bytes of the longest request."""
 _READING = ("GET", "HEAD")
 
 
 class Token:
-    """The secret that a client shows to be allowed to move the arm.
-
-    Raises
-    ------
-    InputError
-        It is empty, or has characters that a header cannot carry.
-    """
+    """The secret that a client shows to be allowed to move the arm."""
 
     def __init__(self, text: str) -> None:
         if not text or not all("!" <= c <= "~" for c in text):
@@ -42,7 +31,7 @@ class Token:
         self._secret = text.encode()
 
     def check(self, given: str | None) -> None:
-        """Raise `RefusalError` unless this is the token; the time it takes tells nothing of it."""
+        """Raise `RefusalError` unless this is the token; compared in constant time."""
         if given is None:
             raise RefusalError(
                 401, "no-token", "this needs the token: 'Authorization: Bearer TOKEN'"
@@ -51,7 +40,7 @@ class Token:
             raise RefusalError(403, "wrong-token", "that is not this daemon's token")
 
     def is_shown(self, headers: Headers) -> bool:
-        """Return whether the token stands in the header Authorization."""
+        """Return whether the token is in the header Authorization."""
         try:
             self.check_headers(headers)
         except RefusalError:
@@ -59,29 +48,22 @@ class Token:
         return True
 
     def check_headers(self, headers: Headers) -> None:
-        """Raise `RefusalError` unless the token stands in the header Authorization."""
+        """Raise `RefusalError` unless the token is in the header Authorization."""
         given = headers.getlist("authorization")
         kind, _, secret = given[0].partition(" ") if len(given) == 1 else ("", "", "")
         self.check(secret.strip() if kind.lower() == "bearer" else None)
 
 
 class Access:
-    """ASGI middleware that refuses requests of strangers and of foreign web pages.
+    """ASGI middleware that refuses requests without the token and those of foreign web pages.
 
-    - A web page that someone on this machine looks at can send requests here. So the request must
-      be addressed to this machine by a name that no stranger's name server can hand out, and if
-      it comes from a page, the page must be the daemon's own.
-    - Whatever is not plain reading needs the token.
-    - A long body is not even collected.
+    - A web page in a browser on this machine can send requests here. So the header Host must be an
+      IP address or a known name, which no foreign name server can resolve to this machine (DNS
+      rebinding), and the header Origin, if there is one, must be the daemon's own.
+    - Any other method than GET and HEAD needs the token.
+    - A body that is too long is refused before it is read whole.
 
-    Parameters
-    ----------
-    app :
-        What is guarded.
-    token :
-        Of those who may move the arm.
-    hosts :
-        Names of this machine beside localhost and addresses in digits.
+    `hosts` are names of this machine, other than localhost.
     """
 
     def __init__(self, app: ASGIApp, *, token: Token, hosts: Iterable[str] = ()) -> None:
@@ -138,7 +120,7 @@ def _host_name(host: str) -> str:
 
 
 async def _collected(receive: Receive, headers: Headers) -> Receive:
-    """Read the body, if it is not too long, and return what hands it out again."""
+    """Read the body, unless it is too long, and return a `Receive` that gives it once more."""
     too_long = RefusalError(413, "too-long", f"the body is longer than {MAX_BODY} bytes")
     given = headers.get("content-length", "0")
     if given.isdecimal() and (len(given) > 12 or int(given) > MAX_BODY):

@@ -2,32 +2,44 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import math
 import os
 import threading
 import time
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
+from urllib.parse import urlsplit
 
 from numpy.typing import ArrayLike
 
 from stiffopt.control.state import Event, Snapshot, State
 from stiffopt.control.trajectory import Trajectory, Waypoint
-from stiffopt.daemon.client_wire import ClientStream, Wire
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
-from stiffopt.daemon.reports import RobotReport, record_of
-from stiffopt.errors import CommandError, InputError, ServiceError, StiffoptError
+from stiffopt.daemon.reports import LEASE_HEADER, RobotReport, error_of
+from stiffopt.daemon.state_json import record_of
+from stiffopt.errors import (
+    CommandError,
+    InputError,
+    MissingExtraError,
+    ServiceError,
+    StiffoptError,
+    require_package,
+)
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task, load_task
 
-__all__ = ["Client"]
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
 
 _TOKEN = "STIFFOPT_TOKEN"
 _POLL = 0.05  # s between two looks at the state
 _STEADY = 0.3  # s for which an arm that has settled stays near
+_LOST = "lease"  # the code of a refusal that says that the client does not have control
+_STATUS = {"input": 422, "too-long": 413, "no-answer": 503, "busy": 503, "internal": 500}
 
 
 class Client:
@@ -43,11 +55,11 @@ class Client:
             client.disarm()
 
     Control is lost, and the arm held, when the daemon does not hear from the client for a time.
-    With the heartbeat ``"automatic"``, a thread of the client sees to that as long as the thread
-    that took control lives. That proves that the process runs, not that the program in it makes
-    any progress: a planner that hangs keeps control. With ``"manual"``, only what the program does
-    counts: commands, `renew`, what it sends to a stream, `wait_until_settled`; take that for
-    anything that moves the arm without a person beside it.
+    With the heartbeat ``"automatic"``, a thread of the client renews control as long as the thread
+    that took it lives. That proves that the process runs, not that the program in it makes any
+    progress: a planner that hangs keeps control. With ``"manual"``, control is renewed only by what
+    the program does: commands, `renew`, targets of a stream, `wait_until_settled`. Use that where
+    no person watches the arm.
 
     A `with` block that ends by an exception holds the arm where it is; one that ends well gives
     control back and lets the arm go on with what it does. Methods may be called from any thread.
@@ -57,12 +69,12 @@ class Client:
     url :
         Of the daemon.
     token :
-        The token itself, or the path of the file that it stands in; None: that of the environment
-        variable STIFFOPT_TOKEN, which may be either too. Reading needs none.
+        The token, or the path of the file that it is in; None: that of the environment variable
+        STIFFOPT_TOKEN, which may be either too. Reading needs none.
     name :
-        For the people who find that control is taken.
+        That others see who find that control is taken.
     heartbeat :
-        Who sees to it that the client is heard, see above.
+        How control is renewed, see above.
     timeout :
         Seconds after which an answer is given up.
 
@@ -85,9 +97,24 @@ class Client:
     ) -> None:
         if heartbeat not in ("automatic", "manual"):
             raise InputError(f"heartbeat must be 'automatic' or 'manual', not {heartbeat!r}")
+        require_package("httpx", "daemon")
+        import httpx
+
+        try:
+            parts = urlsplit(url)
+            good = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
+        except ValueError:
+            good = False
+        if not good:
+            raise InputError(f"'{url}' is no URL of a daemon; one is http://127.0.0.1:8470")
         self.name = name
+        self.url = url.rstrip("/")
         self.heartbeat = heartbeat
-        self._wire = Wire(url, _token(os.environ.get(_TOKEN) if token is None else token), timeout)
+        self._token = _token(os.environ.get(_TOKEN) if token is None else token)
+        self._lease: str | None = None
+        self._httpx = httpx
+        # No proxy of the environment: it would see the token.
+        self._http = httpx.Client(trust_env=False, timeout=timeout, follow_redirects=False)
         self._beat: threading.Thread | None = None
         self._enough = threading.Event()
 
@@ -95,17 +122,12 @@ class Client:
         """Give control back, if this client has it, and disconnect."""
         with suppress(StiffoptError):
             self.release()
-        self._wire.close()
+        self._http.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None and self.in_control:
             with suppress(StiffoptError):
                 self.hold(f"the client ended by {kind.__name__}")
@@ -114,22 +136,22 @@ class Client:
     # Reading ------------------------------------------------------------------------------------
 
     def state(self) -> Snapshot:
-        """Return how things stand."""
-        return record_of(Snapshot, self._wire.ask("GET", "state"))
+        """Return the state of the control loop."""
+        return record_of(Snapshot, self._ask("GET", "state"))
 
     def events(self, since: int = 0) -> tuple[list[Event], int]:
         """Return what has happened since an index, and the index after that."""
-        answer = self._wire.ask("GET", "events", query={"since": since})
+        answer = self._ask("GET", "events", query={"since": since})
         return [record_of(Event, event) for event in answer["events"]], int(answer["next"])
 
     def robot(self) -> RobotReport:
         """Return what arm there is."""
-        return RobotReport.model_validate(self._wire.ask("GET", "robot"))
+        return RobotReport.model_validate(self._ask("GET", "robot"))
 
     def wait_until_settled(
         self, position_tolerance: float, timeout: float, *, angle_tolerance: float = math.inf
     ) -> Snapshot:
-        """Wait until the tip is, and stays, where it shall be.
+        """Wait until the tip is at its target and stays there.
 
         Parameters
         ----------
@@ -180,7 +202,7 @@ class Client:
     @property
     def in_control(self) -> bool:
         """Whether this client has taken control and does not know that it has lost it."""
-        return self._wire.lease is not None
+        return self._lease is not None
 
     def take_control(self) -> None:
         """Take control of the arm.
@@ -192,8 +214,8 @@ class Client:
         """
         if self.in_control:
             return
-        grant = self._wire.ask("POST", "lease", body={"client": self.name})
-        self._wire.lease = str(grant["lease"])
+        grant = self._ask("POST", "lease", body={"client": self.name})
+        self._lease = str(grant["lease"])
         if self.heartbeat == "automatic":
             self._enough = threading.Event()
             self._beat = threading.Thread(
@@ -209,20 +231,20 @@ class Client:
         self._enough.set()
         if self.in_control:
             try:
-                self._wire.ask("DELETE", "lease")
+                self._ask("DELETE", "lease")
             finally:
-                self._wire.lease = None
+                self._lease = None
 
     def renew(self) -> None:
         """Be heard: keep control for another while."""
-        self._wire.ask("POST", "lease/renew")
+        self._ask("POST", "lease/renew")
 
     def _keep_control(
         self, owner: threading.Thread, period: float, enough: threading.Event
     ) -> None:
         while not enough.wait(period) and owner.is_alive():
             try:
-                self._wire.ask("POST", "lease/renew", timeout=4 * period)
+                self._ask("POST", "lease/renew", timeout=4 * period)
             except ServiceError:
                 continue  # perhaps it answers the next time
             except StiffoptError:
@@ -232,11 +254,11 @@ class Client:
 
     def arm(self) -> None:
         """Check everything and put the arm under control."""
-        self._wire.ask("POST", "arm")
+        self._ask("POST", "arm")
 
     def disarm(self) -> None:
         """Let the pressures down slowly, then vent."""
-        self._wire.ask("POST", "disarm")
+        self._ask("POST", "disarm")
 
     def set_task(
         self,
@@ -269,7 +291,7 @@ class Client:
             target = _target(position, pointing, orientation, **tolerance)
             task = Task(robot="robot", target=target, **rest)  # the one that there is
         body = TaskMessage.of(task, robot=robot).model_dump()
-        self._wire.ask("POST", "task", body=body)
+        self._ask("POST", "task", body=body)
 
     def set_target(
         self,
@@ -291,7 +313,7 @@ class Client:
             Direction of the tip, or its quaternion (w, x, y, z).
         """
         target = target or _target(position, pointing, orientation)
-        self._wire.ask("POST", "target", body=TargetMessage.of(target).model_dump())
+        self._ask("POST", "target", body=TargetMessage.of(target).model_dump())
 
     def follow_trajectory(
         self,
@@ -312,19 +334,19 @@ class Client:
         if trajectory is None:
             trajectory = _trajectory(times, positions)
         body = TrajectoryMessage.of(trajectory).model_dump()
-        self._wire.ask("POST", "trajectory", body=body)
+        self._ask("POST", "trajectory", body=body)
 
     def hold(self, reason: str = "asked to") -> None:
         """Keep the pressures as they are."""
-        self._wire.ask("POST", "hold", body={"reason": reason[:200] or "asked to"})
+        self._ask("POST", "hold", body={"reason": reason[:200] or "asked to"})
 
     def vent(self) -> None:
         """Let all pressure out at once; needs the token, not control."""
-        self._wire.ask("POST", "vent")
+        self._ask("POST", "vent")
 
     def reset(self) -> None:
         """Leave the state fault; the arm stays vented."""
-        self._wire.ask("POST", "reset")
+        self._ask("POST", "reset")
 
     def stream(self, rate: float = 20.0) -> ClientStream:
         """Return a stream of states and targets, to be used in a `with` block.
@@ -334,18 +356,202 @@ class Client:
         rate :
             Of the states, in Hz; 0 for none.
         """
-        return ClientStream(self._wire, rate)
+        return ClientStream(self, rate)
+
+    @property
+    def _headers(self) -> dict[str, str]:
+        """The token and the lease."""
+        headers = {} if self._token is None else {"Authorization": f"Bearer {self._token}"}
+        return headers if self._lease is None else {**headers, LEASE_HEADER: self._lease}
+
+    def _ask(
+        self,
+        method: str,
+        path: str,
+        *,
+        body: Any = None,
+        query: dict[str, Any] | None = None,
+        timeout: float | None = None,
+    ) -> Any:
+        """Return the daemon's answer; a refusal is raised as an exception."""
+        lease = self._lease
+        try:
+            answer = self._http.request(
+                method,
+                f"{self.url}/v1/{path}",
+                json=body,
+                params=query,
+                headers=self._headers,
+                timeout=self._httpx.USE_CLIENT_DEFAULT if timeout is None else timeout,
+            )
+        except (self._httpx.HTTPError, RuntimeError) as error:  # RuntimeError: it was closed
+            raise ServiceError(
+                f"the daemon at {self.url} cannot be reached: {error or type(error).__name__}"
+            ) from None
+        if answer.is_success:
+            return answer.json() if answer.content else None
+        code, message = _refusal_in(answer)
+        if code == _LOST and self._lease == lease:
+            self._lease = None
+        raise error_of(answer.status_code, message)
+
+
+class ClientStream:
+    """A WebSocket that carries targets to the daemon and states back; see `Client.stream`.
+
+    Targets are sent without waiting for the answers. One that is refused raises `CommandError`,
+    or `InputError`, at the next `send` or `state`, but for a target that a newer one has
+    overtaken: that is what happens if they come faster than the arm takes them, and does no harm.
+    """
+
+    def __init__(self, client: Client, rate: float) -> None:
+        self._client = client
+        self._rate = rate
+        self._open = ExitStack()
+        self._socket: ClientConnection | None = None
+        self._numbers = itertools.count()
+        self._news = threading.Condition()
+        self._state: Snapshot | None = None
+        self._refused: StiffoptError | None = None
+        self._ended: StiffoptError | None = None
+        self._lease: str | None = None
+        self.accepted = 0
+        """Targets that the daemon has accepted so far."""
+        self.superseded = 0
+        """Targets that a newer one has overtaken so far."""
+
+    def __enter__(self) -> Self:
+        """Connect; raise `ServiceError` if the daemon does not answer."""
+        try:
+            from websockets.exceptions import WebSocketException
+            from websockets.sync.client import connect
+        except ModuleNotFoundError as error:
+            raise MissingExtraError("websockets", "daemon") from error
+        url = "ws" + self._client.url.removeprefix("http") + f"/v1/stream?rate={self._rate:g}"
+        self._lease = self._client._lease
+        try:
+            self._socket = self._open.enter_context(
+                connect(
+                    url,
+                    additional_headers=self._client._headers,
+                    compression=None,
+                    proxy=None,  # it would see the token
+                    open_timeout=5,
+                    close_timeout=2,
+                )
+            )
+        except (OSError, WebSocketException) as error:
+            raise ServiceError(f"no stream from {self._client.url}: {error}") from None
+        threading.Thread(
+            target=self._listen, args=(self._socket,), name="stream", daemon=True
+        ).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._open.close()
+
+    def send(
+        self, target: Target | None = None, *, position: Sequence[float | None] | None = None
+    ) -> None:
+        """Go to a target, or to a position in m, from now on.
+
+        Raises
+        ------
+        CommandError, InputError
+            An earlier target was refused.
+        ServiceError
+            The stream has ended.
+        """
+        self._raise_refusal()
+        message = TargetMessage.of(target or Target(position=position)).model_dump()
+        if self._client._lease != self._lease:  # control was taken after the stream began
+            self._lease = self._client._lease
+            if self._lease is not None:
+                self._send({"lease": self._lease})
+        self._send({"target": message, "seq": next(self._numbers)})
+
+    def state(self, timeout: float = 5.0) -> Snapshot:
+        """Return the newest state that has not been returned yet, waiting for it if need be.
+
+        Raises
+        ------
+        CommandError, InputError
+            A target was refused.
+        ServiceError
+            None came in time, or the stream has ended.
+        """
+        with self._news:
+            there = self._news.wait_for(
+                lambda: self._state is not None or self._ended or self._refused, timeout
+            )
+            if there and self._state is not None:
+                state, self._state = self._state, None
+                if self._refused is None:
+                    return state
+        self._raise_refusal()
+        raise ServiceError(f"no state came within {timeout:g} s")
+
+    def _raise_refusal(self) -> None:
+        with self._news:
+            refused, self._refused = self._refused, None
+            error = refused or self._ended
+        if error is not None:
+            raise error
+
+    def _send(self, message: dict[str, Any]) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        if self._socket is None:
+            raise ServiceError("the stream is not open; use it in a 'with' block")
+        try:
+            self._socket.send(json.dumps(message))
+        except ConnectionClosed as error:
+            raise ServiceError(f"the stream has ended: {error}") from None
+
+    def _listen(self, socket: ClientConnection) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        reason = "the daemon sends what no daemon sends"
+        try:
+            while True:
+                message = json.loads(socket.recv())
+                with self._news:
+                    self._take(message)
+                    self._news.notify_all()
+        except ConnectionClosed as error:
+            reason = str(error)
+        except Exception as error:  # of any kind: the waiting thread must learn of it
+            reason = f"{reason} ({type(error).__name__})"
+        with self._news:
+            self._ended = ServiceError(f"the stream has ended: {reason}")
+            self._news.notify_all()
+
+    def _take(self, message: dict[str, Any]) -> None:
+        if message["type"] == "state":
+            self._state = record_of(Snapshot, message["state"])
+        elif message["type"] == "answer" and message["accepted"]:
+            self.accepted += 1
+        elif "error" in message:
+            error = message["error"]
+            if error["code"] == "superseded":
+                self.superseded += 1
+            else:
+                self._refused = error_of(_STATUS.get(error["code"], 409), error["message"])
 
 
 def _token(given: str | os.PathLike[str] | None) -> str | None:
-    """Return the token that is given, or that stands in the file that is."""
-    if given is None or (isinstance(given, str) and not given):
+    """Return the token that is given, or that is in the file of that path."""
+    if given is None or given == "":
         return None
-    with suppress(OSError, ValueError):
-        return Path(given).read_text(encoding="utf-8").strip()
-    if not isinstance(given, str) or os.sep in given:
-        raise InputError(f"the token's file '{os.fspath(given)}' cannot be read")
-    return given
+    try:
+        token = Path(given).read_text(encoding="utf-8").strip()
+    except (OSError, ValueError):
+        if not isinstance(given, str) or os.sep in given:
+            raise InputError(f"the token's file '{os.fspath(given)}' cannot be read") from None
+        token = given
+    if not (token.isascii() and token.isprintable()):
+        raise InputError("the token has characters that no token has")
+    return token
 
 
 def _target(position: Any, pointing: Any, orientation: Any, **tolerance: Any) -> Target:
@@ -363,3 +569,12 @@ def _trajectory(times: Any, positions: Any) -> Trajectory:
             for time, position in zip(times, positions, strict=True)
         ]
     )
+
+
+def _refusal_in(answer: Any) -> tuple[str, str]:
+    """Return the code and the message of a refusal, also of one that is not the daemon's."""
+    try:
+        error = answer.json()["error"]
+        return str(error["code"]), str(error["message"])
+    except (ValueError, KeyError, TypeError):
+        return "", f"what answers is no stiffopt daemon; it says {answer.status_code}"

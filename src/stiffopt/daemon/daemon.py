@@ -9,7 +9,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
@@ -19,7 +18,7 @@ from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
-from stiffopt.daemon.calls import Part
+from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret, bracketed, check_exposure
 from stiffopt.errors import CommandError, FileError, InputError, MissingExtraError, StiffoptError
@@ -33,10 +32,9 @@ from stiffopt.safety.realtime import real_time, tidy
 from stiffopt.safety.rigs import guarded_rig
 
 if TYPE_CHECKING:
-    from stiffopt.daemon.serving import Server
+    from stiffopt.daemon.server import Server
     from stiffopt.daemon.telemetry import Telemetry
 
-__all__ = ["TIMES", "ControlThread", "Daemon", "DaemonTimes"]
 
 Array = NDArray[np.float64]
 
@@ -78,7 +76,7 @@ TIMES = DaemonTimes()
 class Daemon:
     """The daemon of a rig: guard, control loop, telemetry and the HTTP interface.
 
-    Nothing is connected or started before `start`; it is vented and inactive then, until `arm` is
+    `start` connects and starts everything; the arm is vented and inactive then, until `arm` is
     called here or by a client. `stop`, or the end of a `with` block, lets the pressures down,
     vents, and ends everything.
 
@@ -91,20 +89,12 @@ class Daemon:
     log_folder :
         Where recordings go; None: where the rig file says.
     json_lines :
-        Whether the guard, too, speaks JSON on stderr.
+        Whether the guard writes JSON on stderr.
 
     Attributes
     ----------
-    description : RigDescription
-        What the rig file says.
-    robot : Manipulator
-        The model of the arm.
-    loop : ControlLoop
-        State, events and commands.
-    trouble : str
-        Why it is not certain that the arm is vented, after `stop`; empty if it is.
-    hung : tuple of str
-        Parts that had not ended when `stop` did. They are threads that keep no process from
+    trouble : why it is not certain that the arm is vented, after `stop`; empty if it is.
+    hung : parts that had not ended when `stop` did. Their threads do not keep the process from
         ending, but a library that they are in may: see `os._exit`.
 
     Raises
@@ -156,7 +146,7 @@ class Daemon:
             self.loop,
             self.link,
             self._manager,
-            None if self._server is None else self._is_serving,
+            None if (server := self._server) is None else lambda: server.alive,
         )
         self._stopping = threading.Event()
         self._control: ControlThread | None = None
@@ -165,21 +155,21 @@ class Daemon:
         self._started = self._stopped = self._recorded = False
         self._stop_begun = float("inf")
 
-    # what there is -------------------------------------------------------------------------------
+    # Reading -------------------------------------------------------------------------------------
 
     @property
     def url(self) -> str | None:
-        """Of the control interface; None where there is none."""
+        """URL of the control interface; None where there is none."""
         return None if self._server is None else self._server.url
 
     @property
     def token(self) -> str:
-        """Secret of those who may move the arm."""
+        """The token that a client needs to move the arm."""
         return self._secret.token
 
     @property
     def token_file(self) -> Path | None:
-        """Where it can be read; None where the environment has it, or nobody needs it."""
+        """The file of the token; None where it is in the environment, or no port is open."""
         return None if self._server is None else self._secret.path
 
     @property
@@ -190,7 +180,7 @@ class Daemon:
     @property
     def recording(self) -> str | None:
         """The file that is recorded to; None while there is none."""
-        return None if self._telemetry is None else self._telemetry.path
+        return None if self._telemetry is None else self._telemetry.recording.path
 
     @property
     def ended(self) -> bool:
@@ -204,7 +194,7 @@ class Daemon:
             return TimeoutError("the control thread hangs")
         return None if self._control is None else self._control.failure
 
-    # life ----------------------------------------------------------------------------------------
+    # Start and end -------------------------------------------------------------------------------
 
     def start(self) -> None:
         """Listen, start the guard, connect, check the rig, and begin to tick; it stays vented.
@@ -240,13 +230,7 @@ class Daemon:
         self._manager.ready()
 
     def read_task(self, path: str | os.PathLike[str]) -> Task:
-        """Read a task file and see that it is for this arm.
-
-        Raises
-        ------
-        FileError
-            The file is wrong, or is for another robot.
-        """
+        """Read a task file; raise `FileError` if it is wrong or for another robot."""
         task = load_task(path)
         asked, there = task.resolve_robot().name, self.robot.description.name
         if asked != there:
@@ -258,10 +242,7 @@ class Daemon:
     def arm(self, task: Task | None = None) -> None:
         """Arm as soon as the vented arm has been seen for long enough, and pursue a task.
 
-        Raises
-        ------
-        InputError
-            It cannot be armed, or the task does not suit; it is inactive then.
+        If it cannot be armed, or the task does not suit, it is inactive and `InputError` is raised.
         """
         end = time.monotonic() + TIMES.arming
         while True:
@@ -291,8 +272,8 @@ class Daemon:
 
     def vent(self, reason: str = "asked to", patience: float = 0.5) -> None:
         """Let all pressure out at once, also when the control thread does not answer."""
-        if not Part("vent", lambda: self.loop.vent(reason)).ends_within(patience):
-            Part("vent-link", self.link.vent).ends_within(TIMES.vent)
+        if not ends_within(patience, call_in_thread("vent", lambda: self.loop.vent(reason))):
+            ends_within(TIMES.vent, call_in_thread("vent-link", self.link.vent))
 
     def stop(self) -> State:
         """End everything and return the last state.
@@ -309,15 +290,15 @@ class Daemon:
         self._end_control()
         self._keeper.stop(TIMES.keeper)
         state = self.loop.snapshot().state
-        closing = Part("supply", self.link.close)
+        closing = call_in_thread("supply", self.link.close)
         before = TIMES.control + TIMES.keeper + TIMES.vent
-        closing.ends_within(self._left(before + TIMES.supply, TIMES.supply))
+        ends_within(self._left(before + TIMES.supply, TIMES.supply), closing)
         self._end_the_rest()
-        if not closing.ends_within(self._left(before + TIMES.supply + TIMES.rest)):
+        if not ends_within(self._left(before + TIMES.supply + TIMES.rest), closing):
             self.trouble = "the guard does not end; whether the supply is vented is not known"
             self.hung = ("supply", *self.hung)
-        elif closing.error is not None:
-            self.trouble = str(closing.error)
+        elif closing.exception() is not None:
+            self.trouble = str(closing.exception())
         self._log.detach()
         self._manager.close()
         return state
@@ -346,14 +327,14 @@ class Daemon:
             works["telemetry"] = self._telemetry.stop
         if self._server is not None:
             works["service"] = self._end_service
-        parts = [Part(name, work) for name, work in works.items()]
+        calls = {name: call_in_thread(name, work) for name, work in works.items()}
         end = time.monotonic() + TIMES.rest
-        for part in parts:
-            if not part.ends_within(end - time.monotonic()):
-                self.hung = (*self.hung, part.name)
-                self._warn("stop", f"the {part.name} does not end and is left behind")
-            elif part.error is not None:
-                self._warn("stop", f"the {part.name} did not end well: {part.error}")
+        for name, call in calls.items():
+            if not ends_within(end - time.monotonic(), call):
+                self.hung = (*self.hung, name)
+                self._warn("stop", f"the {name} does not end and is left behind")
+            elif call.exception() is not None:
+                self._warn("stop", f"the {name} did not end well: {call.exception()}")
 
     def _end_service(self) -> None:
         if self._server is not None:
@@ -364,18 +345,13 @@ class Daemon:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
-    # the parts -----------------------------------------------------------------------------------
+    # Parts ---------------------------------------------------------------------------------------
 
     def _make_telemetry(self, service: bool) -> Telemetry | None:
-        """Return what records; without ports it is no loss that stops anyone if it is missing."""
+        """Return the telemetry; without it, a daemon that opens no ports runs all the same."""
         settings = self.description.service
         if not service:
             settings = settings.model_copy(update={"foxglove_port": None})
@@ -400,8 +376,8 @@ class Daemon:
 
     def _make_server(self) -> Server:
         from stiffopt.daemon.metrics import Metrics
+        from stiffopt.daemon.server import Server
         from stiffopt.daemon.service import create_app
-        from stiffopt.daemon.serving import Server
 
         settings, robot = self.description.service, self.robot.description
         app = create_app(
@@ -420,14 +396,14 @@ class Daemon:
         if self._telemetry is None:
             return
         self._recorded = True
-        starting = Part("telemetry", self._telemetry.start)
-        if not starting.ends_within(TIMES.telemetry):
+        starting = call_in_thread("telemetry", self._telemetry.start)
+        if not ends_within(TIMES.telemetry, starting):
             text = (
                 f"telemetry has not started within {TIMES.telemetry:g} s; control goes on without"
             )
             self.loop.add_alarm("telemetry", text)
-        elif starting.error is not None:
-            raise starting.error
+        elif (error := starting.exception()) is not None:
+            raise error
         if (port := self._telemetry.port) is not None:
             self._warn(
                 "foxglove",
@@ -440,11 +416,8 @@ class Daemon:
         """Append an event that is a warning."""
         self.loop.events.add(self._clock.now(), kind, text, Severity.WARNING)
 
-    def _is_serving(self) -> bool:
-        return self._server is not None and self._server.alive
-
     def _listen(self) -> None:
-        """Open the port, then keep the token: not in the place of that of one who has the port."""
+        """Open the port, then write the token: the daemon that has the port keeps its own."""
         if self._server is None:
             return
         given = self._secret.path is None
@@ -459,23 +432,10 @@ class Daemon:
 
 
 class ControlThread(threading.Thread):
-    """Ticks the control loop in real time until it is told to stop, then lets the pressures down.
+    """Ticks the control loop in real time until `stopping` is set, then lets the pressures down.
 
-    Parameters
-    ----------
-    loop, link :
-        The loop, and the link to its guard.
-    stopping :
-        Tells it to stop.
-    manager :
-        Is told in each tick that the loop lives.
-    telemetry :
-        Is handed the state after each tick.
-
-    Attributes
-    ----------
-    failure : BaseException or None
-        What ended it, if it was not told to stop; the loop has vented then.
+    In each tick, the service manager hears that the loop lives, and telemetry gets the state. The
+    loop has vented if a `failure` ended the thread.
     """
 
     def __init__(
@@ -501,11 +461,11 @@ class ControlThread(threading.Thread):
                 notice = self._link.real_time
                 self._tell("guard", notice, well=not notice.startswith("not"))
                 self._loop.run(self._stopping)
-        except BaseException as error:  # `run` has vented; whoever waits is told
+        except BaseException as error:  # `run` has vented; `Daemon.failure` has it
             self.failure = error
 
     def ticked(self, now: Snapshot) -> None:
-        """Pass on the state that a tick has left; in this thread."""
+        """Pass on the state at the end of a tick; in this thread."""
         self._manager.watchdog()
         if self._telemetry is not None:
             self._telemetry.put(now)
@@ -519,6 +479,6 @@ class ControlThread(threading.Thread):
 
 
 def _vibrates(description: RigDescription) -> bool:
-    """Return whether the arm has inertia: all have, but one that is simulated without."""
+    """Return whether the arm has inertia; only a quasi-static simulated one has none."""
     dynamics = getattr(description.plant, "dynamics", None)
     return not (description.supply.simulated and dynamics == "quasi-static")

@@ -1,4 +1,4 @@
-"""Watches a running daemon: replaces a dead guard, tells systemd, makes events of log records."""
+"""What watches a running daemon: systemd's watchdog, events of log records, and a keeper thread."""
 
 from __future__ import annotations
 
@@ -15,36 +15,21 @@ from typing import Any
 
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity
-from stiffopt.errors import MissingExtraError, StiffoptError
+from stiffopt.errors import StiffoptError, require_package
 from stiffopt.safety.guard_client import GuardLink
-
-__all__ = [
-    "Keeper",
-    "LogEvents",
-    "ServiceManager",
-]
 
 
 class ServiceManager:
     """Notifies systemd, if it started this process: ready, alive, state, stopping.
 
     The environment tells: ``NOTIFY_SOCKET``, and ``WATCHDOG_USEC`` if it wants signs of life.
-    Nothing here waits: what the manager does not take at once is lost.
-
-    Parameters
-    ----------
-    clock :
-        Time in s.
+    Nothing here waits: what the manager does not take at once is lost. Raises `MissingExtraError`
+    if there is a manager and sdnotify is not installed.
 
     Attributes
     ----------
     watchdog_interval : seconds after which the manager ends a process that has not called
-        `watchdog`; None: it does not look.
-
-    Raises
-    ------
-    MissingExtraError
-        There is a manager and sdnotify is not installed.
+        `watchdog`; None: it does not.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -58,14 +43,14 @@ class ServiceManager:
         self._say("READY=1")
 
     def status(self, text: str) -> None:
-        """Say how things stand, for people."""
+        """Say what the daemon does, for people."""
         self._say("STATUS=" + " ".join(text.split()))
 
     def watchdog(self) -> None:
-        """Say that all is well; for the control loop itself, in every tick, and nobody else.
+        """Say that the control loop lives; to be called by it alone, in every tick.
 
-        A timer or another thread would go on to say so after the loop hangs. It is passed on when
-        half of the interval is over.
+        (A timer or another thread would go on when the loop hangs.) One call in half an interval is
+        passed on.
         """
         if self.watchdog_interval is None:
             return
@@ -92,10 +77,8 @@ class ServiceManager:
 
 
 def _notifier() -> Any:
-    try:
-        notifier: Any = import_module("sdnotify").SystemdNotifier()
-    except ImportError:
-        raise MissingExtraError("sdnotify", "daemon") from None
+    require_package("sdnotify", "daemon")
+    notifier: Any = import_module("sdnotify").SystemdNotifier()
     if notifier.socket is not None:
         notifier.socket.setblocking(False)
     return notifier
@@ -113,49 +96,43 @@ def _interval() -> float | None:
 
 _OURS = "stiffopt"
 _LOGGERS = (_OURS, "uvicorn", "websockets", "foxglove", "asyncio")
-_QUIET = 1.0  # s in which the same place in the code is not heard again
-_LONGEST = 300  # characters of a text, part of which strangers may have written
+_QUIET = 1.0  # s between two records of the same place in the code
+_LONGEST = 300  # characters of a text, part of which a client may have written
 
 
 class LogEvents(logging.Handler):
     """A logging handler that turns warnings and errors into events of the control loop.
 
-    What strangers can provoke must not push everything else out of the events: of each place in the
-    code one record a second is taken, and that of a library is never more than a warning.
-
-    Parameters
-    ----------
-    loop :
-        Whose events they become.
-    clock :
-        Time in s.
+    Clients without the token can provoke records. So that these do not push all else out of the
+    events, one record per second is taken from each place in the code; those of libraries are never
+    more than warnings.
     """
 
     def __init__(self, loop: ControlLoop, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(logging.WARNING)
         self._loop, self._clock = loop, clock
-        self._heard: dict[tuple[str, str, int], float] = {}
+        self._taken: dict[tuple[str, str, int], float] = {}
 
     def attach(self) -> None:
-        """Hear from now on."""
+        """Take the records of stiffopt and of the libraries that serve it."""
         for name in _LOGGERS:
             logging.getLogger(name).addHandler(self)
 
     def detach(self) -> None:
-        """Hear no more."""
+        """Take no more records."""
         for name in _LOGGERS:
             logging.getLogger(name).removeHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Append an event; what is wrong with a record must not hurt whoever logs."""
+        """Append an event; a malformed record must not fail the code that logs it."""
         with suppress(Exception):
             self._tell(record)
 
     def _tell(self, record: logging.LogRecord) -> None:
         place, now = (record.name, record.pathname, record.lineno), self._clock()
-        if now - self._heard.get(place, -_QUIET) < _QUIET:
+        if now - self._taken.get(place, -_QUIET) < _QUIET:
             return
-        self._heard[place] = now
+        self._taken[place] = now
         ours = record.name.partition(".")[0] == _OURS
         bad = ours and record.levelno >= logging.ERROR
         self._loop.events.add(
@@ -196,22 +173,11 @@ class Keeper:
 
     - A guard process that has ended, which is a fault for the loop, is replaced. Its link has
       vented the supply by then, as far as that answers, and has ended a guard that hung.
-    - When the control interface ends, nobody watches any more whether who has control is alive:
+    - When the control interface ends, the heartbeat of the client in control is no longer checked:
       the arm is held.
-    - The service manager is told the state.
+    - The service manager gets the state, for people.
 
-    Parameters
-    ----------
-    loop :
-        The control loop.
-    link :
-        To its guard.
-    manager :
-        Is told how things stand.
-    serving :
-        Says whether the control interface serves; None where there is none.
-    clock :
-        Time in s.
+    `serving` says whether the control interface serves; None where there is none.
     """
 
     def __init__(
@@ -224,44 +190,47 @@ class Keeper:
     ) -> None:
         self._loop, self._link, self._manager = loop, link, manager
         self._serving, self._clock = serving, clock
-        self._told = ""
+        self._status = ""
         self._guard_at = -float("inf")
         self._held = False
         self._enough = threading.Event()
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Look again and again until `stop`."""
+        """Check repeatedly until `stop`."""
         self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
         self._thread.start()
 
     def stop(self, timeout: float = 2.0) -> None:
-        """Look no more; a guard that is just being started is not waited for."""
+        """End; a guard that is just being started is not waited for."""
         self._enough.set()
         if self._thread is not None:
             self._thread.join(timeout)
 
     def look(self) -> None:
-        """See to everything once."""
+        """Check everything once."""
         self._tell()
         if not self._link.alive:
             self._replace_guard()
-        if self._serving is not None:
-            self._look_at_service(self._serving())
+        if self._serving is not None and not self._serving() and not self._held:
+            self._held = True
+            self._loop.add_alarm(_SERVICE, "the control interface has ended; restart the daemon")
+            with suppress(StiffoptError):  # there may be nothing to hold
+                self._loop.hold("the control interface has ended")
 
     def _run(self) -> None:
         while not self._enough.wait(_LOOK):
             try:
                 self.look()
-            except Exception as error:  # the others must be looked after all the same
+            except Exception as error:  # the other checks go on
                 text = f"unexpected {type(error).__name__}: {error}"
                 self._loop.add_alarm("keeper", text)
 
     def _tell(self) -> None:
         now = self._loop.snapshot()
         text = f"{now.state}: {now.reason}" if now.reason else str(now.state)
-        if text != self._told:
-            self._told = text
+        if text != self._status:
+            self._status = text
             self._manager.status(text)
 
     def _replace_guard(self) -> None:
@@ -284,12 +253,3 @@ class Keeper:
             if self._enough.is_set():  # the daemon has ended meanwhile
                 self._link.close()
         self._guard_at = self._clock()
-
-    def _look_at_service(self, serves: bool) -> None:
-        if serves:
-            return
-        if not self._held:
-            self._held = True
-            self._loop.add_alarm(_SERVICE, "the control interface has ended; restart the daemon")
-            with suppress(StiffoptError):  # there may be nothing to hold
-                self._loop.hold("the control interface has ended")

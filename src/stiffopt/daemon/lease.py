@@ -9,24 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from stiffopt.errors import CommandError
+from stiffopt.daemon.reports import LEASE_HEADER, LeaseReport, RefusalError
 from stiffopt.rig.interface import Clock
-
-__all__ = ["ControlLease", "Holder"]
-
-
-@dataclass(frozen=True)
-class Holder:
-    """The client that has control.
-
-    Attributes
-    ----------
-    client : its name.
-    expires_in : time in s after which control is lost if nothing is heard; not negative.
-    """
-
-    client: str
-    expires_in: float
 
 
 @dataclass
@@ -41,16 +25,9 @@ class _Grant:
 class ControlLease:
     """Control over the arm, granted to one client at a time.
 
-    A client that is not heard for `heartbeat` seconds loses it. Nobody else gets it before what
-    is due then has been done: `check` says that it is due, `settle` that it has been done. Any
-    thread may call any method.
-
-    Parameters
-    ----------
-    heartbeat :
-        In s.
-    clock :
-        That of the rig, which never jumps.
+    A client that is not heard for `heartbeat` seconds loses it, and the arm is to be held. `check`
+    tells of the loss, and no client gets control until `settle` is called after that. What a
+    client without control asks for is refused by `RefusalError`. Any thread may call any method.
     """
 
     def __init__(self, heartbeat: float, clock: Clock) -> None:
@@ -60,59 +37,46 @@ class ControlLease:
         self._grant: _Grant | None = None
 
     @property
-    def holder(self) -> Holder | None:
+    def holder(self) -> LeaseReport | None:
         """Who has control, or None."""
         with self._lock:
-            return None if self._grant is None else self._seen(self._grant)
+            if self._grant is None:
+                return None
+            return LeaseReport(client=self._grant.client, expires_in_s=self._left(self._grant))
 
     def take(self, client: str) -> str:
         """Give control to a client and return what it must show with each command.
 
-        Raises
-        ------
-        CommandError
-            Another has it, or has just lost it and the arm is not held yet.
+        It is refused if another has it, or has just lost it and the arm is not held yet.
         """
         with self._lock:
             grant = self._grant
             if grant is not None and self._is_lost(grant):
-                raise CommandError(
+                raise _refused(
                     f"'{grant.client}' has just lost control and the arm is being held; try again"
                 )
             if grant is not None:
-                raise CommandError(
+                raise _refused(
                     f"'{grant.client}' has control; it ends in "
-                    f"{self._seen(grant).expires_in:.2f} s unless it is renewed"
+                    f"{self._left(grant):.2f} s unless it is renewed"
                 )
             self._grant = _Grant(client, secrets.token_urlsafe(16), self._clock.now())
             return self._grant.identity
 
-    def renew(self, identity: str) -> None:
-        """Note that the client was heard.
-
-        Raises
-        ------
-        CommandError
-            It does not have control.
-        """
+    def renew(self, identity: str | None) -> None:
+        """Note that the client was heard."""
         with self._lock:
             self._own(identity).heard = self._clock.now()
 
-    def release(self, identity: str) -> None:
-        """Take control back from a client that does not want it any more; raises as `renew`."""
+    def release(self, identity: str | None) -> None:
+        """Take control back from a client that does not want it any more."""
         with self._lock:
             self._own(identity)
             self._grant = None
 
     @contextmanager
-    def used(self, identity: str) -> Iterator[None]:
-        """Carry out a command of the client in the body: it counts as heard until that ends.
-
-        Raises
-        ------
-        CommandError
-            It does not have control.
-        """
+    def used(self, identity: str | None) -> Iterator[None]:
+        """Carry out a command of the client in the body: it counts as heard until that ends."""
         with self._lock:
             grant = self._own(identity)
             grant.heard = self._clock.now()
@@ -125,31 +89,27 @@ class ControlLease:
                 grant.busy -= 1
 
     def check(self, now: float) -> str | None:
-        """Return the name of a client that has lost control, until `settle` is called, or None.
-
-        Parameters
-        ----------
-        now :
-            On the clock, in s.
-        """
+        """Return who has lost control at a time, in s, until `settle` is called; or None."""
         with self._lock:
             grant = self._grant
             return grant.client if grant is not None and self._is_lost(grant, now) else None
 
     def settle(self) -> None:
-        """Note that what was due after a loss has been done: others may take control."""
+        """Note that the arm was held after a loss: others may take control."""
         with self._lock:
             if self._grant is not None and self._grant.lost:
                 self._grant = None
 
-    def _own(self, identity: str) -> _Grant:
+    def _own(self, identity: str | None) -> _Grant:
         grant = self._grant
+        if identity is None:
+            raise _refused(f"this needs control; take it, and show the lease in '{LEASE_HEADER}'")
         if grant is None:
-            raise CommandError("you do not have control; take it first")
+            raise _refused("you do not have control; take it first")
         if not hmac.compare_digest(grant.identity.encode(), identity.encode()):
-            raise CommandError(f"you do not have control; '{grant.client}' has it")
+            raise _refused(f"you do not have control; '{grant.client}' has it")
         if self._is_lost(grant):
-            raise CommandError(
+            raise _refused(
                 f"control was lost, as nothing was heard for {self.heartbeat:g} s; take it again"
             )
         return grant
@@ -161,6 +121,11 @@ class ControlLease:
             grant.lost = True
         return grant.lost
 
-    def _seen(self, grant: _Grant) -> Holder:
+    def _left(self, grant: _Grant) -> float:
+        """Return the time in s after which control is lost if nothing is heard; not negative."""
         left = grant.heard + self.heartbeat - self._clock.now()
-        return Holder(grant.client, min(max(left, 0.0), self.heartbeat))
+        return min(max(left, 0.0), self.heartbeat)
+
+
+def _refused(message: str) -> RefusalError:
+    return RefusalError(409, "lease", message)

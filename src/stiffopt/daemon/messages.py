@@ -1,9 +1,8 @@
 """JSON messages of clients (tasks, targets, trajectories), derived from the schemas of the files.
 
-A message is the JSON form of a `Schema`: the same keys, plain numbers in SI, and the unit of a
-quantity at the end of its name. Its fields are made from those of the schema, so a key that is
-added to a schema is in its message too, and no conversion can lose one. Unknown keys, text for
-numbers, NaN and infinities are refused.
+A message is the JSON form of a `Schema`: the same keys, plain numbers in SI units, and names that
+end in the unit. It is made from the fields of the schema, so that a key which is added to a schema
+is in its message too. Unknown keys, text for numbers, NaN and infinities are refused.
 """
 
 from __future__ import annotations
@@ -47,28 +46,11 @@ from stiffopt.optimise.task import Task
 from stiffopt.schema import Schema
 from stiffopt.units import QuantityKind, unit_suffix
 
-__all__ = [
-    "MAX_MESSAGE",
-    "MAX_WAYPOINTS",
-    "ControlRequest",
-    "HoldRequest",
-    "SchemaMessage",
-    "TargetMessage",
-    "TaskMessage",
-    "TaskRequest",
-    "TaskText",
-    "TrajectoryMessage",
-    "message_of",
-    "sentence",
-    "task_of",
-    "trajectory_of",
-]
-
 MAX_MESSAGE = 16_384
 """Characters of the longest message to a stream."""
 _MAX_TEXT = 65_536  # characters of a task file; to read more would keep the control loop waiting
 _MAX_ITEMS = 50  # of a list of descriptions, such as stiffness measures
-_TOLD = 5  # mistakes told at once
+_TOLD = 5  # mistakes in an answer
 _MAX_NUMBERS = 200  # of a list with one number per channel
 
 _UNITS_IN_NAMES = {"orientation": "orientation_wxyz", "matrix": "matrix_n_per_m"}
@@ -111,13 +93,13 @@ def _valid(adapter: TypeAdapter[ModelT], given: Any, place: Loc) -> ModelT:
 
 def sentence(mistakes: Sequence[Any]) -> str:
     """Return pydantic's list of mistakes as one sentence."""
-    told = []
+    parts = []
     for mistake in mistakes[:_TOLD]:
         place = dotted([step for step in mistake["loc"] if not str(step).startswith("<")])
         reason = str(mistake["msg"])
-        told.append(f"{place}: {reason}" if place else reason)
+        parts.append(f"{place}: {reason}" if place else reason)
     more = f"; and {len(mistakes) - _TOLD} more" if len(mistakes) > _TOLD else ""
-    return "; also ".join(told) + more
+    return "; also ".join(parts) + more
 
 
 # Messages from schemas ---------------------------------------------------------------------------
@@ -128,7 +110,7 @@ class SchemaMessage(_Message):
 
     Attributes
     ----------
-    schema_class : what it is the form of.
+    schema_class : the schema.
     names : of its fields in JSON, by their names in the schema.
     """
 
@@ -139,29 +121,20 @@ class SchemaMessage(_Message):
     def of(cls, given: Schema, **more: Any) -> Self:
         """Return the message for a description, in which `more` keys are replaced.
 
-        Raises
-        ------
-        InputError
-            The description is of a subclass whose further keys have no place in the message, or
-            has values that no message may have; the text names the keys.
+        It raises `InputError` if the description is of a subclass whose further keys have no place
+        in the message, or has values that no message may have.
         """
         lost: list[Loc] = []
-        said = {**_json_of(given, (), lost), **more}
+        message = {**_json_of(given, (), lost), **more}
         if lost:
             places = listed([dotted(place) for place in lost])
             raise InputError(
                 f"{places}: the daemon's messages cannot say this, and it would be lost"
             )
-        return _valid(TypeAdapter(cls), said, ())
+        return _valid(TypeAdapter(cls), message, ())
 
     def read(self, **more: Any) -> Any:
-        """Return the description, in which `more` keys are replaced.
-
-        Raises
-        ------
-        InputError
-            It makes no sense.
-        """
+        """Return the description, in which `more` keys are replaced, or raise `InputError`."""
         return self.schema_class(**{**_keys_of(self), **more})
 
 
@@ -173,7 +146,7 @@ def _json_of(value: Any, place: Loc, lost: list[Loc]) -> Any:
         fields = type(value).model_fields
         for name in (*fields, *(value.model_extra or ())):
             field = getattr(value, name)
-            if field is None or (name in fields and _is_unsaid(fields[name])):
+            if field is None or (name in fields and _is_left_out(fields[name])):
                 continue
             if name in message.names:
                 found[message.names[name]] = _json_of(field, (*place, name), lost)
@@ -198,22 +171,20 @@ _MADE: dict[type[Schema], type[SchemaMessage]] = {}
 
 
 def message_of(schema: type[Schema], base: type[SchemaMessage] = SchemaMessage) -> Any:
-    """Return the message class of a schema.
+    """Return the message class of a schema, which has its fields and those of the schemas in it.
 
-    Parameters
-    ----------
-    schema :
-        Its fields become those of the message, and so do those of the schemas in it.
-    base :
-        A message whose own fields take the place of those of the same name.
+    Fields that `base` has take the place of those of the same name.
     """
     if schema not in _MADE or base is not SchemaMessage:
         hints = get_type_hints(schema, include_extras=True)
-        said = {n: info for n, info in schema.model_fields.items() if not _is_unsaid(info)}
-        names = {name: _name(name, hints[name]) for name in said}
+        kept = {n: info for n, info in schema.model_fields.items() if not _is_left_out(info)}
+        names = {
+            name: _UNITS_IN_NAMES.get(name) or name + unit_suffix(_unit(hints[name]))
+            for name in kept
+        }
         fields: dict[str, Any] = {
             names[name]: (_type(hints[name]), _default(info))
-            for name, info in said.items()
+            for name, info in kept.items()
             if names[name] not in base.model_fields
         }
         own = base is not SchemaMessage
@@ -228,19 +199,15 @@ def message_of(schema: type[Schema], base: type[SchemaMessage] = SchemaMessage) 
     return _MADE[schema]
 
 
-def _says(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
+def _with_fields_of(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
     """Return a class decorator that adds the fields of a schema to a message."""
     return lambda base: message_of(schema, base)
 
 
-def _is_unsaid(info: FieldInfo) -> bool:
-    """Whether a field is left out of messages: the file that it was read from, or a constant."""
+def _is_left_out(info: FieldInfo) -> bool:
+    """Whether a field is not in messages: the file that it was read from, or a constant."""
     is_constant = get_origin(info.annotation) is Literal and len(get_args(info.annotation)) == 1
     return bool(info.exclude) or is_constant
-
-
-def _name(name: str, hint: Any) -> str:
-    return _UNITS_IN_NAMES.get(name) or name + unit_suffix(_unit(hint))
 
 
 def _unit(hint: Any) -> str:
@@ -287,7 +254,7 @@ def _default(info: FieldInfo) -> Any:
     return list(info.default) if isinstance(info.default, tuple) else info.default
 
 
-@_says(Target)
+@_with_fields_of(Target)
 class TargetMessage(SchemaMessage):
     """A tip pose in the base frame: a position (null: this axis is free), a direction in which
     the tip points, or an orientation (w, x, y, z).
@@ -296,7 +263,7 @@ class TargetMessage(SchemaMessage):
     model_config = _example(position_m=[0.0, None, 0.2])
 
 
-@_says(Trajectory)
+@_with_fields_of(Trajectory)
 class TrajectoryMessage(SchemaMessage):
     """Waypoints in order of time, all of which ask for the same axes of the pose."""
 
@@ -308,7 +275,7 @@ class TrajectoryMessage(SchemaMessage):
     )
 
 
-@_says(Task)
+@_with_fields_of(Task)
 class TaskMessage(SchemaMessage):
     """A task for the arm. A robot, if it is named, must be the daemon's."""
 
@@ -326,15 +293,10 @@ class TaskMessage(SchemaMessage):
 
 
 def trajectory_of(given: Any) -> Trajectory:
-    """Return the trajectory that the JSON of a `TrajectoryMessage` asks for.
+    """Return the trajectory in the JSON of a `TrajectoryMessage`.
 
-    Its waypoints are read one by one: in one go, ten thousand would keep the control thread, which
-    has to share the interpreter, from its ticks.
-
-    Raises
-    ------
-    InputError
-        It makes no sense.
+    Its waypoints are read one by one: ten thousand at once would block the interpreter, and so the
+    control thread, for too long. A mistake raises `InputError`.
     """
     waypoints = given.get("waypoints") if isinstance(given, dict) else None
     if not isinstance(waypoints, list) or not 1 <= len(waypoints) <= MAX_WAYPOINTS:
@@ -369,24 +331,15 @@ TaskRequest = Annotated[
 
 
 def task_of(given: Any, robot: str) -> Task:
-    """Return the task that the JSON of a `TaskRequest` asks for. No file is read, whatever it says.
+    """Return the task in the JSON of a `TaskRequest`; `robot` is the name of the daemon's.
 
-    Parameters
-    ----------
-    given :
-        From a client.
-    robot :
-        Name of the robot that there is.
-
-    Raises
-    ------
-    InputError
-        It makes no sense, or is for another robot.
+    No file is read, whatever the text of a task file names. A mistake, or another robot, raises
+    `InputError`.
     """
     request = _valid(_TASK, given, ())
     if isinstance(request, TaskText):
         return _task_of_text(request.text, robot)
-    _same_robot(request.robot, robot)
+    _check_robot(request.robot, robot)
     task: Task = request.read(robot=robot)
     return task
 
@@ -397,12 +350,12 @@ def _task_of_text(text: str, robot: str) -> Task:
     except UnicodeEncodeError:
         raise InputError("the text of the task is not UTF-8") from None
     document = document_of(text, "task")
-    _same_robot(document.data.get("robot"), robot)
+    _check_robot(document.data.get("robot"), robot)
     document.data["robot"] = robot
     return from_document(document, "task", Task)
 
 
-def _same_robot(given: Any, robot: str) -> None:
+def _check_robot(given: Any, robot: str) -> None:
     if given is not None and given != robot:
         raise InputError(
             f"robot: {shown(given)} is not the robot here, '{robot}'; name that, or leave it out"

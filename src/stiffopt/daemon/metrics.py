@@ -4,56 +4,40 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from itertools import accumulate
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from stiffopt.control.state import Snapshot, State
 from stiffopt.control.state_fields import Kind, entries
-from stiffopt.errors import MissingExtraError
+from stiffopt.errors import require_package
 
 if TYPE_CHECKING:
     from stiffopt.control.loop import ControlLoop
     from stiffopt.daemon.telemetry import Telemetry
 
-__all__ = ["CONTENT_TYPE", "Metrics"]
 
 _SHARED = {"pressure_pascals": "Gauge pressures of the channels."}
 """Help of metrics that several fields share."""
-
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-"""Of what `Metrics.render` returns."""
 
 
 class Metrics:
     """The metrics of a control loop and its telemetry, as text for Prometheus.
 
-    Parameters
-    ----------
-    name :
-        Of the rig; a label.
-    loop :
-        What is watched.
-    telemetry :
-        Its recording is watched too.
-
-    Raises
-    ------
-    MissingExtraError
-        prometheus-client is not installed.
+    The name of the rig is a label of each. Raises `MissingExtraError` without prometheus-client.
     """
 
     def __init__(self, name: str, loop: ControlLoop, telemetry: Telemetry | None = None) -> None:
-        try:
-            from prometheus_client import CollectorRegistry
-        except ImportError:
-            raise MissingExtraError("prometheus-client", "daemon") from None
+        require_package("prometheus-client", "daemon", "prometheus_client")
+        from prometheus_client import CollectorRegistry
+
         self._name, self._loop, self._telemetry = name, loop, telemetry
-        self._seen: Counter[tuple[str, str]] = Counter()
+        self._seen: Counter[tuple[str, str]] = Counter()  # events
         self._next_event = 0
         self._lock = threading.Lock()
         self._registry = CollectorRegistry(auto_describe=False)
-        self._registry.register(_Collector(self))
+        self._registry.register(self)
 
     def render(self) -> bytes:
         """Return all metrics as text; from any thread."""
@@ -62,17 +46,18 @@ class Metrics:
         with self._lock:
             return generate_latest(self._registry)
 
-    def _families(self) -> Iterator[Any]:
+    def collect(self) -> Iterator[Any]:
+        """Yield all metrics; called by the registry."""
         now = self._loop.snapshot()
         yield from self._of_state(now)
-        yield from self._of_timing(now)
+        yield from self._of_fields(now.timing)
+        yield self._lateness(now)
         yield from self._of_fields(now)
-        yield from self._of_events()
+        yield self._events()
         if self._telemetry is not None:
-            yield self._counter(
-                "telemetry_dropped", "Snapshots never logged.", self._telemetry.dropped
-            )
-            yield self._counter("log_bytes", "Bytes recorded.", self._telemetry.written)
+            dropped, written = self._telemetry.dropped, self._telemetry.recording.written
+            yield self._counter("telemetry_dropped", "Snapshots never logged.", dropped)
+            yield self._counter("log_bytes", "Bytes recorded.", written)
 
     def _of_state(self, now: Snapshot) -> Iterator[Any]:
         states = self._gauges("state", "Where in its life the loop is: 1 for its state.", "state")
@@ -84,27 +69,25 @@ class Metrics:
             alarms.add_metric([self._name, alarm.kind], 1.0)
         yield alarms
 
-    def _of_timing(self, now: Snapshot) -> Iterator[Any]:
+    def _lateness(self, now: Snapshot) -> Any:
         from prometheus_client.core import HistogramMetricFamily
 
         timing = now.timing
-        yield from self._of_fields(timing)
-        edges, counts = timing.lateness
-        total, buckets = 0, []
-        for edge, count in zip((*edges, float("inf")), counts, strict=True):
-            total += count
-            buckets.append(("+Inf" if edge == float("inf") else f"{edge:g}", float(total)))
+        edges = [*(f"{edge:g}" for edge in timing.lateness_edges), "+Inf"]
+        totals = map(float, accumulate(timing.lateness_counts))
+        buckets = list(zip(edges, totals, strict=True))
         late = HistogramMetricFamily(
             "stiffopt_lateness_seconds", "How late ticks begin.", labels=["rig"]
         )
         late.add_metric([self._name], buckets, sum_value=None)
-        yield late
+        return late
 
     def _of_fields(self, record: Any) -> Iterator[Any]:
         """Yield the metrics of a record whose definitions name one."""
         shared: dict[str, Any] = {}
         for entry in entries(type(record)):
-            name, about = entry.shown.metric, _sentence(entry.shown.about)
+            name, about = entry.shown.metric, entry.shown.about
+            about = f"{about[:1].upper()}{about[1:]}."
             value = getattr(record, entry.name) if name else None
             if value is None:
                 continue
@@ -119,10 +102,12 @@ class Metrics:
                         of = (str(channel), entry.shown.label)[: len(labels)]
                         family.add_metric([self._name, *of], number)
             elif isfinite(value):
-                yield self._gauge(name, about, value)
+                family = self._gauges(name, about)
+                family.add_metric([self._name], value)
+                yield family
         yield from shared.values()
 
-    def _of_events(self) -> Iterable[Any]:
+    def _events(self) -> Any:
         from prometheus_client.core import CounterMetricFamily
 
         events, self._next_event = self._loop.events.since(self._next_event)
@@ -132,17 +117,12 @@ class Metrics:
         )
         for (kind, severity), count in sorted(self._seen.items()):
             family.add_metric([self._name, kind, severity], count)
-        yield family
+        return family
 
     def _gauges(self, name: str, text: str, *labels: str) -> Any:
         from prometheus_client.core import GaugeMetricFamily
 
         return GaugeMetricFamily(f"stiffopt_{name}", text, labels=["rig", *labels])
-
-    def _gauge(self, name: str, text: str, value: float) -> Any:
-        family = self._gauges(name, text)
-        family.add_metric([self._name], value)
-        return family
 
     def _counter(self, name: str, text: str, value: float) -> Any:
         from prometheus_client.core import CounterMetricFamily
@@ -150,17 +130,3 @@ class Metrics:
         family = CounterMetricFamily(f"stiffopt_{name}", text, labels=["rig"])
         family.add_metric([self._name], value)
         return family
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}."
-
-
-class _Collector:
-    """Adapts `Metrics` to the registry of prometheus_client."""
-
-    def __init__(self, metrics: Metrics) -> None:
-        self._metrics = metrics
-
-    def collect(self) -> Iterator[Any]:
-        return self._metrics._families()

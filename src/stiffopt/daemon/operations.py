@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from functools import partial
 from math import isfinite
 from typing import Any
 
@@ -14,48 +16,35 @@ from numpy.typing import NDArray
 
 from stiffopt import units
 from stiffopt.control.loop import ControlLoop
+from stiffopt.control.request_queue import Requester, requested_by
 from stiffopt.control.state import Snapshot, State
-from stiffopt.daemon.calls import LoopCalls, start
+from stiffopt.daemon.calls import call_in_thread
 from stiffopt.daemon.lease import ControlLease
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, task_of
 from stiffopt.daemon.reports import (
-    LEASE_HEADER,
     DoneReport,
     GrantReport,
-    LeaseReport,
     RefusalError,
     RobotReport,
     TaskReport,
-    json_of,
     refusal_of,
 )
-from stiffopt.errors import CommandError, StiffoptError
+from stiffopt.daemon.state_json import json_of
+from stiffopt.errors import StiffoptError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.interface import Clock
 
-__all__ = ["Operations"]
-
 _VENTED = (State.UNCONFIGURED, State.INACTIVE, State.FAULT)
+_WAITING = 8  # calls of the loop at once; more than a lively client needs
 _log = logging.getLogger(__name__)
 
 
 class Operations:
     """The daemon's interface without HTTP: reading, control and commands.
 
-    All methods are for one event loop.
-
-    Parameters
-    ----------
-    loop :
-        The control loop.
-    robot :
-        The arm that it steers.
-    heartbeat :
-        A client that was not heard for this long, in s, loses control, and the arm is held.
-    clock :
-        That of the rig.
-    patience :
-        Seconds after which a command to the loop is given up.
+    All methods are for one event loop. The control loop is called in threads, and what it does not
+    answer within `patience`, in s, is given up. A client that was not heard for `heartbeat`, in s,
+    loses control, and the arm is held.
     """
 
     def __init__(
@@ -71,21 +60,19 @@ class Operations:
         self.robot = robot
         self.lease = ControlLease(heartbeat, clock)
         self._clock = clock
-        self._call = LoopCalls(patience)
+        self._patience = patience
+        self._running = 0  # calls of the loop
         self._task: TaskMessage | None = None  # the last that was accepted, while it matters
-        self._told: tuple[Snapshot, dict[str, Any]] | None = None  # the last state as JSON
-        self._settling: asyncio.Task[None] | None = None
+        self._reported: tuple[Snapshot, dict[str, Any]] | None = None  # the last state as JSON
+        self._holding: asyncio.Task[None] | None = None
 
     def state(self) -> dict[str, Any]:
         """Return the state of the loop and who has control, as `StateReport` describes it."""
         holder = self.lease.holder
-        lease = None
-        if holder is not None:
-            lease = LeaseReport(client=holder.client, expires_in_s=holder.expires_in)
         now = self.loop.snapshot()
-        if self._told is None or self._told[0] is not now:  # streams mostly want the same one
-            self._told = (now, json_of(now))
-        return {**self._told[1], "lease": None if lease is None else lease.model_dump()}
+        if self._reported is None or self._reported[0] is not now:  # streams ask for the same one
+            self._reported = (now, json_of(now))
+        return {**self._reported[1], "lease": None if holder is None else holder.model_dump()}
 
     def robot_report(self) -> RobotReport:
         """Return what arm this is."""
@@ -107,12 +94,12 @@ class Operations:
             "orientation_wxyz": _whole(now.target_quaternion),
             "pointing": _whole(now.target_pointing),
         }
-        told = {
+        known = {
             key: [x if isfinite(x) else None for x in value.tolist()]
             for key, value in wanted.items()
             if value is not None
         }
-        target = TargetMessage.model_validate(told) if told else None
+        target = TargetMessage.model_validate(known) if known else None
         given = None if now.state in _VENTED else self._task
         return TaskReport(doing=now.task, target=target, task=given)
 
@@ -120,35 +107,27 @@ class Operations:
 
     async def take(self, client: str) -> GrantReport:
         """Give a client control; raise `RefusalError` if another has it."""
-        await self.watch()  # who had it may be gone
-        with _of_lease():
-            identity = self.lease.take(client)
+        await self.watch()  # the client that had it may be gone
+        identity = self.lease.take(client)
         beat = self.lease.heartbeat
         return GrantReport(lease=identity, heartbeat_s=beat, renew_every_s=beat / 4)
 
-    def renew(self, identity: str | None) -> None:
-        """Note that a client was heard; raise `RefusalError` if it does not have control."""
-        with _of_lease():
-            self.lease.renew(_shown(identity))
-
-    def release(self, identity: str | None) -> None:
-        """Take control back; raise `RefusalError` if the client does not have it."""
-        with _of_lease():
-            self.lease.release(_shown(identity))
-
     async def watch(self) -> None:
-        """Hold the arm if who had control is not heard any more; to be called again and again."""
+        """Hold the arm if the client in control is not heard any more; to be called repeatedly."""
         client = self.lease.check(self._clock.now())
         if client is None:
             return
-        if self._settling is None or self._settling.done():
-            self._settling = asyncio.create_task(self._settle(client))
-        await asyncio.wait([self._settling], timeout=1.0)
+        if self._holding is None or self._holding.done():
+            self._holding = asyncio.create_task(self._hold_after(client))
+        await asyncio.wait([self._holding], timeout=1.0)
 
-    async def _settle(self, client: str) -> None:
-        """Hold; nobody else gets control before the loop has done so or has said why not."""
+    async def _hold_after(self, client: str) -> None:
+        """Hold the arm; control is free after the loop has held it or has refused to."""
+        reason = f"nothing was heard from '{client}', which had control"
+        call = call_in_thread("command", partial(self.loop.hold, reason))
+        await _ended(call)
         try:
-            await start(self.loop.hold, f"nothing was heard from '{client}', which had control")
+            call.result()
         except StiffoptError as refused:  # such as: there is nothing to hold
             _log.info("'%s' has lost control; not held: %s", client, refused)
         except Exception:
@@ -158,28 +137,40 @@ class Operations:
 
     # Commands ---------------------------------------------------------------------------------
 
-    async def arm(self, identity: str | None) -> DoneReport:
-        """Arm."""
-        return await self._forgetting(identity, self.loop.arm)
+    async def command(
+        self,
+        identity: str | None,
+        function: Callable[[], object],
+        *,
+        urgent: bool = False,
+        ends_task: bool = False,
+    ) -> DoneReport:
+        """Carry out a command of a client that has control.
 
-    async def disarm(self, identity: str | None) -> DoneReport:
-        """Let the pressures down, vent and disarm."""
-        return await self._forgetting(identity, self.loop.disarm)
-
-    async def reset(self, identity: str | None) -> DoneReport:
-        """Leave the state fault."""
-        return await self._forgetting(identity, self.loop.reset)
-
-    async def vent(self) -> DoneReport:
-        """Vent at once, whoever has control; rather late than never."""
-        await self._asked(self.loop.vent, "a client asked for it", urgent=True, lasting=True)
-        self._task = None
+        Parameters
+        ----------
+        identity :
+            The lease that the client shows.
+        function :
+            Calls the loop. It may raise `InputError`, and is called in another thread, as it may
+            take long and other clients must be answered meanwhile.
+        urgent :
+            Call it however many calls are already waiting: it makes the arm safer.
+        ends_task :
+            Whether there is no task after it.
+        """
+        with self.lease.used(identity):
+            await self._call(function, urgent=urgent)
+        if ends_task:
+            self._task = None
         return self._done()
 
-    async def hold(self, identity: str | None, reason: str) -> DoneReport:
-        """Keep the pressures as they are."""
-        with self._control(identity):
-            await self._asked(self.loop.hold, reason, urgent=True)
+    async def vent(self) -> DoneReport:
+        """Vent at once, whichever client has control; also after the patience has ended."""
+        await self._call(
+            partial(self.loop.vent, "a client asked for it"), urgent=True, lasting=True
+        )
+        self._task = None
         return self._done()
 
     async def set_task(self, identity: str | None, given: Any) -> DoneReport:
@@ -187,72 +178,74 @@ class Operations:
 
         def pursue() -> TaskMessage:
             task = task_of(given, self.robot.name)
-            message = TaskMessage.of(task, robot=self.robot.name)  # what clients are told later
+            message = TaskMessage.of(task, robot=self.robot.name)  # that clients can read later
             self.loop.set_task(task)
             return message
 
-        with self._control(identity):
-            self._task = await self._asked(pursue)
+        with self.lease.used(identity):
+            self._task = await self._call(pursue)
         return self._done()
-
-    async def command(
-        self, identity: str | None, function: Callable[[Any], None], what: Callable[[], Any]
-    ) -> DoneReport:
-        """Call a command of the loop with the description that `what` returns.
-
-        `what` may raise `InputError`. It is called in another thread, as it may take long, and
-        other clients must be answered meanwhile.
-        """
-        with self._control(identity):
-            await self._asked(lambda: function(what()))
-        return self._done()
-
-    async def _forgetting(self, identity: str | None, function: Callable[[], None]) -> DoneReport:
-        """Call a command of the loop after which there is no task."""
-        with self._control(identity):
-            await self._asked(function)
-            self._task = None
-        return self._done()
-
-    async def _asked(self, function: Callable[..., Any], *args: Any, **how: bool) -> Any:
-        with _as_refusals():
-            return await self._call(function, *args, **how)
 
     def _done(self) -> DoneReport:
         snapshot = self.loop.snapshot()
         return DoneReport(state=snapshot.state, reason=snapshot.reason)
 
-    @contextmanager
-    def _control(self, identity: str | None) -> Iterator[None]:
-        """Do what is in the body for a client that has control, and only for that."""
-        with ExitStack() as stack:
-            with _of_lease():
-                stack.enter_context(self.lease.used(_shown(identity)))
-            yield
+    async def _call(
+        self, function: Callable[[], Any], *, urgent: bool = False, lasting: bool = False
+    ) -> Any:
+        """Call a function that waits for the control loop, in a thread; return its result.
+
+        With `lasting`, the loop still does it after the patience has ended.
+
+        Raises
+        ------
+        RefusalError
+            It fails, does not return in time, or too many calls are waiting already.
+        """
+        if self._running >= _WAITING and not urgent:
+            raise RefusalError(503, "busy", "the control loop has too much to do; try again")
+        requester = Requester()
+
+        def requested() -> Any:
+            with requested_by(Requester() if lasting else requester):
+                return function()
+
+        call = call_in_thread("command", requested)
+        self._running += 1
+        ended = asyncio.ensure_future(_ended(call))
+        ended.add_done_callback(self._count_down)
+        try:
+            await asyncio.wait([ended], timeout=self._patience)
+        finally:  # also where the client has gone
+            never = not call.done() and requester.give_up()
+        if call.done():
+            try:
+                return call.result()
+            except StiffoptError as error:
+                raise refusal_of(error) from None
+        if lasting:
+            outcome = "this is done as soon as it can be"
+        elif never:
+            outcome = "it will not do this any more; look at the state, and ask again"
+        else:
+            outcome = "whether it will still do this is not known: look at the state, or vent"
+        late = f"the control loop did not answer within {self._patience:g} s"
+        raise RefusalError(503, "no-answer", f"{late}; {outcome}")
+
+    def _count_down(self, _: object) -> None:
+        self._running -= 1
 
 
-@contextmanager
-def _as_refusals() -> Iterator[None]:
-    try:
-        yield
-    except StiffoptError as error:
-        raise refusal_of(error) from None
+async def _ended(call: Future[Any]) -> None:
+    """Wait for the end of a call in another thread."""
+    events, ended = asyncio.get_running_loop(), asyncio.Event()
 
+    def tell(_: object) -> None:
+        with suppress(RuntimeError):  # the event loop has ended meanwhile
+            events.call_soon_threadsafe(ended.set)
 
-@contextmanager
-def _of_lease() -> Iterator[None]:
-    try:
-        yield
-    except CommandError as error:
-        raise RefusalError(409, "lease", str(error)) from None
-
-
-def _shown(identity: str | None) -> str:
-    if identity is None:
-        raise RefusalError(
-            409, "lease", f"this needs control; take it, and show the lease in '{LEASE_HEADER}'"
-        )
-    return identity
+    call.add_done_callback(tell)
+    await ended.wait()
 
 
 def _whole(values: NDArray[np.float64] | None) -> NDArray[np.float64] | None:

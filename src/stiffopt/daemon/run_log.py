@@ -1,4 +1,4 @@
-"""Reads the recording of a run, and converts it to a log (log v1) for calibration."""
+"""Reads the recording of a run, and makes a log for calibration of it."""
 
 from __future__ import annotations
 
@@ -10,37 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.state import SeenPose, Snapshot
+from stiffopt.control.state import Event, SeenPose, Severity, Snapshot
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.topics import FORMAT, METADATA, STATES
 from stiffopt.errors import FileError
 from stiffopt.logs.log import Log
-from stiffopt.logs.mcap_log import LOG_METADATA
-from stiffopt.logs.mcap_reading import McapContents, read_mcap
-
-__all__ = [
-    "RecordedRun",
-    "RunEvent",
-    "RunSpan",
-    "is_of_experiment",
-    "log_of_run",
-    "read_run",
-]
+from stiffopt.logs.mcap_file import McapContents, read_mcap
+from stiffopt.logs.mcap_log import LOG_METADATA, log_of_contents
 
 Array = NDArray[np.float64]
 
-_FOREIGN = "is no recording of stiffopt; expected one (.mcap) of 'stiffopt run'"
 _HELD = ("/limits",)  # topics that are logged when they change, and hold until then
-
-
-@dataclass(frozen=True)
-class RunEvent:
-    """Something that happened; see `stiffopt.control.state.Event`. The time is that of the run."""
-
-    time: float
-    kind: str
-    text: str
-    severity: str
 
 
 @dataclass(frozen=True)
@@ -55,23 +35,22 @@ class RunSpan:
 
 @dataclass(frozen=True, eq=False)
 class RecordedRun:
-    """A run, in SI units; what is missing is NaN. Time 0 is when the recording began.
+    """A recorded run, in SI units; NaN is what is unknown. Time 0 is where the recording begins.
 
     Fields of `stiffopt.control.state.Snapshot` that are logged as numbers are attributes, with one
     row per tick: ``run.commanded`` is (N, n), ``run.position_error`` is (N,).
 
     Attributes
     ----------
-    about : what the recording says of itself: ``rig``, ``robot``, ``robot_file`` (its text),
-        ``stiffopt`` (version), ``start_ns`` (date of time 0, since 1970).
+    about : metadata: ``rig``, ``robot``, ``robot_file`` (its text), ``stiffopt`` (version),
+        ``start_ns`` (date of time 0, since 1970).
     channels : number of channels of each segment.
     time : of the ticks (N,), in s.
     fields : the state in each tick, by the names of `Snapshot`.
-    captured : when the tracker captured its frames (M,), in s, increasing.
-    seen_position, seen_quaternion : where it saw the tip (M, 3) and (M, 4), w first.
-    doubted : frames (M,) that no arm could have moved to, or that came with such a one.
-    states, alarms : in order of time.
-    events : in order of time.
+    captured : times of capture of the tracker's samples (M,), in s, increasing.
+    seen_position, seen_quaternion : of the tip in the samples (M, 3) and (M, 4), w first.
+    doubted : samples (M,) that no arm could have moved to, or that came with such a one.
+    states, alarms, events : in order of time, which is that of the run.
     timing : the last ``/timing`` message; empty if there is none.
     complete : whether the recording was ended properly, and nothing in it is damaged.
     """
@@ -86,7 +65,7 @@ class RecordedRun:
     doubted: NDArray[np.bool_]
     states: tuple[RunSpan, ...] = ()
     alarms: tuple[RunSpan, ...] = ()
-    events: tuple[RunEvent, ...] = ()
+    events: tuple[Event, ...] = ()
     timing: Mapping[str, Any] = field(default_factory=dict)
     complete: bool = True
 
@@ -115,41 +94,40 @@ def read_run(path: str | os.PathLike[str]) -> RecordedRun:
     MissingExtraError
         mcap is not installed.
     """
-    name = os.fspath(path)
     found = read_mcap(path)
+    if LOG_METADATA in found.metadata:
+        raise FileError(
+            path, "is a recording of an experiment; expected one of a run of 'stiffopt run'"
+        )
+    return _run_of_contents(path, found)
+
+
+def read_log_of_recording(path: str | os.PathLike[str]) -> tuple[Log, bool]:
+    """Read the log of a run or of an experiment (.mcap); also whether the recording is whole.
+
+    It raises as `read_run`.
+    """
+    found = read_mcap(path)
+    if LOG_METADATA in found.metadata:
+        return log_of_contents(path, found), True
+    run = _run_of_contents(path, found)
+    return log_of_run(run), run.complete
+
+
+def _run_of_contents(path: str | os.PathLike[str], found: McapContents) -> RecordedRun:
     about = found.metadata.get(METADATA, {})
     if not about:
-        if LOG_METADATA in found.metadata:
-            raise FileError(
-                name, "is a recording of an experiment; expected one of a run of 'stiffopt run'"
-            )
-        raise FileError(name, _FOREIGN)
+        raise FileError(path, "is no recording of stiffopt; expected one (.mcap) of 'stiffopt run'")
     if about.get("format") != FORMAT:
         raise FileError(
-            name, f"has the format '{about.get('format')}'; this stiffopt reads '{FORMAT}'"
+            path, f"has the format '{about.get('format')}'; this stiffopt reads '{FORMAT}'"
         )
     if not found.of_topic("/pressure"):
-        raise FileError(name, "has no whole message of a run; it was cut short too early")
+        raise FileError(path, "has no whole message of a run; it was cut short too early")
     try:
         return _run(about, found)
     except (KeyError, ValueError, TypeError) as error:
-        raise FileError(name, f"is damaged: {error}") from None
-
-
-def is_of_experiment(path: str | os.PathLike[str]) -> bool:
-    """Whether a recording is one of an experiment, for `stiffopt.logs.read_mcap_log`.
-
-    Raises
-    ------
-    FileError
-        It cannot be read, or is no recording of stiffopt.
-    MissingExtraError
-        mcap is not installed.
-    """
-    metadata = read_mcap(path, metadata_only=True).metadata
-    if METADATA not in metadata and LOG_METADATA not in metadata:
-        raise FileError(path, _FOREIGN)
-    return LOG_METADATA in metadata
+        raise FileError(path, f"is damaged: {error}") from None
 
 
 def _run(about: Mapping[str, str], found: McapContents) -> RecordedRun:
@@ -172,7 +150,7 @@ def _run(about: Mapping[str, str], found: McapContents) -> RecordedRun:
         states=_states(states, begin, float(time[-1])),
         alarms=_alarms(states, begin, float(time[-1])),
         events=tuple(
-            RunEvent(float(e["time_s"]) - begin, e["kind"], e["text"], e["severity"])
+            Event(float(e["time_s"]) - begin, e["kind"], e["text"], Severity(e["severity"]))
             for e in found.of_topic("/event")
         ),
         timing=timing[-1] if timing else {},
@@ -274,18 +252,18 @@ def _alarms(messages: Sequence[Mapping[str, Any]], begin: float, end: float) -> 
     return tuple(sorted(spans, key=lambda span: span.begin))
 
 
-_GAP = 0.1  # s without a frame, which rows without a tip fill ...
+_GAP = 0.1  # s without a sample, which rows without a tip fill ...
 _STEP = 0.05  # ... s apart
-_NEAR = 0.1  # s between a frame and a reading that belongs to it
+_NEAR = 0.1  # s between a sample and a pressure reading that belongs to it
 _DIGITS = 6  # of a time in s, as log v1 writes it
 
 
 def log_of_run(run: RecordedRun) -> Log:
-    """Return the log of a run. Time 0 is when the recording began; N rows may be none.
+    """Return the log of a run, with a row for each sample of the tracker; there may be no rows.
 
-    A frame that no arm could have moved to, or in which the tip was not seen, gives a row without
-    a tip. Two frames of the same time give one row; of frames that were captured before the first
-    command it is not known what the pressures were, and they are left out.
+    A sample that no arm could have moved to, or without a tip, gives a row without a tip. Two
+    samples of the same time give one row. Samples from before the first command are left out, since
+    the pressures are not known.
     """
     within = (run.captured >= run.time[0]) & (run.captured <= run.time[-1] + _NEAR)
     captured = np.round(run.captured[within], _DIGITS)
@@ -317,7 +295,7 @@ def log_of_run(run: RecordedRun) -> Log:
 
 
 def _fillers(ticks: Array, captured: Array) -> Array:
-    """Return times of ticks, some way apart, in which no frame was captured."""
+    """Return times of ticks, `_STEP` apart, where no sample was captured for `_GAP`."""
     after = np.searchsorted(captured, ticks, side="right")
     edges = np.concatenate([[-np.inf], captured, [np.inf]])
     before, next_one = edges[after], edges[after + 1]
@@ -350,9 +328,8 @@ def _between(run: RecordedRun, time: Array) -> Array:
         if known.any():
             at = read[known]
             line = np.interp(time, at, values[known, channel])
-            after = np.searchsorted(at, time).clip(1, max(len(at) - 1, 1))
-            nearest = np.minimum(
-                np.abs(time - at[after - 1]), np.abs(time - at[np.minimum(after, len(at) - 1)])
-            )
+            after = np.searchsorted(at, time)
+            edges = np.concatenate([[-np.inf], at, [np.inf]])
+            nearest = np.minimum(time - edges[after], edges[after + 1] - time)
             measured[:, channel] = np.where(nearest <= _NEAR, line, np.nan)
     return measured

@@ -1,8 +1,8 @@
-"""The token of those who may move the arm, kept in a file that is this user's alone.
+"""The token that a client needs to move the arm, and the file in which this user can read it.
 
-The token is that of the environment, or it is drawn and written to the file. Other users may be
-able to write to the folder, so files and links that they put in its place are found out. A token
-that is too short is refused where other machines can reach the interface.
+The token is given in the environment, or drawn at random and written to the file. Other users may
+be able to write to the folder, so files and links that they put there are refused. A token that is
+too short is refused where other machines can reach the interface.
 """
 
 from __future__ import annotations
@@ -16,25 +16,14 @@ from contextlib import suppress
 from ipaddress import ip_address
 from pathlib import Path
 
-from stiffopt.errors import FileError, InputError
+from stiffopt.errors import FileError, InputError, os_reason
 from stiffopt.rig.settings import ServiceSettings
-
-__all__ = [
-    "MIN_TOKEN",
-    "Secret",
-    "bracketed",
-    "check_exposure",
-    "check_folder",
-    "check_mine",
-    "is_address",
-    "is_loopback",
-    "make_private",
-    "read_mine",
-]
 
 MIN_TOKEN = 16
 """Characters of a token that is not easily guessed."""
 _LONGEST = 4096  # bytes of a file that is read whole
+_LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_OTHERWISE = "give another log.folder or service.token_file"
 _READ = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
@@ -48,38 +37,28 @@ def make_private(folder: str | os.PathLike[str]) -> None:
         raise NotADirectoryError(20, "not a folder")
 
 
-def check_folder(folder: Path, advice: str) -> None:
+def _check_folder(folder: Path) -> None:
     """Raise `FileError` where another user could exchange files in a folder.
 
-    Parameters
-    ----------
-    folder :
-        What must belong to this user or to root, and be writable for all only if it is sticky.
-    advice :
-        What to do otherwise, as the end of a sentence.
+    It must belong to this user or to root, and be writable for all only if it is sticky.
     """
     found = folder.stat()
     if found.st_uid not in (0, os.geteuid()):
-        raise FileError(folder, f"belongs to another user, who can exchange files there; {advice}")
+        raise FileError(
+            folder, f"belongs to another user, who can exchange files there; {_OTHERWISE}"
+        )
     if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
         raise FileError(
             folder,
             f"is writable for all, so that anyone can exchange files there; take that right away "
-            f"(chmod o-w), or {advice}",
+            f"(chmod o-w), or {_OTHERWISE}",
         )
 
 
-def check_mine(path: Path, advice: str, opened: int | None = None) -> None:
+def _check_mine(path: Path, opened: int | None = None) -> None:
     """Raise `FileError` unless a file is a regular one of this user, or is not there.
 
-    Parameters
-    ----------
-    path :
-        The file; a symbolic link is none.
-    advice :
-        What to do otherwise, as the end of a sentence.
-    opened :
-        Its descriptor if it is open; else what has the name now is looked at.
+    A file that is open is looked at by its descriptor, and any other by its name.
     """
     try:
         found = os.lstat(path) if opened is None else os.fstat(opened)
@@ -95,10 +74,10 @@ def check_mine(path: Path, advice: str, opened: int | None = None) -> None:
         )
     else:
         return
-    raise FileError(path, f"{problem}, or {advice}")
+    raise FileError(path, f"{problem}, or {_OTHERWISE}")
 
 
-def read_mine(path: Path) -> str:
+def _read_mine(path: Path) -> str:
     """Return the text of a short file, without following a link or waiting for a pipe."""
     descriptor = os.open(path, _READ)
     try:
@@ -109,31 +88,14 @@ def read_mine(path: Path) -> str:
         os.close(descriptor)
 
 
-_LOCK = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-_OTHERWISE = "give another log.folder or service.token_file"
-
-
 class Secret:
     """A token, and the file in which a drawn one can be read by this user alone.
 
-    The file is one daemon's for as long as that lives: a lock beside it, which the kernel releases
-    however a process ends, keeps a second one from putting its token in the place of the first's.
-    The lock's file stays: whoever had just opened it would else lock what nobody sees any more.
-    No symbolic link is followed, and nothing is written where another user could exchange it.
-
-    Parameters
-    ----------
-    settings :
-        Of the rig's service.
-    folder, name :
-        Where the file is, and what its name begins with, unless the settings say.
-
-    Attributes
-    ----------
-    token : str
-        The token.
-    path : Path or None
-        The file; None where the environment has the token.
+    The file belongs to one daemon as long as it runs: a second one, which would replace the token,
+    is kept out by a lock (flock) on another file, which the kernel releases however a process ends.
+    The lock file is not removed, since another process may be about to lock it. No symbolic link is
+    followed, and nothing is written where another user could exchange it.
+    `path` is None where the token is in the environment.
     """
 
     def __init__(
@@ -147,7 +109,7 @@ class Secret:
         self._lock: int | None = None  # an open file
 
     def write(self) -> None:
-        """Write the file, in the place of what is there; nobody else can read it at any moment.
+        """Write the file, in the place of what is there; no other user can read it at any moment.
 
         Raises
         ------
@@ -160,9 +122,9 @@ class Secret:
         fresh = self.path.with_name(f".{self.path.name}.{os.getpid()}")
         try:
             make_private(self.path.parent)
-            check_folder(self.path.parent, _OTHERWISE)
+            _check_folder(self.path.parent)
             self._take(self.path)
-            check_mine(self.path, _OTHERWISE)
+            _check_mine(self.path)
             with suppress(FileNotFoundError):
                 fresh.unlink()
             descriptor = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -172,9 +134,9 @@ class Secret:
         except OSError as error:
             with suppress(OSError):
                 fresh.unlink()
-            reason = (error.strerror or str(error)).lower()
             raise FileError(
-                self.path, f"the token cannot be kept there: {reason}; see service.token_file"
+                self.path,
+                f"the token cannot be kept there: {os_reason(error)}; see service.token_file",
             ) from None
 
     def _take(self, path: Path) -> None:
@@ -182,7 +144,7 @@ class Secret:
         if self._lock is not None:
             return
         place = path.with_name(f".{path.name}.lock")
-        check_mine(place, _OTHERWISE)
+        _check_mine(place)
         try:
             lock = os.open(place, _LOCK, 0o600)
         except PermissionError:
@@ -194,7 +156,7 @@ class Secret:
                 "it is not, remove this file, else give another log.folder or service.token_file",
             ) from None
         try:
-            check_mine(place, _OTHERWISE, lock)
+            _check_mine(place, lock)
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(lock)
@@ -216,7 +178,7 @@ class Secret:
         if self.path is None:
             return
         with suppress(OSError, ValueError):
-            if read_mine(self.path).strip() == self.token:
+            if _read_mine(self.path).strip() == self.token:
                 self.path.unlink()
         if self._lock is not None:
             os.close(self._lock)
@@ -232,28 +194,17 @@ def is_loopback(host: str) -> bool:
     A name is on loopback if all its addresses are; one that has no address is not.
     """
     try:
-        found = {host} if is_address(host) else _addresses(host)
+        found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
     except OSError:
         return False
-    return bool(found) and all(ip_address(address).is_loopback for address in found)
+    return bool(found) and all(ip_address(place[0]).is_loopback for *_, place in found)
 
 
 def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str]]:
-    """Return the warnings due before the control interface listens: kinds and texts of events.
+    """Return the warnings for a control interface on a host: kinds and texts of events.
 
-    Parameters
-    ----------
-    host :
-        Where it will listen.
-    token :
-        Of those who may move the arm.
-    given :
-        Whether a person chose the token; else it was drawn.
-
-    Raises
-    ------
-    InputError
-        The token is too short for a host that other machines can reach.
+    `given` is whether a person chose the token; else it was drawn. A token that is too short for a
+    host which other machines can reach raises `InputError`.
     """
     beyond, short = not is_loopback(host), given and len(token) < MIN_TOKEN
     if beyond and short:
@@ -278,11 +229,6 @@ def check_exposure(host: str, token: str, *, given: bool) -> list[tuple[str, str
 def bracketed(host: str) -> str:
     """Return a host as it is written in a URL."""
     return f"[{host}]" if ":" in host else host
-
-
-def _addresses(host: str) -> set[str]:
-    found = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-    return {str(address[0]) for *_, address in found}
 
 
 def is_address(name: str) -> bool:

@@ -22,18 +22,23 @@ from stiffopt.daemon.messages import (
     TargetMessage,
     TaskRequest,
     TrajectoryMessage,
+    sentence,
     trajectory_of,
 )
+from stiffopt.daemon.operations import Operations
+from stiffopt.daemon.page import POLICY, page_of
 from stiffopt.daemon.reports import (
+    LEASE_HEADER,
     DoneReport,
     ErrorReport,
     EventsReport,
     GrantReport,
+    RefusalError,
     RobotReport,
     StateReport,
     TaskReport,
-    json_of,
 )
+from stiffopt.daemon.state_json import json_of
 from stiffopt.errors import MissingExtraError
 from stiffopt.model.description import RobotDescription
 from stiffopt.rig.interface import Clock, SystemClock
@@ -48,15 +53,8 @@ except ModuleNotFoundError as error:
     raise MissingExtraError("fastapi", "daemon") from error
 
 from stiffopt.daemon.access import Access, Token
-from stiffopt.daemon.connections import MEMBER, Crowd, Member
-from stiffopt.daemon.messages import sentence
-from stiffopt.daemon.metrics import CONTENT_TYPE
-from stiffopt.daemon.operations import Operations
-from stiffopt.daemon.page import POLICY, page_of
-from stiffopt.daemon.reports import LEASE_HEADER, RefusalError
+from stiffopt.daemon.server import CONNECTION, ConnectionLimiter, LimitedConnection
 from stiffopt.daemon.stream import Stream
-
-__all__ = ["create_app"]
 
 _WHY = {
     401: "The token is missing.",
@@ -66,7 +64,7 @@ _WHY = {
     422: "The request makes no sense.",
     503: "The control loop does not answer; the message says whether it may still do this.",
 }
-_ABOUT = """What there is to ask of a soft arm's control loop.
+_ABOUT = """Reads the state of a soft arm's control loop, and commands it.
 
 Reading needs nothing. What moves the arm needs the token (Authorization: Bearer TOKEN) and control
 (POST /v1/lease), which one client has at a time and loses when it is not heard. To vent needs the
@@ -76,7 +74,7 @@ SI units stand in the names; null is what is not known. Gauge pressures; poses i
 _log = logging.getLogger(__name__)
 
 _UNREAD = WrapValidator(lambda given, _: given)
-"""Marks a body that may be long: it is read in a thread, not in that which hears all clients."""
+"""Leaves a body that may be long unread: `Operations` reads it in a thread of its own."""
 LeaseHeader = Annotated[
     str | None,
     Header(alias=LEASE_HEADER, description="from POST /v1/lease", max_length=100),
@@ -98,33 +96,17 @@ def create_app(
 
     Parameters
     ----------
-    loop :
-        A control loop.
-    robot :
-        The arm that it steers.
+    loop, robot, heartbeat, clock, patience :
+        See `Operations`.
     token :
-        Secret of those who may move the arm.
-    heartbeat :
-        A client that was not heard for this long, in s, loses control, and the arm is held.
-    clock :
-        That of the rig.
+        That a client needs to move the arm.
     metrics :
-        Returns what Prometheus reads at ``/metrics``; None: there is nothing.
+        Returns what Prometheus reads at ``/metrics``; None: there is no such page.
     hosts :
-        Names of this machine by which clients may speak to it, beside localhost and addresses.
-    patience :
-        Seconds after which a command to the loop is given up.
+        Names of this machine, other than localhost, to which clients may send requests.
 
-    Returns
-    -------
-    FastAPI
-        ``app.state.operations`` is the `Operations` behind it, ``app.state.crowd`` who is
-        connected: `Server` serves it.
-
-    Raises
-    ------
-    InputError
-        The token is empty, or has characters that a header cannot carry.
+    Its ``state.limiter`` limits the connections in a `Server`. A token that a header cannot carry
+    raises `InputError`.
     """
     secret = Token(token)
     operations = Operations(loop, robot, heartbeat, clock or SystemClock(), patience)
@@ -153,14 +135,24 @@ def create_app(
     app.include_router(_control(operations), prefix="/v1")
     app.include_router(_moving(operations), prefix="/v1")
 
-    crowd = app.state.crowd = Crowd(secret.is_shown)
+    limiter = app.state.limiter = ConnectionLimiter(secret.is_shown)
 
     @app.websocket("/v1/stream")
     async def stream(websocket: WebSocket) -> None:
-        member = websocket.scope.get("state", {}).get(MEMBER) or Member()
-        await Stream(websocket, operations, secret, crowd, member).run()
+        connection = websocket.scope.get("state", {}).get(CONNECTION) or LimitedConnection()
+        await Stream(websocket, operations, secret, limiter, connection).run()
 
-    _add_pages(app, metrics)
+    @app.get("/", include_in_schema=False)
+    @app.get("/docs", include_in_schema=False)
+    async def docs() -> HTMLResponse:
+        return HTMLResponse(page_of(app.openapi()), headers={"Content-Security-Policy": POLICY})
+
+    if metrics is not None:
+
+        @app.get("/metrics", include_in_schema=False)
+        async def prometheus() -> Response:
+            return Response(metrics(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
     _add_refusals(app)
     return app
 
@@ -170,7 +162,7 @@ async def _watch(operations: Operations) -> None:
     while True:
         try:
             await operations.watch()
-        except Exception:  # whoever has control must be watched whatever happens
+        except Exception:  # the client in control must be watched whatever happens
             _log.exception("the watch over who has control failed; it goes on")
         await asyncio.sleep(period)
 
@@ -185,7 +177,7 @@ def _reading(operations: Operations) -> APIRouter:
 
     @router.get("/state", response_model=StateReport)
     async def state() -> Response:
-        """How things stand."""
+        """The state of the control loop, and who has control."""
         return JSONResponse(operations.state())
 
     @router.get("/events", response_model=EventsReport, responses=_responses(422))
@@ -231,12 +223,12 @@ def _control(operations: Operations) -> APIRouter:
     @router.post("/lease/renew", status_code=204)
     async def renew(lease: LeaseHeader = None) -> None:
         """Be heard."""
-        operations.renew(lease)
+        operations.lease.renew(lease)
 
     @router.delete("/lease", status_code=204)
     async def release(lease: LeaseHeader = None) -> None:
         """Give control back. The arm goes on with what it does; hold or disarm it before."""
-        operations.release(lease)
+        operations.lease.release(lease)
 
     return router
 
@@ -250,12 +242,12 @@ def _moving(operations: Operations) -> APIRouter:
     @router.post("/arm")
     async def arm(lease: LeaseHeader = None) -> DoneReport:
         """Check everything and put the arm under control."""
-        return await operations.arm(lease)
+        return await operations.command(lease, loop.arm, ends_task=True)
 
     @router.post("/disarm")
     async def disarm(lease: LeaseHeader = None) -> DoneReport:
         """Let the pressures down slowly, then vent."""
-        return await operations.disarm(lease)
+        return await operations.command(lease, loop.disarm, ends_task=True)
 
     @router.post("/task")
     async def set_task(
@@ -267,7 +259,7 @@ def _moving(operations: Operations) -> APIRouter:
     @router.post("/target")
     async def set_target(request: TargetMessage, lease: LeaseHeader = None) -> DoneReport:
         """Go to another target, with the stiffness goal and the limits of the task."""
-        return await operations.command(lease, loop.set_target, request.read)
+        return await operations.command(lease, lambda: loop.set_target(request.read()))
 
     @router.post("/trajectory")
     async def follow_trajectory(
@@ -275,24 +267,25 @@ def _moving(operations: Operations) -> APIRouter:
     ) -> DoneReport:
         """Go through waypoints; time begins now."""
         return await operations.command(
-            lease, loop.follow_trajectory, partial(trajectory_of, request)
+            lease, lambda: loop.follow_trajectory(trajectory_of(request))
         )
 
     @router.post("/hold")
     async def hold(request: HoldRequest | None = None, lease: LeaseHeader = None) -> DoneReport:
         """Keep the pressures as they are, until the next task, target or trajectory."""
-        return await operations.hold(lease, (request or HoldRequest()).reason)
+        reason = (request or HoldRequest()).reason
+        return await operations.command(lease, partial(loop.hold, reason), urgent=True)
 
     @router.post("/reset")
     async def reset(lease: LeaseHeader = None) -> DoneReport:
         """Leave the state fault; the arm stays vented."""
-        return await operations.reset(lease)
+        return await operations.command(lease, loop.reset, ends_task=True)
 
     @stopping.post("/vent")
     async def vent() -> DoneReport:
         """Let all pressure out at once.
 
-        Needs no control: whoever is trusted and sees that something goes wrong may stop the arm,
+        Needs no control: any client with the token that sees something go wrong may stop the arm,
         also while a planner that does not listen any more has control. A body is not looked at.
         """
         return await operations.vent()
@@ -301,21 +294,8 @@ def _moving(operations: Operations) -> APIRouter:
     return router
 
 
-def _add_pages(app: FastAPI, metrics: Callable[[], bytes] | None) -> None:
-    @app.get("/", include_in_schema=False)
-    @app.get("/docs", include_in_schema=False)
-    async def docs() -> HTMLResponse:
-        return HTMLResponse(page_of(app.openapi()), headers={"Content-Security-Policy": POLICY})
-
-    if metrics is not None:
-
-        @app.get("/metrics", include_in_schema=False)
-        async def prometheus() -> Response:
-            return Response(metrics(), media_type=CONTENT_TYPE)
-
-
 def _add_refusals(app: FastAPI) -> None:
-    """Say in one way why a request was not done."""
+    """Answer every request that is not carried out with an `ErrorReport`."""
 
     @app.exception_handler(RefusalError)
     async def refused(request: Request, error: RefusalError) -> JSONResponse:

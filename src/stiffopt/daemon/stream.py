@@ -6,18 +6,17 @@ import asyncio
 import json
 import math
 from contextlib import suppress
+from functools import partial
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from stiffopt.daemon.access import Token
-from stiffopt.daemon.connections import GRACE, MAX_STREAMS, Crowd, Member
 from stiffopt.daemon.messages import MAX_MESSAGE, TargetMessage, sentence
 from stiffopt.daemon.operations import Operations
 from stiffopt.daemon.reports import LEASE_HEADER, RefusalError
-
-__all__ = ["DEFAULT_RATE", "MAX_RATE", "Stream"]
+from stiffopt.daemon.server import GRACE, MAX_STREAMS, ConnectionLimiter, LimitedConnection
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -27,7 +26,7 @@ MAX_RATE = 100.0
 
 
 class AccessMessage(BaseModel):
-    """The token and the lease that let a stream move the arm; a missing one stays as it was."""
+    """The token and the lease that let a stream move the arm; one that is missing is kept."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -36,7 +35,7 @@ class AccessMessage(BaseModel):
 
 
 class StreamedTarget(BaseModel):
-    """A target, and a number by which its answer is known."""
+    """A target, and the number that its answer will have."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -50,16 +49,7 @@ class Stream:
     Of targets that come faster than the control loop takes them, only the newest is passed on:
     a stale one would move the arm to where the client no longer wants it.
 
-    Parameters
-    ----------
-    websocket :
-        Not accepted yet; `Access` has looked at its headers.
-    operations :
-        What is to be done.
-    token :
-        Of those who may move the arm.
-    crowd, member :
-        All connections, and which of them this is.
+    The WebSocket is not accepted yet; `Access` has checked its headers.
     """
 
     def __init__(
@@ -67,13 +57,13 @@ class Stream:
         websocket: WebSocket,
         operations: Operations,
         token: Token,
-        crowd: Crowd,
-        member: Member,
+        limiter: ConnectionLimiter,
+        connection: LimitedConnection,
     ) -> None:
         self._socket = websocket
         self._operations = operations
         self._token = token
-        self._crowd, self._member = crowd, member
+        self._limiter, self._connection = limiter, connection
         self._lease = websocket.headers.get(LEASE_HEADER)
         self._next: StreamedTarget | None = None
         self._arrived = asyncio.Event()
@@ -93,7 +83,7 @@ class Stream:
     async def _serve(self, rate: float) -> None:
         tasks = [asyncio.create_task(self._receive())]
         try:
-            await self._be_seated(tasks[0])
+            await self._be_admitted(tasks[0])
             tasks.append(asyncio.create_task(self._work()))
             if rate > 0:
                 tasks.append(asyncio.create_task(self._report(1 / rate)))
@@ -105,17 +95,17 @@ class Stream:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _be_seated(self, receiving: asyncio.Task[None]) -> None:
-        """Find room among the streams; where there is none, the token may still be shown."""
-        if self._crowd.seat(self._member):
+    async def _be_admitted(self, receiving: asyncio.Task[None]) -> None:
+        """Wait until it may be served; where streams are too many, it may still show the token."""
+        if self._limiter.admit_stream(self._connection):
             return
-        if not self._member.trusted:
+        if not self._connection.trusted:
             shown = asyncio.create_task(self._shown.wait())
             await asyncio.wait([shown, receiving], timeout=GRACE, return_when="FIRST_COMPLETED")
             shown.cancel()
-            if receiving.done() or self._crowd.seat(self._member):
+            if receiving.done() or self._limiter.admit_stream(self._connection):
                 return
-        kind = "with" if self._member.trusted else "without"
+        kind = "with" if self._connection.trusted else "without"
         raise RefusalError(503, "busy", f"there are {MAX_STREAMS} streams {kind} the token already")
 
     async def _report(self, period: float) -> None:
@@ -145,10 +135,10 @@ class Stream:
             if access.token is not None:
                 self._show(access.token)
             self._lease = access.lease or self._lease
-            await self._send({"type": "access", "trusted": self._member.trusted})
+            await self._send({"type": "access", "trusted": self._connection.trusted})
             return
         target = _valid(StreamedTarget, given)
-        if not self._member.trusted:
+        if not self._connection.trusted:
             self._token.check(None)
         replaced, self._next = self._next, target
         self._arrived.set()
@@ -161,15 +151,14 @@ class Stream:
         try:
             self._token.check(token)
         except RefusalError:
-            self._crowd.distrust(self._member)
+            self._limiter.distrust(self._connection)
             raise
-        if not self._crowd.trust(self._member):
+        if not self._limiter.trust(self._connection):
             text = f"there are {MAX_STREAMS} streams with the token already"
             raise RefusalError(503, "busy", text)
         self._shown.set()
 
     async def _work(self) -> None:
-        loop = self._operations.loop
         while True:
             await self._arrived.wait()
             self._arrived.clear()
@@ -177,20 +166,23 @@ class Stream:
             if streamed is None:
                 continue
             try:
-                await self._operations.command(self._lease, loop.set_target, streamed.target.read)
+                await self._operations.command(
+                    self._lease, partial(self._set_target, streamed.target)
+                )
             except RefusalError as refusal:
                 await self._answer(streamed.seq, refusal)
             else:
                 await self._answer(streamed.seq)
 
+    def _set_target(self, target: TargetMessage) -> None:
+        self._operations.loop.set_target(target.read())
+
     async def _answer(self, seq: int, refusal: RefusalError | None = None) -> None:
-        told = {} if refusal is None else refusal.body
-        await self._send({"type": "answer", "seq": seq, "accepted": refusal is None, **told})
+        error = {} if refusal is None else refusal.body
+        await self._send({"type": "answer", "seq": seq, "accepted": refusal is None, **error})
 
     async def _send(self, message: dict[str, Any]) -> None:
-        await self._send_text(json.dumps(message))
-
-    async def _send_text(self, text: str) -> None:
+        text = json.dumps(message)
         async with self._sending:
             await self._socket.send_text(text)
 

@@ -1,7 +1,7 @@
 """Telemetry: sends the state of the loop to Foxglove and records it, in a thread of its own.
 
-The loop hands over a snapshot in each tick, which costs it a microsecond. Whatever fails here
-raises an alarm and does nothing else.
+The loop hands over a snapshot in each tick, which takes a microsecond. A failure here raises an
+alarm, and control goes on.
 """
 
 from __future__ import annotations
@@ -18,17 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.loop import ControlLoop
-from stiffopt.control.state import Alarm, Snapshot
+from stiffopt.control.state import Snapshot
 from stiffopt.daemon.recording import RunRecording
 from stiffopt.daemon.topics import FORMAT, TelemetryChannels
-from stiffopt.errors import MissingExtraError, StiffoptError
+from stiffopt.errors import StiffoptError, require_package
 from stiffopt.files import file_text
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.rig.device import Clock
 from stiffopt.rig.settings import ServiceSettings
-
-__all__ = ["ArmShape", "Telemetry", "TelemetryRates", "about_run"]
 
 Array = NDArray[np.float64]
 
@@ -70,24 +68,20 @@ class Telemetry:
 
     Parameters
     ----------
-    robot :
-        What the arm is believed to be; kept in the recording.
-    name :
+    robot, name :
+        The model of the arm, which is kept in the recording, and the name of the rig.
+    loop, clock :
         Of the rig.
-    loop :
-        What is watched.
     folder :
-        Where recordings go; None: nothing is recorded.
+        Where recordings go.
     settings :
         Where Foxglove may connect.
-    clock :
-        Of the rig.
     backbone :
         Gives poses (m, 4, 4) along the arm for pressures (n,), in Pa.
     about :
         Further metadata for the recording, such as the text of the rig file.
     wall :
-        Nanoseconds since 1970; asked once, so that no change of the wall clock is in the messages.
+        Nanoseconds since 1970; read once, so that messages do not jump with the wall clock.
 
     Raises
     ------
@@ -100,7 +94,7 @@ class Telemetry:
         robot: RobotDescription,
         name: str,
         loop: ControlLoop,
-        folder: str | None,
+        folder: str,
         settings: ServiceSettings,
         *,
         clock: Clock,
@@ -108,10 +102,8 @@ class Telemetry:
         about: Mapping[str, str] | None = None,
         wall: Callable[[], int] = time.time_ns,
     ) -> None:
-        try:
-            from foxglove import Context
-        except ImportError:
-            raise MissingExtraError("foxglove-sdk", "daemon") from None
+        require_package("foxglove-sdk", "daemon", "foxglove")
+        from foxglove import Context
 
         self.dropped = 0
         self._loop, self._name, self._settings = loop, name, settings
@@ -120,14 +112,11 @@ class Telemetry:
         self._context = Context()
         begin = clock.now()
         self._offset = wall() - round(begin * 1e9)
-        self._channels = TelemetryChannels(self._context, self._offset, 2 * _radius(robot))
+        thickness = 2 * max(segment.outer_radius for segment in robot.segments)
+        self._channels = TelemetryChannels(self._context, self._offset, thickness)
         first = loop.snapshot()
         facts = {**about_run(robot, name, first, begin, self._offset), **(about or {})}
-        self._recording = (
-            None
-            if folder is None
-            else RunRecording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
-        )
+        self.recording = RunRecording(folder, name, self._context, facts, wall=lambda: wall() / 1e9)
         self._server: Any = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
@@ -135,32 +124,16 @@ class Telemetry:
         self._next_event = 0
         self._last_state: object = None
         self._logged = np.inf  # nothing was handed over yet
-        self._due_tick = self._due_state = self._due_smooth = self._due_often = (
-            self._due_commit
-        ) = -np.inf
-        self._told: dict[str, str] = {}
-        self._dropped_told = 0
+        self._due_tick = self._due_state = self._due_frames = self._due_shape = -np.inf
+        self._due_commit = -np.inf
+        self._alarms: dict[str, str] = {}
+        self._dropped_before = 0
         self._dropped_at = self._failed_at = -np.inf
 
     @property
     def port(self) -> int | None:
         """Where Foxglove can connect; None while it cannot."""
         return None if self._server is None else int(self._server.port)
-
-    @property
-    def path(self) -> str | None:
-        """The file that is written, or was last."""
-        return None if self._recording is None else self._recording.path
-
-    @property
-    def written(self) -> int:
-        """Bytes recorded so far."""
-        return 0 if self._recording is None else self._recording.written
-
-    @property
-    def waiting(self) -> int:
-        """Snapshots that are not logged yet."""
-        return len(self._queue)
 
     def put(self, snapshot: Snapshot) -> None:
         """Hand over a snapshot; called by the control thread in each tick, and never waits."""
@@ -176,13 +149,10 @@ class Telemetry:
         self._thread.start()
 
     def stop(self, patience: float = 5.0) -> None:
-        """Log what is left, end the recording and listen no more; to stop twice does nothing.
+        """Log the rest, end the recording and stop the server; to stop twice does nothing.
 
-        Raises
-        ------
-        TimeoutError
-            What is being written, as to a disk that hangs, was not done after `patience`, in s;
-            nothing more is recorded then.
+        If what is being written, as to a disk that hangs, is not done after `patience`, in s,
+        nothing more is recorded, and it raises `TimeoutError`.
         """
         self._stop.set()
         if not self._working.acquire(timeout=patience):
@@ -195,40 +165,36 @@ class Telemetry:
         if end.time > (self._queue[-1].time if self._queue else self._logged):
             self.put(end)  # what became of it after the last tick
         self.work(last=True)
-        if self._recording is not None:
-            self._recording.close()
+        self.recording.close()
         if self._server is not None:
             self._server.stop()
             self._server = None
         self._channels.close()
 
     def work(self, *, last: bool = False) -> None:
-        """Log what has come since the last call; with `last`, see it onto the disk at once."""
+        """Log what has come since the last call; with `last`, write it to the disk at once."""
         with self._working:
-            self._work(last)
-
-    def _work(self, last: bool) -> None:
-        if self._recording is not None and not self._recording.is_open:
-            self._commit(time.monotonic())  # to have it before anything is logged
-        while self._queue:
-            self._attempt(self._log, self._queue.popleft())
-            time.sleep(0)  # the control thread may want the interpreter
-        events, self._next_event = self._loop.events.since(self._next_event)
-        for event in events:
-            self._attempt(self._channels.log_event, event)
-        now = time.monotonic()
-        if last or now >= self._due_commit:
-            self._due_commit = now + RATES.commit
-            self._commit(now)
-        self._look_back(now)
+            if not self.recording.is_open:
+                self._commit(time.monotonic())  # to have it before anything is logged
+            while self._queue:
+                self._attempt(self._log, self._queue.popleft())
+                time.sleep(0)  # the control thread may want the interpreter
+            events, self._next_event = self._loop.events.since(self._next_event)
+            for event in events:
+                self._attempt(self._channels.log_event, event)
+            now = time.monotonic()
+            if last or now >= self._due_commit:
+                self._due_commit = now + RATES.commit
+                self._commit(now)
+            self._look_back(now)
 
     def _attempt(self, log: Callable[[Any], None], what: Any) -> None:
-        """Log something; that it fails is told, and no more comes of it."""
+        """Log something; a failure raises an alarm."""
         try:
             log(what)
         except Exception as error:
             self._failed_at = time.monotonic()
-            self._tell("telemetry", f"something could not be logged: {error}")
+            self._set_alarm("telemetry", f"something could not be logged: {error}")
 
     def _run(self) -> None:
         while not self._stop.wait(RATES.wake):
@@ -249,12 +215,12 @@ class Telemetry:
             )
         except RuntimeError as error:
             where = f"{self._settings.host}:{port}"
-            self._tell("foxglove", f"Foxglove cannot connect: {where} is not free ({error})")
+            self._set_alarm("foxglove", f"Foxglove cannot connect: {where} is not free ({error})")
 
     def _log(self, now: Snapshot) -> None:
         self._logged = now.time
         due = on_time = now.time >= self._due_tick - RATES.tick / 2
-        state = (now.state, now.reason, now.task, _kinds(now.alarms))
+        state = (now.state, now.reason, now.task, {alarm.kind for alarm in now.alarms})
         if state != self._last_state or now.time >= self._due_state:
             self._channels.log_state(now)
             self._last_state, self._due_state = state, now.time + RATES.state
@@ -264,11 +230,11 @@ class Telemetry:
             self._due_tick = (self._due_tick if regular else now.time) + RATES.tick
             self._channels.log_tick(now)
         self._channels.log_samples(now)  # each of them
-        if now.time >= self._due_smooth:
-            self._due_smooth = now.time + RATES.frames
+        if now.time >= self._due_frames:
+            self._due_frames = now.time + RATES.frames
             self._channels.log_frames(now)
-        if now.time >= self._due_often:
-            self._due_often = now.time + RATES.shape
+        if now.time >= self._due_shape:
+            self._due_shape = now.time + RATES.shape
             self._channels.log_timing(now, self.dropped)
             self._log_arm(now)
 
@@ -277,30 +243,29 @@ class Telemetry:
             return
         p = np.where(np.isfinite(now.measured), now.measured, now.commanded)
         if np.isfinite(p).all():
-            with suppress(StiffoptError):  # an arm whose shape nobody knows is not drawn
+            with suppress(StiffoptError):  # an arm without a known shape is not drawn
                 self._channels.log_arm(now, self._backbone(p))
 
     def _commit(self, now: float) -> None:
-        if self._recording is not None:
-            self._recording.commit(now)
-            self._tell("log", self._recording.trouble)
+        self.recording.commit(now)
+        self._set_alarm("log", self.recording.trouble)
 
     def _look_back(self, now: float) -> None:
-        """Say what was lost, and that all is well when nothing has gone wrong for a while."""
+        """Raise an alarm for lost snapshots, and clear alarms after a while without a failure."""
         if now > self._failed_at + RATES.calm:
-            self._tell("telemetry", "")
-        if self.dropped > self._dropped_told:
-            self._dropped_told, self._dropped_at = self.dropped, now
+            self._set_alarm("telemetry", "")
+        if self.dropped > self._dropped_before:
+            self._dropped_before, self._dropped_at = self.dropped, now
             text = f"telemetry is too slow; {self.dropped} snapshots were never logged"
-            self._tell("telemetry-lost", text)
+            self._set_alarm("telemetry-lost", text)
         elif now > self._dropped_at + RATES.calm:
-            self._tell("telemetry-lost", "")
+            self._set_alarm("telemetry-lost", "")
 
-    def _tell(self, kind: str, text: str) -> None:
-        """Raise an alarm, or clear it where there is nothing to say; only what changes is told."""
-        if self._told.get(kind, "") == text:
+    def _set_alarm(self, kind: str, text: str) -> None:
+        """Raise an alarm, or clear it if the text is empty; if that changes anything."""
+        if self._alarms.get(kind, "") == text:
             return
-        self._told[kind] = text
+        self._alarms[kind] = text
         if text:
             self._loop.add_alarm(kind, text)
         else:
@@ -308,7 +273,7 @@ class Telemetry:
 
 
 class ArmShape:
-    """Computes the arm's shape as often as its share of the interpreter's time permits."""
+    """The shape of the arm's model, computed as often as `TelemetryRates.shape_share` permits."""
 
     def __init__(self, robot: Manipulator) -> None:
         self._robot = robot
@@ -328,7 +293,7 @@ class ArmShape:
 def about_run(
     robot: RobotDescription, name: str, first: Snapshot, begin: float, offset: int
 ) -> dict[str, str]:
-    """Return the metadata of a recording: all that a reader needs beside the messages."""
+    """Return the metadata of a recording: all that a reader needs, other than the messages."""
     from stiffopt import __version__
 
     return {
@@ -343,11 +308,3 @@ def about_run(
         "start_ns": str(offset + round(begin * 1e9)),
         "stiffopt": __version__,
     }
-
-
-def _radius(robot: RobotDescription) -> float:
-    return max(segment.outer_radius for segment in robot.segments)
-
-
-def _kinds(alarms: tuple[Alarm, ...]) -> frozenset[str]:
-    return frozenset(alarm.kind for alarm in alarms)

@@ -1,17 +1,16 @@
 """Topics of telemetry, live and recorded: the fields of the loop's state as messages.
 
-Which field is in which topic stands in its definition in `stiffopt.control.state`. Where Foxglove
-has a message of its own it is used too, so that its panels show it without set-up: frames, the arm
-as a line, events as a log. Everything else is JSON. Foxglove reads no union types in a schema
-(``["number", "null"]`` makes it refuse the topic), so a schema says what a field is when it is
-there: of what is missing a scalar is left out, and an item of an array is null.
+The definition of a field in `stiffopt.control.state` names its topic. The messages are JSON, and
+frames, the arm as a line and events as a log are messages of Foxglove's own too, which its panels
+show without set-up. Foxglove refuses union types in a schema (``["number", "null"]``), so a schema
+gives the type of a value that is known: an unknown scalar is left out, an unknown item is null.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,17 +18,8 @@ from numpy.typing import NDArray
 
 from stiffopt.control.state import Event, SeenPose, Severity, Snapshot, State, Timing
 from stiffopt.control.state_fields import Entry, Kind, entries
+from stiffopt.daemon.state_json import plain
 from stiffopt.rig.interface import PoseSample
-
-__all__ = [
-    "FORMAT",
-    "METADATA",
-    "STATES",
-    "TelemetryChannels",
-    "encoded",
-    "state_topics",
-    "topic_schemas",
-]
 
 METADATA = "stiffopt-run"
 """Name of the metadata record of a run."""
@@ -51,15 +41,10 @@ _FURTHER: Mapping[str, Mapping[str, Any]] = {  # what is no field of the state
 }
 
 
-_LOGGED: dict[tuple[type, str], tuple[Entry, ...]] = {}
-
-
+@cache
 def _logged(record: type, topic: str) -> tuple[Entry, ...]:
     """Return the fields of a record that are logged in a topic."""
-    if (record, topic) not in _LOGGED:
-        found = tuple(entry for entry in entries(record) if entry.shown.topic == topic)
-        _LOGGED[record, topic] = found
-    return _LOGGED[record, topic]
+    return tuple(entry for entry in entries(record) if entry.shown.topic == topic)
 
 
 def state_topics() -> tuple[str, ...]:
@@ -85,8 +70,9 @@ def topic_schemas() -> dict[str, dict[str, Any]]:
 def encoded(topic: str, time: float, record: Any, **further: Any) -> bytes:
     """Return the message of a topic for a record of the state, at a time in s."""
     message: dict[str, Any] = {"time_s": round(time, _TIME_DECIMALS)}
-    for entry in _logged(type(record), topic):
-        value = _rounded(getattr(record, entry.name), entry)
+    kind: type = type(record)
+    for entry in _logged(kind, topic):
+        value = plain(getattr(record, entry.name), entry, rounded=True)
         if value is not None:
             message[entry.key] = value
     message.update(further)
@@ -106,30 +92,6 @@ def _schema(entry: Entry) -> dict[str, Any]:
     return {"type": entry.kind.value} if item is None else {"type": "array", "items": item}
 
 
-def _rounded(value: Any, entry: Entry) -> Any:
-    """Return the value of a field, rounded, as it is logged; None if it is missing."""
-    if value is None:
-        return None
-    match entry.kind:
-        case Kind.NUMBER:
-            return round(value, entry.decimals) if isfinite(value) else None
-        case Kind.NUMBERS:
-            numbers = value.tolist() if entry.in_array else value
-            return [round(x, entry.decimals) if isfinite(x) else None for x in numbers]
-        case Kind.FLAGS if entry.in_array:
-            return value.tolist()
-        case Kind.COUNTS | Kind.FLAGS:
-            return list(value)
-        case Kind.TEXT:
-            return str(value)
-        case Kind.RECORDS:
-            return [
-                {e.key: _rounded(getattr(item, e.name), e) for e in entries(type(item))}
-                for item in value
-            ]
-    return value
-
-
 Array = NDArray[np.float64]
 
 BASE, TIP, TARGET, SEEN = "base", "tip", "target", "tip_seen"
@@ -141,17 +103,10 @@ _ARM_COLOUR, _TARGET_COLOUR = (0.31, 0.47, 0.65, 0.7), (0.84, 0.15, 0.16, 0.8)
 
 
 class TelemetryChannels:
-    """Writes snapshots, events and the shape of the arm to the topics of telemetry.
+    """Writes snapshots, events and the shape of the arm to the topics of a context of foxglove.
 
-    Parameters
-    ----------
-    context :
-        Of foxglove; whoever listens there gets all that is logged.
-    offset :
-        Nanoseconds since 1970 at the time 0 of the rig's clock. It stays, whatever becomes of the
-        wall clock.
-    thickness :
-        Of the arm as it is drawn, in m.
+    `offset` is the date of time 0 on the rig's clock, in ns since 1970; `thickness` that of the arm
+    as it is drawn, in m.
     """
 
     def __init__(self, context: Any, offset: int, thickness: float) -> None:
@@ -180,12 +135,12 @@ class TelemetryChannels:
         return self._offset + round(time * 1e9)
 
     def log_tick(self, now: Snapshot) -> None:
-        """Log what every tick has: pressures, the tip, and all else that does not change seldom."""
+        """Log the topics that are logged in each tick, such as pressures and the tip."""
         for topic in self._each_tick:
-            self._say(topic, now.time, now)
+            self._log_json(topic, now.time, now)
 
     def log_samples(self, now: Snapshot) -> None:
-        """Log what the tracker has seen; times are those of capture."""
+        """Log the tracker's samples, with the times of capture."""
         for sample in now.samples:
             if sample.visible and not now.rejected:
                 self._seen = sample
@@ -197,19 +152,19 @@ class TelemetryChannels:
                 sample.quaternion,
                 doubted=now.rejected > 0,
             )
-            self._say("/tracker", sample.time, seen, at=now.time)
+            self._log_json("/tracker", sample.time, seen, at=now.time)
 
     def log_state(self, now: Snapshot) -> None:
-        """Log what changes seldom: state, alarms and limits."""
-        self._say("/state", now.time, now, state_number=STATES.index(now.state))
-        self._say("/limits", now.time, now)
+        """Log state, alarms and limits, which change rarely."""
+        self._log_json("/state", now.time, now, state_number=STATES.index(now.state))
+        self._log_json("/limits", now.time, now)
 
     def log_timing(self, now: Snapshot, dropped: int) -> None:
         """Log how punctual the loop is, and how many snapshots never got here."""
-        self._say("/timing", now.time, now.timing, dropped=dropped)
+        self._log_json("/timing", now.time, now.timing, dropped=dropped)
 
     def log_event(self, event: Event) -> None:
-        """Log something that happened, for people and for programs."""
+        """Log an event, for people and for programs."""
         from foxglove.messages import Log, LogLevel
 
         moment = self.nanoseconds(event.time)
@@ -222,11 +177,19 @@ class TelemetryChannels:
             timestamp=_timestamp(moment), level=level, message=event.text, name=event.kind
         )
         self._log.log(message, log_time=moment)
-        self._say("/event", event.time, event)
+        self._log_json("/event", event.time, event)
 
     def log_arm(self, now: Snapshot, poses: Array) -> None:
         """Log the arm's shape from poses (m, 4, 4) along it, and the target."""
-        from foxglove.messages import LinePrimitive, Point3, SceneUpdate
+        from foxglove.messages import (
+            LinePrimitive,
+            Point3,
+            Pose,
+            Quaternion,
+            SceneUpdate,
+            SpherePrimitive,
+            Vector3,
+        )
 
         moment = self.nanoseconds(now.time)
         points = [Point3(x=x, y=y, z=z) for x, y, z in poses[:, :3, 3].tolist()]
@@ -234,11 +197,17 @@ class TelemetryChannels:
         entities = [_entity(moment, "arm", lines=[line])]
         where = _target_place(now)
         if where is not None:
-            entities.append(_ball(moment, where))
+            x, y, z = where.tolist()
+            place = Pose(
+                position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=0, y=0, z=0, w=1)
+            )
+            size = Vector3(x=_TARGET_SIZE, y=_TARGET_SIZE, z=_TARGET_SIZE)
+            ball = SpherePrimitive(pose=place, size=size, color=_colour(_TARGET_COLOUR))
+            entities.append(_entity(moment, TARGET, spheres=[ball]))
         self._scene.log(SceneUpdate(entities=entities), log_time=moment)
 
     def log_frames(self, now: Snapshot) -> None:
-        """Log where tip and target are, and where the tip was last seen."""
+        """Log the frames of the tip, the target and the tip as it was last seen."""
         from foxglove.messages import FrameTransforms
 
         moment = self.nanoseconds(now.time)
@@ -253,10 +222,10 @@ class TelemetryChannels:
         if known:
             self._frames.log(FrameTransforms(transforms=known), log_time=moment)
 
-    def _say(
+    def _log_json(
         self, topic: str, time: float, record: Any, *, at: float | None = None, **more: Any
     ) -> None:
-        """Log what a topic says of a record at a time; it comes in the tick at `at`."""
+        """Log the message of a topic for a record at a time, in the tick at `at`."""
         moment = self.nanoseconds(time if at is None else at)
         self._json[topic].log(encoded(topic, time, record, **more), log_time=moment)
 
@@ -289,16 +258,6 @@ def _frame(moment: int, name: str, position: Array, quaternion: Array | None) ->
         translation=Vector3(x=a, y=b, z=c),
         rotation=Quaternion(x=x, y=y, z=z, w=w),
     )
-
-
-def _ball(moment: int, where: Array) -> Any:
-    from foxglove.messages import Pose, Quaternion, SpherePrimitive, Vector3
-
-    x, y, z = where.tolist()
-    place = Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=0, y=0, z=0, w=1))
-    size = Vector3(x=_TARGET_SIZE, y=_TARGET_SIZE, z=_TARGET_SIZE)
-    ball = SpherePrimitive(pose=place, size=size, color=_colour(_TARGET_COLOUR))
-    return _entity(moment, TARGET, spheres=[ball])
 
 
 def _entity(moment: int, name: str, **shapes: Any) -> Any:

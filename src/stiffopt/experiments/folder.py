@@ -5,17 +5,16 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Self, TypeVar
+from typing import Annotated, TypeVar
 
 from pydantic import Field
 
 from stiffopt.errors import FileError, InputError
 from stiffopt.experiments.conductor import Conductor, TrackedFrame
 from stiffopt.files import read_file, save_file
-from stiffopt.logs import LogLayout, LogRow, LogWriter, McapLogWriter
+from stiffopt.logs import LogLayout, LogWriter, McapLogWriter
 from stiffopt.schema import Schema
 
 SETTINGS = "experiment.yaml"
@@ -87,61 +86,6 @@ def remove_folder(path: Path) -> None:
             path.rmdir()
 
 
-class ExperimentRecording:
-    """A recording as CSV and MCAP, with ``.part`` in the names until it is complete.
-
-    Parameters
-    ----------
-    folder, name :
-        Folder, and name of the files without ending.
-    layout :
-        Columns of the table.
-    begin :
-        Time 0 of the recording on the rig's clock, in s.
-    about :
-        Metadata for the MCAP file.
-    """
-
-    def __init__(
-        self, folder: Path, name: str, layout: LogLayout, begin: float, about: Mapping[str, str]
-    ) -> None:
-        self._begin = begin
-        self._paths = [
-            (folder / f"{name}.part.{ending}", folder / f"{name}.{ending}")
-            for ending in ("mcap", "csv")  # the CSV file last: its name shows completeness
-        ]
-        (part_mcap, _), (part_csv, _) = self._paths
-        for part in (part_mcap, part_csv):
-            part.unlink(missing_ok=True)  # of an interrupted run, which is repeated
-        with ExitStack() as opened:
-            csv = opened.enter_context(LogWriter(part_csv, layout))
-            mcap = opened.enter_context(McapLogWriter(part_mcap, layout, about))
-            self._open = opened.pop_all()
-        self._writers: tuple[LogWriter | McapLogWriter, ...] = (csv, mcap)
-
-    def append(self, row: LogRow) -> None:
-        """Append a row to both files."""
-        for writer in self._writers:
-            writer.append(row)
-
-    def complete(self) -> None:
-        """Close the files and give them their final names."""
-        self._open.close()
-        for part, whole in self._paths:
-            os.replace(part, whole)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._open.close()
-
-
 def check_same(name: str, now: object, then: object) -> None:
     """Refuse to resume an experiment with something that has changed."""
     if now != then:
@@ -156,14 +100,18 @@ def recorded(
     about: Mapping[str, str],
     longest: float = math.inf,
 ) -> Iterator[float]:
-    """Context in which all frames go to a recording, which is complete if nothing is raised.
+    """Context in which all frames are recorded, as CSV and MCAP.
+
+    The names of the files have ``.part`` in them until the end, unless something is raised.
 
     Parameters
     ----------
     conductor : Conductor
         Whose frames are recorded; it has seen the tip.
-    folder, name, about :
-        As for `ExperimentRecording`.
+    folder, name :
+        Folder, and name of the files without ending.
+    about :
+        Metadata for the MCAP file.
     longest :
         Frames later than this are left out, in s.
 
@@ -175,22 +123,27 @@ def recorded(
     turns = any(row.quaternion is not None for row in conductor.rows)
     layout = LogLayout(n=conductor.n, measured=True, tip_quaternion=turns)
     begin = conductor.clock.now()
-    with ExperimentRecording(folder, name, layout, begin, about) as recording:
+    mcap, csv = (folder / f"{name}.part.{ending}" for ending in ("mcap", "csv"))
+    for part in (mcap, csv):
+        part.unlink(missing_ok=True)  # of an interrupted run, which is repeated
+    with LogWriter(csv, layout) as to_csv, McapLogWriter(mcap, layout, about) as to_mcap:
 
         def keep(row: TrackedFrame) -> None:
             if 0 <= row.time - begin <= longest:
-                recording.append(row.logged(begin))
+                to_csv.append(row.logged(begin))
+                to_mcap.append(row.logged(begin))
 
         conductor.sink = keep
         try:
             yield begin
         finally:
             conductor.sink = None
-        recording.complete()
+    for part in (mcap, csv):  # the CSV file last: its name shows completeness
+        os.replace(part, folder / f"{name}{part.suffix}")
 
 
 class RawRecording:
-    """ExperimentRecording of all rows from now on; a run that is resumed continues the CSV file.
+    """A recording of all frames from now on; a run that is resumed continues the CSV file.
 
     Parameters
     ----------

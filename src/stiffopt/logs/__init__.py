@@ -1,10 +1,8 @@
 """Logs of an arm over time (CSV "log v1" and MCAP), and tables of measured stiffness (CSV)."""
 
 from stiffopt.logs.csv_log import LogWriter, read_log, write_log
-from stiffopt.logs.layout import LogLayout
-from stiffopt.logs.log import Body, Log, LogRow
+from stiffopt.logs.log import Body, Log, LogLayout, LogRow
 from stiffopt.logs.mcap_log import McapLogWriter, read_mcap_log
-from stiffopt.logs.mcap_reading import require_mcap
 from stiffopt.logs.stiffness import (
     StiffnessTable,
     read_stiffness_table,
@@ -22,7 +20,6 @@ __all__ = [
     "read_log",
     "read_mcap_log",
     "read_stiffness_table",
-    "require_mcap",
     "write_log",
     "write_stiffness_table",
 ]

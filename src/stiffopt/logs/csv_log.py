@@ -3,42 +3,34 @@
 from __future__ import annotations
 
 import os
-from types import TracebackType
 from typing import Self
 
 import numpy as np
 
-from stiffopt.errors import FileError, InputError
-from stiffopt.logs.layout import LogLayout
-from stiffopt.logs.log import Array, Log, LogRow, log_of_values
-from stiffopt.logs.table import cut_torn_end, read_bytes, read_table
-
-__all__ = ["LogWriter", "read_log", "write_log"]
+from stiffopt.errors import FileError
+from stiffopt.logs.log import Log, LogLayout, LogRow, log_of_values
+from stiffopt.logs.table import cut_torn_end, read_bytes, read_table, replacing, writing
 
 
 class LogWriter:
     """Appends rows to a log (log v1); each is handed to the system when `append` returns.
 
-    A file that is there and has the same columns is continued; `last_time` then says where.
+    An existing file that has the same columns is continued after `last_time`.
 
     Parameters
     ----------
-    path :
-        The file; its folder must exist.
-    layout :
-        Which columns it has.
+    path, layout :
+        The file, whose folder must exist, and its columns.
 
     Attributes
     ----------
-    last_time : float or None
-        Time of the last row; None before the first.
-    was_torn : bool
-        Whether a last line without an end was found and cut off.
+    last_time : time of the last row; None before the first.
+    was_torn : whether a last line without an end was found and cut off.
 
     Raises
     ------
     FileError
-        It cannot be written, or is there and has other columns.
+        It cannot be written, now or later, or is there and has other columns.
     """
 
     def __init__(self, path: str | os.PathLike[str], layout: LogLayout) -> None:
@@ -50,12 +42,10 @@ class LogWriter:
         header = f"{','.join(layout.columns)}\n".encode()
         if os.path.exists(self.path):
             self._take_up(header)
-        try:
+        with writing(self.path):
             self._stream = open(self.path, "ab", buffering=0)  # noqa: SIM115 - kept open
-            if not self._stream.tell():
-                self._write(header)
-        except OSError as error:
-            raise self._cannot(error) from None
+        if not self._stream.tell():
+            self._write(header)
 
     def _take_up(self, header: bytes) -> None:
         """Find where an existing file ends."""
@@ -74,87 +64,39 @@ class LogWriter:
                 raise FileError(self.path, "has no time", line=len(lines)) from None
 
     def append(self, row: LogRow) -> None:
-        """Write a row.
-
-        Raises
-        ------
-        InputError
-            It does not fit the columns, or is not after the last one.
-        FileError
-            It cannot be written.
-        """
-        values = row.values(self.layout)
-        time = round(float(values[0]), 6)
-        if not np.isfinite(time) or (self.last_time is not None and time <= self.last_time):
-            raise InputError(f"a row at {time:g} s cannot follow one at {self.last_time} s")
-        self._write(self._line(values))
-        self.last_time = time
-
-    def _line(self, values: Array) -> bytes:
+        """Write a row; raise `InputError` if it does not fit or is not after the last one."""
+        values = row.values(self.layout, after=self.last_time)
         fields = [
-            "" if value != value else form % value
+            "" if np.isnan(value) else form % value
             for form, value in zip(self._formats, values.tolist(), strict=True)
         ]
-        return f"{','.join(fields)}\n".encode()
+        self._write(f"{','.join(fields)}\n".encode())
+        self.last_time = round(row.time, 6)
 
     def _write(self, data: bytes) -> None:
-        try:
+        with writing(self.path):
             while data:
                 data = data[self._stream.write(data) :]
-        except OSError as error:
-            raise self._cannot(error) from None
 
     def close(self) -> None:
-        """See the rows onto the disk and close; to close twice does nothing.
-
-        Raises
-        ------
-        FileError
-            The disk does not take them.
-        """
+        """Write all rows to the disk and close; to close twice does nothing."""
         if self._stream.closed:
             return
-        try:
+        with writing(self.path), self._stream:
             os.fsync(self._stream.fileno())
-        except OSError as error:
-            raise self._cannot(error) from None
-        finally:
-            self._stream.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _cannot(self, error: OSError) -> FileError:
-        return FileError(self.path, f"cannot be written: {(error.strerror or '').lower()}")
 
 
 def write_log(path: str | os.PathLike[str], log: Log) -> None:
-    """Write a whole recording (log v1), in the place of what is there.
-
-    Raises
-    ------
-    FileError
-        It cannot be written.
-    """
-    part = f"{os.fspath(path)}.part"
-    try:
-        with LogWriter(part, log.layout) as writer:
-            for row in log.rows():
-                writer.append(row)
-        os.replace(part, path)
-    except OSError as error:
-        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None
-    finally:
-        if os.path.exists(part):
-            os.remove(part)
+    """Write a whole log (log v1), in the place of what is there."""
+    with replacing(path) as part, LogWriter(part, log.layout) as writer:
+        for row in log.rows():
+            writer.append(row)
 
 
 def read_log(path: str | os.PathLike[str]) -> Log:

@@ -1,19 +1,111 @@
-"""A log in memory: pressures and poses of an arm over time."""
+"""A log in memory: pressures and poses of an arm over time, and the columns of its files."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import difflib
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.errors import InputError
-from stiffopt.logs.layout import LogLayout
-
-__all__ = ["Array", "Body", "Log", "LogRow", "log_of_values"]
+from stiffopt.errors import FileError, InputError, shown
 
 Array = NDArray[np.float64]
+
+_TIME = "time_s"
+_AXES = ("x", "y", "z")
+_PARTS = ("qw", "qx", "qy", "qz")
+_BODY = re.compile(r"([a-z][a-z0-9]*(?:_[a-z0-9]+)*)_(?:[xyz]_m|q[wxyz])")
+
+
+@dataclass(frozen=True)
+class LogLayout:
+    """Which columns a log has.
+
+    Attributes
+    ----------
+    n : number of channels.
+    measured : whether pressures were measured.
+    tip_quaternion : whether the tip's orientation was tracked.
+    bodies : names of further bodies, and whether their orientation was tracked.
+    force, stage : whether a probe's force and its place were recorded.
+    """
+
+    n: int
+    measured: bool = False
+    tip_quaternion: bool = False
+    bodies: Mapping[str, bool] = field(default_factory=dict)
+    force: bool = False
+    stage: bool = False
+
+    @property
+    def parts(self) -> dict[str, list[str]]:
+        """Columns of each quantity, in the order in which they are written.
+
+        The keys are ``time``, ``commanded``, ``measured``, ``BODY position``, ``BODY quaternion``
+        (the tip is a body), ``force`` and ``stage``.
+        """
+        parts = {"time": [_TIME], "commanded": _pressures("p", self.n)}
+        if self.measured:
+            parts["measured"] = _pressures("pm", self.n)
+        for name, turns in {"tip": self.tip_quaternion, **self.bodies}.items():
+            parts[f"{name} position"] = [f"{name}_{axis}_m" for axis in _AXES]
+            if turns:
+                parts[f"{name} quaternion"] = [f"{name}_{part}" for part in _PARTS]
+        if self.force:
+            parts["force"] = ["force_n"]
+        if self.stage:
+            parts["stage"] = ["stage_m"]
+        return parts
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the columns in the order in which they are written."""
+        return tuple(name for names in self.parts.values() for name in names)
+
+    def split(self, values: Array) -> dict[str, Array]:
+        """Return the values (..., m) of each part, from all values in the order of the columns."""
+        found, end = {}, 0
+        for name, columns in self.parts.items():
+            found[name] = values[..., end : end + len(columns)]
+            end += len(columns)
+        return found
+
+    @classmethod
+    def of_columns(cls, path: str, columns: Sequence[str]) -> LogLayout:
+        """Return the layout of a file that has these columns, in any order.
+
+        It raises `FileError` if a column is missing, there twice or unknown.
+        """
+        names = set(columns)
+        for name in columns:
+            if columns.count(name) > 1:
+                raise FileError(path, f"the column {shown(name)} is there twice", line=1)
+        n = next(k for k in count() if f"p{k + 1}_pa" not in names)
+        bodies = {}
+        for found in filter(None, map(_BODY.fullmatch, columns)):
+            if found[1] != "tip":
+                bodies[found[1]] = bool({f"{found[1]}_{part}" for part in _PARTS} & names)
+        layout = cls(
+            n=max(n, 1),
+            measured=any(re.fullmatch(r"pm\d+_pa", name) for name in names),
+            tip_quaternion=bool({f"tip_{part}" for part in _PARTS} & names),
+            bodies=bodies,
+            force="force_n" in names,
+            stage="stage_m" in names,
+        )
+        wanted = layout.columns
+        unknown = [name for name in columns if name not in wanted]
+        missing = [name for name in wanted if name not in names]
+        if missing:
+            raise FileError(path, _missing(missing[0], unknown), line=1)
+        if unknown:
+            raise FileError(path, _unknown(unknown[0], wanted), line=1)
+        return layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,10 +114,8 @@ class Body:
 
     Attributes
     ----------
-    position : ndarray
-        (N, 3), in m; NaN where it is missing.
-    quaternion : ndarray or None
-        (N, 4), w first; None if no orientation was recorded.
+    position : (N, 3), in m; NaN where it is missing.
+    quaternion : (N, 4), w first; None if no orientation was recorded.
     """
 
     position: Array
@@ -38,22 +128,14 @@ class Log:
 
     Attributes
     ----------
-    time : ndarray
-        (N,), in s, increasing; the steps are uneven.
-    commanded : ndarray
-        Gauge pressures (N, n), in Pa.
-    measured : ndarray or None
-        Gauge pressures (N, n), in Pa.
-    tip_position : ndarray
-        (N, 3), in m, in the tracker's or the base frame.
-    tip_quaternion : ndarray or None
-        (N, 4), w first.
-    bodies : mapping of str to Body
-        Further tracked bodies.
-    force : ndarray or None
-        Force (N,) with which a probe pushes the tip along its axis, in N.
-    stage : ndarray or None
-        Place (N,) of the probe along its axis, in m.
+    time : (N,), in s, increasing; the steps are uneven.
+    commanded : gauge pressures (N, n), in Pa.
+    measured : gauge pressures (N, n), in Pa, or None.
+    tip_position : (N, 3), in m, in the tracker's or the base frame.
+    tip_quaternion : (N, 4), w first, or None.
+    bodies : further tracked bodies.
+    force : force (N,) with which a probe pushes the tip along its axis, in N, or None.
+    stage : place (N,) of the probe along its axis, in m, or None.
     """
 
     time: Array
@@ -66,24 +148,22 @@ class Log:
     stage: Array | None = None
 
     def __post_init__(self) -> None:
-        count = len(self.time)
+        rows = len(self.time)
         if self.commanded.ndim != 2 or not self.commanded.shape[1]:
             raise InputError("a log needs commanded pressures (N, n)")
-        shapes: list[tuple[str, Array | None, tuple[int, ...]]] = [
-            ("time", self.time, (count,)),
-            ("commanded", self.commanded, (count, self.n)),
-            ("measured", self.measured, (count, self.n)),
-            ("tip_position", self.tip_position, (count, 3)),
-            ("tip_quaternion", self.tip_quaternion, (count, 4)),
-            ("force", self.force, (count,)),
-            ("stage", self.stage, (count,)),
-        ]
+        shapes: dict[str, tuple[Array | None, tuple[int, ...]]] = {
+            "time": (self.time, (rows,)),
+            "commanded": (self.commanded, (rows, self.n)),
+            "measured": (self.measured, (rows, self.n)),
+            "tip_position": (self.tip_position, (rows, 3)),
+            "tip_quaternion": (self.tip_quaternion, (rows, 4)),
+            "force": (self.force, (rows,)),
+            "stage": (self.stage, (rows,)),
+        }
         for name, body in self.bodies.items():
-            shapes.append((f"{name}: position", body.position, (count, 3)))
-            shapes.append((f"{name}: quaternion", body.quaternion, (count, 4)))
-        for name, value, shape in shapes:
-            if value is not None and value.shape != shape:
-                raise InputError(f"{name} must have the shape {shape}, not {value.shape}")
+            shapes[f"{name}: position"] = (body.position, (rows, 3))
+            shapes[f"{name}: quaternion"] = (body.quaternion, (rows, 4))
+        check_shapes(shapes)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -113,7 +193,7 @@ class Log:
         )
 
     def rows(self) -> Iterator[LogRow]:
-        """Yield the recording row by row."""
+        """Yield the log row by row."""
         for i in range(len(self)):
             yield LogRow(
                 time=float(self.time[i]),
@@ -143,14 +223,16 @@ class LogRow:
     force: float = np.nan
     stage: float = np.nan
 
-    def values(self, layout: LogLayout) -> Array:
+    def values(self, layout: LogLayout, after: float | None = None) -> Array:
         """Return the row as numbers (m,) in the order of the columns of a layout.
 
         Raises
         ------
         InputError
-            It does not fit the layout.
+            It does not fit the layout, has no time, or is not later than `after`, to 1 us.
         """
+        if not np.isfinite(self.time) or (after is not None and round(self.time, 6) <= after):
+            raise InputError(f"a row at {self.time:g} s cannot follow one at {after} s")
         given: dict[str, ArrayLike | None] = {
             "time": self.time,
             "commanded": self.commanded,
@@ -161,16 +243,13 @@ class LogRow:
         for name, pose in {"tip": (self.position, self.quaternion), **self.bodies}.items():
             given[f"{name} position"], given[f"{name} quaternion"] = pose
         return np.concatenate(
-            [_numbers(name, given.get(name), len(c)) for name, c in layout.parts.items()]
+            [numbers_of(name, given.get(name), len(c)) for name, c in layout.parts.items()]
         )
 
 
 def log_of_values(values: Array, layout: LogLayout) -> Log:
     """Return the log whose columns (N, m) are in the order of a layout."""
-    parts, end = {}, 0
-    for name, columns in layout.parts.items():
-        parts[name] = np.ascontiguousarray(values[:, end : end + len(columns)])
-        end += len(columns)
+    parts = {name: np.ascontiguousarray(part) for name, part in layout.split(values).items()}
     return Log(
         time=parts["time"][:, 0],
         commanded=parts["commanded"],
@@ -186,14 +265,38 @@ def log_of_values(values: Array, layout: LogLayout) -> Log:
     )
 
 
+def check_shapes(shapes: Mapping[str, tuple[NDArray[Any] | None, tuple[int, ...]]]) -> None:
+    """Raise `InputError` unless each array, by its name, has the shape that is given."""
+    for name, (value, shape) in shapes.items():
+        if value is not None and value.shape != shape:
+            raise InputError(f"{name} must have the shape {shape}, not {value.shape}")
+
+
 def _row(values: Array | None, i: int) -> Array | None:
     return values[i] if values is not None else None
 
 
-def _numbers(name: str, value: ArrayLike | None, count: int) -> Array:
+def numbers_of(name: str, value: ArrayLike | None, size: int) -> Array:
+    """Return what a row has for a part (size,): NaN for None and for what is not finite."""
     if value is None:
-        return np.full(count, np.nan)
+        return np.full(size, np.nan)
     numbers = np.asarray(value, dtype=float).reshape(-1)
-    if len(numbers) != count:
-        raise InputError(f"{name} of a row must be {count} numbers, not {len(numbers)}")
+    if len(numbers) != size:
+        raise InputError(f"{name} of a row must be {size} numbers, not {len(numbers)}")
     return np.where(np.isfinite(numbers), numbers, np.nan)
+
+
+def _pressures(prefix: str, n: int) -> list[str]:
+    return [f"{prefix}{k + 1}_pa" for k in range(n)]
+
+
+def _missing(name: str, unknown: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, unknown, n=1)
+    hint = f" (is {shown(near[0])} meant to be that?)" if near else ""
+    return f"the column '{name}' is missing{hint}; a log starts with a row of names"
+
+
+def _unknown(name: str, wanted: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, [*wanted, "force_n", "stage_m"], n=1)
+    hint = f"did you mean '{near[0]}'?" if near else f"the columns here are {', '.join(wanted)}"
+    return f"unknown column {shown(name)}; {hint}"

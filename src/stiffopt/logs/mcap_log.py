@@ -1,8 +1,8 @@
 """A log as MCAP, the format of Foxglove and other viewers: written by experiments, and read back.
 
-A row of the log is one message per topic, all with the same time. The message of ``/pressure`` is
-written last, so a row that has it is whole. There are no chunks: each row has been handed to the
-system when `append` returns, as in `LogWriter`.
+A row of the log is one message per topic, all with the same time, and one chunk of the file. A row
+is on the disk when `append` returns, as in `LogWriter`. The message of ``/pressure`` is written
+last, so that a row that has it is whole.
 
 | topic | is |
 | --- | --- |
@@ -17,28 +17,19 @@ import json
 import os
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
-from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, Self
 
 import numpy as np
 
-from stiffopt.errors import FileError, InputError
-from stiffopt.logs.layout import LogLayout
-from stiffopt.logs.log import Array, Log, LogRow, log_of_values
-from stiffopt.logs.mcap_reading import McapContents, read_mcap, require_mcap
-
-__all__ = ["LOG_METADATA", "McapLogWriter", "read_mcap_log"]
+from stiffopt.errors import FileError, require_package
+from stiffopt.logs.log import Array, Log, LogLayout, LogRow, log_of_values, numbers_of
+from stiffopt.logs.mcap_file import McapContents, McapWriter, read_mcap
+from stiffopt.logs.table import writing
 
 LOG_METADATA = "stiffopt-log"
 """Name of the metadata record of a log."""
-_NUMBER = {"type": "number"}  # or null; but Foxglove refuses a topic whose schema says so
-_LIST = {"type": "array", "items": _NUMBER}
-_SCHEMAS: dict[str, dict[str, Any]] = {
-    "pressure": {"time_s": {"type": "number"}, "commanded_pa": _LIST, "measured_pa": _LIST},
-    "pose": {"position_m": _LIST, "quaternion_wxyz": _LIST},
-    "force": {"force_n": _NUMBER, "stage_m": _NUMBER},
-}
+_REPLACE = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+_SCALARS = ("time_s", "force_n", "stage_m")
 
 
 class McapLogWriter:
@@ -46,19 +37,17 @@ class McapLogWriter:
 
     Parameters
     ----------
-    path :
-        The file; its folder must exist.
-    layout :
-        What is recorded.
+    path, layout :
+        The file, whose folder must exist, and what is recorded.
     about :
         Kept in the file as metadata.
 
     Raises
     ------
     FileError
-        It cannot be written.
+        It cannot be written, now or later.
     MissingExtraError
-        mcap is not installed.
+        foxglove-sdk is not installed.
     """
 
     def __init__(
@@ -67,121 +56,53 @@ class McapLogWriter:
         layout: LogLayout,
         about: Mapping[str, str] | None = None,
     ) -> None:
-        require_mcap()
-        from mcap.writer import Writer
+        require_package("foxglove-sdk", "log", "foxglove")
+        from foxglove import Channel, Context
 
         self.path = os.fspath(path)
         self.layout = layout
         self._start = time.time_ns()  # of the log: viewers want a date
-        self._last = -np.inf
-        try:
-            # an unbuffered file would be given a buffer by the writer, which nobody could flush
-            self._stream: BinaryIO = open(self.path, "wb")  # noqa: SIM115 - kept open
-        except OSError as error:
-            raise self._cannot(error) from None
-        self._writer: Any = Writer(self._stream, use_chunking=False)
-        self._writer.start(library="stiffopt")
-        self._writer.add_metadata(LOG_METADATA, {"start_ns": str(self._start), **_as_text(layout)})
-        if about:
-            self._writer.add_metadata("about", dict(about))
-        self._channels = self._registered()
-        self._flush()
-
-    def _registered(self) -> dict[str, int]:
-        schemas = {
-            name: self._writer.register_schema(
-                f"stiffopt.{name}",
-                "jsonschema",
-                json.dumps({"type": "object", "properties": properties}).encode(),
-            )
-            for name, properties in _SCHEMAS.items()
+        self._last_time: float | None = None
+        self._topics = _topics(layout)
+        context = Context()
+        self._channels = {
+            topic: Channel(topic, schema=_schema(topic, fields), context=context)
+            for topic, fields in self._topics.items()
         }
-        topics = {"/tip": "pose", **{f"/body/{name}": "pose" for name in self.layout.bodies}}
-        if self.layout.force or self.layout.stage:
-            topics["/force"] = "force"
-        topics["/pressure"] = "pressure"
-        return {
-            topic: self._writer.register_channel(topic, "json", schemas[schema])
-            for topic, schema in topics.items()
+        metadata = {
+            LOG_METADATA: {
+                "start_ns": str(self._start),
+                "format": f"{LOG_METADATA}/1",
+                "columns": ",".join(layout.columns),
+            },
+            **({"about": about} if about else {}),
         }
+        with writing(self.path):
+            self._file = McapWriter(os.open(self.path, _REPLACE, 0o666), context, metadata)
 
     def append(self, row: LogRow) -> None:
-        """Write a row.
-
-        Raises
-        ------
-        InputError
-            It does not fit the layout, or is not after the last one.
-        FileError
-            It cannot be written.
-        """
-        row.values(self.layout)  # checked whole before any part is written
-        if not np.isfinite(row.time) or row.time <= self._last:
-            raise InputError(f"a row at {row.time:g} s cannot follow one at {self._last:g} s")
+        """Write a row; raise `InputError` if it does not fit or is not after the last one."""
+        values = row.values(self.layout, after=self._last_time)
+        self._last_time = row.time
+        parts = self.layout.split(values)
         moment = self._start + round(row.time * 1e9)
-        for topic, message in self._messages(row):
+        for topic, fields in self._topics.items():
+            message = {key: _json_of(key, parts.get(part)) for key, part in fields.items()}
             data = json.dumps(message, allow_nan=False).encode()
-            try:
-                self._writer.add_message(self._channels[topic], moment, data, moment)
-            except OSError as error:
-                raise self._cannot(error) from None
-        self._flush()
-        self._last = row.time
-
-    def _messages(self, row: LogRow) -> Iterator[tuple[str, dict[str, Any]]]:
-        yield "/tip", _pose(row.position, row.quaternion)
-        for name in self.layout.bodies:
-            yield f"/body/{name}", _pose(*row.bodies.get(name, (None, None)))
-        if "/force" in self._channels:
-            yield "/force", {"force_n": _plain(row.force), "stage_m": _plain(row.stage)}
-        yield (
-            "/pressure",
-            {
-                "time_s": row.time,
-                "commanded_pa": _plain(row.commanded),
-                "measured_pa": _plain(row.measured),
-            },
-        )
+            self._channels[topic].log(data, log_time=moment)
+        with writing(self.path):
+            self._file.commit()
 
     def close(self) -> None:
-        """Write the summary and close; to close twice does nothing.
-
-        Raises
-        ------
-        FileError
-            The disk does not take it.
-        """
-        if self._stream.closed:
-            return
-        try:
-            self._writer.finish()
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
-        except OSError as error:
-            raise self._cannot(error) from None
-        finally:
-            with suppress(OSError):  # it tries once more to write what it could not
-                self._stream.close()
+        """Write the index and close; to close twice does nothing."""
+        with writing(self.path):
+            self._file.close()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _flush(self) -> None:
-        try:
-            self._stream.flush()
-        except OSError as error:
-            raise self._cannot(error) from None
-
-    def _cannot(self, error: OSError) -> FileError:
-        return FileError(self.path, f"cannot be written: {(error.strerror or '').lower()}")
 
 
 def read_mcap_log(path: str | os.PathLike[str]) -> Log:
@@ -194,8 +115,12 @@ def read_mcap_log(path: str | os.PathLike[str]) -> Log:
     MissingExtraError
         mcap is not installed.
     """
+    return log_of_contents(path, read_mcap(path))
+
+
+def log_of_contents(path: str | os.PathLike[str], found: McapContents) -> Log:
+    """Return the log that the contents of an MCAP file are; raises as `read_mcap_log`."""
     name = os.fspath(path)
-    found = read_mcap(name)
     if LOG_METADATA not in found.metadata:
         raise FileError(name, "is no MCAP recording of stiffopt")
     try:
@@ -208,63 +133,58 @@ def read_mcap_log(path: str | os.PathLike[str]) -> Log:
 
 
 def _whole_rows(found: McapContents, layout: LogLayout) -> Iterator[Array]:
-    parts: dict[str, Any] = {}
+    """Yield the values of the rows whose last message, that of ``/pressure``, is there."""
+    place = {
+        part: (topic, key)
+        for topic, fields in _topics(layout).items()
+        for key, part in fields.items()
+    }
+    messages: dict[str, Any] = {}
     for topic, message in found.messages:
-        parts[topic] = message
-        if topic == "/pressure":  # the last of its row
-            yield _row(parts).values(layout)
-            parts = {}
+        messages[topic] = message
+        if topic == "/pressure":
+            row = []
+            for part, columns in layout.parts.items():
+                where, key = place[part]
+                value = messages.get(where, {}).get(key)
+                row.append(numbers_of(part, value, len(columns)))
+            yield np.concatenate(row)
+            messages = {}
 
 
-def _row(parts: Mapping[str, Any]) -> LogRow:
-    pressure, tip = parts["/pressure"], parts.get("/tip", {})
-    force = parts.get("/force", {})
-    return LogRow(
-        time=float(pressure["time_s"]),
-        commanded=_numbers(pressure["commanded_pa"], 0),
-        measured=_optional(pressure.get("measured_pa")),
-        position=_optional(tip.get("position_m")),
-        quaternion=_optional(tip.get("quaternion_wxyz")),
-        bodies={
-            topic.removeprefix("/body/"): (
-                _numbers(message["position_m"], 3),
-                _optional(message["quaternion_wxyz"]),
-            )
-            for topic, message in parts.items()
-            if topic.startswith("/body/")
+def _topics(layout: LogLayout) -> dict[str, dict[str, str]]:
+    """Return the fields of each topic's messages, and the part of a row that each field holds."""
+    bodies = {"/tip": "tip", **{f"/body/{name}": name for name in layout.bodies}}
+    topics = {
+        topic: {"position_m": f"{body} position", "quaternion_wxyz": f"{body} quaternion"}
+        for topic, body in bodies.items()
+    }
+    if layout.force or layout.stage:
+        topics["/force"] = {"force_n": "force", "stage_m": "stage"}
+    topics["/pressure"] = {
+        "time_s": "time",
+        "commanded_pa": "commanded",
+        "measured_pa": "measured",
+    }
+    return topics
+
+
+def _schema(topic: str, fields: Mapping[str, str]) -> dict[str, Any]:
+    """Return the JSON schema of a topic; that a value may be null, Foxglove does not understand."""
+    number = {"type": "number"}
+    name = "pose" if "position_m" in fields else topic[1:]
+    return {
+        "title": f"stiffopt.{name}",
+        "type": "object",
+        "properties": {
+            key: number if key in _SCALARS else {"type": "array", "items": number} for key in fields
         },
-        force=_number(force.get("force_n")),
-        stage=_number(force.get("stage_m")),
-    )
+    }
 
 
-def _number(value: float | None) -> float:
-    return np.nan if value is None else float(value)
-
-
-def _numbers(values: list[float | None] | None, count: int) -> Array:
-    if values is None:
-        return np.full(count, np.nan)
-    return np.array([_number(value) for value in values])
-
-
-def _optional(values: list[float | None] | None) -> Array | None:
-    return None if values is None else _numbers(values, 0)
-
-
-def _pose(position: Any, quaternion: Any) -> dict[str, Any]:
-    return {"position_m": _plain(position), "quaternion_wxyz": _plain(quaternion)}
-
-
-def _plain(values: Any) -> Any:
-    """Return numbers for JSON: None for those that are not finite."""
-    if values is None:
+def _json_of(key: str, values: Array | None) -> Any:
+    """Return the part of a row that a field holds as JSON, with null for what is missing."""
+    if values is None or not np.isfinite(values).any():
         return None
-    numbers = np.asarray(values, dtype=float)
-    if numbers.ndim == 0:
-        return float(numbers) if np.isfinite(numbers) else None
-    return [value if np.isfinite(value) else None for value in numbers.tolist()]
-
-
-def _as_text(layout: LogLayout) -> dict[str, str]:
-    return {"format": f"{LOG_METADATA}/1", "columns": ",".join(layout.columns)}
+    numbers = [value if np.isfinite(value) else None for value in values.tolist()]
+    return numbers[0] if key in _SCALARS else numbers

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from io import StringIO
+from itertools import count
 from math import isfinite, nan
 
 import numpy as np
 
 from stiffopt.errors import FileError, InputError, shown
-from stiffopt.logs.log import Array
-from stiffopt.logs.table import read_bytes
-
-__all__ = ["StiffnessTable", "read_stiffness_table", "write_stiffness_table"]
+from stiffopt.logs.log import Array, check_shapes
+from stiffopt.logs.table import read_bytes, replacing
 
 BOUNDARIES = ("free", "guided", "clamped")
 _DIRECTION = ("direction_x", "direction_y", "direction_z")
@@ -28,18 +27,12 @@ class StiffnessTable:
 
     Attributes
     ----------
-    pressures : ndarray
-        Commanded gauge pressures (N, n), in Pa.
-    directions : ndarray
-        Unit vectors (N, 3) in the base frame.
-    boundaries : tuple of str
-        ``free``, ``guided`` or ``clamped``, for each row.
-    stiffness : ndarray
-        (N,), in N/m; NaN where none could be measured.
-    sigma : ndarray
-        Standard uncertainty (N,) of `stiffness`, in N/m.
-    others : mapping of str to ndarray
-        Further columns (N,), by name.
+    pressures : commanded gauge pressures (N, n), in Pa.
+    directions : unit vectors (N, 3) in the base frame.
+    boundaries : ``free``, ``guided`` or ``clamped``, for each row.
+    stiffness : (N,), in N/m; NaN where none could be measured.
+    sigma : standard uncertainty (N,) of `stiffness`, in N/m.
+    others : further columns (N,), by name.
     """
 
     pressures: Array
@@ -53,16 +46,15 @@ class StiffnessTable:
         count = len(self.stiffness)
         if self.pressures.ndim != 2 or not self.pressures.shape[1]:
             raise InputError("a table of stiffness needs pressures (N, n)")
-        shapes = {
-            "pressures": (self.pressures.shape, (count, self.pressures.shape[1])),
-            "directions": (self.directions.shape, (count, 3)),
-            "boundaries": ((len(self.boundaries),), (count,)),
-            "sigma": (self.sigma.shape, (count,)),
-            **{name: (values.shape, (count,)) for name, values in self.others.items()},
-        }
-        for name, (shape, wanted) in shapes.items():
-            if shape != wanted:
-                raise InputError(f"{name} must have the shape {wanted}, not {shape}")
+        check_shapes(
+            {
+                "boundaries": (np.array(self.boundaries), (count,)),
+                "pressures": (self.pressures, (count, self.n)),
+                "directions": (self.directions, (count, 3)),
+                "sigma": (self.sigma, (count,)),
+                **{name: (values, (count,)) for name, values in self.others.items()},
+            }
+        )
 
     def __len__(self) -> int:
         return len(self.stiffness)
@@ -74,30 +66,16 @@ class StiffnessTable:
 
 
 def write_stiffness_table(path: str | os.PathLike[str], table: StiffnessTable) -> None:
-    """Write a table as CSV, in the place of what is there.
-
-    Raises
-    ------
-    FileError
-        It cannot be written.
-    """
+    """Write a table as CSV, in the place of what is there."""
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     pressures = [f"p{k + 1}_pa" for k in range(table.n)]
     writer.writerow([*pressures, *_DIRECTION, "boundary", *_VALUES, *table.others])
-    for i in range(len(table)):
-        numbers = [*table.pressures[i], *table.directions[i]]
-        values = [table.stiffness[i], table.sigma[i], *(v[i] for v in table.others.values())]
-        writer.writerow(
-            [*map(_text, numbers), table.boundaries[i], *(_text(value) for value in values)]
-        )
-    part = f"{os.fspath(path)}.part"
-    try:
-        with open(part, "w", encoding="utf-8", newline="") as stream:
-            stream.write(text.getvalue())
-        os.replace(part, path)
-    except OSError as error:
-        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None
+    columns = [*table.pressures.T, *table.directions.T, table.boundaries]
+    columns += [table.stiffness, table.sigma, *table.others.values()]
+    writer.writerows(map(_text, row) for row in zip(*columns, strict=True))
+    with replacing(path) as part, open(part, "w", encoding="utf-8", newline="") as stream:
+        stream.write(text.getvalue())
 
 
 def read_stiffness_table(path: str | os.PathLike[str]) -> StiffnessTable:
@@ -123,31 +101,31 @@ def read_stiffness_table(path: str | os.PathLike[str]) -> StiffnessTable:
     if not lines:
         raise FileError(name, "is empty; expected a row of names", line=1)
     columns = [column.strip() for column in lines[0]]
-    n = 0
-    while f"p{n + 1}_pa" in columns:
-        n += 1
-    pressures = [f"p{k + 1}_pa" for k in range(max(n, 1))]
+    n = max(1, next(k for k in count() if f"p{k + 1}_pa" not in columns))
+    pressures = [f"p{k + 1}_pa" for k in range(n)]
     needed = [*pressures, *_DIRECTION, "boundary", *_VALUES]
     for column in needed:
         if columns.count(column) != 1:
             how = "there twice" if column in columns else "missing"
             raise FileError(name, f"the column '{column}' is {how}", line=1)
-    rows = [
-        _checked_row(name, number, columns, fields)
-        for number, fields in enumerate(lines[1:], start=2)
-    ]
+    rows = []
+    for line, fields in enumerate(lines[1:], start=2):
+        try:
+            rows.append(_checked_row(columns, fields))
+        except ValueError as error:
+            raise FileError(name, str(error), line=line) from None
     numbers = {
         column: np.array([row[column] for row in rows], dtype=float)
         for column in columns
         if column != "boundary"
     }
 
-    def stacked(names: list[str]) -> Array:
+    def stacked(names: Sequence[str]) -> Array:
         return np.stack([numbers[each] for each in names], axis=1)
 
     return StiffnessTable(
         pressures=stacked(pressures),
-        directions=stacked(list(_DIRECTION)),
+        directions=stacked(_DIRECTION),
         boundaries=tuple(str(row["boundary"]) for row in rows),
         stiffness=numbers[_VALUES[0]],
         sigma=numbers[_VALUES[1]],
@@ -155,42 +133,38 @@ def read_stiffness_table(path: str | os.PathLike[str]) -> StiffnessTable:
     )
 
 
-def _checked_row(
-    path: str, line: int, columns: list[str], fields: list[str]
-) -> dict[str, float | str]:
+def _checked_row(columns: list[str], fields: list[str]) -> dict[str, float | str]:
+    """Return a row of a table by its columns; raise `ValueError` if it is wrong."""
     if len(fields) != len(columns):
-        raise FileError(path, f"expected {len(columns)} fields, found {len(fields)}", line=line)
+        raise ValueError(f"expected {len(columns)} fields, found {len(fields)}")
     row: dict[str, float | str] = {}
     for column, text in zip(columns, map(str.strip, fields), strict=True):
-        if column == "boundary":
-            if text not in BOUNDARIES:
-                raise FileError(
-                    path, f"{shown(text)} is not one of {', '.join(BOUNDARIES)}", line=line
-                )
+        needed = column.endswith("_pa") or column in _DIRECTION
+        if column != "boundary":
+            row[column] = _number(column, text) if text or needed else nan
+        elif text in BOUNDARIES:
             row[column] = text
-            continue
-        may_be_missing = not (column.endswith("_pa") or column in _DIRECTION)
-        row[column] = _number(path, line, column, text, may_be_missing)
-    direction = [float(row[column]) for column in _DIRECTION]
-    norm = float(np.linalg.norm(direction))
+        else:
+            raise ValueError(f"{shown(text)} is not one of {', '.join(BOUNDARIES)}")
+    norm = float(np.linalg.norm([float(row[column]) for column in _DIRECTION]))
     if abs(norm - 1) > 1e-3:
-        raise FileError(path, f"the direction has length {norm:.4g}; expected 1", line=line)
+        raise ValueError(f"the direction has length {norm:.4g}; expected 1")
     if float(row["sigma_n_per_m"]) < 0:
-        raise FileError(path, "sigma_n_per_m is negative", line=line)
+        raise ValueError("sigma_n_per_m is negative")
     return row
 
 
-def _number(path: str, line: int, column: str, text: str, may_be_missing: bool) -> float:
-    if not text and may_be_missing:
-        return nan
+def _number(column: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = nan
     if not isfinite(value):
-        raise FileError(path, f"{column}: {shown(text)} is not a finite number", line=line)
+        raise ValueError(f"{column}: {shown(text)} is not a finite number")
     return value
 
 
-def _text(value: float) -> str:
+def _text(value: float | str) -> str:
+    if isinstance(value, str):
+        return value
     return f"{value:.9g}" if isfinite(value) else ""

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from io import BytesIO
 
 import numpy as np
 
-from stiffopt.errors import FileError, shown
+from stiffopt.errors import FileError, os_reason, shown
 from stiffopt.logs.log import Array
-
-__all__ = ["Table", "cut_torn_end", "read_bytes", "read_table"]
 
 _ALLOWED = b"0123456789+-.eE,\n \t"
 _NUMBER = re.compile(r"\s*[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\s*")
@@ -36,10 +36,8 @@ class Table:
 def read_table(path: str | os.PathLike[str]) -> Table:
     """Read a table: a row of names, then numbers; an empty field is a missing value.
 
-    Raises
-    ------
-    FileError
-        It cannot be read; a row has too few or too many fields; a field is no finite number.
+    It raises `FileError` if the file cannot be read, a row has too few or too many fields, or a
+    field is no finite number.
     """
     name = os.fspath(path)
     text = read_bytes(name).removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n")
@@ -64,41 +62,58 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     return Table(name, columns, values)
 
 
-def read_bytes(path: str) -> bytes:
-    """Return what is in a file.
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Return what is in a file; raise `FileError` if it cannot be read."""
+    with reading(path), open(path, "rb") as stream:
+        return stream.read()
 
-    Raises
-    ------
-    FileError
-        It cannot be read.
-    """
+
+@contextmanager
+def reading(path: str | os.PathLike[str], expected: str = "a file") -> Iterator[None]:
+    """Context in which an `OSError` becomes the `FileError` that a file cannot be read."""
     try:
-        with open(path, "rb") as stream:
-            return stream.read()
+        yield
     except FileNotFoundError:
         raise FileError(path, "there is no such file") from None
     except IsADirectoryError:
-        raise FileError(path, "is a folder; expected a file") from None
+        raise FileError(path, f"is a folder; expected {expected}") from None
     except OSError as error:
-        raise FileError(path, f"cannot be read: {(error.strerror or '').lower()}") from None
+        raise FileError(path, f"cannot be read: {os_reason(error)}") from None
+
+
+@contextmanager
+def writing(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Context in which an `OSError` becomes the `FileError` that a file cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise FileError(path, f"cannot be written: {os_reason(error)}") from None
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[str]:
+    """Context that yields the path of a new file, which then takes the place of `path`.
+
+    It raises `FileError` if that cannot be written.
+    """
+    part = f"{os.fspath(path)}.part"
+    try:
+        with writing(path):
+            yield part
+            os.replace(part, path)
+    finally:
+        with suppress(OSError):
+            os.remove(part)
 
 
 def cut_torn_end(path: str) -> bool:
-    """Remove an unfinished last line, as a killed writer leaves it; return whether there was one.
-
-    Raises
-    ------
-    FileError
-        It cannot be read or written.
-    """
+    """Remove the unfinished last line that a killed writer leaves; return whether there was one."""
     text = read_bytes(path)
     end = text.rfind(b"\n") + 1
     if end == len(text):
         return False
-    try:
+    with writing(path):
         os.truncate(path, end)
-    except OSError as error:
-        raise FileError(path, f"cannot be written: {(error.strerror or '').lower()}") from None
     return True
 
 

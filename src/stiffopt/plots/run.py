@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.daemon.run_log import RecordedRun, RunEvent, RunSpan
+from stiffopt.control.state import Event
+from stiffopt.daemon.run_log import RecordedRun, RunSpan
 from stiffopt.errors import printable
 from stiffopt.plots.style import (
     AXES,
@@ -215,7 +216,7 @@ def _shade(panels: Any, run: RecordedRun) -> None:
                 )
 
 
-def _list_events(figure: Any, listed: list[RunEvent], below: float) -> None:
+def _list_events(figure: Any, listed: list[Event], below: float) -> None:
     height = figure.get_figheight()
     for line, event in enumerate(listed):
         text = shorten(printable(event.text), 120, placeholder=" ...")
@@ -226,7 +227,7 @@ def _list_events(figure: Any, listed: list[RunEvent], below: float) -> None:
         figure.text(0.28, y, literal(text), fontsize=8.5, va="center")
 
 
-def _listed(events: tuple[RunEvent, ...]) -> list[RunEvent]:
+def _listed(events: tuple[Event, ...]) -> list[Event]:
     """The events that are listed in words: the gravest where there are too many."""
 
     def rank(index: int) -> tuple[int, int]:
@@ -268,7 +269,7 @@ def _figures(run: RecordedRun) -> str:
 # -- states, alarms and events over time ----------------------------------------------------------
 
 
-def _draw_timeline(axes: Any, run: RecordedRun, listed: list[RunEvent]) -> None:
+def _draw_timeline(axes: Any, run: RecordedRun, listed: list[Event]) -> None:
     """Draw bands for states and alarms, and marks for events; those that are listed by number."""
     kinds = _alarm_kinds(run)
     labels = ["state", *kinds, *(["events"] if run.events else [])]
@@ -295,9 +296,7 @@ def _band(axes: Any, span: RunSpan, row: int, colour: str) -> None:
     axes.fill_between([span.begin, span.end], row - _HALF, row + _HALF, color=colour, linewidth=0.6)
 
 
-def _draw_events(
-    axes: Any, run: RecordedRun, listed: list[RunEvent], row: int, width: float
-) -> None:
+def _draw_events(axes: Any, run: RecordedRun, listed: list[Event], row: int, width: float) -> None:
     numbers = {id(event): number for number, event in enumerate(listed, start=1)}
     last = -float("inf")
     for event in run.events:

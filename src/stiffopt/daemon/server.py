@@ -1,0 +1,366 @@
+"""The HTTP server of the daemon: uvicorn in a thread, with limits on the connections of clients.
+
+There is a limit to connections, to streams (WebSockets) and to the time that a connection may idle.
+Where there are too many, connections that have not shown the token are closed first; they never
+take the place of one that has.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable
+from itertools import chain
+from typing import Any
+
+from starlette.datastructures import Headers
+
+from stiffopt.daemon.messages import MAX_MESSAGE
+from stiffopt.daemon.secret import bracketed
+from stiffopt.errors import InputError, MissingExtraError, ServiceError, os_reason
+
+try:
+    import uvicorn
+    import websockets  # noqa: F401  # which uvicorn needs for the stream
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+    from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+except ModuleNotFoundError as error:
+    raise MissingExtraError(error.name or "uvicorn", "daemon") from error
+
+MAX_CONNECTIONS = 128
+"""Without the token, streams included; and as many with it, streams not included. Each is an open
+file, of which a process may have a thousand or so."""
+MAX_STREAMS = 16
+"""Without the token, and as many with it; a hundred would keep the control loop from its work."""
+GRACE = 1.0
+"""Seconds in which a stream that exceeds the limit may show the token."""
+CONNECTION = "connection"
+"""Key of a WebSocket's `LimitedConnection` in the state of its scope."""
+_HANDSHAKES = 50.0
+"""A second, of streams without the token; each takes some milliseconds of computing."""
+PATIENCE = 30.0
+"""Seconds in which a connection must have had an answer to a request; else it is closed."""
+_BUSY = b'{"error": {"code": "busy", "message": "too many streams without the token"}}'
+_REFUSAL = (
+    b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: application/json\r\nConnection: close\r\n"
+    b"Content-Length: %d\r\n\r\n%s" % (len(_BUSY), _BUSY)
+)
+_STARTING = 10.0  # s
+_CONNECTIONS = 1024  # that have not been accepted yet
+_AT_ONCE = 16  # of these are accepted, then others are heard; far fewer than make anyone give way
+_IDLE = 10  # s; longer than clients keep a connection that they do not use
+_CLOSING = 1  # s for requests that are being answered when the server stops
+_log = logging.getLogger(__name__)
+
+
+class Server:
+    """Serves an ASGI application on a port until it is stopped; port 0 is any free one."""
+
+    def __init__(self, app: Any, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._app = app
+        self._host = host
+        self.port = port
+        self._server: Any = None
+        self._thread: threading.Thread | None = None
+
+    @property
+    def url(self) -> str:
+        """Where clients of this machine reach it."""
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self._host, self._host)
+        return f"http://{bracketed(host)}:{self.port}"
+
+    @property
+    def alive(self) -> bool:
+        """Whether it serves."""
+        return self._thread is not None and self._thread.is_alive() and bool(self._server.started)
+
+    def start(self) -> None:
+        """Listen, and return when clients are answered.
+
+        Raises
+        ------
+        InputError
+            The address cannot be listened on.
+        ServiceError
+            The server does not start.
+        """
+        limiter = getattr(getattr(self._app, "state", None), "limiter", None) or ConnectionLimiter()
+        listening = self._listen()
+        self.port = int(listening.getsockname()[1])
+        config = uvicorn.Config(
+            self._app,
+            http=type("Connection", (BoundedProtocol,), {"limiter": limiter}),
+            backlog=_AT_ONCE,
+            timeout_keep_alive=_IDLE,
+            ws=type("Stream", (StreamProtocol,), {"limiter": limiter}),
+            ws_max_size=8 * MAX_MESSAGE,  # what is longer ends the connection
+            ws_max_queue=4,
+            ws_per_message_deflate=False,  # a small message must not become a large one
+            lifespan="on",
+            log_config=None,
+            log_level=logging.WARNING,
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            timeout_graceful_shutdown=_CLOSING,
+        )
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._run, args=(listening,), name="service", daemon=True
+        )
+        self._thread.start()
+        end = time.monotonic() + _STARTING
+        while not self._server.started:
+            if not self._thread.is_alive() or time.monotonic() > end:
+                self.stop()
+                raise ServiceError(f"the control interface does not start at {self.url}")
+            time.sleep(0.005)
+        listening.listen(_CONNECTIONS)  # `backlog` has made it less
+
+    def stop(self, timeout: float = 5.0) -> None:
+        """End all connections and stop listening; to stop what does not run does nothing."""
+        if self._thread is None:
+            return
+        self._server.should_exit = True
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            _log.warning("the control interface did not stop within %g s", timeout)
+
+    def _run(self, listening: socket.socket) -> None:
+        try:
+            self._server.run([listening])
+        except BaseException:  # uvicorn leaves by SystemExit too
+            _log.exception("the control interface has ended")
+        finally:
+            listening.close()
+
+    def _listen(self) -> socket.socket:
+        try:
+            found = socket.getaddrinfo(
+                self._host, self.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )
+            family, kind, protocol, _, address = found[0]
+            listening = socket.socket(family, kind, protocol)
+        except OSError as error:
+            raise self._cannot(error) from None
+        try:
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listening.bind(address)
+            listening.listen(_CONNECTIONS)
+        except OSError as error:
+            listening.close()
+            raise self._cannot(error) from None
+        return listening
+
+    def _cannot(self, error: OSError) -> InputError:
+        return InputError(
+            f"cannot listen on {self._host} port {self.port}: {os_reason(error)}; "
+            "give another host or port"
+        )
+
+
+class LimitedConnection:
+    """One connection of a client, from when it is accepted until it is lost.
+
+    `drop` closes it at once; `waits_since` returns since when it waits for its client, in s, or
+    None while its client waits for it.
+
+    Attributes
+    ----------
+    trusted : whether it has shown the token.
+    is_stream : whether it has become a WebSocket.
+    served : whether it is a stream that was admitted.
+    """
+
+    def __init__(
+        self,
+        drop: Callable[[], None] = lambda: None,
+        waits_since: Callable[[], float | None] = lambda: None,
+    ) -> None:
+        self.drop, self.waits_since = drop, waits_since
+        self.trusted = self.is_stream = self.served = False
+
+
+class ConnectionLimiter:
+    """The connections of a server, and the rule by which one is closed to make room.
+
+    Where too many have not shown the token, the oldest of them is dropped. One that has shown it
+    makes room only for others that have: the one that has waited longest for its client is dropped.
+    All methods are for one event loop. `trusts` says whether the headers of a request show the
+    token.
+    """
+
+    def __init__(
+        self,
+        trusts: Callable[[Headers], bool] = lambda headers: False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.trusts = trusts
+        self._clock = clock
+        self._anonymous: dict[LimitedConnection, None] = {}  # as sets that keep the order
+        self._trusted: dict[LimitedConnection, None] = {}
+        self._handshakes, self._counted = 0.0, clock()
+
+    def add(self, connection: LimitedConnection) -> None:
+        """Add a connection that has not shown the token."""
+        self._anonymous[connection] = None
+        if len(self._anonymous) > MAX_CONNECTIONS:
+            self._drop(next(iter(self._anonymous)))
+
+    def remove(self, connection: LimitedConnection) -> None:
+        """Forget a connection that is lost; to forget it twice does nothing."""
+        self._anonymous.pop(connection, None)
+        self._trusted.pop(connection, None)
+
+    def trust(self, connection: LimitedConnection) -> bool:
+        """Note that it has shown the token; return False if that makes one stream too many."""
+        if connection.trusted:
+            return True
+        if connection.served and self._count_streams(trusted=True) >= MAX_STREAMS:
+            return False
+        self._anonymous.pop(connection, None)
+        connection.trusted = True
+        self._trusted[connection] = None
+        if not connection.is_stream:
+            self._make_room_for(connection)
+        return True
+
+    def distrust(self, connection: LimitedConnection) -> None:
+        """Note that it has shown a wrong token."""
+        if connection.trusted:
+            connection.trusted = False
+            self._trusted.pop(connection, None)
+            self.add(connection)
+
+    def admit_stream(self, connection: LimitedConnection) -> bool:
+        """Let a stream be served; return False if there are too many of its kind."""
+        if not connection.served and self._count_streams(trusted=connection.trusted) < MAX_STREAMS:
+            connection.served = True
+        return connection.served
+
+    def permits_handshake(self) -> bool:
+        """Count a handshake without the token; return False if there were too many just now."""
+        now = self._clock()
+        passed, self._counted = now - self._counted, now
+        self._handshakes = max(self._handshakes - passed * _HANDSHAKES, 0.0)
+        if self._handshakes >= _HANDSHAKES:
+            return False
+        self._handshakes += 1
+        return True
+
+    def _count_streams(self, *, trusted: bool) -> int:
+        connections = chain(self._anonymous, self._trusted)
+        return sum(c.served and c.trusted is trusted for c in connections)
+
+    def _make_room_for(self, newest: LimitedConnection) -> None:
+        """Drop one of too many with the token: if none waits for its client, the newest."""
+        plain = [c for c in self._trusted if not c.is_stream]
+        if len(plain) > MAX_CONNECTIONS:
+            since = {c: c.waits_since() for c in plain if c is not newest}
+            waiting = {c: moment for c, moment in since.items() if moment is not None}
+            self._drop(min(waiting, key=waiting.__getitem__, default=newest))
+
+    def _drop(self, connection: LimitedConnection) -> None:
+        self.remove(connection)
+        connection.drop()
+
+
+class BoundedProtocol(H11Protocol):
+    """An HTTP connection under a `ConnectionLimiter`, which is closed when it idles.
+
+    Reading needs no token, so that anyone on this machine may connect. Clients that send nothing,
+    send slowly or connect again and again must not keep out one that wants to vent. (uvicorn's own
+    `limit_concurrency` would answer all clients with 503 then.)
+    """
+
+    limiter: ConnectionLimiter
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Add it to the limiter, and begin to count how long it idles."""
+        super().connection_made(transport)
+        self.connection = LimitedConnection(self.drop, self._waits_since)
+        self._closing: asyncio.TimerHandle | None = None
+        self._since = 0.0
+        self._is_refused = False
+        self._begin_to_wait()
+        self.limiter.add(self.connection)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Remove it."""
+        self._stop_waiting()
+        self.limiter.remove(self.connection)
+        super().connection_lost(exc)
+
+    def on_response_complete(self) -> None:
+        """Count from now on."""
+        self._begin_to_wait()
+        super().on_response_complete()
+
+    def handle_websocket_upgrade(self, event: Any) -> None:
+        """Make it a stream.
+
+        Too frequent handshakes without the token are refused before any work is done for them, and
+        after a delay: such a client would try again at once.
+        """
+        self._stop_waiting()
+        if not self.connection.trusted and not self.limiter.permits_handshake():
+            self._is_refused = True
+            self.transport.pause_reading()
+            self._closing = self.loop.call_later(GRACE, self._refuse)
+            return
+        self.connection.is_stream = True
+        self.connection.drop = self.transport.abort
+        self.app_state = {**self.app_state, CONNECTION: self.connection}
+        super().handle_websocket_upgrade(event)
+
+    def drop(self) -> None:
+        """Close it at once."""
+        self.connections.discard(self)  # it is gone; its socket is closed in the next round
+        self.transport.abort()
+
+    def shutdown(self) -> None:
+        """End when the server does."""
+        if self._is_refused:  # h11 waits for an answer that never comes
+            self.drop()
+        else:
+            super().shutdown()
+
+    def _should_upgrade(self) -> bool:
+        """Look for the token in the headers of a request, which have just come."""
+        if not self.connection.trusted and self.limiter.trusts(Headers(raw=self.headers)):
+            self.limiter.trust(self.connection)
+        return super()._should_upgrade()
+
+    def _refuse(self) -> None:
+        self.transport.write(_REFUSAL)
+        self.transport.close()
+
+    def _waits_since(self) -> float | None:
+        """Return since when it waits for its client; None if the client waits for an answer."""
+        cycle = self.cycle
+        waits = cycle is None or cycle.response_complete or cycle.more_body
+        return self._since if waits else None
+
+    def _begin_to_wait(self) -> None:
+        self._stop_waiting()
+        self._since = self.loop.time()
+        self._closing = self.loop.call_later(PATIENCE, self.drop)
+
+    def _stop_waiting(self) -> None:
+        if self._closing is not None:
+            self._closing.cancel()
+            self._closing = None
+
+
+class StreamProtocol(WebSocketsSansIOProtocol):
+    """A WebSocket connection under a `ConnectionLimiter`."""
+
+    limiter: ConnectionLimiter
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Remove it."""
+        self.limiter.remove(self.app_state[CONNECTION])
+        super().connection_lost(exc)
