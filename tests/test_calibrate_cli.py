@@ -15,7 +15,7 @@ import pytest
 import stiffopt
 from recordings import UCL, needs_ucl
 from stiffopt.cli import calibrate_run
-from stiffopt.cli.calibration_logs import fixed_keys, log_names
+from stiffopt.cli.calibrate_run import fixed_keys, log_names
 from stiffopt.cli.main import main
 from stiffopt.errors import FileError
 from stiffopt.files import save_file

@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 import stiffopt
 from stiffopt.cli import exits
 from stiffopt.cli import main as entry
-from stiffopt.cli.console import json_text
+from stiffopt.cli.console import plain_data
 from stiffopt.cli.solve_files import find_tasks
 from stiffopt.cli.solve_records import json_record
 from stiffopt.cli.solved_task import SolvedTask
@@ -320,7 +320,7 @@ def test_nothing_that_is_not_finite_comes_out() -> None:
     task = stiffopt.Task(robot="stiff-flop-1", target={"position": (0, 0, 0.09)})
     solution = PressureSolution("failed", "", task, stiffness=float("nan"))
     answer = SolvedTask("a.yaml", stiffopt.load_robot("stiff-flop-1"), solution, (float("inf"),))
-    (record,) = lines(json_text(json_record(answer)))
+    (record,) = lines(json.dumps(plain_data(json_record(answer)), allow_nan=False))
     assert record["stiffness"] is None
     assert record["stiffnesses_plain"] == [None]
 

@@ -37,9 +37,8 @@ from running import (
 )
 from stiffopt.cli import run_daemon
 from stiffopt.cli.main import main
-from stiffopt.cli.run_ending import Screen
-from stiffopt.cli.run_lines import Lines
-from stiffopt.cli.run_status import LiveStatus, status
+from stiffopt.cli.run_daemon import Screen
+from stiffopt.cli.run_display import Lines, LiveStatus, status
 from stiffopt.control.controller import TipController
 from stiffopt.control.state import Alarm, Event, Severity, State, Timing
 from stiffopt.daemon import daemon as daemon_module
@@ -320,9 +319,8 @@ def test_the_screen_shows_in_order_and_is_not_waited_for_if_it_hangs() -> None:
 
 ENDS = """
 import sys, threading, time
-from stiffopt.cli.run_ending import Backstop
-from stiffopt.cli.run_daemon import _Signals
-with _Signals().heard() as signals, Backstop(0.5, lambda: signals.count > 0):
+from stiffopt.cli.run_daemon import Backstop, _Signals
+with _Signals().handled() as signals, Backstop(0.5, lambda: signals.count > 0):
     print("ready", flush=True)
     threading.Thread(target=time.sleep, args=(60,)).start()  # keeps an interpreter from ending
     if sys.argv[1] == "hangs":

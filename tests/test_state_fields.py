@@ -62,8 +62,7 @@ import numpy as np
 from rich.console import Console
 from made_runs import BEGIN, FakeLoop as FakeRun, ticks
 from fake_loop import FakeLoop
-from stiffopt.cli.run_lines import Lines
-from stiffopt.cli.run_status import status
+from stiffopt.cli.run_display import Lines, status
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.metrics import Metrics
 from stiffopt.daemon.run_log import read_run

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Json, Quiet
 
 CALIBRATE_HELP = """\
@@ -91,6 +92,7 @@ Report = Annotated[
 ]
 
 
+@with_exit_code
 def calibrate(
     robot: Robot,
     out: Annotated[
@@ -152,13 +154,13 @@ def calibrate(
     recordings = calibrate_run.RecordingOptions(
         robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame
     )
-    options = calibrate_run.CalibrateOptions(
-        recordings, out, tuple(stiffness or ()), model, strain_law, tuple(fix or ()), rows, report,
-        as_json, quiet,
+    calibrate_run.run_calibrate(
+        recordings, out, tables=stiffness or (), model=model, strain_law=strain_law, fix=fix or (),
+        rows=rows, report=report, as_json=as_json, quiet=quiet,
     )  # fmt: skip
-    raise typer.Exit(calibrate_run.run_calibrate(options))
 
 
+@with_exit_code
 def validate(
     robot: Robot,
     logs: Annotated[list[str], typer.Argument(metavar="LOG...", show_default=False)],
@@ -177,4 +179,4 @@ def validate(
     recordings = calibrate_run.RecordingOptions(
         robot, tuple(logs), sequence, rezero, pressures, channels, frame
     )
-    raise typer.Exit(calibrate_run.run_validate(recordings, report, as_json=as_json, quiet=quiet))
+    calibrate_run.run_validate(recordings, report, as_json=as_json, quiet=quiet)

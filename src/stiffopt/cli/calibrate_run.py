@@ -1,88 +1,107 @@
-"""What `stiffopt calibrate` and `stiffopt validate` do: read, fit or compare, write, report."""
+"""What `stiffopt calibrate` and `stiffopt validate` do: read, fit or compare, write, report.
+
+What cannot be read or does not fit the robot raises `InputError` before anything is fitted.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import degrees
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 import stiffopt
 from stiffopt.cli import quantities
-from stiffopt.cli.calibration_logs import (
-    RecordingOptions,
-    check_model,
-    fixed_keys,
-    read_tables,
-)
-from stiffopt.cli.console import ProgressBar, show, warnings_as_notes, write_json
-from stiffopt.cli.exits import Interruptible, exit_code
+from stiffopt.cli.console import show, write_json
+from stiffopt.cli.exits import Progress, interruptible_work
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
-from stiffopt.errors import InputError
+from stiffopt.errors import FileError, InputError, require_package, shown
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
-from stiffopt.identify.results import Comparison, Errors, together
+from stiffopt.identify.results import together
 from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.structures import STRUCTURES
+from stiffopt.identify.unknowns import history_unknowns, shape_unknowns
 from stiffopt.identify.validation import validate as compare_robot
-from stiffopt.model.description import RobotDescription
+from stiffopt.logs import (
+    Log,
+    StiffnessTable,
+    read_log,
+    read_mcap_log,
+    read_stiffness_table,
+)
+from stiffopt.model.description import Recordings, RobotDescription, Tolerances
+from stiffopt.model.robot_files import load_description
 from stiffopt.plots.wording import MM
 
-__all__ = [
-    "CalibrateOptions",
-    "RecordingOptions",
-    "run_calibrate",
-    "run_validate",
-]
-
 _ENDINGS = (".yaml", ".yml")
-
-Progress = Callable[[float, float, str], None]
-
-
-@dataclass(frozen=True)
-class CalibrateOptions:
-    """The arguments of `stiffopt calibrate`, as they were given."""
-
-    recordings: RecordingOptions
-    out: str
-    tables: tuple[str, ...]
-    model: str
-    strain_law: str
-    fix: tuple[str, ...]
-    rows: int | None
-    report: str | None
-    as_json: bool
-    quiet: bool
+_SEGMENT = re.compile(r"segments\[\d+\]\.")
 
 
-def run_calibrate(options: CalibrateOptions) -> int:
-    """Fit a robot; write, report and draw it; return the exit code."""
-
-    def work(progress: Progress) -> Callable[[], None]:
-        result = _calibrated(options, progress)
+def run_calibrate(
+    recordings: RecordingOptions,
+    out: str,
+    *,
+    tables: Sequence[str],
+    model: str,
+    strain_law: str,
+    fix: Sequence[str],
+    rows: int | None,
+    report: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Fit a robot; write, report and draw it."""
+    with interruptible_work(quiet=quiet) as progress:
+        check_new_file(out, _ENDINGS)
+        _check_report(report)
+        if report and Path(report).resolve() == Path(out).resolve():
+            raise InputError(f"{out}: the robot file and the report cannot have one name")
+        if not recordings.logs and not tables:
+            raise InputError(
+                "there is nothing to fit to; expected a LOG or a table of stiffness (--stiffness)"
+            )
+        names = ["auto", *(structure.name for structure in STRUCTURES)]
+        if model not in names:
+            raise InputError(
+                f"--model: there is no model {shown(model)}; expected one of {', '.join(names)}"
+            )
+        quantities.choice("--strain-law", strain_law, ("auto", "keep"))
+        counts = {}
+        if rows is not None:
+            counts = {"rows": rows, "trial_rows": min(rows, CalibrationSettings().trial_rows)}
+        robot = recordings.description()
+        settings = recordings.settings(
+            structure=model, strain_law=strain_law, fixed=fixed_keys(fix, robot), **counts
+        )
+        stiffnesses = read_tables(tables, robot)
+        logs = recordings.read(robot, progress)
+        result = fit_robot(robot, logs, stiffnesses, settings, progress)
         progress(1, 1, "writing")
-        with new_folder(options.report) as folder:
+        with new_folder(report) as folder:
             if folder is not None:
                 from stiffopt.cli.calibration_report import write_calibration
 
-                write_calibration(folder, result, options.out)
-            save_file(options.out, "robot", result.robot, _origin(options, result))
-        return lambda: _print_calibration(result, options)
+                write_calibration(folder, result, out)
+            save_file(out, "robot", result.robot, _origin(result, recordings, tables, fix))
+    if quiet and not as_json:
+        return
+    from stiffopt.cli.calibration_report import calibration, calibration_record
 
-    return _run(work, quiet=options.quiet)
+    if as_json:
+        write_json(calibration_record(result, out, report))
+    else:
+        show(calibration(result, out, report))
 
 
 def run_validate(
     recordings: RecordingOptions, report: str | None, *, as_json: bool, quiet: bool
-) -> int:
-    """Compare a robot with logs; report and draw; return the exit code."""
-
-    def work(progress: Progress) -> Callable[[], None]:
+) -> None:
+    """Compare a robot with logs; report and draw."""
+    with interruptible_work(quiet=quiet) as progress:
         _check_report(report)
         settings = recordings.settings()
         robot = recordings.description()
@@ -93,64 +112,170 @@ def run_validate(
                 from stiffopt.cli.calibration_report import write_validation
 
                 write_validation(folder, robot, found)
+    if quiet and not as_json:
+        return
+    from stiffopt.cli.calibration_report import validation, validation_record
 
-        def print_result() -> None:
-            if as_json:
-                write_json(validation_record(robot, found))
-            elif not quiet:
-                from stiffopt.cli.calibration_report import validation
-
-                show(validation(robot, found, report))
-
-        return print_result
-
-    return _run(work, quiet=quiet)
+    if as_json:
+        write_json(validation_record(robot, found))
+    else:
+        show(validation(robot, found, report))
 
 
-def _run(work: Callable[[Progress], Callable[[], None]], *, quiet: bool) -> int:
-    """Work with progress, then print the result, as `work` returns it; return the exit code."""
-
-    def whole() -> None:
-        bar = ProgressBar(quiet=quiet)
-        with Interruptible() as interruptible, bar.shown(), warnings_as_notes(quiet=quiet):
-
-            def progress(done: float, total: float, words: str) -> None:
-                interruptible.check()
-                bar.report(done, total, words)
-
-            print_result = work(progress)
-        print_result()
-
-    return exit_code(whole)
+# -- robot, recordings and tables of stiffness -----------------------------------------------------
 
 
-def _calibrated(options: CalibrateOptions, progress: Progress) -> CalibrationResult:
-    check_new_file(options.out, _ENDINGS)
-    _check_report(options.report)
-    if options.report and Path(options.report).resolve() == Path(options.out).resolve():
-        raise InputError(f"{options.out}: the robot file and the report cannot have one name")
-    if not options.recordings.logs and not options.tables:
-        raise InputError(
-            "there is nothing to fit to; expected a LOG or a table of stiffness (--stiffness)"
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Options of both commands: which robot, which recordings of it, and how they are read."""
+
+    robot: str
+    logs: tuple[str, ...]
+    sequence: bool
+    rezero: bool
+    pressures: str
+    channels: str | None
+    frame: str | None
+
+    def settings(self, **others: Any) -> CalibrationSettings:
+        """Return the settings of a calibration: of these options, and others."""
+        quantities.choice("--pressures", self.pressures, ("commanded", "measured"))
+        given = {"sequence": self.sequence, "rezero": self.rezero, "pressures": self.pressures}
+        return CalibrationSettings(**given, **others)
+
+    def description(self) -> RobotDescription:
+        """Return the robot, with the channels and the frame of the options in its recordings."""
+        robot = load_description(self.robot)
+        change: dict[str, Any] = {}
+        if self.channels is not None:
+            change["channels"] = quantities.channels("--channels", self.channels)
+            if len(change["channels"]) != robot.n_pressures:
+                raise InputError(
+                    f"--channels: {shown(self.channels)} names {len(change['channels'])} columns, "
+                    f"the robot '{robot.name}' has {robot.n_pressures} channels; expected one for "
+                    "each"
+                )
+        if self.frame is not None:
+            change["frame"] = self.frame
+        if not change:
+            return robot
+        recordings = (robot.recordings or Recordings()).model_copy(update=change)
+        return robot.model_copy(update={"recordings": recordings})
+
+    def read(self, robot: RobotDescription, progress: Progress) -> list[tuple[str, Log]]:
+        """Return the logs with their names, see `log_names`."""
+        names = log_names(self.logs)
+        if any(path.lower().endswith(".mcap") for path in self.logs):
+            require_package("mcap", "log")
+        found = []
+        for i, (name, path) in enumerate(zip(names, self.logs, strict=True)):
+            progress(i, len(names), f"reading {name}")
+            log = _read(path)
+            _check_channels(path, log, robot)
+            found.append((name, log))
+        return found
+
+
+def log_names(paths: Sequence[str]) -> list[str]:
+    """Return a name for each file: its own, with as many folders as tell it from the others."""
+    parts = [Path(path).resolve().parts for path in paths]
+    for i, each in enumerate(parts):
+        if each in parts[:i]:
+            raise FileError(paths[i], "is given twice; expected each log once")
+    depth = [1] * len(parts)
+    while True:
+        names = ["/".join(each[-n:]) for each, n in zip(parts, depth, strict=True)]
+        same = [i for i, name in enumerate(names) if names.count(name) > 1]
+        if not same:
+            return names
+        for i in same:
+            depth[i] += 1
+
+
+def read_tables(paths: Sequence[str], robot: RobotDescription) -> list[StiffnessTable]:
+    """Return tables of stiffness."""
+    tables = []
+    for path in paths:
+        table = read_stiffness_table(path)
+        if table.pressures.shape[1] != robot.n_pressures:
+            raise FileError(
+                path,
+                f"has {table.pressures.shape[1]} pressures, the robot '{robot.name}' has "
+                f"{robot.n_pressures} channels",
+            )
+        tables.append(table)
+    return tables
+
+
+def fixed_keys(given: Sequence[str], robot: RobotDescription) -> tuple[str, ...]:
+    """Return the parameters that --fix names: by whole keys, without an index, or by their ends."""
+    known = _fitted_keys(robot)
+    found: list[str] = []
+    for text in given:
+        wanted = text.strip()
+        meant = [
+            key
+            for key in known
+            for candidate in (key, _SEGMENT.sub("", key))
+            if candidate == wanted or candidate.startswith((f"{wanted}[", f"{wanted}."))
+        ]
+        if not meant:
+            ends = dict.fromkeys(re.sub(r"\[\d+\]", "", _SEGMENT.sub("", key)) for key in known)
+            raise InputError(
+                f"--fix: {shown(text)} is no parameter of the robot '{robot.name}' that is fitted; "
+                f"expected a key such as {known[0]}, or one of {', '.join(ends)} for all of them"
+            )
+        found += meant
+    return tuple(dict.fromkeys(found))
+
+
+def _fitted_keys(robot: RobotDescription) -> list[str]:
+    """Keys of all parameters that some model fits."""
+    tolerances = robot.tolerances or Tolerances()
+    keys: dict[str, None] = {}
+    for structure in STRUCTURES:
+        begun = structure.applied(robot, float(max(robot.pressure_max)))
+        unknowns = shape_unknowns(begun, structure.shape, tolerances)
+        for each in (*unknowns, *history_unknowns(begun, tolerances)):
+            if each.parameter is not None:
+                keys[each.parameter.key] = None
+    return list(keys)
+
+
+def _read(path: str) -> Log:
+    if path.lower().endswith(".mcap"):
+        return read_mcap_log(path)
+    try:
+        return read_log(path)
+    except FileError as error:
+        try:
+            read_stiffness_table(path)
+        except FileError:
+            raise error from None
+        raise FileError(
+            path, f"is a table of stiffness, not a log; give it as --stiffness {path}"
+        ) from None
+
+
+def _check_channels(path: str, log: Log, robot: RobotDescription) -> None:
+    columns = robot.recordings.channels if robot.recordings is not None else ()
+    if columns:
+        if max(columns) > log.n:
+            raise FileError(
+                path,
+                f"has no column p{max(columns)}_pa, which --channels or the robot file names; "
+                f"there are {log.n} pressures",
+            )
+    elif log.n != robot.n_pressures:
+        example = ",".join(str(c + 1) for c in range(robot.n_pressures))
+        raise FileError(
+            path,
+            f"has {log.n} pressures, the robot '{robot.name}' has {robot.n_pressures} channels; "
+            f"say with --channels which column each channel has, such as --channels {example}",
         )
-    check_model(options.model)
-    quantities.choice("--strain-law", options.strain_law, ("auto", "keep"))
-    rows = {}
-    if options.rows is not None:
-        rows = {
-            "rows": options.rows,
-            "trial_rows": min(options.rows, CalibrationSettings().trial_rows),
-        }
-    robot = options.recordings.description()
-    settings = options.recordings.settings(
-        structure=options.model,
-        strain_law=options.strain_law,
-        fixed=fixed_keys(options.fix, robot),
-        **rows,
-    )
-    tables = read_tables(options.tables, robot)
-    logs = options.recordings.read(robot, progress)
-    return fit_robot(robot, logs, tables, settings, progress)
+
+
+# -- results --------------------------------------------------------------------------------------
 
 
 def _check_report(path: str | None) -> None:
@@ -161,16 +286,20 @@ def _check_report(path: str | None) -> None:
         require_matplotlib()
 
 
-def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
+def _origin(
+    result: CalibrationResult,
+    recordings: RecordingOptions,
+    tables: Sequence[str],
+    fix: Sequence[str],
+) -> list[str]:
     """The comment at the top of the robot file: the data and options that it came from."""
-    recordings = options.recordings
     lines = [f"Calibrated by stiffopt {stiffopt.__version__} from {Path(recordings.robot).name}."]
     names = [each.name for each in result.calibrated]
     if names:
         lines.append(f"Logs: {', '.join(names)}.")
-    if options.tables:
-        tables = ", ".join(os.path.basename(path) for path in options.tables)
-        lines.append(f"Tables of stiffness: {tables}.")
+    if tables:
+        files = ", ".join(os.path.basename(path) for path in tables)
+        lines.append(f"Tables of stiffness: {files}.")
     lines.append(f"Model: {result.structure.name}, {result.structure.words}.")
     if names:
         errors = together(result.calibrated)
@@ -178,102 +307,12 @@ def _origin(options: CalibrateOptions, result: CalibrationResult) -> list[str]:
             f"Error of the tip on these logs: mean {errors.mean * MM:.2f} mm, "
             f"95 % below {errors.p95 * MM:.2f} mm."
         )
-    words = ["the logs are a sequence"] * recordings.sequence + [
-        "each log has its own origin"
-    ] * recordings.rezero
+    words = ["the logs are a sequence"] * recordings.sequence
+    words += ["each log has its own origin"] * recordings.rezero
     if recordings.pressures != "commanded":
         words.append(f"{recordings.pressures} pressures drive the model")
-    if options.fix:
-        words.append(f"not fitted: {', '.join(options.fix)}")
+    if fix:
+        words.append(f"not fitted: {', '.join(fix)}")
     if words:
         lines.append(f"Options: {'; '.join(words)}.")
     return lines
-
-
-def _print_calibration(result: CalibrationResult, options: CalibrateOptions) -> None:
-    if options.as_json:
-        write_json(calibration_record(result, options.out, options.report))
-    elif not options.quiet:
-        from stiffopt.cli.calibration_report import calibration
-
-        show(calibration(result, options.out, options.report))
-
-
-# -- for programs ---------------------------------------------------------------------------------
-
-
-def validation_record(robot: RobotDescription, found: Sequence[Comparison]) -> dict[str, Any]:
-    """Return the errors of all logs together and of each, for JSON."""
-    return {
-        **_with_outside(robot, found),
-        "robot": robot.name,
-        "remarks": [f"{each.name}: {remark}" for each in found for remark in each.remarks],
-        "logs": {each.name: _with_outside(robot, [each]) for each in found},
-    }
-
-
-def calibration_record(result: CalibrationResult, out: str, report: str | None) -> dict[str, Any]:
-    """Return the result of a calibration for JSON."""
-    length = result.before.length
-    return {
-        "robot": result.robot.name,
-        "out": out,
-        "report": report,
-        "model": result.structure.name,
-        "strain_laws": [segment.strain_law for segment in result.robot.segments],
-        "models": [
-            {
-                "name": each.structure.name,
-                "held_back_mean_mm": each.score * MM,
-                "held_back": {name: _errors(e, length) for name, e in each.folds.items()},
-            }
-            for each in result.candidates
-        ],
-        "before": _comparisons(result.nominal, length),
-        "after": _comparisons(result.calibrated, result.robot.length),
-        "held_back": {name: _errors(e, length) for name, e in result.held_back.items()},
-        "parameters": [
-            {
-                "name": each.name,
-                "key": each.key or None,
-                "unit": each.unit,
-                "before": each.before,
-                "value": each.value,
-                "interval_95": [each.low, each.high],
-                "learnt": each.learnt,
-                "tolerances_from_before": each.far,
-            }
-            for each in result.estimates
-        ],
-        "remarks": list(result.remarks),
-    }
-
-
-def _comparisons(found: Sequence[Comparison], length: float) -> dict[str, Any] | None:
-    if not found:
-        return None
-    logs = {each.name: _errors(each.errors, length) for each in found}
-    return {**_errors(together(found), length), "logs": logs}
-
-
-def _with_outside(robot: RobotDescription, found: Sequence[Comparison]) -> dict[str, Any]:
-    record = _errors(together(found), robot.length)
-    if robot.calibration is None:
-        return {**record, "outside_training_percent": None, "outside_training": None}
-    inside = np.concatenate([each.inside for each in found])
-    beyond = [each.rows(~each.inside) for each in found if not each.inside.all()]
-    return {
-        **record,
-        "outside_training_percent": float(np.mean(~inside) * 100),
-        "outside_training": _errors(together(beyond), robot.length) if beyond else None,
-    }
-
-
-def _errors(errors: Errors, length: float) -> dict[str, Any]:
-    names = ("mean", "median", "p95", "max")
-    return {
-        "n": errors.n,
-        "position_error_mm": {name: getattr(errors, name) * MM for name in names},
-        "position_error_percent_of_length": errors.mean / length * 100,
-        "angle_error_deg": None if errors.angle is None else degrees(errors.angle),
-    }

@@ -1,27 +1,41 @@
-"""Reports of a calibration and of a validation: for the terminal, and as a page with figures."""
+"""Results of a calibration and of a validation: for the terminal, as a page with figures, as JSON.
+
+The tables of the terminal and of the page are the same.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import degrees, floor, isfinite, log10
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from stiffopt.cli import calibration_tables as tables
-from stiffopt.cli.tables import MarkdownPage, title
+from stiffopt.cli.tables import MarkdownPage, TextTable, title
+from stiffopt.directions import direction_name
 from stiffopt.errors import printable
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.results import TIED, Comparison
-from stiffopt.identify.validation import compare_stiffness
+from stiffopt.identify.results import TIED, Comparison, Errors, FittedEstimate, together
+from stiffopt.identify.unknowns import BASE, SENSOR
+from stiffopt.identify.validation import StiffnessComparison, compare_stiffness
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.parameters import Parameter
 from stiffopt.plots import calibration as plots
+from stiffopt.plots.wording import BAR, MM, figures, vector_text
 
 _MOST_REMARKS = 8  # of the logs, at the terminal; the page has all
 _MOST_STIFFNESSES = 30
 _MOST_PAIRS = 3
 _MOST_DRAWN = 60  # measured stiffnesses
+_UNITS = {"Pa": ("kPa", 1e-3), "m": ("mm", 1e3), "rad": ("deg", 180 / np.pi), "s": ("s", 1.0)}
+_ALL = "all"
+_NORMAL = 1.96  # standard deviations of a 95 % interval
+_OTHERS = "base in the tracker's frame, and sensors (moves from the robot file)"
+_BEGIN = "how the logs begin"
 
 # -- the terminal ---------------------------------------------------------------------------------
 
@@ -31,16 +45,16 @@ def calibration(result: CalibrationResult, out: str, report: str | None) -> Rend
     blocks: list[RenderableType] = [title(f"{result.robot.name}: calibration")]
     blocks.append(Text(f"  model  {result.structure.name}: {result.structure.words}"))
     if len(result.candidates) > 1:
-        blocks += [Text(""), tables.models_compared(result).renderable()]
+        blocks += [Text(""), models_compared(result).renderable()]
     if result.calibrated:
-        blocks += [Text(""), tables.errors_before_and_after(result).renderable()]
+        blocks += [Text(""), errors_before_and_after(result).renderable()]
     if result.held_back:
-        blocks += [Text(""), tables.errors_held_back(result).renderable()]
+        blocks += [Text(""), errors_held_back(result).renderable()]
     if result.tables:
         rows = compare_stiffness(result.tables, result.before, result.robot)
-        blocks += [Text(""), tables.stiffnesses_compared(rows[:_MOST_STIFFNESSES]).renderable()]
+        blocks += [Text(""), stiffnesses_compared(rows[:_MOST_STIFFNESSES]).renderable()]
         blocks += _more(len(rows) - _MOST_STIFFNESSES, "of these", report)
-    for table in tables.fitted_numbers(result, beginnings=False):
+    for table in fitted_numbers(result, beginnings=False):
         blocks += [Text(""), table.renderable()]
     found = [f"{each.name}: {remark}" for each in result.calibrated for remark in each.remarks]
     blocks += _list("What was found in the logs", found, report)
@@ -61,8 +75,8 @@ def validation(
 ) -> RenderableType:
     """Return the report of a validation for the terminal."""
     blocks: list[RenderableType] = [title(f"{robot.name}: validation")]
-    blocks += [Text(""), tables.errors_of_logs(robot, found).renderable()]
-    blocks += _list("Training range", tables.range_remarks(robot, found), report, most=None)
+    blocks += [Text(""), errors_of_logs(robot, found).renderable()]
+    blocks += _list("Training range", range_remarks(robot, found), report, most=None)
     remarks = [f"{each.name}: {remark}" for each in found for remark in each.remarks]
     blocks += _list("What was found in the logs", remarks, report)
     if report is not None:
@@ -98,15 +112,7 @@ def _more(count: int, what: str, report: str | None) -> list[RenderableType]:
 
 
 def write_calibration(folder: Path, result: CalibrationResult, out: str) -> None:
-    """Write the page of a calibration and its figures into a folder.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
-    FileError
-        If a figure cannot be written.
-    """
+    """Write the page of a calibration and its figures into a folder."""
     name = result.robot.name
     page = MarkdownPage(folder, f"{name}: calibration")
     page.text(
@@ -115,15 +121,15 @@ def write_calibration(folder: Path, result: CalibrationResult, out: str) -> None
     )
     if result.calibrated:
         page.heading("Errors of the tip")
-        page.table(tables.errors_before_and_after(result))
-        _errors(page, result.robot, result.calibrated, result.nominal)
+        page.table(errors_before_and_after(result))
+        _draw_errors(page, result.robot, result.calibrated, result.nominal)
     if result.held_back:
         page.heading("What was held back")
         page.text("The model fitted to the rest predicts what it has not seen:")
-        page.table(tables.errors_held_back(result))
+        page.table(errors_held_back(result))
     if len(result.candidates) > 1:
         page.heading("Models")
-        page.table(tables.models_compared(result))
+        page.table(models_compared(result))
         page.figure(
             "models.png", "Errors of each model in what was held back",
             plots.plot_models(
@@ -138,7 +144,7 @@ def write_calibration(folder: Path, result: CalibrationResult, out: str) -> None
         "the share of the robot file's own uncertainty (its variance) that the data removed: near "
         "0 %, a number is still what the robot file said."
     )
-    for table in tables.fitted_numbers(result, beginnings=True):
+    for table in fitted_numbers(result, beginnings=True):
         page.text(f"**{table.title[:1].upper()}{table.title[1:]}**")
         page.table(table)
     _remarks(page, result.remarks)
@@ -157,28 +163,20 @@ def write_calibration(folder: Path, result: CalibrationResult, out: str) -> None
 
 
 def write_validation(folder: Path, robot: RobotDescription, found: Sequence[Comparison]) -> None:
-    """Write the page of a validation and its figures into a folder.
-
-    Raises
-    ------
-    MissingExtraError
-        If matplotlib is not installed.
-    FileError
-        If a figure cannot be written.
-    """
+    """Write the page of a validation and its figures into a folder."""
     page = MarkdownPage(folder, f"{robot.name}: validation")
     page.text("Nothing of the robot was fitted to these logs.")
     page.heading("Errors of the tip")
-    page.table(tables.errors_of_logs(robot, found))
+    page.table(errors_of_logs(robot, found))
     page.heading("Training range")
-    page.bullets(tables.range_remarks(robot, found))
+    page.bullets(range_remarks(robot, found))
     page.heading("Figures")
-    _errors(page, robot, found, ())
+    _draw_errors(page, robot, found, ())
     _remarks(page, [f"{each.name}: {remark}" for each in found for remark in each.remarks])
     page.write()
 
 
-def _errors(
+def _draw_errors(
     page: MarkdownPage,
     robot: RobotDescription,
     found: Sequence[Comparison],
@@ -208,7 +206,7 @@ def _errors(
 def _stiffness(page: MarkdownPage, result: CalibrationResult) -> None:
     rows = compare_stiffness(result.tables, result.before, result.robot)
     page.heading("Stiffness")
-    page.table(tables.stiffnesses_compared(rows))
+    page.table(stiffnesses_compared(rows))
     if rows:
         page.figure(
             "stiffness.png", "Stiffness, measured and predicted",
@@ -220,3 +218,321 @@ def _remarks(page: MarkdownPage, remarks: Sequence[str]) -> None:
     if remarks:
         page.heading("Remarks")
         page.bullets(remarks)
+
+
+# -- errors of the tip ----------------------------------------------------------------------------
+
+
+def errors_before_and_after(result: CalibrationResult) -> TextTable:
+    """Errors of the tip in each log, before and after calibration."""
+    turns = any(each.angle is not None for each in (*result.nominal, *result.calibrated))
+    heading = ("log", "before", "95 %", "after", "95 %", "max", "%", *(("axis",) * turns))
+
+    def row(name: str, before: Errors, after: Errors) -> tuple[str, ...]:
+        cells = [before.mean, before.p95, after.mean, after.p95, after.max]
+        share = after.mean / result.robot.length * 100
+        numbers = [*(_millimetres(each) for each in cells), _decimals(share, 2)]
+        return (name, *numbers, *((_angle(after),) * turns))
+
+    rows = [
+        row(one.name, one.errors, other.errors)
+        for one, other in zip(result.nominal, result.calibrated, strict=True)
+    ]
+    if len(rows) > 1:
+        rows.append(row(_ALL, together(result.nominal), together(result.calibrated)))
+    return TextTable(
+        "Error of the tip in mm, before and after",
+        heading,
+        tuple(rows),
+        "before, after: mean distance from the measured tip in the logs that were fitted; %: mean "
+        "after, of the arm's length" + "; axis: mean angle in deg" * turns,
+    )
+
+
+def errors_of_logs(robot: RobotDescription, found: Sequence[Comparison]) -> TextTable:
+    """Errors of the tip in each log, and the share of rows outside the range that was seen."""
+    turns = any(each.angle is not None for each in found)
+    known = robot.calibration is not None
+    heading = ("log", "rows", "mean", "median", "95 %", "max", "%")
+    further = ("axis",) * turns + ("outside",) * known
+
+    def row(name: str, e: Errors, inside: float) -> tuple[str, ...]:
+        numbers = [_millimetres(each) for each in (e.mean, e.median, e.p95, e.max)]
+        share = _decimals(e.mean / robot.length * 100, 2)
+        return (
+            name, f"{e.n}", *numbers, share, *((_angle(e),) * turns),
+            *((_percent(1 - inside),) * known),
+        )  # fmt: skip
+
+    rows = [row(each.name, each.errors, float(each.inside.mean())) for each in found]
+    if len(rows) > 1:
+        inside = np.concatenate([each.inside for each in found])
+        rows.append(row(_ALL, together(found), float(inside.mean())))
+    remark = "distance of the predicted from the measured tip; %: mean, of the arm's length"
+    remark += "; axis: mean angle in deg" * turns
+    if known:
+        remark += "; outside: rows with pressures that the calibration had not seen"
+    return TextTable("Error of the tip in mm", (*heading, *further), tuple(rows), remark)
+
+
+def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
+    """Return sentences on the logs whose pressures the calibration had not seen."""
+    if robot.calibration is None:
+        return [
+            f"the robot '{robot.name}' was not calibrated: there is no recorded range that these "
+            "logs could leave"
+        ]
+    lines = []
+    for each in found:
+        if each.inside.all():
+            continue
+        within, beyond = each.rows(each.inside).errors, each.outside
+        what = _beyond(robot, each)
+        text = (
+            f"{each.name}: {_percent(1 - float(each.inside.mean()))} of the rows lie outside "
+            f"what the calibration has seen{what}; the mean error there is "
+            f"{_millimetres(beyond.mean)} mm"
+        )
+        if within.n:
+            text += f", elsewhere {_millimetres(within.mean)} mm"
+        lines.append(text)
+    return lines or ["all pressures lie within what the calibration has seen"]
+
+
+def _beyond(robot: RobotDescription, found: Comparison) -> str:
+    """Which channel exceeds the recorded range most, and by how much, in parentheses."""
+    calibration = robot.calibration
+    if calibration is None or not calibration.pressure_max:
+        return ""
+    highest = found.pressures.max(axis=0)
+    seen = np.array(calibration.pressure_max)
+    over = highest - seen
+    worst = int(np.argmax(over))
+    if over[worst] > 0.02 * seen.max():
+        return (
+            f" ({robot.channel_name(worst)} goes to {highest[worst] * BAR:.2f} bar, it was "
+            f"recorded to {seen[worst] * BAR:.2f} bar)"
+        )
+    return " (combinations of pressures that are higher together, or below what was recorded)"
+
+
+# -- models ---------------------------------------------------------------------------------------
+
+
+def models_compared(result: CalibrationResult) -> TextTable:
+    """Models that were compared, by their errors in what each was not fitted to."""
+    chosen = result.structure.name
+    rows = []
+    for each in result.candidates:
+        worst = max(each.folds, key=lambda name: each.folds[name].mean)
+        mark = "  <- chosen" if each.structure.name == chosen else ""
+        rows.append(
+            (
+                each.structure.name + mark,
+                each.structure.words,
+                _millimetres(each.score),
+                f"{_millimetres(each.folds[worst].mean)} ({worst})",
+            )
+        )
+    return TextTable(
+        "Models, by their error in what was held back",
+        ("model", "it has", "mean mm", "worst"),
+        tuple(rows),
+        "the simplest of those that predict about as well as the best is chosen",
+        words=("it has", "worst"),
+    )
+
+
+def errors_held_back(result: CalibrationResult) -> TextTable:
+    """Errors in what the chosen model was not fitted to."""
+    return TextTable(
+        "Error of the tip in what was held back (the others are fitted)",
+        ("held back", "mean mm", "95 %", "max"),
+        tuple(
+            (name, _millimetres(e.mean), _millimetres(e.p95), _millimetres(e.max))
+            for name, e in result.held_back.items()
+        ),
+    )
+
+
+# -- numbers that were fitted ---------------------------------------------------------------------
+
+
+def fitted_numbers(result: CalibrationResult, *, beginnings: bool) -> list[TextTable]:
+    """The fitted numbers with their 95 % intervals, a table for each segment.
+
+    With `beginnings` also the state and the origin with which each log begins.
+    """
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    for each in result.estimates:
+        title, words = _place(each)
+        if title != _BEGIN or beginnings:
+            groups.setdefault(title, []).append(_number_row(each, words))
+    heading = ("", "robot file", "fitted", "95 % interval", "unit", "learnt")
+    return [
+        TextTable(title, heading, tuple(rows), words=("unit",)) for title, rows in groups.items()
+    ]
+
+
+def _place(estimate: FittedEstimate) -> tuple[str, str]:
+    """The title of the table in which a number stands, and its name there."""
+    if not estimate.key:
+        begins = estimate.name.startswith("zero of ") or " at the beginning of " in estimate.name
+        words = estimate.name.replace(f"{BASE},", "base,").replace(f"{SENSOR},", "sensor,")
+        return (_BEGIN if begins else _OTHERS), words
+    title = f"segment {Parameter(estimate.key).segment + 1}"
+    return title, estimate.name.replace(f", {title}", ",").removesuffix(",")
+
+
+def _number_row(estimate: FittedEstimate, words: str) -> tuple[str, ...]:
+    unit, factor = _UNITS.get(estimate.unit, ("", 1.0))
+    if estimate.key.endswith(".share"):
+        unit, factor = "%", 100.0
+    low, value, high = (each * factor for each in (estimate.low, estimate.value, estimate.high))
+    half = max(high - low, 0.0) / 2
+    places = 1 - floor(log10(half)) if half > 0 and isfinite(half) else 3
+    places = min(max(places, 0), 5)
+    before = _plain(estimate.before * factor, places) if estimate.key else "-"
+    learnt = f"{estimate.learnt * 100:.0f} %"
+    return (
+        words, before, _decimals(value, places),
+        f"{_decimals(low, places)} to {_decimals(high, places)}", unit, learnt,
+    )  # fmt: skip
+
+
+def _plain(value: float, places: int) -> str:
+    """A number as it stands in a file, without zeros at its end."""
+    return f"{round(value, max(places, 3)) + 0.0:.8g}"
+
+
+# -- stiffness ------------------------------------------------------------------------------------
+
+
+def stiffnesses_compared(rows: Sequence[StiffnessComparison]) -> TextTable:
+    """Stiffness, measured and predicted."""
+
+    def text(value: float | None) -> str:
+        return "-" if value is None else figures(value)
+
+    return TextTable(
+        "Stiffness in N/m, measured and predicted",
+        ("pressures (bar)", "direction", "measured", "before", "after", "off by"),
+        tuple(
+            (
+                vector_text(pressure * BAR for pressure in row.pressures),
+                f"{direction_name(row.direction)}, {row.boundary}",
+                f"{figures(row.measured)} +- {_two(_NORMAL * row.sigma)}",
+                text(row.before),
+                text(row.after),
+                "-" if row.after is None else f"{(row.after / row.measured - 1) * 100:+.0f} %",
+            )
+            for row in rows
+        ),
+        "+-: 95 % interval of the measurement; off by: after, relative to the measured value",
+        words=("direction",),
+    )
+
+
+# -- words ----------------------------------------------------------------------------------------
+
+
+def _millimetres(value: float) -> str:
+    return _decimals(value * MM, 2)
+
+
+def _decimals(value: float, places: int) -> str:
+    """A number with so many decimals; a dash where there is none, and no minus before zero."""
+    return f"{round(value, places) + 0.0:.{places}f}" if isfinite(value) else "-"
+
+
+def _two(value: float) -> str:
+    """A number with two significant figures, and no power of ten before a million."""
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _angle(errors: Errors) -> str:
+    return "-" if errors.angle is None else f"{degrees(errors.angle):.1f}"
+
+
+def _percent(share: float) -> str:
+    return f"{share * 100:.0f} %" if share == 0 or share >= 0.01 else f"{share * 100:.1g} %"
+
+
+# -- for programs ---------------------------------------------------------------------------------
+
+
+def validation_record(robot: RobotDescription, found: Sequence[Comparison]) -> dict[str, Any]:
+    """Return the errors of all logs together and of each, for JSON."""
+    return {
+        **_outside_record(robot, found),
+        "robot": robot.name,
+        "remarks": [f"{each.name}: {remark}" for each in found for remark in each.remarks],
+        "logs": {each.name: _outside_record(robot, [each]) for each in found},
+    }
+
+
+def calibration_record(result: CalibrationResult, out: str, report: str | None) -> dict[str, Any]:
+    """Return the result of a calibration for JSON."""
+    length = result.before.length
+    return {
+        "robot": result.robot.name,
+        "out": out,
+        "report": report,
+        "model": result.structure.name,
+        "strain_laws": [segment.strain_law for segment in result.robot.segments],
+        "models": [
+            {
+                "name": each.structure.name,
+                "held_back_mean_mm": each.score * MM,
+                "held_back": {name: _errors_record(e, length) for name, e in each.folds.items()},
+            }
+            for each in result.candidates
+        ],
+        "before": _comparisons_record(result.nominal, length),
+        "after": _comparisons_record(result.calibrated, result.robot.length),
+        "held_back": {name: _errors_record(e, length) for name, e in result.held_back.items()},
+        "parameters": [
+            {
+                "name": each.name,
+                "key": each.key or None,
+                "unit": each.unit,
+                "before": each.before,
+                "value": each.value,
+                "interval_95": [each.low, each.high],
+                "learnt": each.learnt,
+                "tolerances_from_before": each.far,
+            }
+            for each in result.estimates
+        ],
+        "remarks": list(result.remarks),
+    }
+
+
+def _comparisons_record(found: Sequence[Comparison], length: float) -> dict[str, Any] | None:
+    if not found:
+        return None
+    logs = {each.name: _errors_record(each.errors, length) for each in found}
+    return {**_errors_record(together(found), length), "logs": logs}
+
+
+def _outside_record(robot: RobotDescription, found: Sequence[Comparison]) -> dict[str, Any]:
+    record = _errors_record(together(found), robot.length)
+    if robot.calibration is None:
+        return {**record, "outside_training_percent": None, "outside_training": None}
+    inside = np.concatenate([each.inside for each in found])
+    beyond = [each.rows(~each.inside) for each in found if not each.inside.all()]
+    return {
+        **record,
+        "outside_training_percent": float(np.mean(~inside) * 100),
+        "outside_training": _errors_record(together(beyond), robot.length) if beyond else None,
+    }
+
+
+def _errors_record(errors: Errors, length: float) -> dict[str, Any]:
+    names = ("mean", "median", "p95", "max")
+    return {
+        "n": errors.n,
+        "position_error_mm": {name: getattr(errors, name) * MM for name in names},
+        "position_error_percent_of_length": errors.mean / length * 100,
+        "angle_error_deg": None if errors.angle is None else degrees(errors.angle),
+    }

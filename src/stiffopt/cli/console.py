@@ -1,7 +1,7 @@
-"""What is printed, and where: answers to stdout; errors, notes and progress to stderr.
+"""Printing: answers to stdout; errors, notes and progress to stderr.
 
-Nothing that is printed is markup, for a path may hold brackets. rich is imported when something is
-shown and not before: JSON and help need none of it.
+Brackets in what is printed are no markup of rich, for a path may hold some. rich is imported when
+something is shown: JSON and help do without it.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ import math
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from time import monotonic
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Self
 
 from stiffopt.errors import SlowWarning, printable
 
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 _REFRESH = 0.1  # s, between two changes of a progress bar
 
 
-class Closed(Exception):  # noqa: N818 - no error: the reader has had enough
-    """Nobody reads stdout any more."""
+class Closed(Exception):  # noqa: N818 - no error: `head`, for example, reads a few lines
+    """The program that read stdout has closed it."""
 
 
 def console_on(*, stderr: bool = False) -> Console:
@@ -37,25 +37,8 @@ def console_on(*, stderr: bool = False) -> Console:
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
 
 
-@contextmanager
-def _noticing_closed_pipe() -> Iterator[None]:
-    try:
-        yield
-    except BrokenPipeError:
-        # what is buffered, and what the interpreter flushes as it ends, must go somewhere
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, sys.stdout.fileno())
-        raise Closed from None
-
-
 def show(renderable: RenderableType) -> None:
-    """Print text or a table to stdout, in colour on a terminal.
-
-    Raises
-    ------
-    Closed
-        Nobody reads stdout any more.
-    """
+    """Print text or a table to stdout, in colour on a terminal; see `write_line`."""
     console = console_on()
     with console.capture() as capture:
         console.print(renderable)
@@ -63,28 +46,22 @@ def show(renderable: RenderableType) -> None:
 
 
 def write_line(text: str) -> None:
-    """Print a line to stdout as it is, whatever its width.
-
-    Raises
-    ------
-    Closed
-        Nobody reads stdout any more.
-    """
-    if sys.stdout is None:  # closed by whoever started us
+    """Print a line to stdout as it is, whatever its width; raise `Closed` if nobody reads it."""
+    if sys.stdout is None:  # the program was started without one
         return
-    with _noticing_closed_pipe():
+    try:
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()
+    except BrokenPipeError:
+        # what is buffered, and what the interpreter flushes as it ends, must go somewhere
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, sys.stdout.fileno())
+        raise Closed from None
 
 
 def write_json(record: Mapping[str, Any]) -> None:
-    """Print a record as one line of strict JSON to stdout, see `json_text`."""
-    write_line(json_text(record))
-
-
-def json_text(record: Mapping[str, Any]) -> str:
-    """Return a record as one line of strict JSON: arrays are lists, NaN and infinity are null."""
-    return json.dumps(plain_data(record), allow_nan=False)
+    """Print a record as one line of strict JSON to stdout: arrays are lists, NaN is null."""
+    write_line(json.dumps(plain_data(record), allow_nan=False))
 
 
 def plain_data(value: Any) -> Any:
@@ -115,33 +92,33 @@ def report_note(message: str) -> None:
 
 
 @contextmanager
-def warnings_as_notes(*, quiet: bool) -> Iterator[None]:
-    """Show a `SlowWarning` as a note, or not at all."""
-    others = warnings.showwarning
+def showing_slow_warnings(show: Callable[[str], object]) -> Iterator[None]:
+    """Context in which the text of each `SlowWarning` is shown by a function."""
+    show_other = warnings.showwarning
 
-    def show_note(
-        message: Warning | str,
-        category: type[Warning],
-        filename: str,
-        lineno: int,
-        file: TextIO | None = None,
-        line: str | None = None,
+    def show_warning(
+        message: Warning | str, category: type[Warning], *rest: Any, **more: Any
     ) -> None:
-        if not issubclass(category, SlowWarning):
-            others(message, category, filename, lineno, file, line)
-        elif not quiet:
-            report_note(str(message))
+        if issubclass(category, SlowWarning):
+            show(str(message))
+        else:
+            show_other(message, category, *rest, **more)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", SlowWarning)
-        warnings.showwarning = show_note
+        warnings.showwarning = show_warning
         yield
 
 
-class ProgressBar:
-    """What goes on, how much of it is done and how long the rest takes.
+def warnings_as_notes(*, quiet: bool) -> AbstractContextManager[None]:
+    """Context in which a `SlowWarning` is shown as a note, or not at all."""
+    return showing_slow_warnings(lambda text: None if quiet else report_note(text))
 
-    It is shown on stderr, on a terminal only, and is gone when the work is done.
+
+class ProgressBar:
+    """Says what is being done, how much of it is done and how long the rest takes.
+
+    It is a context: from the first report to its end it is shown on stderr, on a terminal only.
     """
 
     def __init__(self, *, quiet: bool) -> None:
@@ -150,19 +127,11 @@ class ProgressBar:
         self._is_shown = False
         self._shown_at = 0.0
 
-    @contextmanager
-    def shown(self) -> Iterator[None]:
-        """Context in which progress is shown once there is some."""
-        try:
-            yield
-        finally:
-            self._stop()
+    def __enter__(self) -> Self:
+        return self
 
-    @contextmanager
-    def hidden(self) -> Iterator[None]:
-        """Context without the bar, in which something else may be printed or asked."""
-        self._stop()
-        yield
+    def __exit__(self, *_: object) -> None:
+        self.hide()
 
     def report(self, done: float, total: float | None, text: str) -> None:
         """Show how far the work is; `total` is None where nobody knows."""
@@ -182,7 +151,8 @@ class ProgressBar:
             self._progress.start()
             self._is_shown = True
 
-    def _stop(self) -> None:
+    def hide(self) -> None:
+        """Remove the bar until the next report, so that something else can be printed."""
         if self._progress is not None:
             self._progress.stop()
         self._is_shown = False

@@ -1,4 +1,4 @@
-"""How a command ends: exit codes, errors and Ctrl-C."""
+"""How a command ends: exit codes, errors, Ctrl-C and other signals."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ import _thread
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from functools import wraps
 from types import FrameType
-from typing import Any
+from typing import Any, ParamSpec
 
-from stiffopt.cli.console import report_error
+import typer
+
+from stiffopt.cli.console import ProgressBar, report_error, warnings_as_notes
 from stiffopt.errors import StiffoptError
 
 SOLVED = 0
@@ -22,17 +25,21 @@ FAULT = 5
 INTERRUPTED = 130
 """Ctrl-C."""
 CLOSED_PIPE = 141
-"""Whoever read the output has had enough (as a shell reports it for other programs)."""
+"""The program that read the output has closed it; a shell's code for the signal SIGPIPE."""
 
 OF_STATUS = {"solved": SOLVED, "unreachable": UNREACHABLE, "failed": FAILED}
+ENDING_SIGNALS = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+"""Signals that ask a program to end."""
 
 _MOST_SERIOUS_FIRST = (BAD_INPUT, FAILED, UNREACHABLE)
 _REPEAT = 0.02  # s, between two repetitions of an interrupt
-_ENDING_SIGNALS = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-)
 
 Handler = Callable[[int, FrameType | None], None]
+Progress = Callable[[float, float, str], None]
+"""Takes how much is done, of how much, and what is being done."""
+P = ParamSpec("P")
 
 
 class RigFaultError(StiffoptError):
@@ -40,33 +47,41 @@ class RigFaultError(StiffoptError):
 
 
 def most_serious(codes: Iterable[int]) -> int:
-    """Return the code that speaks for all: 2, then 4, then 3, then 0."""
+    """Return the exit code of several files: 2 if one has it, else 4, 3 or 0 in this order."""
     seen = set(codes)
     return next((code for code in _MOST_SERIOUS_FIRST if code in seen), SOLVED)
 
 
-def exit_code(work: Callable[[], object]) -> int:
-    """Do the work of a command, report the error that ends it, and return its exit code."""
-    try:
-        work()
-    except KeyboardInterrupt:
-        return INTERRUPTED
-    except StiffoptError as error:
-        report_error(str(error))
-        return FAULT if isinstance(error, RigFaultError) else BAD_INPUT
-    return SOLVED
+def with_exit_code(command: Callable[P, int | None]) -> Callable[P, None]:
+    """Let a command of typer end with an exit code, and report the error that ends it.
+
+    The code is the one that the command returns (None is 0), or the one of the error.
+    """
+
+    @wraps(command)
+    def run(*arguments: P.args, **options: P.kwargs) -> None:
+        try:
+            code = command(*arguments, **options) or SOLVED
+        except KeyboardInterrupt:
+            code = INTERRUPTED
+        except StiffoptError as error:
+            report_error(str(error))
+            code = FAULT if isinstance(error, RigFaultError) else BAD_INPUT
+        raise typer.Exit(code)
+
+    return run
 
 
 @contextmanager
 def handled(handlers: Mapping[int, Handler]) -> Iterator[None]:
-    """Context in which signals are handled so; in a thread other than the main one, nothing is.
+    """Context with handlers for signals by their numbers; without effect outside the main thread.
 
     A signal that was ignored stays ignored: the program runs under nohup.
     """
     before: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        heard = (n for n in handlers if signal.getsignal(n) is not signal.SIG_IGN)
-        before = {number: signal.signal(number, handlers[number]) for number in heard}
+        changed = [n for n in handlers if signal.getsignal(n) is not signal.SIG_IGN]
+        before = {number: signal.signal(number, handlers[number]) for number in changed}
     try:
         yield
     finally:
@@ -74,70 +89,73 @@ def handled(handlers: Mapping[int, Handler]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-class Interruptible:
+@contextmanager
+def interruptible() -> Iterator[Callable[[], None]]:
     """Context in which Ctrl-C raises KeyboardInterrupt for certain.
 
     CasADi clears Python errors while it converts its arguments, a KeyboardInterrupt among them: the
-    work would go on, or stumble over a value that is missing. So the interrupt is repeated until it
-    has got through.
+    work would go on, or fail for a value that is missing. So the interrupt is repeated until the
+    context is left. The function that it gives raises KeyboardInterrupt if Ctrl-C was pressed.
     """
+    is_pressed, over = False, threading.Event()
 
-    def __init__(self) -> None:
-        self._pressed = False
-        self._over = threading.Event()
-        self._handling = handled({})
-
-    def __enter__(self) -> Interruptible:
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self._handling = handled({signal.SIGINT: self._handle})
-        self._handling.__enter__()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._over.set()
-        self._handling.__exit__(None, None, None)
-
-    def check(self) -> None:
-        """Raise KeyboardInterrupt if Ctrl-C was pressed and has not got through yet."""
-        if self._pressed:
+    def check() -> None:
+        if is_pressed:
             raise KeyboardInterrupt
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._over.is_set():
+    def repeat() -> None:
+        while not over.wait(_REPEAT):
+            _thread.interrupt_main()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal is_pressed
+        if over.is_set():
             return
-        if not self._pressed:
-            self._pressed = True
-            threading.Thread(target=self._repeat, daemon=True).start()
+        if not is_pressed:
+            is_pressed = True
+            threading.Thread(target=repeat, daemon=True).start()
         raise KeyboardInterrupt
 
-    def _repeat(self) -> None:
-        while not self._over.wait(_REPEAT):
-            _thread.interrupt_main()
+    is_default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    with handled({signal.SIGINT: handle} if is_default else {}):
+        try:
+            yield check
+        finally:
+            over.set()
+
+
+@contextmanager
+def interruptible_work(*, quiet: bool) -> Iterator[Progress]:
+    """Context of work that Ctrl-C ends, with warnings as notes; gives a function for progress."""
+    with (
+        interruptible() as check,
+        ProgressBar(quiet=quiet) as bar,
+        warnings_as_notes(quiet=quiet),
+    ):
+
+        def progress(done: float, total: float, text: str) -> None:
+            check()
+            bar.report(done, total, text)
+
+        yield progress
 
 
 class InterruptBetweenSteps:
-    """Turns signals that end a program into one KeyboardInterrupt between two steps of its work.
+    """Turns signals into one KeyboardInterrupt between two steps of the work.
 
-    The first signal is raised by `check`, which the work calls at each step; a second does not wait
-    for that. While a rig is closed none is raised: the arm is vented first.
-
-    Parameters
-    ----------
-    signals :
-        Their numbers; by default all that ask a program to end.
+    The first signal is raised by `check`, which the work calls at each step; a second one at once.
+    After `hold` none is raised, so that a rig can be vented and closed.
     """
 
-    def __init__(self, signals: Iterable[int] = _ENDING_SIGNALS) -> None:
+    def __init__(self, signals: Iterable[int] = ENDING_SIGNALS) -> None:
         self._signals = tuple(signals)
         self._pressed = False
         self._at_once = False
         self._held = False
 
-    @contextmanager
-    def handled(self) -> Iterator[None]:
-        """Context in which signals are handled so."""
-        with handled(dict.fromkeys(self._signals, self._handle)):
-            yield
+    def handled(self) -> AbstractContextManager[None]:
+        """Context in which the signals are handled."""
+        return handled(dict.fromkeys(self._signals, self._handle))
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a signal has come."""
@@ -145,12 +163,12 @@ class InterruptBetweenSteps:
             raise KeyboardInterrupt
 
     def hold(self) -> None:
-        """Raise nothing from now on."""
+        """From now on raise nothing when a signal comes."""
         self._held = True
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Context of what waits for a person: there a signal does not wait for a step."""
+        """Context in which a signal is raised at once, while a person is asked for something."""
         self.check()
         self._at_once = True
         try:

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Json, Quiet, RigArgument, command_group
 
 experiment_app = command_group(help="Do the paper's experiments on a rig, real or simulated.")
@@ -73,6 +74,7 @@ NoPlot = Annotated[bool, typer.Option("--no-plot", help="Draw no figure.")]
 
 
 @experiment_app.command("kinematics", help=KINEMATICS_HELP, epilog=_KINEMATICS_EPILOG)
+@with_exit_code
 def kinematics(
     rig: RigArgument,
     out: Out = None,
@@ -125,13 +127,14 @@ def kinematics(
         "pressures": pressures, "period": period, "repetitions": repetitions, "poses": poses,
         "settle": settle, "max": most,
     }  # fmt: skip
-    options = experiment_run.ExperimentOptions(
-        rig, out, resume, model, not no_plot, quiet, given, as_json
-    )
-    raise typer.Exit(experiment_run.run("kinematics", options))
+    experiment_run.run(
+        "kinematics", rig, given, out=out, resume=resume, model=model, plot=not no_plot,
+        as_json=as_json, quiet=quiet,
+    )  # fmt: skip
 
 
 @experiment_app.command("stiffness", help=STIFFNESS_HELP, epilog=_STIFFNESS_EPILOG)
+@with_exit_code
 def stiffness(
     rig: RigArgument,
     out: Out = None,
@@ -183,5 +186,6 @@ def stiffness(
         "displacement": displacement, "force": force, "steps": steps, "repetitions": repetitions,
         "settle": settle,
     }  # fmt: skip
-    options = experiment_run.ExperimentOptions(rig, out, resume, model, not no_plot, quiet, given)
-    raise typer.Exit(experiment_run.run("stiffness", options))
+    experiment_run.run(
+        "stiffness", rig, given, out=out, resume=resume, model=model, plot=not no_plot, quiet=quiet
+    )

@@ -35,13 +35,7 @@ class ExperimentReport:
         return Group(title(self.title), labelled(lines), Text(""), self.table.renderable())
 
     def write(self, folder: Path) -> None:
-        """Write the report as a Markdown page into a folder.
-
-        Raises
-        ------
-        FileError
-            It cannot be written.
-        """
+        """Write the report as a Markdown page into a folder."""
         page = MarkdownPage(folder, self.title)
         page.bullets([f"{label}: {text}" for label, text in self.lines])
         page.table(self.table)
@@ -56,32 +50,45 @@ def kinematics_report(
 ) -> ExperimentReport:
     """Return the report of a kinematics experiment, and of its combined poses if there are any."""
     found: list[KinematicsResult | CoverageResult] = [result]
+    lines = [
+        ("model", f"{model.description.name}, {model.length * MM:g} mm long"),
+        (
+            "sequence",
+            f"each of {settings.channels} channels to "
+            f"{', '.join(f'{p * BAR:g}' for p in settings.pressures)} bar, {result.time[-1]:.0f} s",
+        ),
+        ("recordings", f"{result.repetitions}, {len(result.errors):,} samples compared"),
+    ]
+    doubts = list(result.doubts)
+    heading: tuple[str, ...] = ("tip error", "mm", "% of length")
+    remark = "distance of the model's tip from the measured one, at the measured pressures"
+    if coverage is not None:
+        found.append(coverage)
+        low, high = (
+            f"{round(p * BAR, 2) + 0.0:g}"
+            for p in (coverage.pressures.min(), coverage.pressures.max())
+        )
+        text = (
+            f"{len(coverage.errors)} of {settings.poses}, all channels, {low} to {high} bar; the "
+            f"tip moved by {coverage.speed.mean() * MM:.2f} mm in the last second"
+        )
+        lines.append(("combined poses", text))
+        doubts += [f"combined poses: {doubt}" for doubt in coverage.doubts]
+        heading += ("combined: mm", "% of length")
+        remark += "; combined: at the end of each pose"
+    elif settings.poses:
+        doubts.append("no combined pose was held with the tip in sight")
+    if result.repetitions > 1:
+        text = f"differ by {result.repeatability * MM:.2f} mm in the mean"
+        lines.append(("repetitions", text))
 
     def row(label: str, errors: list[float]) -> tuple[str, ...]:
         cells = [(f"{e * MM:.2f}", f"{e / result.length * 100:.1f}") for e in errors]
         return label, *(text for cell in cells for text in cell)
 
-    peaks = ", ".join(f"{p * BAR:g}" for p in settings.pressures)
-    heading: tuple[str, ...] = ("tip error", "mm", "% of length")
-    remark = "distance of the model's tip from the measured one, at the measured pressures"
-    if coverage is not None:
-        found.append(coverage)
-        heading += ("combined: mm", "% of length")
-        remark += "; combined: at the end of each pose"
     return ExperimentReport(
         title=f"{settings.rig}: kinematics",
-        lines=(
-            ("model", f"{model.description.name}, {model.length * MM:g} mm long"),
-            (
-                "sequence",
-                f"each of {settings.channels} channels to {peaks} bar, {result.time[-1]:.0f} s",
-            ),
-            ("recordings", f"{result.repetitions}, {len(result.errors):,} samples compared"),
-            *_combined(coverage, settings),
-            *_spread(result),
-            *(("DOUBT", doubt) for doubt in result.doubts),
-            *_combined_doubts(coverage, settings),
-        ),
+        lines=(*lines, *(("DOUBT", doubt) for doubt in doubts)),
         table=TextTable(
             "",
             heading,
@@ -128,42 +135,6 @@ def kinematics_record(
         "doubts": result.doubts,
         "combined": combined,
     }
-
-
-def _combined(
-    coverage: CoverageResult | None, settings: KinematicsSettings
-) -> tuple[tuple[str, str], ...]:
-    if coverage is None:
-        return ()
-    low, high = coverage.pressures.min() * BAR, coverage.pressures.max() * BAR
-    return (
-        (
-            "combined poses",
-            f"{len(coverage.errors)} of {settings.poses}, all channels, {_bar(low)} to "
-            f"{_bar(high)} bar; the tip moved by {coverage.speed.mean() * MM:.2f} mm in the last "
-            "second",
-        ),
-    )
-
-
-def _bar(value: float) -> str:
-    return f"{round(value, 2) + 0.0:g}"
-
-
-def _combined_doubts(
-    coverage: CoverageResult | None, settings: KinematicsSettings
-) -> tuple[tuple[str, str], ...]:
-    if coverage is not None:
-        return tuple(("DOUBT", f"combined poses: {doubt}") for doubt in coverage.doubts)
-    if settings.poses:
-        return (("DOUBT", "no combined pose was held with the tip in sight"),)
-    return ()
-
-
-def _spread(result: KinematicsResult) -> tuple[tuple[str, str], ...]:
-    if result.repetitions < 2:
-        return ()
-    return (("repetitions", f"differ by {result.repeatability * MM:.2f} mm in the mean"),)
 
 
 def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentReport:

@@ -1,4 +1,4 @@
-"""What `stiffopt experiment` does: check everything, move the arm, vent it, report and draw."""
+"""What `stiffopt experiment` does: check all files and options, move the arm, vent it, report."""
 
 import re
 import sys
@@ -19,9 +19,8 @@ from stiffopt.cli.console import (
 )
 from stiffopt.cli.exits import (
     InterruptBetweenSteps,
-    Interruptible,
     RigFaultError,
-    exit_code,
+    interruptible,
 )
 from stiffopt.errors import DeviceError, InputError, StiffoptError, require_package
 from stiffopt.experiments import (
@@ -52,29 +51,12 @@ from stiffopt.logs import write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
 
-FIGURE, TABLE = "figure.png", "stiffness.csv"
-POSES_FIGURE = "poses.png"
-
 Settings = KinematicsSettings | StiffnessSettings
 
 
 @dataclass(frozen=True)
-class ExperimentOptions:
-    """The arguments of a command; `given` are the settings of the experiment, None where absent."""
-
-    rig: str
-    out: str | None
-    resume: str | None
-    model: str | None
-    plot: bool
-    quiet: bool
-    given: Mapping[str, str | int | None]
-    as_json: bool = False
-
-
-@dataclass(frozen=True)
 class _Plan:
-    """Everything that was checked before anything moves."""
+    """What an experiment needs, checked before anything moves."""
 
     rig: Rig
     rate: float
@@ -94,46 +76,79 @@ class _Plan:
         return not missing_series(self.folder, self.settings)
 
 
-def run(experiment: str, options: ExperimentOptions) -> int:
-    """Do an experiment, or go on with it; report and draw; return the exit code."""
+def run(
+    experiment: str,
+    rig: str,
+    given: Mapping[str, Any],
+    *,
+    out: str | None,
+    resume: str | None,
+    model: str | None,
+    plot: bool,
+    as_json: bool = False,
+    quiet: bool,
+) -> None:
+    """Do an experiment, or go on with one; report and draw.
 
-    def work() -> None:
-        with Interruptible(), warnings_as_notes(quiet=options.quiet):
-            plan = _planned(experiment, options)
-        try:
-            with warnings_as_notes(quiet=options.quiet):
-                _do(plan, options)
-                with Interruptible():
-                    _report(plan, options)
-        except (KeyboardInterrupt, _StoppedError):
-            if not options.quiet:
-                report_note(
-                    f"what was recorded is in {plan.folder}; go on with: "
-                    f"stiffopt experiment {experiment} {options.rig} --resume {plan.folder}"
-                )
-            raise
+    `given` are the options that are settings of the experiment, None where an option is absent.
+    """
+    if plot:
+        from stiffopt.plots import require_matplotlib
 
-    return exit_code(work)
+        require_matplotlib()
+    require_package("foxglove-sdk", "log", "foxglove")
+    if resume is not None and out is not None:
+        raise InputError("give --out for a new experiment or --resume for an old one, not both")
+    given = {key: value for key, value in given.items() if value is not None}
+    with interruptible(), warnings_as_notes(quiet=quiet):
+        plan = _planned(experiment, rig, given, out, resume, model)
+    try:
+        with warnings_as_notes(quiet=quiet):
+            _do(plan, quiet=quiet)
+            with interruptible():
+                settings = plan.settings
+                if isinstance(settings, KinematicsSettings):
+                    _report_kinematics(plan, settings, plot=plot, as_json=as_json, quiet=quiet)
+                else:
+                    _report_stiffness(plan, settings, plot=plot, quiet=quiet)
+    except (KeyboardInterrupt, _StoppedError):
+        if not quiet:
+            report_note(
+                f"what was recorded is in {plan.folder}; go on with: "
+                f"stiffopt experiment {experiment} {rig} --resume {plan.folder}"
+            )
+        raise
 
 
 class _StoppedError(RigFaultError):
-    """The rig was opened, and something went wrong on it."""
+    """Something went wrong after the rig was opened."""
 
 
 # -- before anything moves ------------------------------------------------------------------------
 
 
-def _planned(experiment: str, options: ExperimentOptions) -> _Plan:
-    if options.plot:
-        from stiffopt.plots import require_matplotlib
-
-        require_matplotlib()
-    require_package("foxglove-sdk", "log", "foxglove")
-    if options.resume is not None and options.out is not None:
-        raise InputError("give --out for a new experiment or --resume for an old one, not both")
-    rig, name, rate, log_folder = _rig(options.rig)
-    settings, folder = _settings(experiment, options, rig, name, log_folder)
-    model = load_robot(rig.robot if options.model is None else options.model)
+def _planned(
+    experiment: str,
+    rig_file: str,
+    given: Mapping[str, Any],
+    out: str | None,
+    resume: str | None,
+    model_name: str | None,
+) -> _Plan:
+    rig, name, rate, log_folder = _rig(rig_file)
+    if resume is None:
+        about = {"rig": name, "robot": rig.robot.name, "channels": rig.supply.n}
+        schema = KinematicsSettings if experiment == "kinematics" else StiffnessSettings
+        settings: Settings = schema(
+            **about, **{key: _read(key, value) for key, value in given.items()}
+        )
+        folder = Path(log_folder) / _new_name(experiment, name) if out is None else Path(out)
+    else:
+        folder = Path(resume)
+        settings = _old_settings(experiment, folder, given)
+        check_same("the robot", rig.robot.name, settings.robot)
+        check_same("the number of channels", rig.supply.n, settings.channels)
+    model = load_robot(rig.robot if model_name is None else model_name)
     if model.n_pressures != rig.supply.n:
         raise InputError(
             f"the robot '{model.description.name}' has {model.n_pressures} channels, the rig has "
@@ -147,18 +162,12 @@ def _planned(experiment: str, options: ExperimentOptions) -> _Plan:
         coverage_for(rig, settings.poses, settings.settle, settings.max)
     else:
         check_stiffness(rig, settings)
-        _check_that_somebody_is_there(rig)
-    is_new = options.resume is None
-    if is_new:
+        by_hand = rig.probe is not None and rig.probe.needs_a_person
+        if by_hand and (sys.stdin is None or not sys.stdin.isatty()):
+            raise InputError("this probe is mounted by hand; run the experiment at a terminal")
+    if resume is None:
         create_folder(folder, settings)
-    return _Plan(rig, rate, folder, settings, model, is_new)
-
-
-def _check_that_somebody_is_there(rig: Rig) -> None:
-    """Refuse a probe that must be mounted by hand where nobody can be asked to."""
-    by_hand = rig.probe is not None and rig.probe.needs_a_person
-    if by_hand and (sys.stdin is None or not sys.stdin.isatty()):
-        raise InputError("this probe is mounted by hand; run the experiment at a terminal")
+    return _Plan(rig, rate, folder, settings, model, is_new=resume is None)
 
 
 def _rig(path: str) -> tuple[Rig, str, float, str]:
@@ -170,39 +179,24 @@ def _rig(path: str) -> tuple[Rig, str, float, str]:
     return open_rig(path), description.name, description.rate, description.log.folder
 
 
-def _settings(
-    experiment: str, options: ExperimentOptions, rig: Rig, name: str, log_folder: str
-) -> tuple[Settings, Path]:
-    """The settings of the experiment, and the folder in which it is recorded."""
-    schema = KinematicsSettings if experiment == "kinematics" else StiffnessSettings
-    given = {key: value for key, value in options.given.items() if value is not None}
-    if options.resume is not None:
-        if given:
-            raise InputError(
-                f"--{next(iter(given))} cannot be changed when an experiment is resumed; "
-                f"{options.resume} says what is done"
-            )
-        folder = Path(options.resume)
-        settings: Settings = (
-            _kinematics_settings(folder)
-            if experiment == "kinematics"
-            else open_folder(folder, StiffnessSettings)
-        )
-        check_same("the robot", rig.robot.name, settings.robot)
-        check_same("the number of channels", rig.supply.n, settings.channels)
-        return settings, folder
-    about = {"rig": name, "robot": rig.robot.name, "channels": rig.supply.n}
-    settings = schema(**about, **{key: _read(key, value) for key, value in given.items()})
-    if options.out is not None:
-        return settings, Path(options.out)
+def _new_name(experiment: str, rig: str) -> str:
+    """Name of the folder of a new experiment: that of the rig, and the time."""
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    safe = re.sub(r"[^\w.-]+", "-", name).strip("-.") or "rig"
-    return settings, Path(log_folder) / f"{experiment}_{safe}_{stamp}"
+    safe = re.sub(r"[^\w.-]+", "-", rig).strip("-.") or "rig"
+    return f"{experiment}_{safe}_{stamp}"
 
 
-def _kinematics_settings(folder: Path) -> KinematicsSettings:
-    """Settings of a folder; an old one that does not mention combined poses has none."""
+def _old_settings(experiment: str, folder: Path, given: Mapping[str, Any]) -> Settings:
+    """Settings of an experiment that is resumed."""
+    if given:
+        raise InputError(
+            f"--{next(iter(given))} cannot be changed when an experiment is resumed; "
+            f"{folder} says what is done"
+        )
+    if experiment == "stiffness":
+        return open_folder(folder, StiffnessSettings)
     settings = open_folder(folder, KinematicsSettings)
+    # an old folder that does not mention combined poses has none
     begun_with = settings.poses if "poses" in settings.model_fields_set else 0
     return settings.model_copy(update={"poses": begun_with})
 
@@ -231,37 +225,34 @@ def _read(key: str, value: str | int) -> Any:
 # -- on the rig -----------------------------------------------------------------------------------
 
 
-def _do(plan: _Plan, options: ExperimentOptions) -> None:
+def _do(plan: _Plan, *, quiet: bool) -> None:
     if plan.is_complete:
-        if not options.quiet:
+        if not quiet:
             report_note(f"{plan.folder} is complete; nothing was left to do")
         return
-    interrupt, bar = InterruptBetweenSteps(), ProgressBar(quiet=options.quiet)
-    common: dict[str, Any] = {
-        "rate": plan.rate, "progress": bar.report, "check": interrupt.check,
-    }  # fmt: skip
+    interrupt, bar = InterruptBetweenSteps(), ProgressBar(quiet=quiet)
 
     @contextmanager
     def waiting_for_a_person() -> Iterator[None]:
-        with bar.hidden(), interrupt.at_once():
+        bar.hide()
+        with interrupt.at_once():
             yield
 
     def work() -> list[str]:
-        if isinstance(plan.settings, KinematicsSettings):
-            return run_kinematics(plan.rig, plan.folder, plan.settings, **common)
+        rig, folder, settings = plan.rig, plan.folder, plan.settings
+        common: dict[str, Any] = {
+            "rate": plan.rate, "progress": bar.report, "check": interrupt.check,
+        }  # fmt: skip
+        if isinstance(settings, KinematicsSettings):
+            return run_kinematics(rig, folder, settings, **common)
         return run_stiffness(
-            plan.rig,
-            plan.folder,
-            plan.settings,
-            plan.model,
-            aside=waiting_for_a_person,
-            **common,
+            rig, folder, settings, plan.model, aside=waiting_for_a_person, **common
         )
 
-    with alone_in(plan.folder), interrupt.handled(), bar.shown():
+    with alone_in(plan.folder), interrupt.handled(), bar:
         _open(plan)
         notes = _on_rig(plan.rig, work, interrupt)
-    if not options.quiet:
+    if not quiet:
         for note in notes:
             report_note(note)
 
@@ -300,47 +291,39 @@ def _on_rig(rig: Rig, work: Callable[[], list[str]], interrupt: InterruptBetween
 # -- afterwards -----------------------------------------------------------------------------------
 
 
-def _report(plan: _Plan, options: ExperimentOptions) -> None:
-    """Evaluate, report, draw."""
-    if isinstance(plan.settings, KinematicsSettings):
-        _report_kinematics(plan, plan.settings, options)
-    else:
-        _report_stiffness(plan, plan.settings, options)
-
-
 def _report_kinematics(
-    plan: _Plan, settings: KinematicsSettings, options: ExperimentOptions
+    plan: _Plan, settings: KinematicsSettings, *, plot: bool, as_json: bool, quiet: bool
 ) -> None:
     folder, model = plan.folder, plan.model
     result = evaluate_kinematics(read_recordings(folder, settings), model)
     coverage = evaluate_coverage(read_rounds(folder, round_count(settings.poses)), model)
     report = experiment_report.kinematics_report(result, coverage, settings, model)
     report.write(folder)
-    if options.plot:
+    if plot:
         from stiffopt.plots import save_figure
         from stiffopt.plots.experiments import plot_coverage, plot_kinematics
 
-        save_figure(plot_kinematics(result, title=report.title), folder / FIGURE)
+        save_figure(plot_kinematics(result, title=report.title), folder / "figure.png")
         if coverage is not None:
             title = f"{report.title}, combined poses"
-            save_figure(plot_coverage(coverage, title=title), folder / POSES_FIGURE)
-    if options.as_json:
+            save_figure(plot_coverage(coverage, title=title), folder / "poses.png")
+    if as_json:
         record = experiment_report.kinematics_record(result, coverage, settings, model)
         write_json({**record, "folder": str(folder)})
-    elif not options.quiet:
+    elif not quiet:
         show(report.renderable(str(folder)))
 
 
-def _report_stiffness(plan: _Plan, settings: StiffnessSettings, options: ExperimentOptions) -> None:
+def _report_stiffness(plan: _Plan, settings: StiffnessSettings, *, plot: bool, quiet: bool) -> None:
     folder, model = plan.folder, plan.model
     result = evaluate_stiffness(folder, settings, model)
-    write_stiffness_table(folder / TABLE, result.table())
+    write_stiffness_table(folder / "stiffness.csv", result.table())
     report = experiment_report.stiffness_report(result, model)
     report.write(folder)
-    if options.plot:
+    if plot:
         from stiffopt.plots import save_figure
         from stiffopt.plots.experiments import plot_stiffness
 
-        save_figure(plot_stiffness(result, title=report.title), folder / FIGURE)
-    if not options.quiet:
+        save_figure(plot_stiffness(result, title=report.title), folder / "figure.png")
+    if not quiet:
         show(report.renderable(str(folder)))

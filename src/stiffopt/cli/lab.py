@@ -1,8 +1,26 @@
-"""The command `stiffopt lab`: a simulated arm behind real protocols."""
+"""The command `stiffopt lab`: a simulated arm behind the protocols of real devices."""
 
-from typing import Annotated
+from __future__ import annotations
+
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
+from stiffopt.cli.exits import FAULT, SOLVED, with_exit_code
+from stiffopt.errors import InputError
+
+if TYPE_CHECKING:
+    from stiffopt.lab.virtual import VirtualLab
+
+_TICK = 0.2  # s, between two checks of whether the arm still moves
 
 LAB_HELP = """\
 Start a simulated arm in real time behind the protocols of a rig file's devices.
@@ -30,6 +48,7 @@ Exit codes:
 """
 
 
+@with_exit_code
 def lab(
     rig: Annotated[str, typer.Argument(metavar="RIG", help="A rig file.")],
     out: Annotated[
@@ -53,8 +72,119 @@ def lab(
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Print no notes; the rig file and errors only.")
     ] = False,
-) -> None:
+) -> int:
     """Run the virtual lab."""
-    from stiffopt.cli.lab_run import run  # here, so that --help waits for no numerics
+    # here, so that --help waits for no numerics; without numba there is no lab
+    from stiffopt.files import file_text, save_file
+    from stiffopt.lab.virtual import VirtualLab
+    from stiffopt.model.robot_files import load_description, robot_path
+    from stiffopt.rig.config import load_rig_description
 
-    raise typer.Exit(run(rig, out, supply, tracker, quiet=quiet))
+    if out is not None and Path(out).exists() and Path(rig).exists() and Path(out).samefile(rig):
+        raise InputError(f"--out {out} is the rig file itself; give another name")
+    description = load_rig_description(rig)
+    folder = Path(rig).parent
+    robot = load_description(description.robot, base=folder)
+    with warnings_as_notes(quiet=quiet):
+        virtual_lab = VirtualLab(description, robot, supply, tracker)
+    with virtual_lab, _until_signal() as ended:
+        addressed = virtual_lab.start()
+        addressed = addressed.model_copy(update={"robot": robot_path(description.robot, folder)})
+        if out is None:
+            write_line(file_text("rig", addressed).rstrip())
+        else:
+            save_file(out, "rig", addressed)
+        if not quiet:
+            where = f"in {out}" if out else "above"
+            report_note(f"the lab runs; the rig file {where} drives it. Ctrl-C ends it.")
+        _serve(virtual_lab, ended, quiet=quiet)
+    if virtual_lab.bench.failure is not None:
+        report_error(str(virtual_lab.bench.failure))
+        return FAULT
+    return SOLVED
+
+
+def _serve(lab: VirtualLab, ended: threading.Event, *, quiet: bool) -> None:
+    """Carry out what is typed until the lab is ended or the arm cannot be followed."""
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(lines,), daemon=True).start()
+    while not ended.is_set() and lab.bench.failure is None:
+        try:
+            words = lines.get(timeout=_TICK).split()
+        except queue.Empty:
+            continue
+        if words == ["quit"]:
+            return
+        try:
+            answer = _obey(lab, words)
+        except InputError as error:
+            report_error(str(error))
+        else:
+            if answer and not quiet:
+                report_note(answer)
+
+
+def _listen(lines: queue.SimpleQueue[str]) -> None:
+    """Pass on what is typed; in the background of a terminal, or without one, that is nothing."""
+    if sys.stdin is None:
+        return
+    with suppress(OSError, ValueError):
+        for line in sys.stdin:
+            if line.strip():
+                lines.put(line)
+
+
+def _obey(lab: VirtualLab, words: list[str]) -> str:
+    """Carry out a command and return what to say about it."""
+    if words[0] == "fault" and len(words) in (3, 4):
+        channel = None if len(words) == 3 else _channel(words[3])
+        lab.world.inject(words[1], words[2], channel)
+        return f"{words[1]}: {words[2]}"
+    if words[0] == "mount" and len(words) == 4:
+        lab.bench.mount(_direction(words[1:]))
+        return f"the probe's rail is along {' '.join(words[1:])}"
+    if words == ["status"]:
+        bars = ", ".join(f"{p * 1e-5:.3f}" for p in lab.world.pressures)
+        tip = ", ".join(f"{x * 1e3:.1f}" for x in lab.world.plant.tip_pose()[:3, 3])
+        faults = {device: fault for device, fault in lab.world.faults.items() if fault != "ok"}
+        told = ", ".join(f"{device} {fault}" for device, fault in faults.items()) or "none"
+        return f"pressures {bars} bar; tip at {tip} mm; faults: {told}"
+    raise InputError(
+        f"'{' '.join(words)}' is no command; there are: fault DEVICE NAME [CHANNEL], "
+        "mount X Y Z, status, quit"
+    )
+
+
+def _channel(word: str) -> int:
+    if not word.isdecimal() or int(word) < 1:
+        raise InputError(f"expected a channel counted from 1, not '{word}'")
+    return int(word) - 1
+
+
+def _direction(words: list[str]) -> list[float]:
+    try:
+        direction = [float(word) for word in words]
+    except ValueError:
+        raise InputError(f"expected a direction such as '0 1 0', not '{' '.join(words)}'") from None
+    if not any(direction) or not all(abs(x) < 1e9 for x in direction):
+        raise InputError("expected a direction such as '0 1 0'")
+    return direction
+
+
+@contextmanager
+def _until_signal() -> Iterator[threading.Event]:
+    """Give an event that Ctrl-C and SIGTERM set."""
+    ended = threading.Event()
+
+    def end(number: int, frame: Any) -> None:
+        ended.set()
+
+    handlers: dict[int, Any] = {signal.SIGINT: end, signal.SIGTERM: end}
+    if hasattr(signal, "SIGTTIN"):  # to read a terminal from the background would stop the lab
+        handlers[signal.SIGTTIN] = signal.SIG_IGN
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield ended
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

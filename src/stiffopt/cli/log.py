@@ -1,15 +1,17 @@
-"""The commands `stiffopt log export` and `stiffopt log plot`: their options and help."""
+"""The commands `stiffopt log export` and `stiffopt log plot`: a recorded run as CSV or figure."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-log_app = typer.Typer(
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode=None,
-    help="Look at what 'stiffopt run' has recorded.",
-)
+from stiffopt.cli.console import report_note, write_line
+from stiffopt.cli.exits import interruptible, with_exit_code
+from stiffopt.cli.options import command_group
+from stiffopt.cli.outputs import check_new_file, check_picture
+from stiffopt.errors import FileError
+
+log_app = command_group(help="Look at what 'stiffopt run' has recorded.")
 
 _CODES = """
 \b
@@ -52,12 +54,8 @@ Recorded = Annotated[str, typer.Argument(metavar="RUN", help="A recording (.mcap
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")]
 
 
-@log_app.callback()
-def _log() -> None:
-    pass
-
-
 @log_app.command("export", help=EXPORT_HELP, epilog=_EXPORT_EPILOG)
+@with_exit_code
 def export(
     run: Recorded,
     csv: Annotated[bool, typer.Option("--csv", help="As CSV, log v1: the only format yet.")] = True,
@@ -67,13 +65,30 @@ def export(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Export a recording."""
-    from stiffopt.cli import log_run  # here, so that --help waits for no numerics
+    """Write a recording as log v1."""
+    with interruptible() as check:
+        import numpy as np  # here, so that --help waits for no numerics
 
-    raise typer.Exit(log_run.export(run, out, quiet=quiet))
+        from stiffopt.daemon.run_log import read_log_of_recording
+        from stiffopt.logs import write_log
+
+        path = str(Path(run).with_suffix(".csv")) if out is None else out
+        check_new_file(path, (".csv",))
+        log, whole = read_log_of_recording(run)
+        if not len(log):
+            raise FileError(run, "has no row to export; it was cut short too early")
+        write_log(path, log)
+        check()
+    if quiet:
+        return
+    if not whole:
+        report_note(f"{run} was cut short or damaged; what is whole was exported")
+    seen = int(np.isfinite(log.tip_position).all(axis=1).sum())
+    write_line(f"{path}: {len(log)} rows, {seen} with a tip, {log.time[-1] - log.time[0]:.1f} s")
 
 
 @log_app.command("plot", help=PLOT_HELP, epilog=_PLOT_EPILOG)
+@with_exit_code
 def plot(
     run: Recorded,
     out: Annotated[
@@ -86,6 +101,17 @@ def plot(
     quiet: Quiet = False,
 ) -> None:
     """Draw a recording."""
-    from stiffopt.cli import log_run
+    with interruptible() as check:
+        from stiffopt.daemon.run_log import read_run
+        from stiffopt.plots import save_figure
+        from stiffopt.plots.run import plot_run
 
-    raise typer.Exit(log_run.plot(run, out, quiet=quiet))
+        path = str(Path(run).with_suffix(".png")) if out is None else out
+        check_picture(path)
+        recorded = read_run(run)
+        if not recorded.complete and not quiet:
+            report_note(f"{run} was cut short or damaged; what is whole was drawn")
+        save_figure(plot_run(recorded), path)
+        check()
+    if not quiet:
+        write_line(path)

@@ -24,15 +24,13 @@ from stiffopt.cli.map import map_app
 from stiffopt.cli.options import Version, command_group
 from stiffopt.cli.robots import robots
 from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
-from stiffopt.cli.solve import HELP, examples, solve
+from stiffopt.cli.solve import EXAMPLES, HELP, solve
 from stiffopt.cli.vent import VENT_EPILOG, VENT_HELP, vent
-
-__all__ = ["app", "main", "solve_pressure_app", "solve_pressure_main"]
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 app = command_group(context_settings=_SETTINGS)
-app.command("solve", help=HELP, epilog=examples("stiffopt solve"))(solve)
+app.command("solve", help=HELP, epilog=EXAMPLES.format(command="stiffopt solve"))(solve)
 app.command("robots")(robots)
 app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
 app.command("vent", help=VENT_HELP, epilog=VENT_EPILOG)(vent)
@@ -44,7 +42,9 @@ app.command("validate", help=VALIDATE_HELP, epilog=VALIDATE_EPILOG)(validate)
 app.command("lab", help=LAB_HELP, epilog=LAB_EPILOG)(lab)
 
 solve_pressure_app = command_group(context_settings=_SETTINGS)
-solve_pressure_app.command("solve-pressure", help=HELP, epilog=examples("solve-pressure"))(solve)
+solve_pressure_app.command(
+    "solve-pressure", help=HELP, epilog=EXAMPLES.format(command="solve-pressure")
+)(solve)
 
 
 @app.callback()
@@ -81,6 +81,6 @@ def _run(application: typer.Typer, name: str, arguments: Sequence[str] | None) -
         report_error(f"cannot write the answer: {error.strerror or error}")
         return BAD_INPUT
     finally:
-        if arguments is None:  # the process ends here, and a last search for garbage takes 40 ms
+        if arguments is None:  # the process ends here; without this the collector runs for 40 ms
             gc.freeze()
     return 0

@@ -1,9 +1,13 @@
-"""The commands `stiffopt map workspace` and `stiffopt map arm`: their options and their help."""
+"""The commands `stiffopt map workspace` and `stiffopt map arm`: options, help, order of work."""
 
-from typing import Annotated
+import signal
+from time import perf_counter
+from typing import Annotated, Any
 
 import typer
 
+from stiffopt.cli.console import ProgressBar, report_note, show, warnings_as_notes, write_json
+from stiffopt.cli.exits import InterruptBetweenSteps, interruptible_work, with_exit_code
 from stiffopt.cli.options import (
     BoundaryOption,
     FrameOption,
@@ -12,6 +16,8 @@ from stiffopt.cli.options import (
     RobotArgument,
     command_group,
 )
+from stiffopt.cli.outputs import check_ending, check_picture, check_writable
+from stiffopt.errors import InputError
 
 map_app = command_group(
     help="Map an arm: where its tip can be, how stiff it is there, and how stiff along its length."
@@ -44,6 +50,7 @@ Examples:
 
 
 @map_app.command("workspace", help=HELP, epilog=_EPILOG)
+@with_exit_code
 def workspace(
     robot: RobotArgument,
     out: Annotated[
@@ -92,17 +99,57 @@ def workspace(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Map a workspace."""
-    from stiffopt.cli.map_workspace import (  # here, so that --help waits for no numerics
-        WorkspaceOptions,
-        run,
-    )
+    """Make a map of a workspace, or continue one; print and draw it."""
+    check_picture(plot)
+    from stiffopt.cli import map_report, quantities  # here, so that --help waits for no numerics
+    from stiffopt.model.manipulator import load_robot
+    from stiffopt.workspace import map_workspace
 
-    options = WorkspaceOptions(
-        robot, out, samples, levels, cell, direction, kind, boundary, frame, seed, scheduler,
-        plot, as_json, overwrite, quiet,
-    )  # fmt: skip
-    raise typer.Exit(run(options))
+    begin = perf_counter()
+    directions = None
+    if direction is not None:
+        directions = [quantities.direction("--direction", text) for text in direction]
+    choices: dict[str, Any] = {"kind": kind, "boundary": boundary, "frame": frame}
+    size = quantities.quantity("--cell", cell, "m", "length")
+    mapped = load_robot(robot)
+    interrupt = InterruptBetweenSteps([signal.SIGINT])
+    so_far: tuple[int, int] | None = None
+
+    def progress(done: int, total: int) -> None:
+        nonlocal so_far
+        is_first, so_far = so_far is None, (done, total)
+        interrupt.check()
+        if is_first and done and not quiet:
+            report_note(f"{out} goes on after {done:,} of {total:,} samples")
+        bar.report(done, total, f"{done:,} of {total:,} samples")
+
+    try:
+        with interrupt.handled(), ProgressBar(quiet=quiet) as bar, warnings_as_notes(quiet=quiet):
+            found = map_workspace(
+                mapped, out, directions=directions, samples=samples, levels=levels, cell=size,
+                seed=seed, scheduler=scheduler, overwrite=overwrite, progress=progress, **choices,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        if so_far is not None and not quiet:
+            how = (
+                f"the same command goes on with {out}"
+                if out
+                else "nothing was kept: with --out a run can be resumed"
+            )
+            report_note("stopped after {:,} of {:,} samples; ".format(*so_far) + how)
+        raise
+    seconds = perf_counter() - begin
+    if out is not None and not found.evaluated and not quiet:
+        report_note(f"{out} is complete; there was nothing left to sample")
+    if as_json:
+        write_json(map_report.workspace_record(found, out, seconds))
+    elif not quiet:
+        show(map_report.workspace_summary(found, out, seconds))
+    if plot is not None:
+        from stiffopt.plots import save_figure
+        from stiffopt.plots.maps import plot_workspace
+
+        save_figure(plot_workspace(found), plot)
 
 
 ARM_HELP = """\
@@ -123,6 +170,7 @@ Examples:
 
 
 @map_app.command("arm", help=ARM_HELP, epilog=_ARM_EPILOG)
+@with_exit_code
 def arm(
     robot: RobotArgument,
     channels: Annotated[
@@ -160,11 +208,53 @@ def arm(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Map the stiffness along an arm."""
-    from stiffopt.cli.map_arm import ArmOptions, run
+    """Map the stiffness along an arm, or of its tip over two pressures; print, write, draw it."""
+    check_picture(plot)
+    if csv is not None:
+        check_ending(csv, (".csv",))
+        check_writable(csv)
+    alone = {"--channels": channels, "--pressures": pressures, "--points": points}
+    for name, value in alone.items():
+        if over is not None and value is not None:
+            raise InputError(f"{name} has no meaning for a map over two pressures (--over)")
+    if over is None and levels is not None:
+        raise InputError("--levels is for a map over two pressures; give --over too")
 
-    options = ArmOptions(
-        robot, channels, pressures, points, over, levels, boundary, frame, plot, csv, as_json,
-        quiet,
-    )  # fmt: skip
-    raise typer.Exit(run(options))
+    from stiffopt.cli import map_report, quantities
+    from stiffopt.experiments.arm_map import ArmMap, TipMap, map_arm, map_tip
+    from stiffopt.model.manipulator import load_robot
+
+    with interruptible_work(quiet=quiet) as report:
+
+        def progress(done: float, total: float) -> None:
+            report(done, total, "stiffness")
+
+        mapped = load_robot(robot)
+        choices: dict[str, Any] = {"boundary": boundary, "frame": frame}
+        found: ArmMap | TipMap
+        if over is not None:
+            found = map_tip(
+                mapped, quantities.channels("--over", over), levels=levels or 31,
+                progress=progress, **choices,
+            )  # fmt: skip
+        else:
+            groups, peaks = None, None
+            if channels is not None:
+                groups = [quantities.channels("--channels", text) for text in channels]
+            if pressures is not None:
+                peaks = quantities.pressures("--pressures", pressures)
+            found = map_arm(
+                mapped, groups, peaks, points=points or 25, progress=progress, **choices
+            )
+    if csv is not None:
+        map_report.write_csv(csv, found)
+    if plot is not None:
+        from stiffopt.plots import save_figure
+        from stiffopt.plots.maps import plot_arm_map, plot_tip_map
+
+        drawn = plot_arm_map(found) if isinstance(found, ArmMap) else plot_tip_map(found)
+        save_figure(drawn, plot)
+    if as_json:
+        write_json(map_report.record(found))
+    elif not quiet:
+        show(map_report.summary(found))

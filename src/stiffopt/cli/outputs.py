@@ -1,4 +1,7 @@
-"""Files and folders that commands write: checked before long work, written whole or not at all."""
+"""Files and folders that commands write: checked before long work, written whole or not at all.
+
+Each check raises `FileError` if something cannot be written.
+"""
 
 import os
 import tempfile
@@ -8,36 +11,21 @@ from pathlib import Path
 
 from stiffopt.errors import FileError, os_reason
 
-PICTURES = (".png", ".pdf", ".svg")
-"""Endings of the files in which a figure can be drawn."""
+_PICTURES = (".png", ".pdf", ".svg")
 
 
 def check_picture(path: str | None) -> None:
-    """Check the path of a figure; None is none.
-
-    Raises
-    ------
-    FileError
-        It has the wrong ending, or cannot be written.
-    MissingExtraError
-        matplotlib is not installed.
-    """
+    """Check the path of a figure, if there is one, and that matplotlib is installed."""
     if path is not None:
         from stiffopt.plots import require_matplotlib
 
-        check_ending(path, PICTURES)
+        check_ending(path, _PICTURES)
         require_matplotlib()
         check_writable(path)
 
 
 def check_new_file(path: str, endings: tuple[str, ...]) -> None:
-    """Check the path of a file that is written only where there is none.
-
-    Raises
-    ------
-    FileError
-        It is there, cannot be written, or has the wrong ending.
-    """
+    """Check the path and ending of a file that must not exist yet."""
     check_writable(path)
     check_ending(path, endings)
     if os.path.lexists(path):
@@ -45,13 +33,7 @@ def check_new_file(path: str, endings: tuple[str, ...]) -> None:
 
 
 def check_new_folder(path: str) -> None:
-    """Check the path of a folder that is made only where there is nothing.
-
-    Raises
-    ------
-    FileError
-        It is there, or cannot be made.
-    """
+    """Check the path of a folder that must not exist yet."""
     if os.path.lexists(path):
         raise FileError(path, "exists; give another folder, or remove it")
     parent = os.path.dirname(os.path.abspath(path))
@@ -63,13 +45,7 @@ def check_new_folder(path: str) -> None:
 
 @contextmanager
 def new_folder(path: str | None) -> Iterator[Path | None]:
-    """Context with a folder that gets its name at the end, and is removed if something fails.
-
-    Raises
-    ------
-    FileError
-        It cannot be made.
-    """
+    """Context with a folder that gets its name at the end, and is removed if something fails."""
     if path is None:
         yield None
         return

@@ -1,4 +1,7 @@
-"""Values of options: quantities with units, lists and ranges of them, directions, channels."""
+"""Reads the values of options: quantities with units, lists of them, directions, channels.
+
+Each function raises `InputError`, which names the option, if it cannot read the text.
+"""
 
 import re
 
@@ -11,7 +14,7 @@ _MOST = 1000  # values of a range
 
 
 def quantity(option: str, text: str, unit: str, what: str) -> float:
-    """Return one quantity in SI, or an error that names the option."""
+    """Return one quantity in SI."""
     try:
         return parse_quantity(text, unit, what)
     except InputError as error:
@@ -25,13 +28,7 @@ def choice(option: str, text: str, allowed: tuple[str, ...]) -> None:
 
 
 def pressures(option: str, text: str) -> tuple[float, ...]:
-    """Return pressures in Pa from ``0.4,0.8,1.0 bar`` or, ends included, ``0:1.5:0.25 bar``.
-
-    Raises
-    ------
-    InputError
-        It is neither.
-    """
+    """Return pressures in Pa from ``0.4,0.8,1.0 bar`` or, with both ends, ``0:1.5:0.25 bar``."""
     example = "expected pressures such as '0.4,0.8,1.0 bar' or '0:1.5:0.25 bar'"
     found = _LIST.fullmatch(text)
     if found is None:
@@ -58,13 +55,7 @@ def pressures(option: str, text: str) -> tuple[float, ...]:
 
 
 def directions(option: str, text: str) -> tuple[tuple[float, ...], ...]:
-    """Return unit vectors from names such as ``x,y,-z``.
-
-    Raises
-    ------
-    InputError
-        A name is unknown, or given twice.
-    """
+    """Return unit vectors from names such as ``x,y,-z``."""
     found = []
     for part in text.split(","):
         name = part.strip()
@@ -81,13 +72,7 @@ def directions(option: str, text: str) -> tuple[tuple[float, ...], ...]:
 
 
 def direction(option: str, text: str) -> tuple[float, ...]:
-    """Return a vector from ``x``, ``y``, ``z`` or three numbers such as ``0,0.6,0.8``.
-
-    Raises
-    ------
-    InputError
-        It is neither.
-    """
+    """Return a vector from ``x``, ``y``, ``z`` or three numbers such as ``0,0.6,0.8``."""
     if text.strip() in _AXES:
         return _AXES[text.strip()]
     try:
@@ -103,13 +88,7 @@ def direction(option: str, text: str) -> tuple[float, ...]:
 
 
 def channels(option: str, text: str) -> tuple[int, ...]:
-    """Return channel numbers, counted from 1, from ``1,2``.
-
-    Raises
-    ------
-    InputError
-        Something else stands there, or a channel is given twice.
-    """
+    """Return channel numbers, counted from 1, from ``1,2``."""
     parts = [part.strip() for part in text.split(",")]
     if not all(part.isdecimal() and int(part) > 0 for part in parts):
         raise InputError(f"{option}: {shown(text)} are no channels; expected numbers such as 1,2")

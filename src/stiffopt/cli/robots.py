@@ -3,11 +3,13 @@
 from typing import TYPE_CHECKING
 
 from stiffopt.cli.console import show
+from stiffopt.cli.exits import with_exit_code
 
 if TYPE_CHECKING:
     from stiffopt.model.description import RobotDescription
 
 
+@with_exit_code
 def robots() -> None:
     """List the robots that come with stiffopt; a task file names one of them or a robot file."""
     from stiffopt.cli.tables import number_table

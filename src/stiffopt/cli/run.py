@@ -1,8 +1,11 @@
 """The command `stiffopt run`: its options and help."""
 
+import sys
 from typing import Annotated
 
 import typer
+
+from stiffopt.cli.exits import with_exit_code
 
 RUN_HELP = """\
 Hold an arm at its task in closed loop: run the daemon of a rig in the foreground.
@@ -30,6 +33,7 @@ Exit codes:
 """
 
 
+@with_exit_code
 def run(
     rig: Annotated[str, typer.Argument(metavar="RIG", help="A rig file.")],
     task: Annotated[
@@ -57,15 +61,15 @@ def run(
     json_lines: Annotated[
         bool, typer.Option("--json-lines", help="Print JSON lines on a terminal too.")
     ] = False,
-) -> None:
+) -> int:
     """Run the daemon."""
-    from stiffopt.cli.run_daemon import (  # here, so that --help waits for no numerics
-        RunOptions,
-        run,
-    )
-
-    style = "plain" if plain else "json" if json_lines else "auto"
     if plain and json_lines:
         raise typer.BadParameter("give --plain or --json-lines, not both")
-    options = RunOptions(task, arm, duration, not no_service, log_folder, style)
-    raise typer.Exit(run(rig, options))
+    from stiffopt.cli.run_daemon import run  # here, so that --help waits for no numerics
+
+    is_terminal = sys.stdout is not None and sys.stdout.isatty()
+    style = "plain" if plain else "live" if is_terminal and not json_lines else "json"
+    return run(
+        rig, task=task, arm=arm, duration=duration, service=not no_service, log_folder=log_folder,
+        style=style,
+    )  # fmt: skip

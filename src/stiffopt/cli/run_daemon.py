@@ -1,132 +1,109 @@
-"""Runs the daemon in the foreground: starts it, shows its state, ends it on a signal."""
+"""Runs the daemon in the foreground: starts it, shows its state, ends it on a signal.
+
+It ends in bounded time, even if the terminal or a thread hangs.
+"""
 
 from __future__ import annotations
 
+import logging
 import os
-import signal
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Self
 
-from stiffopt.cli.console import report_error
-from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED
+from stiffopt.cli.console import report_error, showing_slow_warnings
+from stiffopt.cli.exits import BAD_INPUT, ENDING_SIGNALS, FAULT, SOLVED, handled
 from stiffopt.cli.quantities import quantity
-from stiffopt.cli.run_ending import Backstop, Screen, leave
-from stiffopt.cli.run_lines import Lines, RunDisplay
+from stiffopt.cli.run_display import Lines, LiveStatus, write_at_once
 from stiffopt.control.state import State
-from stiffopt.errors import InputError, SlowWarning, StiffoptError
+from stiffopt.daemon.calls import call_in_thread, ends_within
+from stiffopt.errors import InputError, StiffoptError
 from stiffopt.rig.config import load_rig_description
 
 if TYPE_CHECKING:
     from stiffopt.daemon.daemon import Daemon
 
-__all__ = ["RunOptions", "run"]
+_CHECK = 0.2  # s, between two checks of whether the end has begun
+_LOOK = 0.05  # s, between two checks of whether it is over
+_LAST_OUTPUT = 1.0  # s, for what is shown at the end
+_FLUSH = 0.3  # s
+_LATE = "error: the daemon did not end in time and is left as it is; its guard vents"
+_PRIORITY = -10  # niceness, where permitted: see `_raise_priority`
+_log = logging.getLogger(__name__)
 
-_SIGNALS = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-)
-_LOOK = 0.05  # s between looks at whether it has ended
-_LAST_WORDS = 1.0  # s for what is shown at the end
-_FAVOURED = -10  # niceness, where permitted: see `_favour`
 
+def run(
+    rig: str,
+    *,
+    task: str | None,
+    arm: bool,
+    duration: str | None,
+    service: bool,
+    log_folder: str | None,
+    style: str,
+) -> int:
+    """Run the daemon of a rig until it is ended; return the exit code.
 
-@dataclass(frozen=True)
-class RunOptions:
-    """The options of `stiffopt run`.
-
-    Attributes
-    ----------
-    task : path of a task file.
-    arm : whether to arm at once.
-    duration : as text with a unit.
-    service : whether ports are opened.
-    log_folder : instead of the rig file's.
-    style : ``auto``, ``plain`` or ``json``.
+    `rig` and `task` are paths of files, `duration` is text with a unit, `service` says whether
+    ports are opened, `style` is ``live``, ``plain`` or ``json``.
     """
-
-    task: str | None = None
-    arm: bool = False
-    duration: str | None = None
-    service: bool = True
-    log_folder: str | None = None
-    style: str = "auto"
-
-
-def run(rig: str, options: RunOptions) -> int:
-    """Run the daemon of a rig until it is ended; return the exit code."""
-    try:
-        seconds = _checked(options)
-        load_rig_description(rig)  # its mistakes are told before anything is loaded
-        with _Signals().heard() as signals:
-            return _run(rig, options, seconds, signals)
-    except StiffoptError as error:
-        report_error(str(error))
-        return BAD_INPUT
-
-
-def _checked(options: RunOptions) -> float:
-    """Return the duration in s; raise `InputError` if the options contradict each other."""
-    if options.task is not None and not options.arm:
+    if task is not None and not arm:
         raise InputError("--task needs --arm: a task is pursued once the arm is armed")
-    if not options.service and not (options.arm and options.task):
+    if not service and not (arm and task):
         raise InputError("--no-service needs --arm and --task: nobody else could give them")
-    if options.arm and os.environ.get("NOTIFY_SOCKET"):
+    if arm and os.environ.get("NOTIFY_SOCKET"):
         raise InputError(
             "a service must not arm by itself, for it would do so whenever it is restarted; let a "
             "client arm ('stiffopt.Client')"
         )
-    if options.duration is None:
-        return float("inf")
-    seconds = quantity("--duration", options.duration, "s", "time")
+    seconds = float("inf") if duration is None else quantity("--duration", duration, "s", "time")
     if not seconds > 0:
         raise InputError("--duration: expected a time above 0 s")
-    return seconds
+    load_rig_description(rig)  # its mistakes are told before anything is loaded
+    with _Signals().handled() as signals:
+        _raise_priority()
+        from stiffopt.daemon.daemon import TIMES, Daemon
 
-
-def _run(rig: str, options: RunOptions, seconds: float, signals: _Signals) -> int:
-    _favour()
-    from stiffopt.daemon.daemon import TIMES, Daemon
-
-    style = _style(options.style)
-    daemon = Daemon(
-        rig,
-        service=options.service,
-        log_folder=options.log_folder,
-        json_lines=style == "json",
-    )
-    screen = Screen()
-    watch = _Watch(daemon, _display(style, daemon), signals, screen)
-    longest = daemon.description.safety.ramp_time + TIMES.stop
-    with Backstop(longest, watch.is_ending), _warnings_shown(watch):
-        state, refused = _steered(daemon, watch, options, seconds)
-        code = _verdict(daemon, state, refused, watch.report)
-        if not screen.finish(_LAST_WORDS) or daemon.hung:
-            leave(code)
+        daemon = Daemon(rig, service=service, log_folder=log_folder, json_lines=style == "json")
+        screen = Screen()
+        watch = _Watch(daemon, _display(style, daemon), signals, screen)
+        longest = daemon.description.safety.ramp_time + TIMES.stop
+        with Backstop(longest, watch.is_ending), showing_slow_warnings(watch.say_slow):
+            state, refused = _steered(
+                daemon, watch, task, arm=arm, seconds=seconds, unattended=not service
+            )
+            code = _verdict(daemon, watch, state, refused)
+            if not screen.finish(_LAST_OUTPUT) or daemon.hung:
+                leave(code)
     return code
 
 
 def _steered(
-    daemon: Daemon, watch: _Watch, options: RunOptions, seconds: float
+    daemon: Daemon,
+    watch: _Watch,
+    task_file: str | None,
+    *,
+    arm: bool,
+    seconds: float,
+    unattended: bool,
 ) -> tuple[State, str]:
-    """Run a daemon from its start to its end; return the last state, and why it was refused."""
+    """Run a daemon from its start to its end; return the last state, and why it did not start."""
     refused = ""
     try:
         with watch.signals.interrupting():
-            task = None if options.task is None else daemon.read_task(options.task)
+            task = None if task_file is None else daemon.read_task(task_file)
             name = daemon.description.name
             watch.say("starting", f"connecting to {name}; a first start compiles the model")
             daemon.start()
             watch.begin()
-            if options.arm and not watch.is_ending():
+            if arm and not watch.is_ending():
                 daemon.arm(task)
-        watch.go_on(time.monotonic() + seconds, unattended=not options.service)
+        watch.go_on(time.monotonic() + seconds, unattended=unattended)
     except KeyboardInterrupt:
         pass  # before it was ready
     except StiffoptError as error:
@@ -138,28 +115,28 @@ def _steered(
     return state, refused
 
 
-def _verdict(daemon: Daemon, state: State, refused: str, report: Callable[[str], None]) -> int:
+def _verdict(daemon: Daemon, watch: _Watch, state: State, refused: str) -> int:
     """Return the exit code; report what went wrong."""
     if refused:
-        report(refused)
+        watch.report(refused)
     if daemon.trouble:
-        report(f"THE ARM MAY BE UNDER PRESSURE: {daemon.trouble}")
+        watch.report(f"THE ARM MAY BE UNDER PRESSURE: {daemon.trouble}")
         return FAULT
     if daemon.failure is not None:
         kind = type(daemon.failure).__name__
-        report(f"control ended, vented, by {kind}: {daemon.failure}; please report it")
+        watch.report(f"control ended, vented, by {kind}: {daemon.failure}; please report it")
         return FAULT
     if state is State.FAULT:
-        report(f"ended in the state fault, vented: {daemon.loop.snapshot().reason}")
+        watch.report(f"ended in the state fault, vented: {daemon.loop.snapshot().reason}")
         return FAULT
     return BAD_INPUT if refused else SOLVED
 
 
 class _Watch:
-    """Shows the state of a daemon while it runs and while it ends."""
+    """Waits while a daemon runs and while it ends, and shows its state."""
 
     def __init__(
-        self, daemon: Daemon, display: RunDisplay, signals: _Signals, screen: Screen
+        self, daemon: Daemon, display: LiveStatus | Lines, signals: _Signals, screen: Screen
     ) -> None:
         self.signals = signals
         self._display, self._daemon, self._screen = display, daemon, screen
@@ -174,6 +151,10 @@ class _Watch:
         """Show something that is no event of the loop."""
         self._screen.post(lambda: self._display.say(kind, text))
 
+    def say_slow(self, text: str) -> None:
+        """Show a `SlowWarning`."""
+        self.say("slow", text)
+
     def report(self, text: str) -> None:
         """Show an error on stderr."""
         self._screen.post(lambda: report_error(text))
@@ -183,12 +164,12 @@ class _Watch:
         self._screen.post(lambda: self._display.begin(self._daemon))
 
     def show(self) -> None:
-        """Show what is new, unless what was new before is not shown yet."""
+        """Show what is new, unless the last update still waits to be shown."""
         if not self._screen.is_behind:
             self._screen.post(self._update)
 
     def end(self) -> None:
-        """Show what was last, and then no more."""
+        """Show the last state, and then no more."""
         self._screen.post(self._update)
         self._screen.post(self._display.end)
 
@@ -197,9 +178,9 @@ class _Watch:
         self._display.update(self._daemon.loop.snapshot(), events)
 
     def go_on(self, end: float, *, unattended: bool) -> None:
-        """Show until a signal comes, `end` is over, or control has ended.
+        """Show until a signal comes, the time `end` has come, or control has ended.
 
-        Where no client could ever reset it, a fault is the end too.
+        A fault ends it too if it is `unattended`, as no client can reset it then.
         """
         while not (self.signals.count or self._daemon.ended or time.monotonic() > end):
             self.show()
@@ -224,12 +205,7 @@ class _Watch:
 
 
 class _Signals:
-    """Counts the signals that are to end the program, without interrupting it.
-
-    Attributes
-    ----------
-    count : how many have come.
-    """
+    """Counts the signals that ask the program to end, without interrupting it."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -237,21 +213,14 @@ class _Signals:
         self._news: SimpleQueue[None] = SimpleQueue()  # an Event's lock is not for handlers
 
     @contextmanager
-    def heard(self) -> Iterator[_Signals]:
-        """Context in which they are."""
-        before: dict[int, Any] = {}
-        if threading.current_thread() is threading.main_thread():
-            meant = [n for n in _SIGNALS if signal.getsignal(n) is not signal.SIG_IGN]  # nohup
-            before = {number: signal.signal(number, self._handle) for number in meant}
-        try:
+    def handled(self) -> Iterator[_Signals]:
+        """Context in which they are counted."""
+        with handled(dict.fromkeys(ENDING_SIGNALS, self._handle)):
             yield self
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
 
     @contextmanager
     def interrupting(self) -> Iterator[None]:
-        """Context of what may take long while nothing is under pressure: there one interrupts."""
+        """Context in which a signal raises KeyboardInterrupt, while nothing is under pressure."""
         if self.count:
             raise KeyboardInterrupt
         self._interrupt = True
@@ -273,46 +242,90 @@ class _Signals:
             raise KeyboardInterrupt
 
 
-def _style(asked: str) -> str:
-    """Return ``live``, ``plain`` or ``json``."""
-    if asked != "auto":
-        return asked
-    return "live" if sys.stdout is not None and sys.stdout.isatty() else "json"
-
-
-def _display(style: str, daemon: Daemon) -> RunDisplay:
+def _display(style: str, daemon: Daemon) -> LiveStatus | Lines:
     if style == "live":
-        from stiffopt.cli.run_status import LiveStatus
-
         robot = daemon.robot.description
         names = [robot.channel_name(k) for k in range(robot.n_pressures)]
         return LiveStatus(daemon.description.name, names)
     return Lines(as_json=style == "json")
 
 
-@contextmanager
-def _warnings_shown(watch: _Watch) -> Iterator[None]:
-    """Show a `SlowWarning` where the rest is shown."""
-    others = warnings.showwarning
-
-    def show(message: Warning | str, category: type[Warning], *rest: Any, **more: Any) -> None:
-        if issubclass(category, SlowWarning):
-            watch.say("slow", str(message))
-        else:
-            others(message, category, *rest, **more)
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", SlowWarning)
-        warnings.showwarning = show
-        yield
-
-
-def _favour() -> None:
+def _raise_priority() -> None:
     """Raise the priority of this process, where that is permitted.
 
-    The control thread is real-time, but must wait for whichever thread has the interpreter; that
-    one should not in turn have to wait for other programs.
+    The control thread is real-time, but must wait for the thread that has the interpreter, which
+    should not in turn wait for other programs.
     """
     with suppress(OSError, AttributeError):
-        if os.getpriority(os.PRIO_PROCESS, 0) > _FAVOURED:
-            os.setpriority(os.PRIO_PROCESS, 0, _FAVOURED)
+        if os.getpriority(os.PRIO_PROCESS, 0) > _PRIORITY:
+            os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
+
+
+class Screen:
+    """Prints from a thread of its own, since writing to a terminal may block."""
+
+    def __init__(self) -> None:
+        self._waiting: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="screen", daemon=True)
+        self._thread.start()
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether something waits to be shown."""
+        return not self._waiting.empty()
+
+    def post(self, show: Callable[[], object]) -> None:
+        """Have something shown; this waits for nothing."""
+        self._waiting.put(show)
+
+    def finish(self, seconds: float) -> bool:
+        """Show what waits and then nothing more; return whether that is done in time."""
+        self._waiting.put(None)
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        while (show := self._waiting.get()) is not None:
+            try:
+                show()
+            except Exception:
+                _log.exception("something could not be shown")
+
+
+class Backstop:
+    """A watchdog that ends the process some seconds after `has_begun` says that the end has begun.
+
+    It does nothing if the context is left before.
+    """
+
+    def __init__(self, seconds: float, has_begun: Callable[[], bool]) -> None:
+        self._seconds, self._has_begun = seconds, has_begun
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="backstop", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+
+    def _run(self) -> None:
+        while not self._has_begun():
+            if self._over.wait(_CHECK):
+                return
+        if not self._over.wait(self._seconds):
+            write_at_once(sys.stderr, _LATE)
+            leave(FAULT)
+
+
+def leave(code: int) -> None:
+    """End this process at once, without waiting for any thread; what was printed is flushed."""
+    ends_within(_FLUSH, call_in_thread("flush", _flush))
+    os._exit(code)
+
+
+def _flush() -> None:
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError, AttributeError):
+            stream.flush()

@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from stiffopt.cli.exits import with_exit_code
 from stiffopt.cli.options import Quiet, Version
 
 HELP = """\
@@ -14,7 +15,7 @@ names. Subfolders are left alone; files in a folder that say they are something 
 files, are skipped with a note. A wrong file is reported on stderr, and the others are still solved.
 """
 
-_EXAMPLES = """\
+EXAMPLES = """\
 \b
 Examples:
   {command} problems/two_segment_stiff_x.yaml
@@ -40,11 +41,7 @@ A task file:
 """
 
 
-def examples(command: str) -> str:
-    """Return what stands at the end of the help."""
-    return _EXAMPLES.format(command=command)
-
-
+@with_exit_code
 def solve(
     tasks: Annotated[
         list[str], typer.Argument(metavar="TASK", help="Task files, or folders of them.")
@@ -88,12 +85,8 @@ def solve(
     ] = 0,
     quiet: Quiet = False,
     version: Version = False,
-) -> None:
+) -> int:
     """Solve task files."""
-    from stiffopt.cli.solve_run import (  # here, so that --help waits for no numerics
-        SolveOptions,
-        run,
-    )
+    from stiffopt.cli.solve_run import Batch  # here, so that --help waits for no numerics
 
-    options = SolveOptions(as_json, out, plot, pareto, seed, quiet)
-    raise typer.Exit(run(tasks, options))
+    return Batch(as_json, out, plot, pareto, seed, quiet).run(tasks)

@@ -1,9 +1,12 @@
-"""Files of `solve`: task files that are read, result files and figures that are written."""
+"""Files of `solve`: task files that are read, result files and figures that are written.
+
+A path that cannot be used raises `FileError`.
+"""
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from stiffopt.cli.outputs import check_ending, check_picture, check_writable
 from stiffopt.cli.solve_records import result_record
@@ -15,44 +18,34 @@ RESULT_FORMAT = "stiffopt-result/1"
 _YAML = (".yaml", ".yml")
 
 
-@dataclass(frozen=True)
-class TaskFiles:
-    """Task files in the order in which they are solved, and folders and files that hold no task.
+class TaskFiles(NamedTuple):
+    """Paths of task files in the order of work, and notes and errors about what holds no task."""
 
-    Attributes
-    ----------
-    paths : of the task files, as the user would write them.
-    skipped : notes about files in folders that are no task files.
-    errors : about folders that cannot be used.
-    """
-
-    paths: tuple[str, ...]
-    skipped: tuple[str, ...] = ()
-    errors: tuple[FileError, ...] = ()
+    paths: list[str]
+    skipped: list[str]
+    errors: list[FileError]
 
 
 def find_tasks(named: Iterable[str]) -> TaskFiles:
     """Replace each folder by the task files in it, sorted by name; subfolders are left alone.
 
     A file in a folder is left out, with a note, only if its `format` says that it is something
-    else, a robot file for example.  One that cannot be read or says nothing may be a task file
+    else, a robot file for example.  One that cannot be read or has no `format` may be a task file
     with a mistake in it, and is kept.
     """
-    files: list[str] = []
-    skipped: list[str] = []
-    errors: list[FileError] = []
+    found = TaskFiles([], [], [])
     for name in named:
         if not os.path.isdir(name):
-            files.append(name)
+            found.paths.append(name)
             continue
         try:
             tasks, others = _in_folder(name)
         except FileError as error:
-            errors.append(error)
+            found.errors.append(error)
         else:
-            files.extend(tasks)
-            skipped.extend(others)
-    return TaskFiles(tuple(files), tuple(skipped), tuple(errors))
+            found.paths.extend(tasks)
+            found.skipped.extend(others)
+    return found
 
 
 def _in_folder(folder: str) -> tuple[list[str], list[str]]:
@@ -86,13 +79,7 @@ def _other_kind(path: str) -> str | None:
 
 
 def check_result_file(path: str, tasks: Sequence[str]) -> None:
-    """Check the path of --out before any long work is done.
-
-    Raises
-    ------
-    FileError
-        It cannot be written, has the wrong ending, or is a file of another kind.
-    """
+    """Check the path of --out: only another result file is overwritten."""
     check_writable(path)
     if os.path.exists(path) and not os.path.isfile(path):
         return  # a pipe, a terminal
@@ -119,16 +106,9 @@ def _is_result_file(path: str) -> bool:
 
 
 def picture_names(plot: str | None, tasks: Sequence[str]) -> tuple[str | None, ...]:
-    """Return the file of each task's figure, which can be written; None without --plot.
+    """Return the checked path of each task's figure; None without --plot.
 
     Of one task it is FILE.png itself, of several FILE-<task>.png.
-
-    Raises
-    ------
-    FileError
-        One cannot be written, or has the wrong ending.
-    MissingExtraError
-        matplotlib is not installed.
     """
     if plot is None:
         return (None,) * len(tasks)
@@ -149,25 +129,13 @@ def picture_names(plot: str | None, tasks: Sequence[str]) -> tuple[str | None, .
 
 
 def write_results(path: str, solved: Sequence[SolvedTask]) -> None:
-    """Write the result file.
-
-    Raises
-    ------
-    FileError
-        It cannot be written.
-    """
+    """Write the result file."""
     results = [result_record(each) for each in solved]
     write_file(path, {"format": RESULT_FORMAT, "results": results})
 
 
 def draw(solved: SolvedTask, path: str) -> None:
-    """Draw a solved task.
-
-    Raises
-    ------
-    InputError
-        There is nothing to draw, as the solver failed, or the file cannot be written.
-    """
+    """Draw a solved task; raise `InputError` if the solver failed and there is nothing to draw."""
     from stiffopt.plots import plot_solution, save_figure
 
     figure = plot_solution(
@@ -175,6 +143,6 @@ def draw(solved: SolvedTask, path: str) -> None:
         solved.solution,
         front=solved.front,
         plain=solved.plain[0] if solved.plain else None,
-        title=solved.name,
+        title=Path(solved.file).stem,
     )
     save_figure(figure, path)

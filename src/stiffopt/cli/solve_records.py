@@ -13,10 +13,34 @@ from stiffopt.units import format_quantity
 
 Record = dict[str, Any]
 
+_BLOCKS = {
+    "translation_per_force": (slice(0, 3), slice(0, 3), "m/N"),
+    "translation_per_moment": (slice(0, 3), slice(3, 6), "m/(N*m)"),
+    "rotation_per_force": (slice(3, 6), slice(0, 3), "rad/N"),
+    "rotation_per_moment": (slice(3, 6), slice(3, 6), "rad/(N*m)"),
+}
+"""Blocks of the compliance: rows, columns and unit."""
+
+
+def priced(solution: PressureSolution) -> Sensitivities | None:
+    """Return the sensitivities if they are prices in stiffness, else None."""
+    given = solution.sensitivities
+    if given is None or not solution.found or given.objective_unit not in ("N/m", "N*m/rad"):
+        return None
+    return given
+
+
+def _relaxed(term: Term) -> str:
+    """What of a term can be relaxed, and has a price."""
+    return f"{term.name}_{'margin' if term.is_inequality else 'tolerance'}"
+
+
+# -- JSON -----------------------------------------------------------------------------------------
+
 
 def json_record(solved: SolvedTask) -> Record:
     """Return a solved task for JSON, in SI units."""
-    solution = solved.solution
+    solution, known = solved.solution, solved.uncertainty
     record: Record = {
         "task": solved.file,
         "status": solution.status,
@@ -24,17 +48,20 @@ def json_record(solved: SolvedTask) -> Record:
         "pressures_pa": solution.pressures,
         "tip_position_m": solution.tip_position,
         "tip_quaternion_wxyz": solution.tip_quaternion,
-        "position_error_m": solution.position_error,
-        "angle_error_rad": solution.angle_error,
-        **{f"{t.result_name}_{t.unit}": solution.errors.get(t.name) for t in _others(solution)},
+        "position_error_m": None,
+        "angle_error_rad": None,
+        **{
+            f"{term.result_name}_{term.unit}": solution.errors.get(term.name)
+            for term in solution.task.target.terms
+        },
         "stiffness": solution.stiffness,
         "stiffness_unit": solution.stiffness_unit,
         "stiffnesses": solution.stiffnesses,
         "stiffnesses_plain": solved.plain,
-        "stiffness_interval": _interval(solved),
+        "stiffness_interval": solved.intervals[0] if solved.intervals else None,
         "matrix_distance": solution.matrix_distance,
-        "tip_uncertainty_m": _semi_axes(solved),
-        "inside_recorded_range": None if solved.uncertainty is None else solved.uncertainty.inside,
+        "tip_uncertainty_m": known.semi_axes if known and known.semi_axes.any() else None,
+        "inside_recorded_range": None if known is None else known.inside,
         "compliance": solution.compliance,
         "active_bounds": solution.active_bounds,
         "freedom": solution.freedom,
@@ -48,11 +75,6 @@ def json_record(solved: SolvedTask) -> Record:
     return record
 
 
-def _interval(solved: SolvedTask) -> tuple[float, float] | None:
-    """95 % interval of the task's first stiffness, or None where nothing is known of it."""
-    return solved.intervals[0] if solved.intervals else None
-
-
 def _json_sensitivities(solution: PressureSolution) -> Record | None:
     given = solution.sensitivities
     if given is None:
@@ -64,25 +86,15 @@ def _json_sensitivities(solution: PressureSolution) -> Record | None:
     if priced(solution):
         record |= {
             "per_bound_per_pa": given.per_bound,
-            "per_position_tolerance_per_m": given.per_position_tolerance,
-            "per_angle_tolerance_per_rad": given.per_angle_tolerance,
+            "per_position_tolerance_per_m": None,
+            "per_angle_tolerance_per_rad": None,
             **{
                 f"per_{_relaxed(term)}_per_{term.unit}": given.per_tolerance.get(term.name)
-                for term in _others(solution)
+                for term in solution.task.target.terms
             },
             "objective_unit": given.objective_unit,
         }
     return record
-
-
-def _others(solution: PressureSolution) -> list[Term]:
-    """Terms of the target whose errors have no place in all records."""
-    return [t for t in solution.task.target.terms if t.name not in ("position", "angle")]
-
-
-def _relaxed(term: Term) -> str:
-    """What of a term can be relaxed, and has a price."""
-    return f"{term.name}_{'margin' if term.is_inequality else 'tolerance'}"
 
 
 def _json_point(solution: PressureSolution) -> Record:
@@ -94,15 +106,7 @@ def _json_point(solution: PressureSolution) -> Record:
     }
 
 
-def priced(solution: PressureSolution) -> Sensitivities | None:
-    """Return the sensitivities if they are prices in stiffness, else None."""
-    given = solution.sensitivities
-    if given is None or not solution.found or given.objective_unit not in ("N/m", "N*m/rad"):
-        return None
-    return given
-
-
-# -- the result file ------------------------------------------------------------------------
+# -- the result file ------------------------------------------------------------------------------
 
 
 def result_record(solved: SolvedTask) -> Record:
@@ -116,13 +120,11 @@ def result_record(solved: SolvedTask) -> Record:
         "pressures": _quantities(solution.pressures, "Pa", "bar"),
         "tip": _tip(solution),
         "uncertainty": _uncertainty(solved),
-        "position_error": _quantity(solution.position_error, "m", "mm"),
-        "angle_error": _quantity(solution.angle_error, "rad", "deg"),
         **{
             term.result_name: _quantity(
                 solution.errors.get(term.name), term.unit, term.shown(0.0)[1]
             )
-            for term in _others(solution)
+            for term in solution.task.target.terms
         },
         "stiffness": _stiffnesses(solved),
         "matrix_distance": solution.matrix_distance,
@@ -146,12 +148,6 @@ def _tip(solution: PressureSolution) -> Record | None:
     }
 
 
-def _semi_axes(solved: SolvedTask) -> Any:
-    """Semi-axes (3,) of the tip's ellipsoid in m; None where no calibration saw positions."""
-    known = solved.uncertainty
-    return None if known is None or not known.semi_axes.any() else known.semi_axes
-
-
 def _uncertainty(solved: SolvedTask) -> Record | None:
     known = solved.uncertainty
     if known is None:
@@ -171,26 +167,25 @@ def _stiffnesses(solved: SolvedTask) -> list[Record] | None:
         {
             "value": _quantity(value, measure.unit),
             "interval": None if ends is None else [_quantity(end, measure.unit) for end in ends],
-            "plain": _quantity(blind, measure.unit),
+            "plain": _quantity(at_plain, measure.unit),
             **measure.said(),
         }
-        for measure, value, blind, ends in zip(
+        for measure, value, at_plain, ends in zip(
             solution.task.measures, solution.stiffnesses, plain, intervals, strict=False
         )
     ] or None
 
 
 def _compliance(solution: PressureSolution) -> Record | None:
-    """The four blocks of the matrix, each with its unit."""
     matrix = solution.compliance
     if matrix is None:
         return None
     return {
         "frame": "tip",
-        "translation_per_force": {"matrix": plain_data(matrix[:3, :3]), "unit": "m/N"},
-        "translation_per_moment": {"matrix": plain_data(matrix[:3, 3:]), "unit": "m/(N*m)"},
-        "rotation_per_force": {"matrix": plain_data(matrix[3:, :3]), "unit": "rad/N"},
-        "rotation_per_moment": {"matrix": plain_data(matrix[3:, 3:]), "unit": "rad/(N*m)"},
+        **{
+            name: {"matrix": plain_data(matrix[rows, columns]), "unit": unit}
+            for name, (rows, columns, unit) in _BLOCKS.items()
+        },
     }
 
 
@@ -199,14 +194,12 @@ def _worth(solution: PressureSolution) -> Record | None:
     given = priced(solution)
     if given is None:
         return None
-    unit = given.objective_unit
+    gained = given.objective_unit
     return {
-        **{name: _quantity(value, f"{unit}/Pa") for name, value in given.per_bound.items()},
-        "position_tolerance": _quantity(given.per_position_tolerance, f"{unit}/m"),
-        "angle_tolerance": _quantity(given.per_angle_tolerance, f"{unit}/rad"),
+        **{name: _quantity(value, f"{gained}/Pa") for name, value in given.per_bound.items()},
         **{
-            _relaxed(term): _quantity(given.per_tolerance.get(term.name), f"{unit}/{term.unit}")
-            for term in _others(solution)
+            _relaxed(term): _quantity(given.per_tolerance.get(term.name), f"{gained}/{term.unit}")
+            for term in solution.task.target.terms
         },
     }
 

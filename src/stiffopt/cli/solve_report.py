@@ -1,8 +1,7 @@
-"""Solved tasks for people: a block of text for each task, and a table of several."""
+"""Solved tasks as text for the terminal: a block for each task, and a summary of several."""
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from math import degrees
 from typing import Any
 
@@ -24,6 +23,7 @@ from stiffopt.plots.wording import (
     figures,
     gain_text,
     least_maximised,
+    limit_of,
     unit_text,
     vector_text,
 )
@@ -81,7 +81,6 @@ def _robot(solved: SolvedTask) -> str:
 def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
     """Pressures in bar, a row for each segment; those at a limit say so."""
     description = solved.robot.description
-    active = solved.solution.active_bounds
     table = Table.grid(padding=(0, 2), pad_edge=False)
     widest = max(segment.n_channels for segment in description.segments)
     table.add_row("", *(Text(f"channel {k + 1}", "dim") for k in range(widest)))
@@ -89,18 +88,16 @@ def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
     for number, segment in enumerate(description.segments, start=1):
         cells = []
         for _ in range(segment.n_channels):
-            name = description.channel_name(index)
-            at = next((side for side in ("min", "max") if f"{name} {side}" in active), "")
-            cells.append(_pressure(pressures[index], at))
+            limit = limit_of(solved.solution, description.channel_name(index))
+            cells.append(
+                Text.assemble(
+                    (f"{pressures[index] * BAR + 0.0:.3f} bar", "bold"),
+                    (f" {limit}".rstrip(), "yellow"),
+                )
+            )
             index += 1
         table.add_row(Text(f"segment {number}", "dim"), *cells)
     return table
-
-
-def _pressure(value: float, at: str) -> Text:
-    return Text.assemble(
-        (f"{value * BAR + 0.0:.3f} bar", "bold"), (f" {at}" if at else "", "yellow")
-    )
 
 
 def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
@@ -160,10 +157,10 @@ def _stiffnesses(solved: SolvedTask) -> Iterable[Line]:
     goal = solution.task.stiffness
     plain = solved.plain or (None,) * len(solution.stiffnesses)
     intervals = solved.intervals or (None,) * len(solution.stiffnesses)
-    for number, (measure, value, blind, ends) in enumerate(
+    for number, (measure, value, at_plain, ends) in enumerate(
         zip(solution.task.measures, solution.stiffnesses, plain, intervals, strict=False)
     ):
-        yield "" if number else "stiffness", _stiffness(measure, value, blind, ends)
+        yield "" if number else "stiffness", _stiffness(measure, value, at_plain, ends)
     if (
         goal is not None
         and isinstance(goal.match, MatchMatrix)
@@ -275,53 +272,36 @@ def _list(solved: SolvedTask, solution: PressureSolution) -> str:
     return " | ".join(groups)
 
 
-@dataclass(frozen=True)
-class SummaryRow:
-    """A task in the summary."""
-
-    file: str
-    status: str
-    position: str = ""
-    angle: str = ""
-    stiffness: str = ""
-    gain: str = ""
-    time: str = ""
-
-    @classmethod
-    def of(cls, solved: SolvedTask, seconds: float) -> "SummaryRow":
-        """Return the row of a task that took this time altogether."""
-        solution = solved.solution
-        position, angle = solution.position_error, solution.angle_error
-        unit = unit_text(solution.stiffness_unit)
-        return cls(
-            solved.file,
-            solution.status,
-            "" if position is None else f"{position * MM:.3f}",
-            "" if angle is None else f"{degrees(angle):.2f}",
-            "" if solution.stiffness is None else f"{figures(solution.stiffness)} {unit}",
-            gain_text(solution.stiffnesses[0], solved.plain[0]) if solved.plain else "",
-            f"{seconds:.1f}",
-        )
+def summary_row(solved: SolvedTask, seconds: float) -> tuple[str, ...]:
+    """Return the line of the summary for a task that took this time altogether."""
+    solution = solved.solution
+    position, angle = solution.position_error, solution.angle_error
+    unit = unit_text(solution.stiffness_unit)
+    return (
+        solved.file,
+        solution.status,
+        "" if position is None else f"{position * MM:.3f}",
+        "" if angle is None else f"{degrees(angle):.2f}",
+        "" if solution.stiffness is None else f"{figures(solution.stiffness)} {unit}",
+        gain_text(solution.stiffnesses[0], solved.plain[0]) if solved.plain else "",
+        f"{seconds:.1f}",
+    )
 
 
-def summary(rows: Sequence[SummaryRow]) -> RenderableType:
-    """Return one line for each task and how many came to what."""
-    names = [os.path.basename(row.file) for row in rows]
+def summary(rows: Sequence[tuple[str, ...]]) -> RenderableType:
+    """Return one line for each task, and how many have which status.
+
+    A row is a `summary_row`, or the file and the status alone.
+    """
+    names = [os.path.basename(file) for file, *_ in rows]
     if len(set(names)) < len(rows):
-        names = [row.file for row in rows]
+        names = [file for file, *_ in rows]
     table = number_table("task", "status", "error mm", "deg", "stiffness", "gain", "time s")
     table.columns[0].no_wrap = False
     table.columns[0].overflow = "fold"
     table.columns[1].justify = "left"
-    for name, row in zip(names, rows, strict=True):
-        table.add_row(
-            Text(printable(name)),
-            Text(row.status, _COLOURS[row.status]),
-            *(row.position, row.angle, row.stiffness, row.gain, row.time),
-        )
-    return Group(table, "", Text(_counts(rows)))
-
-
-def _counts(rows: Sequence[SummaryRow]) -> str:
-    counts = {status: sum(row.status == status for row in rows) for status in _COLOURS}
-    return f"{len(rows)} tasks: " + ", ".join(f"{n} {name}" for name, n in counts.items() if n)
+    for name, (_, status, *numbers) in zip(names, rows, strict=True):
+        table.add_row(Text(printable(name)), Text(status, _COLOURS[status]), *numbers)
+    counts = {each: sum(status == each for _, status, *_ in rows) for each in _COLOURS}
+    words = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    return Group(table, "", Text(f"{len(rows)} tasks: {words}"))

@@ -20,16 +20,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of text with a title above and a remark below it.
+    """A table of text with a title above it, if it is not empty, and a remark below it.
 
-    Attributes
-    ----------
-    title : empty for none.
-    heading : of each column.
-    rows : a cell for each heading.
-    remark : what headings or numbers mean, as the end of a sentence.
-    words : headings of the columns that hold words; all but the first and these hold numbers, which
-        stand to the right and are never broken.
+    The first column holds words, as do those whose headings are in `words`; the others hold
+    numbers, which are aligned to the right and never broken. The remark says what headings or
+    numbers mean.
     """
 
     title: str
@@ -52,10 +47,9 @@ class TextTable:
             )
         for row in self.rows:
             table.add_row(*map(printable, row))
-        parts: list[RenderableType] = [Text(f"  {printable(self.title)}", "bold")] * bool(
-            self.title
-        )
-        parts.append(table)
+        parts: list[RenderableType] = [table]
+        if self.title:
+            parts.insert(0, Text(f"  {printable(self.title)}", "bold"))
         if self.remark:
             parts.append(Text(f"  {self.remark}", "dim"))
         return Group(*parts)
@@ -121,13 +115,7 @@ class MarkdownPage:
         self._lines += [f"![{alt}]({name})", ""]
 
     def write(self, name: str = "report.md") -> None:
-        """Write the page into the folder.
-
-        Raises
-        ------
-        FileError
-            It cannot be written.
-        """
+        """Write the page into the folder."""
         write_whole(self._folder / name, "\n".join(self._lines).encode())
 
 

@@ -1,10 +1,13 @@
-"""The command `stiffopt vent`: let the pressure out of a rig, whoever commands it."""
+"""The command `stiffopt vent`: let the pressure out of a rig, also while a program commands it."""
 
 from typing import Annotated
 
 import typer
 
+from stiffopt.cli.console import report_error, write_json, write_line
+from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED, with_exit_code
 from stiffopt.cli.options import RigArgument
+from stiffopt.errors import DeviceError, StiffoptError
 
 VENT_HELP = """\
 Let all pressure out of the arm of RIG at once.
@@ -29,17 +32,15 @@ Exit codes:
 """
 
 
+@with_exit_code
 def vent(
     rig: RigArgument,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object: vented, text.")
     ] = False,
-) -> None:
+) -> int:
     """Vent a rig."""
-    from stiffopt.cli.console import report_error, write_json, write_line
-    from stiffopt.cli.exits import BAD_INPUT, FAULT, SOLVED
-    from stiffopt.errors import DeviceError, StiffoptError
-    from stiffopt.safety.vent import vent_rig
+    from stiffopt.safety.vent import vent_rig  # here, so that --help waits for no numerics
 
     vented, code = False, SOLVED
     try:
@@ -54,4 +55,4 @@ def vent(
         write_line(text)
     if not vented:
         report_error(text)
-    raise typer.Exit(code)
+    return code

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,21 +27,11 @@ from stiffopt.plots.style import (
     make_logarithmic,
     stacked_panels,
     thinned,
-    tidy,
 )
 from stiffopt.plots.wording import BAR, MM, vector_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = [
-    "plot_errors_over_pressure",
-    "plot_errors_over_time",
-    "plot_models",
-    "plot_paths",
-    "plot_stiffnesses",
-    "plot_tip_over_time",
-]
 
 Array = NDArray[np.float64]
 
@@ -72,12 +61,7 @@ def plot_errors_over_time(
 ) -> Figure:
     """Draw the error of the tip over time, a panel for each log.
 
-    Parameters
-    ----------
-    found : sequence of Comparison
-    before : sequence of Comparison
-        The same logs, compared with the robot file as it was before; may be empty.
-    title : str
+    `before` may hold the same logs, compared with the robot file as it was before.
     """
     shown = _worst(found)
     figure, panels = _rows(len(shown), _ROW if len(shown) > 2 else 2 * _ROW)
@@ -172,42 +156,41 @@ def plot_errors_over_pressure(
 
     Last in a row is the norm of the segment's pressures; what the calibration has seen is shaded.
     """
-    columns = max(segment.n_channels for segment in robot.segments) + 1
+    last = max(segment.n_channels for segment in robot.segments)
     shown = [found[i] for i in _worst(found)]
     labels = [literal(each.name) for each in shown]
-    known = robot.calibration is not None and len(robot.calibration.pressure_max) > 0
-    if known:
+    seen = robot.calibration
+    if seen is not None and seen.pressure_max:
         labels.append("what the calibration has seen")
+    else:
+        seen = None
     in_a_line = max(1, min(len(labels), _LEGEND // (max(map(len, labels)) + 4)))
     head = max(_HEAD, 0.35 + _LINE * -(-len(labels) // in_a_line))
     figure, panels = _rows(
-        robot.n_segments, 2.5, columns=columns, head=head, between=0.08, sharey=True
+        robot.n_segments, 2.5, columns=last + 1, head=head, between=0.08, sharey=True
     )
-    for axes in panels.flat:
-        axes.set_visible(False)
-    stands_aside = False
-    for each in _panels_of_pressure(robot, shown):
-        axes = panels[each.segment, each.column]
-        axes.set_visible(True)
-        aside = _side_by_side(each.pressures)
-        stands_aside |= bool(aside.any())
-        if each.seen is not None:
-            margin = float(aside.max(initial=0.0))
-            low, high = each.seen
-            axes.axvspan((low - margin) * BAR, (high + margin) * BAR, color=RANGE, zorder=0)
-        for number, (log, p) in enumerate(zip(shown, each.pressures, strict=True)):
-            rows = _evenly(len(p), _SCATTERED)
-            axes.plot(
-                (p[rows] + aside[number]) * BAR, log.distance[rows] * MM, ".", markersize=3.0,
-                alpha=0.5, markeredgewidth=0, color=channel_colour(number),
-            )  # fmt: skip
-        axes.set_xlabel(each.label)
+    begin, are_moved = 0, False
+    for s, segment in enumerate(robot.segments):
+        end = begin + segment.n_channels
+        for channel in range(begin, end):
+            axes = panels[s, channel - begin]
+            pressures = [each.pressures[:, channel] for each in shown]
+            limits = (seen.pressure_min[channel], seen.pressure_max[channel]) if seen else None
+            are_moved |= _draw_clouds(axes, shown, pressures, limits)
+            axes.set_xlabel(f"{robot.channel_name(channel)} (bar)")
+        for axes in panels[s, end - begin : last]:
+            axes.set_visible(False)
+        norms = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in shown]
+        limits = (0.0, seen.pressure_norm[s]) if seen else None
+        are_moved |= _draw_clouds(panels[s, last], shown, norms, limits)
+        panels[s, last].set_xlabel(f"norm of segment {s + 1} (bar)")
+        begin = end
     for axes in panels[:, 0]:
         axes.set_ylabel("error (mm)")
     highest = max((float(np.nanmax(each.distance, initial=0.0)) for each in shown), default=1.0)
     panels[0, 0].set_ylim(0, 1.05 * highest * MM)
     handles = list(panels[0, 0].lines)
-    if known:
+    if seen:
         from matplotlib.patches import Patch
 
         handles.append(Patch(color=RANGE))
@@ -216,62 +199,36 @@ def plot_errors_over_pressure(
         handletextpad=0.4,
     )  # fmt: skip
     what = "error of the tip over pressure"
-    if stands_aside:
+    if are_moved:
         what += " (the logs, of a few pressures each, stand side by side)"
     draw_head(figure, title, _note(what, found, _worst(found)))
     return figure
 
 
-@dataclass(frozen=True)
-class _PressurePanel:
-    """What one panel of errors over pressure shows, in Pa.
+def _draw_clouds(
+    axes: Any,
+    logs: Sequence[Comparison],
+    pressures: Sequence[Array],
+    limits: tuple[float, float] | None,
+) -> bool:
+    """Draw the errors of logs over pressures in Pa, and shade limits.
 
-    Attributes
-    ----------
-    segment, column : where it stands.
-    label : of its horizontal axis.
-    pressures : of each log, (N,).
-    seen : least and greatest that the calibration has seen; None where it is not known.
+    Logs of a few pressures are moved apart so that they do not hide each other; return whether.
     """
-
-    segment: int
-    column: int
-    label: str
-    pressures: list[Array]
-    seen: tuple[float, float] | None
-
-
-def _panels_of_pressure(
-    robot: RobotDescription, logs: Sequence[Comparison]
-) -> Iterator[_PressurePanel]:
-    """A panel for each channel of a segment, and one for the norm of the segment's pressures."""
-    calibration = robot.calibration
-    if calibration is not None and not calibration.pressure_max:
-        calibration = None
-    last = max(segment.n_channels for segment in robot.segments)
-    begin = 0
-    for s, segment in enumerate(robot.segments):
-        end = begin + segment.n_channels
-        for channel in range(begin, end):
-            seen = None
-            if calibration is not None:
-                seen = calibration.pressure_min[channel], calibration.pressure_max[channel]
-            pressures = [each.pressures[:, channel] for each in logs]
-            label = f"{robot.channel_name(channel)} (bar)"
-            yield _PressurePanel(s, channel - begin, label, pressures, seen)
-        norms = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in logs]
-        seen = None if calibration is None else (0.0, calibration.pressure_norm[s])
-        yield _PressurePanel(s, last, f"norm of segment {s + 1} (bar)", norms, seen)
-        begin = end
-
-
-def _side_by_side(pressures: Sequence[Array]) -> Array:
-    """How far each log is moved aside, so that logs of few pressures do not hide each other."""
     every = np.concatenate(pressures)
-    if len(np.unique(every)) > _FEW:
-        return np.zeros(len(pressures))
-    places: Array = np.arange(len(pressures), dtype=float) - (len(pressures) - 1) / 2
-    return places * _ASIDE * float(np.ptp(every))
+    moves = np.arange(len(logs), dtype=float) - (len(logs) - 1) / 2
+    few = len(np.unique(every)) <= _FEW
+    moves *= _ASIDE * float(np.ptp(every)) if few else 0.0
+    if limits is not None:
+        margin = float(moves.max(initial=0.0))
+        axes.axvspan((limits[0] - margin) * BAR, (limits[1] + margin) * BAR, color=RANGE, zorder=0)
+    for number, (log, p) in enumerate(zip(logs, pressures, strict=True)):
+        rows = _evenly(len(p), _SCATTERED)
+        axes.plot(
+            (p[rows] + moves[number]) * BAR, log.distance[rows] * MM, ".", markersize=3.0,
+            alpha=0.5, markeredgewidth=0, color=channel_colour(number),
+        )  # fmt: skip
+    return bool(moves.any())
 
 
 # -- models and stiffness -------------------------------------------------------------------------
@@ -303,7 +260,6 @@ def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "m
     axes.set_xlim(left=0)
     axes.set_xlabel("mean error of the tip (mm)")
     legend_beside(axes, title="held back", alignment="left")
-    tidy(axes)
     draw_head(figure, title, f"bars: mean over what was held back      chosen: {chosen}")
     return figure
 
@@ -341,7 +297,6 @@ def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiff
         axes.set_xlim(left=0)
     axes.grid(axis="x", alpha=0.25, which="both")
     legend_beside(axes)
-    tidy(axes)
     draw_head(figure, title, "measured, and predicted at the same pressures")
     return figure
 
@@ -356,7 +311,7 @@ def _label(row: StiffnessComparison) -> str:
 
 
 def _rows(rows: int, height: float, *, columns: int = 1, **settings: Any) -> tuple[Figure, Any]:
-    """Figure with rows of panels of a height in inches, and the panels (rows, columns)."""
+    """Figure with rows of panels of one height in inches, and the panels (rows, columns)."""
     gap = _GAP * (1.25 if columns > 1 and "sharey" not in settings else 1.0)
     settings = {"head": _HEAD, "foot": _FOOT, "gap": gap, **settings}
     return stacked_panels([height] * rows, columns=columns, **settings)

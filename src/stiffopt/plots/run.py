@@ -25,14 +25,11 @@ from stiffopt.plots.style import (
     make_logarithmic,
     stacked_panels,
     thinned,
-    tidy,
 )
 from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-__all__ = ["plot_run"]
 
 Array = NDArray[np.float64]
 
@@ -60,15 +57,7 @@ _APART = 0.012  # of the panel's width, between two numbers of events
 
 
 def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
-    """Draw a run.
-
-    Parameters
-    ----------
-    run :
-        At least one tick.
-    title :
-        By default the name of the rig.
-    """
+    """Draw a run of at least one tick; the title is by default the name of the rig."""
     listed = _listed(run.events)
     stiff = bool(np.isfinite(run.stiffness).any())
     angles = bool(np.isfinite(run.angle_error).any())
@@ -125,7 +114,6 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
         axes.set_ylim(middle - _SMALLEST_RANGE / 2, middle + _SMALLEST_RANGE / 2)
     axes.set_ylabel(f"tip {'xyz'[axis]} (mm)")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _draw_error(axes: Any, run: RecordedRun) -> None:
@@ -141,7 +129,6 @@ def _draw_error(axes: Any, run: RecordedRun) -> None:
     else:
         axes.set_yticks([])
         axes.text(0.5, 0.5, "no target was set", transform=axes.transAxes, ha="center", color=GREY)
-    tidy(axes)
 
 
 def _draw_angle(axes: Any, run: RecordedRun) -> None:
@@ -153,7 +140,6 @@ def _draw_angle(axes: Any, run: RecordedRun) -> None:
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) -> None:
@@ -183,7 +169,6 @@ def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) 
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, -0.03), high + 0.02 * (high - low))
     legend_beside(axes, handles=handles)
-    tidy(axes)
 
 
 def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
@@ -198,7 +183,6 @@ def _draw_stiffness(axes: Any, run: RecordedRun) -> None:
     axes.set_ylabel("stiffness\n(N/m, N m/rad)")
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
-    tidy(axes)
 
 
 def _shade(panels: Any, run: RecordedRun) -> None:
@@ -284,8 +268,8 @@ def _draw_timeline(axes: Any, run: RecordedRun, listed: list[Event]) -> None:
             _band(axes, span, 1 + kinds.index(span.kind), _ALARM)
     if run.events:
         _draw_events(axes, run, listed, len(labels) - 1, width)
-    names = [literal(_short(label)) for label in labels]
-    axes.set_yticks(range(len(labels)), names)
+    names = [label if len(label) <= _LONGEST else f"{label[: _LONGEST - 3]}..." for label in labels]
+    axes.set_yticks(range(len(labels)), [literal(name) for name in names])
     axes.set_ylim(len(labels) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0, labelsize=8)
     axes.tick_params(axis="x", labelsize=9)
@@ -309,10 +293,6 @@ def _draw_events(axes: Any, run: RecordedRun, listed: list[Event], row: int, wid
                 str(number), (event.time, row), xytext=(2, 0), textcoords="offset points",
                 va="center", fontsize=8, color=colour, weight="bold",
             )  # fmt: skip
-
-
-def _short(name: str) -> str:
-    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 3]}..."
 
 
 def _alarm_kinds(run: RecordedRun) -> list[str]:

@@ -21,6 +21,12 @@ def least_maximised(solution: PressureSolution) -> float | None:
     return min(solution.stiffnesses[:count], default=None)
 
 
+def limit_of(solution: PressureSolution, channel: str) -> str:
+    """Return at which limit a channel is: ``min``, ``max`` or, at none, an empty text."""
+    sides = (s for s in ("min", "max") if f"{channel} {s}" in solution.active_bounds)
+    return next(sides, "")
+
+
 def unit_text(unit: str | None) -> str:
     """Return a unit as people write it."""
     return (unit or "").replace("*", " ")

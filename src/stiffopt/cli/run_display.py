@@ -1,13 +1,19 @@
-"""The live status of `stiffopt run` on a terminal."""
+"""Shows a run: as a live status on a terminal, or as lines, in JSON for programs."""
 
 from __future__ import annotations
 
 import math
+import os
+import select
+import sys
 import time
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from datetime import UTC, datetime
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -15,15 +21,17 @@ from rich.table import Table
 from rich.text import Text
 
 from stiffopt.cli.console import console_on
+from stiffopt.cli.tables import labelled
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
+from stiffopt.daemon.state_json import plain
 from stiffopt.errors import printable
+from stiffopt.safety.messages import json_line
 
 if TYPE_CHECKING:
     from stiffopt.daemon.daemon import Daemon
 
-__all__ = ["LiveStatus", "status"]
-
+_LONGEST = 500  # characters of a text: a pipe takes 4096 bytes at once or not at all
 _COLOURS = {
     State.UNCONFIGURED: "bold white",
     State.INACTIVE: "bold cyan",
@@ -38,34 +46,93 @@ _UNKNOWN = "-"
 _FACTORS = {"": (1.0, 3), "mm": (1e3, 1), "deg": (180 / math.pi, 1)}  # and decimals of a vector
 
 
-class LiveStatus:
-    """Shows the state of the loop in one place of the terminal.
+def write_at_once(stream: TextIO, line: str) -> None:
+    """Write a line unless that would block, or the stream is closed or absent."""
+    data = f"{line}\n".encode(errors="backslashreplace")
+    with suppress(OSError, ValueError, AttributeError):
+        number = stream.fileno()
+        ready = select.poll()
+        ready.register(number, select.POLLOUT)
+        if ready.poll(0):
+            os.write(number, data)
 
-    A terminal that is gone or fails is no reason to end: nothing is shown then.
+
+class Lines:
+    """Writes a line to stdout for each event and each change of state.
+
+    Writing never waits and never fails: a line is left out if its reader has stopped or is gone,
+    for the arm is more important.
 
     Parameters
     ----------
-    name :
-        Of the rig.
-    channels :
-        Names (n,) of the channels.
-    console :
-        Where it is shown.
+    as_json :
+        As an object with ``time`` (of day, UTC), ``level``, ``kind`` and ``text``; else for people.
     now :
         Time on the rig's clock, in s.
     """
 
-    period = 0.25
+    period = 0.05  # s, between two updates
+
+    def __init__(self, *, as_json: bool, now: Callable[[], float] = time.monotonic) -> None:
+        self._as_json, self._now = as_json, now
+        self._last: dict[str, Any] = {}
+
+    def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
+        """Write a line about this moment."""
+        self._line(self._now(), str(severity), kind, text)
+
+    def begin(self, daemon: Daemon) -> None:
+        """Write where the daemon is reached and what it records."""
+        found: dict[str, Any] = {
+            "url": daemon.url,
+            "token_file": None if daemon.token_file is None else str(daemon.token_file),
+            "recording": daemon.recording,
+            "foxglove_port": daemon.foxglove_port,
+        }
+        known = {key: value for key, value in found.items() if value is not None}
+        words = ", ".join(f"{key.replace('_', ' ')} {value}" for key, value in known.items())
+        self._line(self._now(), "info", "started", f"runs; {words or 'no ports'}", **known)
+
+    def update(self, now: Snapshot, events: list[Event]) -> None:
+        """Write the new events, and the state if it has changed."""
+        for event in events:
+            self._line(event.time, str(event.severity), event.kind, event.text)
+        shown = [entry for entry in entries(type(now)) if entry.shown.line]
+        fields = {entry.json[0]: plain(getattr(now, entry.name), entry) for entry in shown}
+        if fields != self._last:
+            self._last = fields
+            text = f"{now.state}: {now.reason}" if now.reason else str(now.state)
+            level = "error" if now.state is State.FAULT else "info"
+            self._line(now.time, level, "state", text, **fields)
+
+    def end(self) -> None:
+        """Do nothing; see `LiveStatus`."""
+
+    def _line(self, moment: float, level: str, kind: str, text: str, **more: Any) -> None:
+        text = text[:_LONGEST]
+        stamp = datetime.fromtimestamp(time.time() - (self._now() - moment), UTC)
+        if self._as_json:
+            line = json_line(level, kind, text, stamp, **more)
+        else:
+            mark = "" if level == "info" else f"{level.upper()}: "
+            clock = stamp.astimezone().strftime("%H:%M:%S")
+            line = f"{clock} {mark}{printable(text)} [{kind}]"
+        write_at_once(sys.stdout, line)
+
+
+class LiveStatus:
+    """Shows the state of the loop in one place of the terminal.
+
+    A terminal that is gone or fails is no reason to end: nothing is shown then. `name` is that of
+    the rig, `channels` are those of its channels (n,).
+    """
+
+    period = 0.25  # s, between two updates
 
     def __init__(
-        self,
-        name: str,
-        channels: Sequence[str],
-        *,
-        console: Console | None = None,
-        now: Callable[[], float] = time.monotonic,
+        self, name: str, channels: Sequence[str], *, console: Console | None = None
     ) -> None:
-        self._name, self._channels, self._now = name, channels, now
+        self._name, self._channels = name, channels
         self._live = Live(
             console=console or console_on(), auto_refresh=False, vertical_overflow="crop"
         )
@@ -77,17 +144,17 @@ class LiveStatus:
 
     def say(self, kind: str, text: str, severity: Severity = Severity.INFO) -> None:
         """Show something as an event of this moment."""
-        self._events.append(Event(self._now(), kind, text, severity))
+        self._events.append(Event(time.monotonic(), kind, text, severity))
         if not self._live.is_started:
             self._attempt(lambda: self._live.console.print(Text(text, _LEVELS[severity])))
 
     def begin(self, daemon: Daemon) -> None:
-        """Start to show."""
+        """Start to show, with the addresses of a daemon."""
         self._daemon = daemon
         self._attempt(self._live.start)
 
     def update(self, now: Snapshot, events: list[Event]) -> None:
-        """Show how things stand now."""
+        """Show the state, and events with the last ones before them."""
         self._events.extend(events)
         if self._before is not None and now.time > self._before[0]:
             self._rate = (now.timing.ticks - self._before[1]) / (now.time - self._before[0])
@@ -121,29 +188,23 @@ def status(
     events: Sequence[Event] = (),
     daemon: Daemon | None = None,
 ) -> RenderableType:
-    """Return the state of the loop as something that rich can print.
+    """Return the state of the loop for the terminal.
 
-    Parameters
-    ----------
-    now :
-        What is shown.
-    name, channels :
-        Of the rig and of its channels (n,).
-    rate :
-        Of the loop, in Hz; NaN where unknown.
-    events :
-        The latest.
-    daemon :
-        Where everything is.
+    `name` is that of the rig, `channels` are those of its channels (n,), `rate` is the loop's in
+    Hz, NaN where unknown; the addresses and files of the daemon come last.
     """
     armed = now.state in (State.ACTIVE, State.HOLDING)
-    parts: list[RenderableType] = [_headline(now, name), _table(_fields(now, armed))]
-    parts.append(_pressures(now, channels))
-    stiffness = _stiffness(now) if armed else []
-    parts.append(_table([*stiffness, *_loop(now, rate), *_alarms(now)]))
-    parts += [_event(event) for event in events]
+    rows: list[tuple[str, RenderableType]] = [*_stiffness(now)] if armed else []
+    rows += _loop(now, rate)
+    for alarm in now.alarms:
+        rows.append(("ALARM", Text(f"{printable(alarm.text)} [{alarm.kind}]", "bold red")))
+    parts: list[RenderableType] = [_headline(now, name), labelled(_fields(now, armed))]
+    parts += [_pressures(now, channels), labelled(rows)]
+    for event in events:
+        line = f"  {printable(event.text)} [{event.kind}]"
+        parts.append(Text(line, _LEVELS[event.severity]))
     if daemon is not None:
-        parts.append(_table(_places(daemon)))
+        parts.append(labelled(_places(daemon)))
     return Group(*parts)
 
 
@@ -188,15 +249,12 @@ def _pressures(now: Snapshot, channels: Sequence[str]) -> Table:
     for k, name in enumerate(channels):
         commanded, high = float(now.commanded[k]), float(now.high[k])
         measured = float(now.measured[k])
-        marks = []
-        if now.saturated[k]:
-            marks.append("saturated")
         table.add_row(
             f"  {name}",
             _bar(measured if math.isfinite(measured) else commanded, commanded, high),
             f"{commanded * 1e-5:.3f} bar",
             "not measured" if math.isnan(measured) else f"is {measured * 1e-5:.3f}",
-            Text(" ".join(marks), "yellow"),
+            Text("saturated" if now.saturated[k] else "", "yellow"),
         )
     return table
 
@@ -243,25 +301,11 @@ def _loop(now: Snapshot, rate: float) -> list[tuple[str, RenderableType]]:
 def _percentile(lateness: tuple[tuple[float, ...], tuple[int, ...]], share: float) -> str:
     """Return the edge of the histogram below which a share of all ticks began."""
     edges, counts = lateness
-    total, so_far = sum(counts), 0
-    if not total:
+    so_far = list(accumulate(counts))
+    if not so_far or not so_far[-1]:
         return ""
-    for edge, count in zip(edges, counts, strict=False):
-        so_far += count
-        if so_far >= share * total:
-            return f"{edge * 1e3:g} ms"
-    return "more than 0.5 s"
-
-
-def _alarms(now: Snapshot) -> list[tuple[str, RenderableType]]:
-    return [
-        ("ALARM", Text(f"{printable(alarm.text)} [{alarm.kind}]", "bold red"))
-        for alarm in now.alarms
-    ]
-
-
-def _event(event: Event) -> Text:
-    return Text(f"  {printable(event.text)} [{event.kind}]", _LEVELS[event.severity])
+    at = bisect_left(so_far, share * so_far[-1])
+    return f"{edges[at] * 1e3:g} ms" if at < len(edges) else "more than 0.5 s"
 
 
 def _places(daemon: Daemon) -> list[tuple[str, RenderableType]]:
@@ -275,15 +319,6 @@ def _places(daemon: Daemon) -> list[tuple[str, RenderableType]]:
         rows.append(("recording", daemon.recording))
     rows.append(("", Text("Ctrl-C lets the pressures down and ends; twice vents at once", "dim")))
     return rows
-
-
-def _table(rows: Sequence[tuple[str, RenderableType]]) -> Table:
-    table = Table.grid(padding=(0, 2, 0, 0))
-    table.add_column(style="dim", no_wrap=True)
-    table.add_column()
-    for name, value in rows:
-        table.add_row(f"  {name}", value)
-    return table
 
 
 def _triple(
