@@ -182,18 +182,17 @@ def _set_batch_policy(process: int) -> None:
 
 
 class PlannerEnd:
-    """The control loop's end of the connection; a call raises `OSError` if the other is closed.
-
-    It is made from a file descriptor. `has_answer` returns whether there is something to receive,
-    if only that the other end is closed.
-    """
+    """The control loop's end of the connection; a call raises `OSError` if the other is closed."""
 
     def __init__(self, handle: int) -> None:
         self.connection = Connection(handle)
-        poll = select.poll()  # `Connection.poll` is slow: it makes a selector each time
-        poll.register(handle, select.POLLIN)  # errors are reported in any case
-        self.has_answer = lambda: bool(poll.poll(0))
+        self._poll = select.poll()  # `Connection.poll` is slow: it makes a selector each time
+        self._poll.register(handle, select.POLLIN)  # errors are reported in any case
         self._sent: PlanRequest | None = None
+
+    def has_answer(self) -> bool:
+        """Whether there is something to receive, if only that the other end is closed."""
+        return bool(self._poll.poll(0))
 
     def send(self, request: PlanRequest) -> None:
         """Send a request; the one before must have been answered."""
