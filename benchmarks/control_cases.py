@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -430,7 +429,9 @@ class TrueModel:
         gravity = self.base[:3, :3].T @ np.array(robot.gravity)
         update = {"gravity": tuple(gravity.tolist()), "tip_mass": robot.tip_mass + payload}
         self.model = load_robot(with_true_values(robot, mismatch).model_copy(update=update))
-        with _passing_cache():  # nobody needs the code of this very arm again
+        # nobody needs the code of this very arm again
+        cache = tempfile.TemporaryDirectory()
+        with cache, patch.dict(os.environ, STIFFOPT_CACHE_DIR=cache.name):
             self._tip = TipModel(self.model)
 
     def position(self, pressures: Array) -> Array:
@@ -525,19 +526,3 @@ class TrueModel:
         )  # fmt: skip
         p = BAR * np.clip(found.x, low, high)
         return p if np.linalg.norm(self.position(p) - place) < REACHED else None
-
-
-@contextmanager
-def _passing_cache() -> Iterator[None]:
-    """Context whose compiled code is kept on disk no longer than that."""
-    name = "STIFFOPT_CACHE_DIR"
-    before = os.environ.get(name)
-    with tempfile.TemporaryDirectory() as folder:
-        os.environ[name] = folder
-        try:
-            yield
-        finally:
-            if before is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = before

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from quality import KINDS, case, random_task
 from reference import pose_errors
 from stiffopt import Manipulator, Target, Task, load_robot
-from stiffopt.lie import quaternion_from_rotation
+from stiffopt.lie import quaternion_from_rotation, rotation_from_quaternion
 from stiffopt.optimise.task import Load
 
 Vector = NDArray[np.float64]
@@ -111,14 +111,7 @@ def moved(robot: Manipulator, task: Task, p: Vector) -> Target:
     if target.pointing is not None:
         changes["pointing"] = tuple((turn @ np.array(target.pointing)).tolist())
     if target.orientation is not None:
-        changes["orientation"] = tuple(_turned(turn, np.array(target.orientation)).tolist())
+        rotation = turn @ rotation_from_quaternion(np.array(target.orientation))
+        quaternion = quaternion_from_rotation(rotation)
+        changes["orientation"] = tuple((quaternion * np.copysign(1.0, quaternion[0])).tolist())
     return target.model_copy(update=changes)
-
-
-def _turned(rotation: Vector, quaternion: Vector) -> Vector:
-    """The quaternion (w, x, y, z) of ``rotation R(quaternion)``."""
-    a, b = quaternion_from_rotation(rotation), quaternion
-    scalar = a[0] * b[0] - a[1:] @ b[1:]
-    vector = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    product = np.append(scalar, vector)
-    return np.asarray(product if product[0] >= 0 else -product)

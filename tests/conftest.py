@@ -15,6 +15,7 @@ import pytest
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 os.environ["MPLBACKEND"] = "Agg"
+os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy is imported: small matrices, many processes
 os.environ["STIFFOPT_COMPILER"] = "none"  # but for tests that ask for `compiled`
 os.environ["STIFFOPT_COMPILE"] = "wait"  # but for tests of code that is made in the background
 
@@ -38,8 +39,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session")
 def code_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where compiled code is kept for all tests of this run."""
-    return tmp_path_factory.mktemp("code")
+    """Where compiled code is kept for all tests of this run, whichever process runs them."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # each of them has its own below
+    cache = folder / "code"
+    cache.mkdir(exist_ok=True)
+    return cache
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 import stiffopt as so
 from stiffopt.model import compiler as build
-from stiffopt.optimise import prepared as preparation
+from stiffopt.optimise.settings import KEPT
 
 KINDS = {
     "position": {},
@@ -190,21 +190,21 @@ def test_one_structure_is_compiled_once(robot, task, monkeypatch):
 
 def test_preparations_are_forgotten(robot):
     rng = np.random.default_rng(2)
-    tasks = [random_task(robot, rng) for _ in range(preparation._MOST_KEPT + 5)]
+    tasks = [random_task(robot, rng) for _ in range(KEPT.per_arm + 5)]
     first = so.solve_pressure(robot, tasks[0]).pressures
     so.solve_batch(robot, tasks)
-    assert len(robot.kept("prepared", dict)) <= preparation._MOST_KEPT
+    assert len(robot.kept("prepared", dict)) <= KEPT.per_arm
     np.testing.assert_array_equal(so.solve_pressure(robot, tasks[0]).pressures, first)
 
 
 def test_varying_limits_do_not_fill_the_memory(robot, task):
     first = so.solve_pressure(robot, task).pressures
-    for step in range(preparation._MOST_KEPT + 3):
+    for step in range(KEPT.per_arm + 3):
         limits = so.Task.model_fields["pressure"].annotation(max=1.4e5 + step)
         limited = task.model_copy(update={"pressure": limits})
         assert so.solve_pressure(robot, limited, guess=first).found
     for group in ("prepared", "samples", "fast solvers"):
-        assert len(robot.kept(group, dict)) <= preparation._MOST_KEPT
+        assert len(robot.kept(group, dict)) <= KEPT.per_arm
 
 
 def test_many_stiffnesses_are_left_to_the_general_method(robot, task):

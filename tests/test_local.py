@@ -45,7 +45,7 @@ def program(kind, number=0, name="stiff-flop-2"):
     task = case(robot(name), kind, SEED, number)
     problem = PressureProblem(robot(name), task)
     table = Prepared(robot(name), task, 0).samples
-    return problem, np.array(list(starts(problem, table).candidates))
+    return problem, np.array(list(starts(problem, table)[0]))
 
 
 def feasible(problem, point):

@@ -12,8 +12,9 @@ pressures           0.01 bar, where they are unique; with them the tip to 0.05 m
                     and the same active bounds
 ==================  ====================================================================
 
-Both methods are held to it.  Pressures count as unique where the equally good ends of the
-independent reference lie within 0.005 bar (`pressures_spread_bar`, see problems/golden/update.py).
+Both methods are held to it, the compiled one by all problems in the long form only.  Pressures
+count as unique where the equally good ends of the independent reference lie within 0.005 bar
+(`pressures_spread_bar`, see problems/golden/update.py).
 """
 
 import json
@@ -45,13 +46,36 @@ def solved(path: Path, way: str) -> PressureSolution:
     return solve_pressure(robot(task.robot, path.parent, way), task)
 
 
-@pytest.fixture(params=["general", "compiled"])
-def way(request: pytest.FixtureRequest) -> str:
-    """The general method in the CasADi VM, or the compiled solver."""
-    name: str = request.param
-    if name == "compiled":
-        request.getfixturevalue(name)
-    return name
+COMPILED = (  # in the short form: a task of each layout, and of each kind of target and of measure
+    "four_channel_connectors",
+    "hanging_retraction",
+    "neo_hookean_stiff_x",
+    "one_segment_free_height",
+    "three_segment_stiff_y",
+    "two_segment_at_least",
+    "two_segment_clamped",
+    "two_segment_least_pressure",
+    "two_segment_match_matrix",
+    "two_segment_orientation",
+    "two_segment_stiff_x",
+    "two_segment_wide_tolerance",
+    "unreachable_pointing",
+)
+
+
+def each_way(files: list[Path]) -> pytest.MarkDecorator:
+    """The general method in the CasADi VM, and the compiled solver."""
+    cases = [pytest.param(path, "general", id=f"general-{path.stem}") for path in files]
+    for path in files:
+        marks = () if path.stem in COMPILED else pytest.mark.long
+        cases.append(pytest.param(path, "compiled", id=f"compiled-{path.stem}", marks=marks))
+    return pytest.mark.parametrize(("path", "way"), cases)
+
+
+@pytest.fixture(autouse=True)
+def _code(request: pytest.FixtureRequest) -> None:
+    if request.node.name.partition("[")[2].startswith("compiled"):
+        request.getfixturevalue("compiled")
 
 
 def golden(path: Path) -> dict[str, Any]:
@@ -96,7 +120,7 @@ def test_names_are_plain(path):
     assert path.stem.replace("-" if path.parent.name == "robots" else "_", "").isalnum()
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+@each_way(FILES)
 def test_answer_is_the_golden_one(path, way):
     solution, expected = solved(path, way), golden(path)
     assert solution.status == expected["status"], solution.message
@@ -124,9 +148,7 @@ def test_answer_is_the_golden_one(path, way):
     assert solution.matrix_distance == near(expected["matrix_distance"], absolute=1e-3)
 
 
-@pytest.mark.parametrize(
-    "path", [path for path in FILES if is_unique(golden(path))], ids=lambda path: path.stem
-)
+@each_way([path for path in FILES if is_unique(golden(path))])
 def test_pressures_are_the_golden_ones(path, way):
     solution, expected = solved(path, way), golden(path)
     assert solution.pressures is not None

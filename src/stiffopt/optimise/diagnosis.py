@@ -1,8 +1,4 @@
-"""What to say where a task cannot be met, or leaves no choice.
-
-`closest_configuration` finds the pressures that come nearest to an unreachable pose; the rest
-puts findings into words.
-"""
+"""Tasks that cannot be met, or leave no choice: the closest configuration, and messages."""
 
 from collections.abc import Iterable
 from math import inf
@@ -36,7 +32,9 @@ def closest_configurations(
     results: list[LocalResult] = []
     for term in sorted(terms, key=lambda t: (not t.is_inequality, -t.order)):
         stage = stage.changed(problem.closest(term.name))
-        results = _descents(stage, [*(result.point.x for result in results[:1]), *xs])
+        starts = [*(result.point.x for result in results[:1]), *xs]
+        tries = Effort(len(starts), CLOSEST.agreeing, CLOSEST.most_descents)
+        results = list(search(stage, starts, tries, CLOSEST.same).results)
         if not results:
             return []
         ball = [b for b in results[0].point.balls if b.name == term.name]
@@ -44,11 +42,6 @@ def closest_configurations(
         allowed = max(term.radius, least * (1 + 1e-6) + 1e-7)
         stage = stage.changed(stage.objective, {term.name: allowed})
     return results
-
-
-def _descents(problem: PressureProblem, xs: list[Vector]) -> list[LocalResult]:
-    tries = Effort(len(xs), CLOSEST.agreeing, CLOSEST.most_descents)
-    return list(search(problem, xs, tries, CLOSEST.same).results)
 
 
 def unimproved(problem: PressureProblem, x: Vector) -> LocalResult:

@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.loaded import LoadedArm
 from stiffopt.optimise.program import Program, pressure_ranges
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.search import effort
-from stiffopt.optimise.settings import DESCENT, REACH, SEARCH, Effort
+from stiffopt.optimise.settings import DESCENT, KEPT, REACH, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
 
 Vector = NDArray[np.float64]
@@ -30,7 +29,6 @@ Vector = NDArray[np.float64]
 _NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
 _UNSOLVED = 0
-_CHUNK = 8  # tasks that a thread takes at a time
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
@@ -101,20 +99,14 @@ class FastSolver:
     program : Program
         Any of that structure.
     table : SampleTable
-        Where searches start.
-    arm : LoadedArm, optional
-        The arm if gravity or a load acts.
+        Where searches start; that of a loaded arm has the arm in machine code.
     """
 
     def __init__(
-        self,
-        library: Library,
-        robot: Manipulator,
-        program: Program,
-        table: SampleTable,
-        arm: LoadedArm | None = None,
+        self, library: Library, robot: Manipulator, program: Program, table: SampleTable
     ) -> None:
-        self._library, self._table, self._arm = library, table, arm  # what pointers below lead to
+        self._library, self._table = library, table  # what pointers below lead to
+        arm = table.arm
         size = library.cdll.stiffopt_setup_size
         size.restype = _integer
         if size() != ctypes.sizeof(_Setup):
@@ -217,9 +209,9 @@ class FastSolver:
 
         def work(starts: Iterator[int]) -> None:
             for start in starts:
-                self._run(rows, numbers, start, min(start + _CHUNK, len(rows)))
+                self._run(rows, numbers, start, min(start + KEPT.chunk, len(rows)))
 
-        in_parallel(work, range(0, len(rows), _CHUNK), threads)
+        in_parallel(work, range(0, len(rows), KEPT.chunk), threads)
         return [self._answer(each) for each in numbers]
 
     def _run(self, rows: Vector, answers: Vector, begin: int, end: int) -> None:

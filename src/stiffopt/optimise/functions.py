@@ -1,4 +1,4 @@
-"""The functions of a task structure on one arm: machine code where that can be had."""
+"""The functions of a task's structure on one arm: machine code where there is some, else the VM."""
 
 from collections.abc import Hashable
 from functools import cached_property, partial
@@ -10,90 +10,89 @@ from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.compiled import Library, library
 from stiffopt.model.layout import Layout, free_tip_function
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.rod import rod_functions
+from stiffopt.optimise.loaded import tip_functions
 from stiffopt.optimise.program import Program
+from stiffopt.optimise.settings import KEPT
 
-_SOURCES = (str(Path(__file__).with_name("native") / "solver.c"),)
-_COMPILED = ("pose", "point", "judge")
-_MOST_MEASURES = 6  # of more, code takes too long to compile: the general method serves them
+_NATIVE = Path(__file__).with_name("native")
 
 
 class Functions:
-    """Those of `Program`, on the inputs of the tip's shape and `Arm.parameters` of the program's.
+    """Those of `Program`, of the inputs of the tip's shape and `Arm.parameters` of the program's.
 
-    From the library, or each made in the CasADi VM when it is first asked for.
+    Each is made when it is first asked for: in machine code or, without, in the CasADi VM.
     """
 
     def __init__(self, robot: Manipulator, program: Program) -> None:
         self._robot = robot
         self._program = program
         self._library: Library | None = None
+        self._made: dict[str, BatchFunction] = {}
 
     @property
     def library(self) -> Library | None:
-        """Machine code of an arm without loads, with the compiled solver; None for the VM."""
+        """Machine code with the compiled solver; None where the general method has to serve.
+
+        The integrator in C, for arms under gravity or loads, knows of the tip alone.
+        """
         robot, program = self._robot, self._program
-        if (
-            self._library is None
-            and not robot.is_loaded
-            and len(program.measures) <= _MOST_MEASURES
-        ):
-            content = (robot.layout.skeleton, program.structure)
-            make = partial(_free_functions, robot.layout, program)
-            self._library = library(content, make, _SOURCES, daqp=True)
+        if self._library is None and robot.is_loaded:
+            if not program.has_stations and rod_functions(robot.layout) is not None:
+                self._library = library(
+                    (robot.layout.skeleton, program.structure, "loaded"),
+                    partial(_loaded_functions, robot.layout, program),
+                    (str(_NATIVE / "loaded_solver.c"),), daqp=True,
+                )  # fmt: skip
+        elif self._library is None and len(program.measures) <= KEPT.most_measures:
+            self._library = library(
+                (robot.layout.skeleton, program.structure),
+                partial(_free_functions, robot.layout, program),
+                (str(_NATIVE / "solver.c"),), daqp=True,
+            )  # fmt: skip
         return self._library
 
-    @cached_property
-    def pose(self) -> BatchFunction:
-        """See `Program.pose`."""
-        return self._function("pose")
-
-    @cached_property
-    def point(self) -> BatchFunction:
-        """See `Program.point`."""
-        return self._function("point")
-
-    @cached_property
-    def judge(self) -> BatchFunction:
-        """See `Program.judge`."""
-        return self._function("judge")
+    def __getitem__(self, name: str) -> BatchFunction:
+        """``pose``, ``point`` or ``judge``, as `Program` has them."""
+        if name not in self._made:
+            compiled = None if self._robot.is_loaded else self.library
+            self._made[name] = compiled.function(name) if compiled else self._interpreted(name)
+        return self._made[name]
 
     @cached_property
     def worth(self) -> BatchFunction | None:
         """See `Program.worth`; None where `point` takes hardly longer than a call."""
-        return None if self.library or self._robot.is_loaded else self._function("worth")
+        return None if self._robot.is_loaded or self.library else self._interpreted("worth")
 
-    def _function(self, name: str) -> BatchFunction:
-        if self.library is not None:
-            return self.library.function(name)
-        outputs = getattr(self._program, name)
-        if self._robot.is_loaded:
-            formula = self._robot.tip_function(name, outputs, self._program.n_parameters)
-            return InterpretedFunction(formula)
-        return _interpreted(self._robot.layout, self._program.structure, name, self._program)
-
-
-def _free_functions(layout: Layout, program: Program) -> list[ca.Function]:
-    return [_formula(layout, program, name) for name in _COMPILED]
-
-
-def _formula(layout: Layout, program: Program, name: str) -> ca.Function:
-    return free_tip_function(layout, name, getattr(program, name), program.n_parameters)
+    def _interpreted(self, name: str) -> InterpretedFunction:
+        """One of the functions in the CasADi VM; free arms of one layout share it."""
+        robot, program = self._robot, self._program
+        if robot.is_loaded:
+            outputs = getattr(program, name)
+            return InterpretedFunction(robot.tip_function(name, outputs, program.n_parameters))
+        key = (robot.layout, program.structure, name)
+        if key not in _in_vm:
+            while len(_in_vm) >= KEPT.in_vm:
+                _in_vm.pop(next(iter(_in_vm)), None)
+            _in_vm[key] = InterpretedFunction(_free_function(robot.layout, program, name))
+        return _in_vm[key]
 
 
 _in_vm: dict[Hashable, InterpretedFunction] = {}
-_MOST_IN_VM = 256
 
 
-def _interpreted(
-    layout: Layout, structure: Hashable, name: str, program: Program
-) -> InterpretedFunction:
-    """One of the functions in the CasADi VM; arms of one layout share it."""
-    key = (layout, structure, name)
-    if key not in _in_vm:
-        while len(_in_vm) >= _MOST_IN_VM:
-            _in_vm.pop(next(iter(_in_vm)), None)
-        _in_vm[key] = InterpretedFunction(_formula(layout, program, name))
-    return _in_vm[key]
+def _free_function(layout: Layout, program: Program, name: str) -> ca.Function:
+    return free_tip_function(layout, name, getattr(program, name), program.n_parameters)
+
+
+def _free_functions(layout: Layout, program: Program) -> list[ca.Function]:
+    return [_free_function(layout, program, name) for name in ("pose", "point", "judge")]
+
+
+def _loaded_functions(layout: Layout, program: Program) -> list[ca.Function]:
+    equations = rod_functions(layout)
+    assert equations is not None  # see `Functions.library`
+    return [*equations.functions, *tip_functions(program, layout)]
 
 
 def functions(robot: Manipulator, program: Program) -> Functions:

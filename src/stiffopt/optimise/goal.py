@@ -1,6 +1,6 @@
-"""What a task requires of the tip's stiffness: the part ``stiffness`` of the task file.
+"""`StiffnessGoal`, the part ``stiffness`` of a task file: what the tip's stiffness should be.
 
-What may stand there are the measures in `stiffopt.optimise.measures`.
+It is made of the measures in `stiffopt.optimise.measures`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ OneOrMore = Annotated[Items[MeasureT], BeforeValidator(_as_items)]
 
 
 class StiffnessGoal(Schema):
-    """What is asked of the tip's stiffness.
+    """Stiffnesses to maximise, to match and to keep above a value.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Finding the kinds of terms and of measures: one class in each file of a package."""
+"""Discovery of the kinds of terms and measures in the files of a package."""
 
 from importlib import import_module
 from pkgutil import iter_modules

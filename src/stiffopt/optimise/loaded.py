@@ -6,8 +6,6 @@ pose terms and measures are functions of the tip, see `tip_functions`.
 
 import ctypes
 from collections.abc import Iterator
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -17,18 +15,16 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.batch import in_parallel
-from stiffopt.model.compiled import Library, library
+from stiffopt.model.compiled import Library
 from stiffopt.model.layout import Layout, symbolic_arm
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.rod import rod_functions, rod_pieces
 from stiffopt.model.shape import PointOfArm
 from stiffopt.optimise.program import Program
+from stiffopt.optimise.settings import KEPT
 
 Vector = NDArray[np.float64]
 
-_SOURCES = (str(Path(__file__).with_name("native") / "loaded_solver.c"),)
-
-_CHUNK = 8  # equilibria that a thread settles at a time
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
@@ -138,29 +134,8 @@ class _Rod(ctypes.Structure):
     ]
 
 
-def loaded_library(robot: Manipulator, program: Program) -> Library | None:
-    """Machine code for tasks of the program's structure on this arm under any load."""
-    if rod_functions(robot.layout) is None:
-        return None
-    known: dict[object, Library] = robot.kept("loaded libraries", dict)
-    if program.structure in known:
-        return known[program.structure]
-    content = (robot.layout.skeleton, program.structure, "loaded")
-    make = partial(_functions, robot.layout, program)
-    found = library(content, make, _SOURCES, daqp=True)
-    if found is not None:  # else another thread may be compiling
-        known[program.structure] = found
-    return found
-
-
-def _functions(layout: Layout, program: Program) -> list[ca.Function]:
-    equations = rod_functions(layout)
-    assert equations is not None  # or nobody would ask
-    return [*equations.functions, *tip_functions(program, layout)]
-
-
 class LoadedArm:
-    """A loaded arm as the compiled solver sees it.
+    """An arm under gravity or a load in machine code: its rod, and equilibria from rest.
 
     Attributes
     ----------
@@ -218,8 +193,8 @@ class LoadedArm:
             for start in starts:
                 self._settle(
                     self.address, pressures.ctypes.data, states.ctypes.data, poses.ctypes.data,
-                    found.ctypes.data, start, min(start + _CHUNK, count),
+                    found.ctypes.data, start, min(start + KEPT.chunk, count),
                 )  # fmt: skip
 
-        in_parallel(work, range(0, count, _CHUNK))
+        in_parallel(work, range(0, count, KEPT.chunk))
         return found != 0, states, poses

@@ -33,7 +33,7 @@ _CURVED = 2.0  # second-order error of a correction, for the squared first order
 
 @dataclass(frozen=True, eq=False)
 class LocalResult:
-    """Where a descent ended.
+    """End of a descent.
 
     Attributes
     ----------

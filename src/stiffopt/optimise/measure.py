@@ -1,8 +1,8 @@
-"""What a stiffness measure is: a scalar of the tip's compliance that a task bounds or optimises.
+"""`Measure`, the base class of scalars of the tip's compliance that a task bounds or optimises.
 
-Each kind has a file of its own in `stiffopt.optimise.measures`.  A measure is both: what the task
-file says, and the formula.  It splits into its *structure*, for which functions are compiled, and
-its *parameters*, which are arguments of them.
+Each kind has a file of its own in `stiffopt.optimise.measures`.  A measure is an entry of the task
+file and a symbolic formula in one.  It splits into its *structure*, for which functions are
+compiled, and its *parameters*, which are arguments of them.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ class Measure(Schema):
         """What a match minimises, as a function of the formula's value, and its derivative."""
         raise NotImplementedError
 
-    # -- what is said of it -----------------------------------------------------------------
+    # -- in reports -------------------------------------------------------------------------
 
     @property
     def is_stiffness(self) -> bool:
-        """Whether the formula is the logarithm of a stiffness; else its square root is told."""
+        """Whether the formula is the logarithm of a stiffness; else it is a squared distance."""
         return True
 
     def holds(self, value: float) -> bool:
@@ -74,11 +74,11 @@ class Measure(Schema):
         return True
 
     def shortfall(self, value: float) -> str:
-        """Of one that is not: what was required, and what can be had."""
+        """Message for a value that does not hold: what was required, and the best there is."""
         return ""
 
     def said(self) -> dict[str, Any]:
-        """Its keys and values but for what is required of it."""
+        """Its keys and values in the task file, without the required value and tolerance."""
         said = self.model_dump(exclude={"value", "tolerance"})
         return {key: list(v) if isinstance(v, tuple) else v for key, v in said.items()}
 

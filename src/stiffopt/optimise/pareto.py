@@ -7,12 +7,10 @@ import numpy as np
 from stiffopt.errors import InputError, shown
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.numeric import checked_integer
+from stiffopt.optimise.settings import ANSWER
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.task import Task
-
-LARGEST_SHARE = 0.25
-"""Largest position tolerance of the front, as a share of the arm's length."""
 
 
 def pareto_front(
@@ -40,7 +38,7 @@ def pareto_front(
     if which is None:
         raise InputError("a trade-off needs a target with a position or an angle")
     own: float = getattr(task.target.tolerance, which)
-    largest = LARGEST_SHARE * robot.length if which == "position" else pi
+    largest = ANSWER.largest_tolerance * robot.length if which == "position" else pi
     front: list[PressureSolution] = []
     for size in np.geomspace(own, max(own, largest), n):
         tolerance = task.target.tolerance.model_copy(update={which: float(size)})

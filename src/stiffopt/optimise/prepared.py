@@ -1,4 +1,4 @@
-"""What tasks have in common that differ in their target only: prepared once, kept by the robot."""
+"""What tasks that differ in their target alone share: limits, samples and compiled solvers."""
 
 from collections.abc import Callable, Hashable
 from functools import cached_property
@@ -12,17 +12,15 @@ from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.fast import FastSolver
 from stiffopt.optimise.functions import functions
-from stiffopt.optimise.loaded import LoadedArm, loaded_library
+from stiffopt.optimise.loaded import LoadedArm
 from stiffopt.optimise.problem import floor_bounds
 from stiffopt.optimise.program import Program, ProgramStructure
 from stiffopt.optimise.samples import SampleTable
+from stiffopt.optimise.settings import KEPT
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
-
-_MOST_KEPT = 64  # of each kind of thing that varies from task to task
-
 Made = TypeVar("Made")
 
 
@@ -47,6 +45,8 @@ class Prepared:
         self._floors = floor_bounds(task.stiffness)
         self.unit = task.measures[0].unit if task.measures else None
         self._seed = seed
+        limits = (self.lower.tobytes(), self.upper.tobytes())
+        self._key = (self.robot.tip_load, *limits, seed)
         self._rows: dict[ProgramStructure, tuple[FastSolver, Vector] | None] = {}
 
     def program(self, target: Target) -> Program:
@@ -55,62 +55,44 @@ class Prepared:
 
     def fast(self, program: Program) -> tuple[FastSolver, Vector] | None:
         """Compiled solver and the row of a task without its target; None if there is none."""
-        if self.robot.is_loaded and program.has_stations:
-            return None  # the integrator in C knows of the tip alone
         structure = program.structure
         if structure not in self._rows:
-            loaded = self.robot.is_loaded
-            library = (
-                loaded_library(self.robot, program)
-                if loaded
-                else functions(self.robot, program).library
-            )
+            library = functions(self.robot, program).library
             if library is None:
                 return None  # not remembered: another thread may be compiling
-            if loaded:
-                self._rows[structure] = self._loaded(library, program)
-                return self._rows[structure]
-            limits = (self.lower.tobytes(), self.upper.tobytes(), self._seed)
-            solver = _recent(
-                self.robot, "fast solvers", (structure, limits),
-                lambda: FastSolver(library, self.robot, program, self.samples),
-            )  # fmt: skip
-            row = solver.row(program, self.lower, self.upper, self._floors)
-            self._rows[structure] = (solver, row)
+            solver = self._solver(library, program)
+            found = None
+            if solver is not None:
+                found = solver, solver.row(program, self.lower, self.upper, self._floors)
+            self._rows[structure] = found
         return self._rows[structure]
 
-    def _loaded(self, library: Library, program: Program) -> tuple[FastSolver, Vector] | None:
-        """The same for an arm under gravity or a load; None if it does not stand at rest."""
-        start = self._loaded_start(library)
-        if start is None:
+    def _solver(self, library: Library, program: Program) -> FastSolver | None:
+        """Compiled solver; None for a loaded arm that does not stand at rest."""
+        if not self.robot.is_loaded:
+            return _recent(
+                self.robot, "fast solvers", (program.structure, self._key),
+                lambda: FastSolver(library, self.robot, program, self.samples),
+            )  # fmt: skip
+        table = _recent(self.robot, "loaded arms", self._key, lambda: self._loaded_samples(library))
+        return None if table is None else FastSolver(library, self.robot, program, table)
+
+    def _loaded_samples(self, library: Library) -> SampleTable | None:
+        """Samples of the arm under its load in machine code; None if it does not stand at rest."""
+        try:
+            arm = LoadedArm(library, self.robot)
+            table = SampleTable(self.robot, self.lower, self.upper, self._seed, arm)
+        except EquilibriumError:
             return None
-        arm, table = start
-        solver = FastSolver(library, self.robot, program, table, arm)
-        return solver, solver.row(program, self.lower, self.upper, self._floors)
-
-    def _loaded_start(self, library: Library) -> tuple[LoadedArm, SampleTable] | None:
-        """The arm under its load and its samples; None if it does not stand at rest."""
-        lower, upper = self.lower, self.upper
-        key = (self.robot.tip_load, lower.tobytes(), upper.tobytes(), self._seed)
-
-        def make() -> tuple[LoadedArm, SampleTable] | None:
-            try:
-                arm = LoadedArm(library, self.robot)
-                table = SampleTable(self.robot, lower, upper, self._seed, arm.settled)
-            except EquilibriumError:
-                return None
-            return (arm, table) if len(table.pressures) else None
-
-        return _recent(self.robot, "loaded arms", key, make)
+        return table if len(table.pressures) else None
 
     @cached_property
     def samples(self) -> SampleTable:
-        """Configurations that searches start from."""
-        lower, upper = self.lower, self.upper
-        key = (self.robot.tip_load, lower.tobytes(), upper.tobytes(), self._seed)
+        """Configurations that searches of the general method, or of a free arm, start from."""
         return _recent(
-            self.robot, "samples", key, lambda: SampleTable(self.robot, lower, upper, self._seed)
-        )
+            self.robot, "samples", self._key,
+            lambda: SampleTable(self.robot, self.lower, self.upper, self._seed),
+        )  # fmt: skip
 
 
 def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:
@@ -134,6 +116,6 @@ def _recent(robot: Manipulator, group: str, key: Hashable, make: Callable[[], Ma
     found = kept.get(key)
     if found is None:
         found = kept[key] = (make(),)
-        if len(kept) > _MOST_KEPT:
+        if len(kept) > KEPT.per_arm:
             kept.pop(next(iter(kept)), None)
     return found[0]

@@ -20,7 +20,7 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Multipliers:
-    """Prices at a solution: what the objective would gain per unit of each constraint.
+    """Lagrange multipliers: what the objective would gain per unit of each constraint.
 
     Attributes
     ----------

@@ -150,7 +150,7 @@ class ProgramPoint:
 
 @dataclass(frozen=True)
 class Objective:
-    """What is minimised, as a function of a point.
+    """A function of a point that is minimised.
 
     The value is the largest of `terms` (t,); several terms are minimised together (the smallest
     of several stiffnesses maximised).  `curvature` is a convex guess of the Hessian.  With
@@ -200,8 +200,8 @@ class PressureProblem:
         self.parameters = robot.parameters(self.program.parameters)
         self._functions = functions(robot, self.program)
         self._is_loaded = robot.is_loaded
-        self._pose = Evaluator(robot, self._functions.pose)
-        self._full = Evaluator(robot, self._functions.point)
+        self._pose = Evaluator(robot, self._functions["pose"])
+        self._full = Evaluator(robot, self._functions["point"])
         self._set_constraints()
         self.objective = self._objective()
         self.floors = floor_bounds(task.stiffness)
@@ -224,12 +224,14 @@ class PressureProblem:
         if self._is_loaded:
             residual, jacobian = self._pose(x * self.unit, self.parameters)
         else:
-            residual, jacobian = self._functions.pose(x * self.unit, self.parameters)
+            residual, jacobian = self._functions["pose"](x * self.unit, self.parameters)
         return ProgramPoint(x, residual[:, 0], jacobian.T * self.unit, self.constraints, *_NOTHING)
 
     def poses(self, x: Vector) -> tuple[Vector, Vector]:
         """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads."""
-        residuals, jacobians = self._functions.pose.many(x * self.unit, self.parameters, threads=1)
+        residuals, jacobians = self._functions["pose"].many(
+            x * self.unit, self.parameters, threads=1
+        )
         return residuals[:, :, 0], jacobians.swapaxes(1, 2) * self.unit
 
     def point(self, x: Vector) -> ProgramPoint:
@@ -239,7 +241,7 @@ class PressureProblem:
             outputs = self._full(x * self.unit, self.parameters)
             self._pose.restart(self._full.state)
         else:
-            outputs = self._functions.point(x * self.unit, self.parameters)
+            outputs = self._functions["point"](x * self.unit, self.parameters)
         residual, jacobian, terms, term_gradients, floors, floor_gradients = outputs
         return ProgramPoint(
             x,
@@ -270,7 +272,7 @@ class PressureProblem:
 
     def judged(self, pressures: Vector) -> tuple[list[float], Vector, Vector, list[float]]:
         """What `Judgement.of` takes, at pressures (n,) in Pa of an arm without loads."""
-        residuals, pose, compliance, values = self._functions.judge(pressures, self.parameters)
+        residuals, pose, compliance, values = self._functions["judge"](pressures, self.parameters)
         return residuals.ravel().tolist(), pose.T, compliance.T, values.ravel().tolist()
 
     # -- objectives -------------------------------------------------------------------------
@@ -350,7 +352,7 @@ class PressureProblem:
 
 
 class Bounding:
-    """What the steps of local searches take from the constraints that are not infinitely wide.
+    """The constraints of finite radius, as arrays for the steps of local searches.
 
     Attributes
     ----------

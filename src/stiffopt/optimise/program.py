@@ -1,4 +1,4 @@
-"""From the structure of a task to the functions that its nonlinear program consists of.
+"""The symbolic functions of a task's nonlinear program: residuals, objective, floors.
 
 A task splits into its *structure* (which axes, which kinds of stiffness), for which functions are
 made once, and its *parameters* (positions, directions, values), which are arguments of them.
@@ -20,6 +20,7 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.shape import Shape
 from stiffopt.optimise.goal import StiffnessGoal
 from stiffopt.optimise.measure import Measure
+from stiffopt.optimise.settings import PROGRAM
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.term import Term
 
@@ -27,10 +28,6 @@ Vector = NDArray[np.float64]
 
 BAR = 1e5
 """In Pa."""
-
-_SOME_PRESSURE = 2.25e-7
-"""Weight of the mean square pressure where a stiffness is matched: of all that match as well the
-one with less pressure."""
 
 Aim = Literal["maximise", "match", "least pressure"]
 
@@ -68,7 +65,7 @@ class Constraint(NamedTuple):
 
 
 class ProgramStructure(NamedTuple):
-    """What functions are made for; equal for tasks that share them."""
+    """What compiled functions depend on; equal for tasks that share them."""
 
     terms: tuple[Hashable, ...]
     measures: tuple[Hashable, ...]
@@ -85,7 +82,7 @@ class Program:
     terms : tuple of Term
     measures : tuple of Measure
         What is maximised, or matched, then the floors.
-    aim : what is done with those that are no floors.
+    aim : whether the first ones are maximised or matched; without any, pressure is minimised.
     n_floors : int
     reference : float
         Pressure in Pa that is one unit of mean square pressure.
@@ -145,7 +142,7 @@ class Program:
     @property
     def precision(self) -> float:
         """Decrease of the objective that no longer matters."""
-        return {"maximise": 1e-7, "least pressure": 4e-10}.get(self.aim, 1e-10)
+        return float(getattr(PROGRAM, self.aim.replace(" ", "_")))
 
     def constraints(self, length: float) -> tuple[Constraint, ...]:
         """How the residual is bounded, for an arm of this length."""
@@ -265,4 +262,5 @@ class Program:
             return mean_square, slope
         measure, own = next(self._own_parameters(parameters))
         mismatch, factor = measure.mismatch(values, own)
-        return mismatch + _SOME_PRESSURE * mean_square, factor * gradients + _SOME_PRESSURE * slope
+        some = PROGRAM.some_pressure
+        return mismatch + some * mean_square, factor * gradients + some * slope

@@ -1,6 +1,5 @@
 """Sampled configurations of an arm, from which searches start."""
 
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -8,12 +7,11 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.loaded import LoadedArm
 from stiffopt.optimise.settings import SAMPLES
 from stiffopt.optimise.term import Term
 
 Vector = NDArray[np.float64]
-
-Settled = Callable[[Vector], tuple[NDArray[np.bool_], Vector, Vector]]
 
 
 class SampleTable:
@@ -26,9 +24,8 @@ class SampleTable:
         Range in Pa.
     seed : int
         Shifts the low-discrepancy sequence.
-    settled : callable, optional
-        Of a loaded arm, in place of its own equilibria: which pressures (N, n) in Pa have one,
-        their states (N, s) and poses (N, 12).
+    arm : LoadedArm, optional
+        A loaded robot in machine code, which finds the equilibria then.
 
     Attributes
     ----------
@@ -36,7 +33,7 @@ class SampleTable:
         In Pa.
     poses : ndarray (N, 4, 4)
     states : ndarray (N, s)
-        Of the equilibria, if `settled` is given.
+        Of the equilibria, if there is such an arm.
     """
 
     def __init__(
@@ -45,19 +42,20 @@ class SampleTable:
         lower: Vector,
         upper: Vector,
         seed: int,
-        settled: Settled | None = None,
+        arm: LoadedArm | None = None,
     ) -> None:
+        self.arm = arm
         count = SAMPLES.free
         if robot.is_loaded:
-            count = SAMPLES.loaded if settled is None else SAMPLES.compiled
+            count = SAMPLES.loaded if arm is None else SAMPLES.compiled
         x = lower + (upper - lower) * _spread_with_edges(count, len(lower), seed)
         if robot.is_loaded:
             # under load little pressure can do much: every other sample is scaled down
             scale = 10 ** (-2.5 * np.arange(count) / count)
             scale[::2] = 1.0
             x = lower + (x - lower) * scale[:, np.newaxis]
-            if settled is not None:
-                found, states, flat = settled(x)
+            if arm is not None:
+                found, states, flat = arm.settled(x)
                 x, self.states = x[found], np.ascontiguousarray(states[found])
                 poses = _unflattened(flat[found])
             else:

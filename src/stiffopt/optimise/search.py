@@ -12,7 +12,6 @@ The folder ``native`` holds the same method in C.
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,9 +29,9 @@ Vector = NDArray[np.float64]
 def effort(rows: int, covered: float, loaded: bool = False) -> Effort:
     """Effort of a search.
 
-    A target that asks for less than a position is reached in very different ways, and the best of
-    them is easily overlooked; so it is with one of a large tolerance.  Measured against hundreds of
-    descents: see benchmarks.
+    A target of fewer components than a position, or of a large tolerance, is reached in very
+    different ways, of which the best is easily overlooked.  The numbers were tuned against hundreds
+    of descents a task, see benchmarks/quality.py.
 
     Parameters
     ----------
@@ -52,22 +51,8 @@ def effort(rows: int, covered: float, loaded: bool = False) -> Effort:
     return Effort(*(int(a + share * (b - a)) for a, b in zip(placed, loose, strict=True)))
 
 
-class Starts(NamedTuple):
-    """Where a search starts.
-
-    Attributes
-    ----------
-    candidates : iterator of ndarray (n,)
-        Variables of the problem.
-    effort : Effort
-    """
-
-    candidates: Iterator[Vector]
-    effort: Effort
-
-
-def starts(problem: PressureProblem, table: SampleTable) -> Starts:
-    """Pressures to start from, those near the target, and how hard to try.
+def starts(problem: PressureProblem, table: SampleTable) -> tuple[Iterator[Vector], Effort]:
+    """Variables (n,) to start from, those near the target first, and how hard to try.
 
     Less hard than compiled code does for an arm without loads, since all takes longer here: one
     descent less must agree and, with up to six pressures, where there are few optima, half of the
@@ -82,12 +67,12 @@ def starts(problem: PressureProblem, table: SampleTable) -> Starts:
         screened = full.screened // 2 if few else full.screened
         order = table.nearest_first(distances, screened)
         tries = full._replace(screened=screened, agreeing=full.agreeing - 1)
-        return Starts(iter(x[order]), tries)
+        return iter(x[order]), tries
     order = table.nearest_first(distances)
     mixed = [i for pair in zip(order, range(len(order)), strict=True) for i in pair]
     x = x[list(dict.fromkeys(mixed))]
     unlike = (x[i] for i in _unlike_first(problem, x))
-    return Starts(islice(unlike, SEARCH.general_starts_loaded), full)
+    return islice(unlike, SEARCH.general_starts_loaded), full
 
 
 @dataclass(frozen=True)
@@ -137,7 +122,7 @@ def search(
 
 
 class _Trail:
-    """What a search has seen so far."""
+    """Results of the descents of a search so far."""
 
     def __init__(self, same: float, agreeing: int) -> None:
         self._same, self._agreeing = same, agreeing

@@ -157,9 +157,63 @@ class PriceSettings:
     least: float = 1e-9
 
 
+@dataclass(frozen=True)
+class ProgramSettings:
+    """Objectives of the nonlinear program (`stiffopt.optimise.program`).
+
+    Attributes
+    ----------
+    maximise, match, least_pressure : decrease of each objective that no longer matters.
+    some_pressure : weight of the mean square pressure where a stiffness is matched: of all
+        pressures that match as well, the least are wanted.
+    """
+
+    maximise: float = 1e-7
+    match: float = 1e-10
+    least_pressure: float = 4e-10
+    some_pressure: float = 2.25e-7
+
+
+@dataclass(frozen=True)
+class AnswerSettings:
+    """Answers and what is reported of them.
+
+    Attributes
+    ----------
+    tried : local optima that are judged in turn if the best is not reached from rest.
+    at_limit : how far from a limit a pressure still counts as at it, in Pa.
+    largest_tolerance : of the trade-off between error and stiffness, as a share of the arm.
+    """
+
+    tried: int = 5
+    at_limit: float = 1e-3
+    largest_tolerance: float = 0.25
+
+
+@dataclass(frozen=True)
+class KeptSettings:
+    """What is compiled and kept for later tasks, and how work is shared out.
+
+    Attributes
+    ----------
+    most_measures : stiffnesses of a task on a free arm; of more, code takes too long to compile.
+    per_arm : of each kind of thing that varies from task to task.
+    in_vm : functions in the CasADi VM, of all arms.
+    chunk : tasks, or equilibria, that a thread takes at a time.
+    """
+
+    most_measures: int = 6
+    per_arm: int = 64
+    in_vm: int = 256
+    chunk: int = 8
+
+
 REACH = ReachSettings()
 DESCENT = DescentSettings()
 SEARCH = SearchSettings()
 CLOSEST = ClosestSettings()
 SAMPLES = SampleSettings()
 PRICES = PriceSettings()
+PROGRAM = ProgramSettings()
+ANSWER = AnswerSettings()
+KEPT = KeptSettings()

@@ -1,4 +1,4 @@
-"""PressureSolution: what was found, judged from the model and from nothing else."""
+"""The answer to a task, and its judgement by the model alone."""
 
 import math
 import threading
@@ -14,15 +14,13 @@ from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.program import Program
+from stiffopt.optimise.settings import ANSWER
 from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 Status = Literal["solved", "unreachable", "failed"]
 
 _explaining = threading.RLock()
-
-PRESSURE_SLACK = 1e-3
-"""How far from a limit a pressure still counts as at it, in Pa."""
 
 
 def _protect(owner: object, *names: str) -> None:
@@ -75,7 +73,7 @@ class Confidence:
 
 @dataclass(frozen=True)
 class Sensitivities:
-    """What small changes at the solution would do.
+    """First-order effects of small changes at the solution.
 
     Attributes
     ----------
@@ -118,7 +116,7 @@ class Sensitivities:
 
 
 class Explanation(NamedTuple):
-    """What a solution says of itself beside its numbers; see `PressureSolution`."""
+    """The fields of a `PressureSolution` that take longer to compute than the solution itself."""
 
     message: str
     active_bounds: tuple[str, ...]
@@ -194,10 +192,7 @@ class PressureSolution:
 
     @classmethod
     def explained_later(cls, explain: Callable[[], "Explanation"], **fields: Any) -> Self:
-        """A solution whose `Explanation` is made when one of its fields is first asked for.
-
-        Explaining takes longer than solving; whoever asks for pressures alone need not wait.
-        """
+        """A solution whose `Explanation` is computed when one of its fields is first read."""
         solution = cls.__new__(cls)
         solution.__dict__.update(fields, _explain=explain)
         for name in ("pressures", "tip_pose", "compliance"):
@@ -307,7 +302,7 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
         If the arm has no equilibrium at these pressures that is reached from rest.
     """
     program = Program.of(task.target, task.stiffness, robot.description)
-    found = Evaluator(robot, functions(robot, program).judge)
+    found = Evaluator(robot, functions(robot, program)["judge"])
     residuals, pose, compliance, values = found(pressures, robot.parameters(program.parameters))
     lower, upper = task.pressure_bounds(robot.description)
     within = are_within(pressures, lower, upper)
@@ -321,8 +316,8 @@ def active_bounds(robot: Manipulator, task: Task, pressures: Vector) -> dict[str
     found = {}
     for index in range(robot.n_pressures):
         name = robot.description.channel_name(index)
-        if pressures[index] >= upper[index] - PRESSURE_SLACK:
+        if pressures[index] >= upper[index] - ANSWER.at_limit:
             found[f"{name} max"] = (index, 1)
-        elif pressures[index] <= lower[index] + PRESSURE_SLACK:
+        elif pressures[index] <= lower[index] + ANSWER.at_limit:
             found[f"{name} min"] = (index, -1)
     return found

@@ -25,7 +25,7 @@ from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.reach import reach
 from stiffopt.optimise.search import Search, search, starts
-from stiffopt.optimise.settings import PRICES, Effort
+from stiffopt.optimise.settings import ANSWER, PRICES, Effort
 from stiffopt.optimise.solution import (
     Confidence,
     Explanation,
@@ -41,7 +41,6 @@ from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
 
-_JUDGED = 5  # local optima that are tried in turn if the best does not hold from rest
 _ONE = Effort(1, 1, 1)
 
 
@@ -240,7 +239,7 @@ class PressureSolver:
     def _first_that_holds(self, problem: PressureProblem, found: Search) -> PressureSolution:
         """Best local optimum that the model confirms from rest."""
         best: PressureSolution | None = None
-        for result in found.results[:_JUDGED]:
+        for result in found.results[: ANSWER.tried]:
             try:
                 solution = self._solution(problem, result, found.confidence)
             except EquilibriumError:
@@ -271,8 +270,8 @@ class PressureSolver:
                 return self._first_that_holds(problem, again)
         results = results[:1]
         if self.robot.is_loaded:  # what is found need not be what is reached from rest
-            as_they_are = (diagnosis.unimproved(problem, x) for x in candidates[:_JUDGED])
-            results = [*results[:_JUDGED], *as_they_are]
+            as_they_are = (diagnosis.unimproved(problem, x) for x in candidates[: ANSWER.tried])
+            results = [*results[: ANSWER.tried], *as_they_are]
         judged = []
         for result in results:
             try:

@@ -1,4 +1,4 @@
-"""What a task asks of the arm's configuration: the part ``target`` of the task file.
+"""`Target`, the part ``target`` of a task file: conditions on the arm's configuration.
 
 Its keys are those of the terms in `stiffopt.optimise.terms`.
 """
@@ -34,7 +34,7 @@ else:
 
 
 class Target(_Keys):
-    """What the arm's tip and body have to meet, in the base frame.
+    """Conditions on the arm's tip and body, in the base frame.
 
     A subclass may have further terms: fields with the class of the term in their annotation,
     ``Annotated[MyValue | None, MyTerm]``, and None as default.
@@ -45,7 +45,7 @@ class Target(_Keys):
     pointing : unit vector along which the tip's z axis shall point, or None.
     orientation : unit quaternion (w, x, y, z) with w >= 0, or None.
     above : plane above which the tip stays, or None.
-    tolerance : how near is near enough.
+    tolerance : largest errors.
     """
 
     tolerance: Tolerance = Tolerance()

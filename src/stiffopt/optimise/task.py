@@ -1,4 +1,4 @@
-"""What is asked of an arm: the schema of the task file and the task in code, in one.
+"""`Task`: target, stiffness goal, load and limits; the schema of the task file and a class in code.
 
 Everything is in SI: m, rad, Pa, N, N m. Built in code::
 
@@ -29,8 +29,6 @@ from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
 from stiffopt.units import Force, Moment, Pressure, read_from_file, within
-
-__all__ = ["Load", "PressureRange", "Task", "load_task"]
 
 
 class Load(Schema):
@@ -67,13 +65,13 @@ class PressureRange(Schema):
 
 
 class Task(Schema):
-    """What is asked of an arm.
+    """Where an arm's tip should be, and how stiff.
 
     Attributes
     ----------
     robot : name of a built-in robot, or path of a robot file relative to the task file.
     target : tip pose.
-    stiffness : what is asked of the stiffness, or None: the pose with the least pressure.
+    stiffness : stiffness goal, or None: the pose with the least pressure.
     load : load at the tip, or None.
     pressure : limits that tighten the robot's.
     source : the file that the task was read from, or None.

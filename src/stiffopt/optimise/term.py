@@ -1,4 +1,4 @@
-"""What a term is: one condition of a task on the configured arm.
+"""`Term`, the base class of all conditions of a task on the configured arm.
 
 A term is a smooth function of the tip, or of stations along the body: a residual r whose length
 must not exceed a tolerance, ``|r| <= tolerance``, or inequalities ``g >= 0``.  Each kind of term
@@ -26,11 +26,12 @@ from stiffopt.units import Angle, Length
 
 Vector = NDArray[np.float64]
 
-_SHOWN = {"m": ("mm", 1e3), "rad": ("deg", 180 / math.pi)}
+_SHOWN = {"m": ("mm", 1e3, 4), "rad": ("deg", 180 / math.pi, 3)}
+"""Units in which people read lengths and angles, factors to them, and digits."""
 
 
 class Tolerance(Schema):
-    """How near is near enough.
+    """Largest errors of the tip.
 
     Attributes
     ----------
@@ -72,7 +73,7 @@ class Term(ABC):
     value :
         What the task file says under `key`, read and in SI.
     tolerance : Tolerance
-        The tolerances of the target, for terms that have none of their own.
+        Of the target; a term that is named like one of its fields has that as radius.
 
     Attributes
     ----------
@@ -113,6 +114,7 @@ class Term(ABC):
 
     def __init__(self, value: Any, tolerance: Tolerance) -> None:
         self.value = value
+        self.radius = getattr(tolerance, self.name, self.radius)
 
     # -- the formula ------------------------------------------------------------------------
 
@@ -167,13 +169,13 @@ class Term(ABC):
 
     def shown(self, value: float) -> tuple[float, str]:
         """A value in the unit in which people read it, and that unit."""
-        unit, factor = _SHOWN.get(self.unit, (self.unit, 1.0))
+        unit, factor, _ = _SHOWN.get(self.unit, (self.unit, 1.0, 4))
         return value * factor, unit
 
     def words(self, value: float) -> str:
         """An error or margin as people read it: ``0.35 mm``."""
-        number, unit = self.shown(value)
-        return f"{number:.4g} {unit}"
+        unit, factor, digits = _SHOWN.get(self.unit, (self.unit, 1.0, 4))
+        return f"{value * factor:.{digits}g} {unit}"
 
 
 @cache

@@ -1,20 +1,21 @@
-"""The tip at one set of pressures after the other, fast enough for a control loop.
+"""Tip pose, Jacobian and compliance from tick to tick, fast enough for a control loop.
 
 `Manipulator` gives the same from rest each time and in the CasADi VM, which takes milliseconds
 under gravity or loads.  Here an equilibrium is found from the one before, in machine code.
 """
 
 import ctypes
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.compiled import CompiledFunction, Library, compiling_at_once, library
+from stiffopt.model.compiled import Library, compiling_at_once, library
 from stiffopt.model.layout import Layout
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.rod import rod_functions
@@ -47,12 +48,6 @@ class TipAt(NamedTuple):
     compliance: Vector
 
 
-class _Way(Protocol):
-    """A way to the tip at checked pressures (n,); None where the model has to say why not."""
-
-    def __call__(self, pressures: Vector) -> TipAt | None: ...
-
-
 class TipModel:
     """Pose, Jacobian and compliance of an arm's tip, one set of pressures after the other.
 
@@ -83,9 +78,8 @@ class TipModel:
     def __init__(self, robot: Manipulator) -> None:
         self._robot = robot
         with compiling_at_once():
-            way = _loaded_way(robot) if robot.is_loaded else _free_way(robot)
-        self.is_fast = way is not None
-        self._way = way or _no_way
+            self._way = _loaded_way(robot) if robot.is_loaded else _free_way(robot)
+        self.is_fast = self._way is not None
 
     def copy(self) -> "TipModel":
         """The same arm, from rest, for use in another thread."""
@@ -101,27 +95,9 @@ class TipModel:
         EquilibriumError
             The loaded arm has no stable equilibrium there.
         """
-        p = self._robot.checked_pressures(pressures)
-        return self._way(p) or self._by_model(p)
-
-    def _by_model(self, p: Vector) -> TipAt:
-        robot = self._robot
-        return TipAt(robot.tip_pose(p), robot.tip_jacobian(p), robot.tip_compliance(p))
-
-
-def _no_way(pressures: Vector) -> TipAt | None:
-    return None
-
-
-class _FreeTip:
-    """Closed form, in machine code."""
-
-    def __init__(self, function: CompiledFunction, numbers: Vector) -> None:
-        self._function, self._numbers = function, numbers
-
-    def __call__(self, pressures: Vector) -> TipAt | None:
-        pose, jacobian, compliance, margin = self._function(pressures, self._numbers)
-        return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
+        robot, p = self._robot, self._robot.checked_pressures(pressures)
+        found = None if self._way is None else self._way(p)
+        return found or TipAt(robot.tip_pose(p), robot.tip_jacobian(p), robot.tip_compliance(p))
 
 
 class _LoadedTip:
@@ -157,9 +133,22 @@ class _LoadedTip:
         )
 
 
+_Way = Callable[[Vector], TipAt | None]
+"""From checked pressures (n,) to the tip; None where the model has to say why not."""
+
+
 def _free_way(robot: Manipulator) -> _Way | None:
+    """Closed form, in machine code; None without a compiler."""
     code = library(("free tip", robot.layout.skeleton), partial(_free_function, robot.layout))
-    return None if code is None else _FreeTip(code.function("tip_at"), robot.numbers)
+    if code is None:
+        return None
+    function, numbers = code.function("tip_at"), robot.numbers
+
+    def at(pressures: Vector) -> TipAt | None:
+        pose, jacobian, compliance, margin = function(pressures, numbers)
+        return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
+
+    return at
 
 
 def _free_function(layout: Layout) -> list[ca.Function]:

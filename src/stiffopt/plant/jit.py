@@ -10,14 +10,15 @@ from __future__ import annotations
 import hashlib
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 from stiffopt.errors import MissingExtraError, SlowWarning
 
-__all__ = ["jit", "tell_if_new"]
+__all__ = ["compiling_once", "jit"]
 
 FunctionT = TypeVar("FunctionT", bound=Callable[..., Any])
 
@@ -32,13 +33,42 @@ def _folder() -> str:
     return str(Path(root) / "simulator" / hashlib.sha256(text).hexdigest()[:16])
 
 
-@cache
-def tell_if_new() -> None:
-    """Warn, once, if nothing is kept yet and all must be compiled."""
-    if not any(Path(_folder()).rglob("*.nbi")):
-        warnings.warn(
-            "the simulator is compiled, once; that takes half a minute", SlowWarning, stacklevel=2
-        )
+_done = False  # whether this process has compiled, or loaded, what it needs
+
+
+@contextmanager
+def compiling_once() -> Iterator[None]:
+    """Around the first use of compiled functions: one process compiles while others wait for it.
+
+    Warns of the wait if nothing is kept yet.
+    """
+    global _done
+    with _lock():
+        if not _done and not any(Path(_folder()).rglob("*.nbi")):
+            warnings.warn(
+                "the simulator is compiled, once; that takes half a minute",
+                SlowWarning,
+                stacklevel=4,
+            )
+        yield
+        _done = True
+
+
+@contextmanager
+def _lock() -> Iterator[None]:
+    if _done:
+        yield
+        return
+    try:
+        import fcntl
+
+        handle = open(Path(_folder()) / "lock", "a")  # noqa: SIM115 (closed below)
+    except (ImportError, OSError):  # no such locks, or nowhere to keep what is compiled
+        yield
+        return
+    with handle:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
 
 
 def jit(function: FunctionT) -> FunctionT:

@@ -31,7 +31,7 @@ from stiffopt.plant.build import (
     node_at,
 )
 from stiffopt.plant.dynamics import RodState
-from stiffopt.plant.jit import tell_if_new
+from stiffopt.plant.jit import compiling_once
 from stiffopt.plant.material import FibreMemory, Scheme
 from stiffopt.plant.rod import RodLoads, contact_energy, contact_force, depth_of
 from stiffopt.plant.settings import PlantLoad, PlantSettings
@@ -114,7 +114,6 @@ class Plant:
     settling = Settling()
 
     def __init__(self, robot: RobotDescription, settings: PlantSettings | None = None) -> None:
-        tell_if_new()
         self.robot = robot
         self.settings = settings or PlantSettings()
         self.mismatch = draw(robot, self.settings)
@@ -125,9 +124,10 @@ class Plant:
         self._plate: tuple[Array, float, float, float] | None = None
         self._material = make_material(robot, self.settings, self.mismatch, self._channels, 0.0)
         self._mesh(None)
-        self._state = self._at_rest()
-        self.set_load(self.settings.load)
-        self._tame()
+        with compiling_once():
+            self._state = self._at_rest()
+            self.set_load(self.settings.load)
+            self._tame()
 
     def _tame(self) -> None:
         """Set the viscosity so that it damps the first bending mode as asked, and settle."""

@@ -19,16 +19,6 @@ static void tip_inputs(const Program *P, const Linear *l, double *R, double *C) 
 
 static Work work_of(const Program *P) { return (Work){P->arg, P->res, P->iw, P->w}; }
 
-/* The tip's twist in its own axes by a pressure. */
-static void body_twist(const Linear *l, int64_t pressure, double *twist) {
-    const double *base = l->twist + 6 * (6 + pressure), *turn = l->turn + 3 * (6 + pressure);
-    for (int i = 0; i < 3; i++) {
-        twist[i] = 0;
-        for (int j = 0; j < 3; j++) twist[i] += l->R[3 * j + i] * base[j];
-        twist[3 + i] = turn[i];
-    }
-}
-
 /* Gradient by the pressures (n) of a value with these derivatives by C (6, 6, by columns).
  *
  * The derivative G is taken apart into products y z' (as many as its rank, one for a directional
@@ -68,7 +58,7 @@ static int evaluate(Program *P, Point *p, int full) {
             forget_state(s, p);
             return 0;
         }
-    } else if (!settle_nearby(&work, rod, pressures, p->state)) {
+    } else if (!settle_nearby(&work, rod, pressures, 0, p->state)) {
         return 0;
     }
     if (!linearise(&work, rod, p->state, l)) return 0;

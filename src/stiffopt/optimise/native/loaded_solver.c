@@ -1,8 +1,6 @@
-/* The solver of solver.c for an arm under gravity or loads, and what its samples need. */
+/* The solver of solver.c for an arm under gravity or loads. */
 #define STIFFOPT_LOADED
 #include "solver.c"
-
-#include "rod_calls.h"
 
 /* A point of a task's program at pressures (n), from rest: all that evaluate gives, in order;
  * 0 where there is no equilibrium. */

@@ -19,7 +19,6 @@
 #include <stdint.h>
 #include <string.h>
 
-#define MOST_KINDS 4
 #define STAGES 11
 #define TURNS 3
 #define WRENCHES 6
@@ -70,6 +69,12 @@ typedef struct {
     double *w;
 } Work;
 
+#define NEW_WORK(name)                                  \
+    const double *name##_arg[WORK_ARG];                 \
+    double *name##_res[WORK_RES], name##_w[WORK_W + 1]; \
+    casadi_int name##_iw[WORK_IW + 1];                  \
+    Work name = {name##_arg, name##_res, name##_iw, name##_w}
+
 /* Row i of the method's table: the stages that its state is made of, and where it lies. */
 typedef struct {
     double at;
@@ -105,51 +110,37 @@ static const double WEIGHT[STAGES] = {1. / 20, 0, 0, 0, 0, 0, 0,
 
 /* -- generated functions, by kind of section ------------------------------------------------ */
 
-static int section_newton(const Work *work, int64_t kind) {
-    switch (kind) {
-#ifdef NEWTON1_N_IN
-    case 1: return newton1(work->arg, work->res, work->iw, work->w, 0);
+/* A kind that the layout does not have is never called for. */
+#ifndef NEWTON1_N_IN
+#define newton1 newton0
+#define linear1 linear0
+#define adjoint1 adjoint0
 #endif
-#ifdef NEWTON2_N_IN
-    case 2: return newton2(work->arg, work->res, work->iw, work->w, 0);
+#ifndef NEWTON2_N_IN
+#define newton2 newton0
+#define linear2 linear0
+#define adjoint2 adjoint0
 #endif
-#ifdef NEWTON3_N_IN
-    case 3: return newton3(work->arg, work->res, work->iw, work->w, 0);
+#ifndef NEWTON3_N_IN
+#define newton3 newton0
+#define linear3 linear0
+#define adjoint3 adjoint0
 #endif
-    default: return newton0(work->arg, work->res, work->iw, work->w, 0);
-    }
-}
 
-static int section_linear(const Work *work, int64_t kind) {
-    switch (kind) {
-#ifdef LINEAR1_N_IN
-    case 1: return linear1(work->arg, work->res, work->iw, work->w, 0);
-#endif
-#ifdef LINEAR2_N_IN
-    case 2: return linear2(work->arg, work->res, work->iw, work->w, 0);
-#endif
-#ifdef LINEAR3_N_IN
-    case 3: return linear3(work->arg, work->res, work->iw, work->w, 0);
-#endif
-    default: return linear0(work->arg, work->res, work->iw, work->w, 0);
+#define SECTION_FUNCTION(name)                                                   \
+    static int section_##name(const Work *work, int64_t kind) {                  \
+        switch (kind) {                                                          \
+        case 1: return name##1(work->arg, work->res, work->iw, work->w, 0);      \
+        case 2: return name##2(work->arg, work->res, work->iw, work->w, 0);      \
+        case 3: return name##3(work->arg, work->res, work->iw, work->w, 0);      \
+        default: return name##0(work->arg, work->res, work->iw, work->w, 0);     \
+        }                                                                        \
     }
-}
 
+SECTION_FUNCTION(newton)
+SECTION_FUNCTION(linear)
 #ifdef RIGID_ADJOINT_N_IN /* a library may do without add_curvature */
-static int section_adjoint(const Work *work, int64_t kind) {
-    switch (kind) {
-#ifdef ADJOINT1_N_IN
-    case 1: return adjoint1(work->arg, work->res, work->iw, work->w, 0);
-#endif
-#ifdef ADJOINT2_N_IN
-    case 2: return adjoint2(work->arg, work->res, work->iw, work->w, 0);
-#endif
-#ifdef ADJOINT3_N_IN
-    case 3: return adjoint3(work->arg, work->res, work->iw, work->w, 0);
-#endif
-    default: return adjoint0(work->arg, work->res, work->iw, work->w, 0);
-    }
-}
+SECTION_FUNCTION(adjoint)
 #endif
 
 /* -- small algebra -------------------------------------------------------------------------- */
@@ -571,13 +562,15 @@ static int settle(const Work *work, const Rod *rod, const double *pressures, dou
     return follow(work, rod, &start, &end, SHORTEST_FROM_REST, 1, state) == 1;
 }
 
-/* Equilibrium at pressures next to that of a state, which is moved there. */
-static int settle_nearby(const Work *work, const Rod *rod, const double *pressures, double *state) {
+/* Equilibrium at pressures next to that of a state, which is moved there; a stable one if `stable`
+ * is not 0. */
+static int settle_nearby(const Work *work, const Rod *rod, const double *pressures, int stable,
+                         double *state) {
     double from[rod->n];
     memcpy(from, state, sizeof from);
     if (!memcmp(from, pressures, sizeof from)) return 1;
     Condition start = condition_of(rod, from), end = condition_of(rod, pressures);
-    return follow(work, rod, &start, &end, SHORTEST_NEARBY, 0, state) == 1;
+    return follow(work, rod, &start, &end, SHORTEST_NEARBY, stable, state) == 1;
 }
 
 /* Pose of the tip of a state (12): position, rotation by columns. */
@@ -695,6 +688,16 @@ static int linearise(const Work *work, const Rod *rod, const double *state, Line
     return l->known = 1;
 }
 
+/* The tip's twist in its own axes by a pressure. */
+static void body_twist(const Linear *l, int64_t pressure, double *twist) {
+    const double *base = l->twist + 6 * (6 + pressure), *turn = l->turn + 3 * (6 + pressure);
+    for (int i = 0; i < 3; i++) {
+        twist[i] = 0;
+        for (int j = 0; j < 3; j++) twist[i] += l->R[3 * j + i] * base[j];
+        twist[3 + i] = turn[i];
+    }
+}
+
 #ifdef RIGID_ADJOINT_N_IN
 /* Adds d(y' C z)/dp to a gradient (n), C (6, 6) the compliance in base axes.
  *
@@ -787,5 +790,27 @@ static int add_curvature(const Work *work, const Rod *rod, const Linear *l, cons
     return 1;
 }
 #endif
+
+/* -- as `LoadedArm` calls for them ---------------------------------------------------------- */
+
+/* State of the unpressurised arm under its weight; 0 where it falls over. */
+int stiffopt_hang(const Rod *rod, double *state) {
+    NEW_WORK(work);
+    return hang(&work, rod, state);
+}
+
+/* Equilibria from rest at pressures begin to end - 1 (n each, in Pa), and whether there are any:
+ * states, and poses (12): position, rotation by columns. */
+int stiffopt_settle(const Rod *rod, const double *pressures, double *states, double *poses,
+                    int64_t *found, int64_t begin, int64_t end) {
+    NEW_WORK(work);
+    int64_t size = rod_state_size(rod);
+    for (int64_t i = begin; i < end; i++) {
+        double *state = states + i * size;
+        found[i] = settle(&work, rod, pressures + i * rod->n, state) &&
+                   tip_pose(&work, rod, state, poses + 12 * i);
+    }
+    return 0;
+}
 
 #endif

@@ -2,11 +2,9 @@
 #include <stdint.h>
 
 #include "functions.h"
-#include "rod_calls.h"
+#include "rod.h"
 
-#define FOUND 0
-#define BEYOND_LAW 1
-#define NO_EQUILIBRIUM 2
+enum { FOUND, BEYOND_LAW, NO_EQUILIBRIUM };
 
 /* Numbers of memory that stiffopt_tip needs. */
 int64_t stiffopt_tip_memory(const Rod *rod) { return linear_size(rod); }
@@ -39,12 +37,9 @@ static void write_tip(const Rod *rod, const Linear *l, double *pose) {
     }
     pose[15] = 1;
     for (int64_t k = 0; k < n; k++) {
-        const double *twist = l->twist + 6 * (6 + k), *turn = l->turn + 3 * (6 + k);
-        for (int i = 0; i < 3; i++) {
-            double sum = 0;
-            for (int j = 0; j < 3; j++) sum += l->R[3 * j + i] * twist[j];
-            jacobian[n * i + k] = sum, jacobian[n * (3 + i) + k] = turn[i];
-        }
+        double twist[6];
+        body_twist(l, k, twist);
+        for (int i = 0; i < 6; i++) jacobian[n * i + k] = twist[i];
     }
     for (int i = 0; i < 2; i++)
         for (int j = 0; j < 2; j++)
@@ -58,29 +53,17 @@ static void write_tip(const Rod *rod, const Linear *l, double *pose) {
                 (compliance[6 * i + j] + compliance[6 * j + i]) / 2;
 }
 
-/* Stable equilibrium at pressures next to that of a state, which is moved there. */
-static int settle_stably_nearby(const Work *work, const Rod *rod, const double *pressures,
-                                double *state) {
-    double from[rod->n];
-    memcpy(from, state, sizeof from);
-    if (!memcmp(from, pressures, sizeof from)) return 1;
-    Condition start = condition_of(rod, from), end = condition_of(rod, pressures);
-    return follow(work, rod, &start, &end, SHORTEST_NEARBY, 1, state) == 1;
-}
-
 /* The tip at pressures (n): pose, Jacobian and compliance, from a state's equilibrium or, where
  * the state begins with NaN or that leads nowhere, from rest.  The state is moved along; without
  * an equilibrium it begins with NaN. */
 int stiffopt_tip(const Rod *rod, const double *pressures, double *state, double *memory,
                  double *found) {
-    const double *arg[WORK_ARG];
-    double *res[WORK_RES], w[WORK_W + 1], least;
-    casadi_int iw[WORK_IW + 1];
-    Work work = {arg, res, iw, w};
-    arg[0] = pressures, arg[1] = rod->numbers, res[0] = &least;
-    if (margin(arg, res, iw, w, 0) || !(least > 0)) return BEYOND_LAW;
+    NEW_WORK(work);
+    double least;
+    work.arg[0] = pressures, work.arg[1] = rod->numbers, work.res[0] = &least;
+    if (margin(work.arg, work.res, work.iw, work.w, 0) || !(least > 0)) return BEYOND_LAW;
     Linear l = linear_in(rod, memory);
-    if ((!isnan(state[0]) && settle_stably_nearby(&work, rod, pressures, state)) ||
+    if ((!isnan(state[0]) && settle_nearby(&work, rod, pressures, 1, state)) ||
         settle(&work, rod, pressures, state))
         if (linearise(&work, rod, state, &l)) {
             write_tip(rod, &l, found);

@@ -7,7 +7,7 @@ import numpy as np
 
 from stiffopt import lie
 from stiffopt.directions import Quaternion
-from stiffopt.optimise.term import Nearness, Term, Tolerance, Vector
+from stiffopt.optimise.term import Nearness, Term, Vector
 
 
 class OrientationTerm(Term):
@@ -19,10 +19,6 @@ class OrientationTerm(Term):
     example: ClassVar[Any] = [0.98, 0.17, 0.1, 0.0]
     order = 2
     size = 3
-
-    def __init__(self, value: tuple[float, ...], tolerance: Tolerance) -> None:
-        super().__init__(value, tolerance)
-        self.radius = tolerance.angle
 
     @property
     def parameters(self) -> tuple[float, ...]:
@@ -42,10 +38,6 @@ class OrientationTerm(Term):
         turn = tuple((-2 * factor * W.T.ravel()).tolist())
         limit = 2 * math.sin(min(self.radius, math.pi) / 2) / math.pi
         return Nearness(offset=6 * factor, turn=turn, root=1.0, limit=limit)
-
-    def words(self, value: float) -> str:
-        """In degrees."""
-        return f"{math.degrees(value):.3g} deg"
 
     @classmethod
     def moved_back(cls, value: Any, offset: Vector) -> Any:

@@ -8,7 +8,7 @@ import numpy as np
 
 from stiffopt import lie
 from stiffopt.directions import Direction
-from stiffopt.optimise.term import Nearness, Term, Tolerance, Vector
+from stiffopt.optimise.term import Nearness, Term, Vector
 
 _ALIGNED = 1e-8  # squared sine of an angle below which its series is used
 
@@ -26,10 +26,6 @@ class PointingTerm(Term):
     example: ClassVar[Any] = [0.1, -0.2, 0.9]
     order = 1
     size = 2
-
-    def __init__(self, value: tuple[float, ...], tolerance: Tolerance) -> None:
-        super().__init__(value, tolerance)
-        self.radius = tolerance.angle
 
     @property
     def parameters(self) -> tuple[float, ...]:
@@ -59,10 +55,6 @@ class PointingTerm(Term):
         turn = (0.0,) * 6 + tuple(-2 * value / math.pi**2 for value in self.value)
         limit = 2 * math.sin(min(self.radius, math.pi) / 2) / math.pi
         return Nearness(offset=2 / math.pi**2, turn=turn, root=1.0, limit=limit)
-
-    def words(self, value: float) -> str:
-        """In degrees."""
-        return f"{math.degrees(value):.3g} deg"
 
     @classmethod
     def moved_back(cls, value: Any, offset: Vector) -> Any:

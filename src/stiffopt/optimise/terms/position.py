@@ -41,7 +41,6 @@ class PositionTerm(Term):
 
     def __init__(self, value: tuple[float | None, ...], tolerance: Tolerance) -> None:
         super().__init__(value, tolerance)
-        self.radius = tolerance.position
         self.axes = tuple(axis for axis, wanted in enumerate(value) if wanted is not None)
         self.size = len(self.axes)
 
