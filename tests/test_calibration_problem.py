@@ -257,7 +257,7 @@ def test_a_robot_of_coordinates() -> None:
         assert unknown.parameter is not None
         before, after = (unknown.parameter.value(r) for r in (problem.description, robot))
         moved = x[i] * unknown.deviation
-        is_ratio = unknown.unit == "" and unknown.parameter.is_positive
+        is_ratio = unknown.unit == "" and unknown.parameter.number.positive
         expected = before * np.exp(moved) if is_ratio else before + moved
         assert after == pytest.approx(expected, rel=1e-6), unknown.name
 

@@ -102,7 +102,7 @@ def robot_file(folder: Path, law: str = "paper", **changes: float) -> RobotDescr
 
 def test_every_kind_of_number_of_a_segment_is_tested_here() -> None:
     with pytest.raises(InputError) as told:
-        assert Parameter("segments[0].outer_radius").unit
+        assert Parameter("segments[0].outer_radius").number
     listed = str(told.value).partition("of a segment, ")[2].removesuffix(" can").split(", ")
     common = {key for key in listed if not key.startswith("law.")}
     assert common == {re.sub(r"\[\d+\]", "", key) for key in VALUES}
@@ -115,8 +115,8 @@ def test_a_parameter_is_the_number_in_the_file(key: str, tmp_path: Path) -> None
     parameter = Parameter(full(key))
     assert parameter.value(description) == before
     assert parameter.segment == 1
-    assert parameter.unit == unit
-    assert parameter.is_positive == positive
+    assert parameter.number.unit == unit
+    assert parameter.number.positive == positive
     assert parameter.is_history == key.startswith("history")
     by_hand = robot_file(tmp_path, **{key: after})
     changed = with_values(description, {parameter: after})
@@ -244,7 +244,7 @@ def test_what_is_no_key(key: str) -> None:
 @pytest.mark.parametrize("key", ["segments[0].connector", "segments[0].chambers.radius"])
 def test_what_is_no_parameter(key: str) -> None:
     with pytest.raises(InputError, match=r"cannot be a parameter; of a segment, length, .* can"):
-        assert Parameter(key).unit
+        assert Parameter(key).number
 
 
 @pytest.mark.parametrize(

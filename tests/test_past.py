@@ -36,6 +36,7 @@ KINDS = {
     "all but dead time": FULL.model_copy(update={"dead_time": 0.0}),
     "all": FULL,
 }
+SHARES = ("play[0].share", "play[1].share", "creep[0].share", "creep[1].share")
 SIDES = np.array([0.5, -0.2, 0.1])
 FINE = 2e-3  # s
 
@@ -138,7 +139,7 @@ def test_derivatives_by_times(name: str, log: tuple[Array, Array, Start, Effecti
         value = getattr(FULL, name) + change
         return run(FULL.model_copy(update={name: value}), time, pressures, start)
 
-    almost_everywhere(getattr(found, f"per_{name}"), difference(at, 1e-6))
+    almost_everywhere(found.per_number[name], difference(at, 1e-6))
 
 
 @pytest.mark.parametrize("j", range(4))
@@ -152,8 +153,8 @@ def test_derivatives_by_shares(j: int, log: tuple[Array, Array, Start, Effective
         return run(changed, time, pressures, start)
 
     # u is linear in the shares
-    assert found.per_share[:, :, j] == pytest.approx(difference(at, 1e-3), abs=1e-4)
-    assert np.abs(found.per_share[:, :, j]).max() > 1 * KPA
+    assert found.per_number[SHARES[j]] == pytest.approx(difference(at, 1e-3), abs=1e-4)
+    assert np.abs(found.per_number[SHARES[j]]).max() > 1 * KPA
 
 
 @pytest.mark.parametrize("c", range(3))
@@ -165,7 +166,7 @@ def test_derivatives_by_memory(c: int, log: tuple[Array, Array, Start, Effective
         return run(FULL.model_copy(update={"memory": tuple(memory)}), time, pressures, start)
 
     expected = np.zeros_like(found.pressures)
-    expected[:, c] = found.per_memory[:, c]
+    expected[:, c] = found.per_number[f"memory[{c}]"][:, c]
     assert difference(at, 1e-3) == pytest.approx(expected, abs=1e-4)
     assert np.abs(expected).max() > 1 * KPA
 
@@ -190,9 +191,9 @@ def test_derivatives_by_sides(c: int) -> None:
 def test_without_a_lag_nothing_depends_on_it() -> None:
     time, pressures = course(100)
     found = run(History(play=PLAYS), time, pressures)
-    assert not found.per_lag.any()
-    assert not found.per_lag_falling.any()
-    assert not found.per_dead_time[0].any()
+    assert not found.per_number["lag"].any()
+    assert not found.per_number["lag_falling"].any()
+    assert not found.per_number["dead_time"][0].any()
 
 
 # -- from log to log ------------------------------------------------------------------------
@@ -230,7 +231,9 @@ def test_derivatives_go_on_in_the_next_log(name: str) -> None:
         first = run(history, time, one, start)
         return run(history, time, small, first.end)
 
-    almost_everywhere(getattr(at(0.0), f"per_{name}"), difference(at, 1e-6), 0.97)
+    found = at(0.0)
+    per = found.per_side if name == "side" else found.per_number[name]
+    almost_everywhere(per, difference(at, 1e-6), 0.97)
 
 
 # -- how it is run --------------------------------------------------------------------------
@@ -243,8 +246,10 @@ def test_results_do_not_depend_on_how_many_rows_are_run_at_once(
     usual = run(FULL, time, pressures)
     monkeypatch.setattr(past, "_CHUNKS", (1, 3, 64))
     other = run(FULL, time, pressures)
-    for name in ("pressures", "per_lag", "per_lag_falling", "per_dead_time", "per_side"):
+    for name in ("pressures", "per_side"):
         assert getattr(usual, name) == pytest.approx(getattr(other, name), rel=1e-12, abs=1e-9)
+    for name, per in usual.per_number.items():
+        assert per == pytest.approx(other.per_number[name], rel=1e-12, abs=1e-9)
     assert usual.end.states == pytest.approx(other.end.states, rel=1e-12)
 
 
@@ -276,8 +281,10 @@ def test_only_wanted_rows_are_returned() -> None:
     found = Past(FULL, 3).effective(time, pressures, rows, start, FULL)
     every = run(FULL, time, pressures)
     assert found.pressures == pytest.approx(every.pressures[rows], rel=1e-12)
-    assert found.per_share.shape == (6, 3, 4)
-    assert found.per_share == pytest.approx(every.per_share[rows], rel=1e-9, abs=1e-9)
+    for name in SHARES:
+        assert found.per_number[name].shape == (6, 3)
+        expected = every.per_number[name][rows]
+        assert found.per_number[name] == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_starts() -> None:

@@ -14,7 +14,7 @@ from stiffopt.identify.calibration import calibrate
 from stiffopt.identify.past import Past, Start
 from stiffopt.identify.recording import Recording, Track
 from stiffopt.identify.settings import SAMPLING, CalibrationSettings
-from stiffopt.identify.setup import begins, chosen_rows, sample, thinned
+from stiffopt.identify.setup import begins, chosen_rows, sampled, thinned
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Log
 from stiffopt.model.history import History, Play
@@ -135,7 +135,8 @@ def test_chosen_rows_are_even_and_seen() -> None:
 
 def test_a_sample() -> None:
     time, pressures = ramps(duration=100.0)
-    found = sample(recording(time, pressures), SPAN, 50, "unknown")
+    whole = recording(time, pressures)
+    found = sampled(whole, chosen_rows(whole, 50), SPAN, "unknown")
     assert len(found.rows) == 50
     assert found.begin == "unknown"
     assert found.weight == pytest.approx(np.ones(50))

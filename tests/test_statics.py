@@ -166,8 +166,8 @@ def test_compliance_is_the_derivative_of_the_equilibrium(name, at):
                     end = model.loaded_tip_pose(p, dead)
                 else:
                     loads = model._loads._replace(station=np.concatenate([dead, np.zeros(6)]))
-                    state = model._equilibrium.settle(p, loads, at)
-                    end = model._equilibrium.shape(state, np.array([at]), at)[0]
+                    state = model._equilibrium(at).settle(p, loads)
+                    end = model._equilibrium(at).shape(state, np.array([at]))[0]
                 ends.append(so.lie.log(so.lie.inverse(T) @ end))
             columns.append((ends[0] - ends[1]) / (2 * scale[i]))
         return np.array(columns).T

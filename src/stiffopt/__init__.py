@@ -7,6 +7,7 @@ at its task. All quantities are in SI units.
 """
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -107,32 +108,13 @@ _NAMES = {
 }
 _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
 __all__ = sorted((*_MODULE_OF, "__version__"))
-_MODULES = (
-    "control",
-    "daemon",
-    "directions",
-    "documents",
-    "errors",
-    "experiments",
-    "files",
-    "identify",
-    "lie",
-    "logs",
-    "model",
-    "optimise",
-    "rig",
-    "safety",
-    "schema",
-    "units",
-    "workspace",
-)
 
 
 def __getattr__(name: str) -> Any:
     if name in _MODULE_OF:
         value = globals()[name] = getattr(import_module(_MODULE_OF[name]), name)
         return value
-    if name in _MODULES:
+    if not name.startswith("_") and find_spec(f"{__name__}.{name}") is not None:
         return import_module(f"{__name__}.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 

@@ -12,8 +12,6 @@ from stiffopt.errors import InputError
 from stiffopt.schema import Vector, items_of
 from stiffopt.units import Number
 
-__all__ = ["Direction", "Frame", "Quaternion", "direction_name"]
-
 
 def _unit_vector(vector: tuple[float, ...]) -> tuple[float, ...]:
     """Return a vector at length 1; leave it be if it has that already."""

@@ -20,8 +20,6 @@ from stiffopt.errors import FileError, Loc, dotted, shown
 from stiffopt.schema import Schema, explain
 from stiffopt.units import FROM_FILE
 
-__all__ = ["file_text", "from_document", "line_of", "read_file", "save_file"]
-
 MAX_MISTAKES = 10  # told at once
 VERSIONS = {"robot": 1, "task": 1, "rig": 1}
 """The version of each kind of file that is read; a kind not listed is at version 1."""

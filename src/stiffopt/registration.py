@@ -15,8 +15,6 @@ from stiffopt.directions import Quaternion
 from stiffopt.schema import Schema, Vector
 from stiffopt.units import Length
 
-__all__ = ["Placement", "Registration"]
-
 Array = NDArray[np.float64]
 
 

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
+from stiffopt.model.arguments import checked_integer
 from stiffopt.model.compliance import Boundary, Frame
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.numeric import checked_integer
 
 Array = NDArray[np.float64]
 

@@ -31,7 +31,6 @@ from stiffopt.identify.setup import (
     Setup,
     TableSource,
     description_of,
-    placements,
     recordings_of,
     tables_of,
 )
@@ -51,8 +50,6 @@ from stiffopt.model.description import Recordings, RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.registration import Placement, Registration
-
-__all__ = ["CalibrationResult", "calibrate"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[float, float, str], None]
@@ -191,7 +188,7 @@ def _candidate(
 
 
 class _Teller:
-    """Tells progress as evaluations go by, of which nobody knows how many there will be."""
+    """Progress of a calibration in phases, each of an unknown number of evaluations."""
 
     def __init__(self, progress: Progress | None, fits: int) -> None:
         self._progress = progress
@@ -296,22 +293,13 @@ def _result(
     teller: _Teller,
 ) -> CalibrationResult:
     listed = estimates(found)
-    settings = setup.settings
     robot = _robot(setup, found)
     teller.begin("comparing")
 
     def compared(
         description: RobotDescription, known: Mapping[str, float]
     ) -> tuple[Comparison, ...]:
-        return compare(
-            description,
-            setup.recordings,
-            sequence=settings.sequence,
-            rezero=settings.rezero,
-            settle=settings.settle,
-            known=known,
-            tell=teller,
-        )
+        return compare(Setup.of(description, setup.recordings, (), setup.settings), known, teller)
 
     remarks = [
         f"{recording.name}: {remark}"
@@ -343,21 +331,21 @@ def _result(
 def _robot(setup: Setup, found: Fit) -> RobotDescription:
     """Return the calibrated robot with its registration and its covariance."""
     problem, x = found.problem, found.x
-    given = placements(setup.description)
     recordings = setup.description.recordings
+    given = recordings or Recordings()
     if setup.recordings:
         base, sensors, _, _ = problem.unknowns.slices()
         moves = x * problem.scale
         base_in_tracker = problem.base_in_tracker @ _motion(moves[base])
         places = {
-            point.name: _placement(_inverse(_motion(moves[own]) @ point.sensor))
+            point.name: _inverse_placement(_motion(moves[own]) @ point.sensor)
             for point, own in zip(problem.points, sensors, strict=True)
         }
         recordings = Recordings(
             channels=given.channels,
             frame=given.frame,
             registration=Registration(
-                tracker_in_base=_placement(_inverse(base_in_tracker)),
+                tracker_in_base=_inverse_placement(base_in_tracker),
                 tip_in_sensor=places["tip"],
             ),
             bodies={
@@ -416,72 +404,62 @@ def _record(setup: Setup, found: Fit) -> Calibration:
 
     A fit to tables alone keeps what an earlier calibration knew of everything else.
     """
-    shape = [
-        i
-        for i, unknown in enumerate(found.problem.unknowns.parameters)
-        if unknown.parameter is not None and not unknown.parameter.is_history
-    ]
-    unknowns = [found.problem.unknowns.all[i] for i in shape]
-    covariance = found.covariance[np.ix_(shape, shape)]
-    deviation = np.sqrt(np.diag(covariance))
-    correlation = np.round(covariance / np.outer(deviation, deviation), REPORT.correlation_digits)
+    from scipy.linalg import block_diag  # a large library; only fits need it
+
+    fitted: list[FittedParameter] = []
+    places = []
+    deviations = np.sqrt(np.diag(found.covariance))
+    for i, unknown in enumerate(found.problem.unknowns.parameters):
+        if unknown.parameter is not None and not unknown.parameter.is_history:
+            deviation = float(f"{deviations[i] * unknown.deviation:.6g}")
+            places.append(i)
+            fitted.append(
+                FittedParameter(
+                    key=unknown.parameter.key, deviation=deviation, prior=unknown.deviation
+                )
+            )
+    correlation = (found.covariance / np.outer(deviations, deviations))[np.ix_(places, places)]
+    fitted += (unlearnt := _softening(setup, found))
     known = setup.description.calibration
-    fitted = {unknown.parameter.key for unknown in unknowns if unknown.parameter is not None}
-    unlearnt = _softening(setup, found)
     before = known if known is not None and not setup.recordings else Calibration()
-    kept = [i for i, each in enumerate(before.parameters) if each.key not in fitted]
-    sizes = len(deviation), len(unlearnt), len(kept)
-    full = np.eye(sum(sizes))
-    full[: sizes[0], : sizes[0]] = correlation
-    if kept:
-        full[-sizes[2] :, -sizes[2] :] = np.array(before.correlation)[np.ix_(kept, kept)]
+    keys = {each.key for each in fitted}
+    kept = [i for i, each in enumerate(before.parameters) if each.key not in keys]
+    blocks = [np.round(correlation, REPORT.correlation_digits), np.eye(len(unlearnt))]
+    blocks.append(np.reshape(before.correlation, (len(before.parameters),) * 2)[np.ix_(kept, kept)])
     pressures = [recording.pressures for recording in setup.recordings]
-    pressures += [table.pressures for table in setup.tables]
-    seen = np.concatenate(pressures)
+    seen = np.concatenate([*pressures, *(table.pressures for table in setup.tables)])
     ends = np.cumsum([0, *(segment.n_channels for segment in setup.description.segments)])
     norms = [float(np.linalg.norm(seen[:, a:b], axis=1).max()) for a, b in itertools.pairwise(ends)]
     low, high = seen.min(axis=0), seen.max(axis=0)
     if before.pressure_min:
         low, high = np.minimum(low, before.pressure_min), np.maximum(high, before.pressure_max)
         norms = np.maximum(norms, before.pressure_norm).tolist()
+    noise = found.problem.noise
     turns = any(point.turns for point in found.problem.points)
     return Calibration(
         logs=before.logs + tuple(recording.name for recording in setup.recordings),
-        parameters=tuple(
-            FittedParameter(
-                key=unknown.parameter.key,
-                deviation=float(f"{d * unknown.deviation:.6g}"),
-                prior=unknown.deviation,
-            )
-            for unknown, d in zip(unknowns, deviation, strict=True)
-            if unknown.parameter is not None
-        )
-        + unlearnt
-        + tuple(before.parameters[i] for i in kept),
-        correlation=tuple(tuple(row) for row in full.tolist()),
-        position_residual=found.problem.noise.position
-        if setup.recordings
-        else before.position_residual,
-        angle_residual=found.problem.noise.angle if turns else before.angle_residual,
+        parameters=(*fitted, *(before.parameters[i] for i in kept)),
+        correlation=tuple(tuple(row) for row in block_diag(*blocks).tolist()),
+        position_residual=noise.position if setup.recordings else before.position_residual,
+        angle_residual=noise.angle if turns else before.angle_residual,
         pressure_min=tuple(low.tolist()),
         pressure_max=tuple(high.tolist()),
         pressure_norm=tuple(norms),
     )
 
 
-def _softening(setup: Setup, found: Fit) -> tuple[FittedParameter, ...]:
+def _softening(setup: Setup, found: Fit) -> list[FittedParameter]:
     """Softening, which poses alone cannot tell from pressure that acts ever more strongly."""
     if setup.tables:
-        return ()
-    return tuple(
+        return []
+    tolerance = setup.tolerances.softening
+    return [
         FittedParameter(
-            key=f"segments[{s}].compensation.softening",
-            deviation=setup.tolerances.softening,
-            prior=setup.tolerances.softening,
+            key=f"segments[{s}].compensation.softening", deviation=tolerance, prior=tolerance
         )
         for s, segment in enumerate(found.robot.segments)
         if segment.compensation is not None and segment.compensation.modulus_per_pressure
-    )
+    ]
 
 
 def _motion(twist: Array) -> Array:
@@ -491,14 +469,10 @@ def _motion(twist: Array) -> Array:
     return np.asarray(lie.exp(full))
 
 
-def _placement(transform: Array) -> Placement:
-    """Placement of a transform (4, 4), with as many digits as a robot file needs."""
-    found = Placement.of(transform)
+def _inverse_placement(transform: Array) -> Placement:
+    """Placement of the inverse of a transform (4, 4), with as many digits as a file needs."""
+    found = Placement.of(np.asarray(np.linalg.inv(transform), dtype=float))
     return Placement(
         position=tuple(round(x, 8) for x in found.position),
         orientation=tuple(round(q, 8) for q in found.orientation),
     )
-
-
-def _inverse(transform: Array) -> Array:
-    return np.asarray(np.linalg.inv(transform))

@@ -20,8 +20,6 @@ from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted
 from stiffopt.identify.settings import FIT
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["Fit", "fit"]
-
 Array = NDArray[np.float64]
 
 
@@ -31,16 +29,11 @@ class Fit:
 
     Attributes
     ----------
-    problem : CalibrationProblem
-        With the noise and the weights that were used at last.
-    x : ndarray
-        Scaled coordinates (d,).
-    cost : float
-        Half the sum of the squared residuals, with the loss and the prior.
-    covariance : ndarray
-        Of x, (d, d): unknowns that nothing was learnt of have the variance one.
-    independent : float
-        How many rows are one independent one.
+    problem : with the noise and the weights that were used at last.
+    x : scaled coordinates (d,).
+    cost : half the sum of the squared residuals, with the loss and the prior.
+    covariance : of x, (d, d): unknowns that nothing was learnt of have the variance one.
+    independent : how many rows are one independent one.
     """
 
     problem: CalibrationProblem
@@ -74,12 +67,9 @@ def fit(
     problem : CalibrationProblem
     starts : sequence of (d,)
         Scaled coordinates.
-    tell :
-        Is called at every evaluation of the problem, to show progress or to stop by raising.
-    rounds : int
-        How often the noise and the weights are made to fit the residuals.
-    most : int
-        Evaluations of the problem in each round.
+    tell : is called at every evaluation of the problem, to show progress or to stop by raising.
+    rounds : how often the noise and the weights are made to fit the residuals.
+    most : evaluations of the problem in each round.
     """
     begun = [_minimum(problem, start, tell, most) for start in starts]
     x, cost = min(begun, key=lambda found: found[1])

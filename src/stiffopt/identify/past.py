@@ -1,4 +1,4 @@
-"""Effective pressures along a recording, with their derivatives by the history's numbers.
+"""Effective pressures along a recording, with their derivatives by the numbers of the history.
 
 The operators are those of `stiffopt.model.history`.  Here they are run over a whole log at once,
 with derivatives by lag, dead time, shares and the state in which the log begins.
@@ -18,8 +18,6 @@ from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import compiling_at_once, library
 from stiffopt.model.history import NO_HISTORY, History
 
-__all__ = ["Effective", "Past", "Start"]
-
 Array = NDArray[np.float64]
 
 _CHUNKS = (1, 32, 128, 512, 2048)  # rows that may be run at once; fewer are filled up
@@ -33,15 +31,11 @@ class Start:
 
     Attributes
     ----------
-    states : ndarray
-        Of the operators (m, c).
-    per_side : ndarray
-        Their derivatives (m, c) by the side of each channel, see `History.settled`.
-    before : ndarray
-        Pressures (c,) until the first row, in Pa.
-    per_time : ndarray or None
-        Derivatives (3, m, c) of the states by lag, falling lag and dead time, which a log that
-        went before leaves; None where there was none.
+    states : of the operators (m, c).
+    per_side : their derivatives (m, c) by the side of each channel, see `History.settled`.
+    before : pressures (c,) until the first row, in Pa.
+    per_time : derivatives (3, m, c) of the states by lag, falling lag and dead time, which a log
+        that went before leaves; None where there was none.
     """
 
     states: Array
@@ -71,23 +65,16 @@ class Effective:
 
     Attributes
     ----------
-    pressures : ndarray
-        (M, c), in Pa.
-    per_lag, per_lag_falling, per_dead_time, per_side, per_memory : ndarray
-        (M, c); by lags and dead time in s, and by side and memory of the same channel.
-    per_share : ndarray
-        (M, c, parts).
-    end : Start
-        State in which another log of the sequence begins.
+    pressures : (M, c), in Pa.
+    per_number : their derivatives (M, c) by the numbers of the history, by their keys: ``lag``,
+        ``lag_falling``, ``dead_time``, ``memory[0]``, ``play[0].share``, ``creep[0].share``, ...
+    per_side : their derivatives (M, c) by the side on which the same channel begins.
+    end : state in which another log of the sequence begins.
     """
 
     pressures: Array
-    per_lag: Array
-    per_lag_falling: Array
-    per_dead_time: Array
+    per_number: dict[str, Array]
     per_side: Array
-    per_memory: Array
-    per_share: Array
     end: Start
 
 
@@ -96,10 +83,8 @@ class Past:
 
     Parameters
     ----------
-    history : History or None
-        Widths and times of its operators count; lag and shares are given for each run.
-    channels : int
-        Number of channels c.
+    history : widths and times of its operators count; lag and shares are given for each run.
+    channels : number of channels c.
     """
 
     def __init__(self, history: History | None, channels: int) -> None:
@@ -125,10 +110,8 @@ class Past:
             Commanded, in Pa; they run evenly from row to row.
         wanted : (M,)
             Rows whose effective pressures are returned, increasing.
-        start :
-            State before the first row.
-        history :
-            With the values to use; its operators are those of this object.
+        start : state before the first row.
+        history : with the values to use; its operators are those of this object.
         """
         delayed, slope = _delayed(time, pressures, start.before, history.dead_time)
         steps = np.diff(time, prepend=time[0] - np.median(np.diff(time)) if len(time) > 1 else 1.0)
@@ -161,17 +144,20 @@ class Past:
         def mixed(states: Array) -> Array:
             return np.asarray(states[:, 0] + memory * slow(states))
 
-        end = self._start(state, pressures[-1])
-        return Effective(
-            pressures=mixed(values),
-            per_lag=mixed(by_lag),
-            per_lag_falling=mixed(by_falling),
-            per_dead_time=mixed(by_dead),
-            per_side=mixed(by_side),
-            per_memory=slow(values),
-            per_share=np.swapaxes(values[:, 1:] - values[:, :1], 1, 2) * memory[:, np.newaxis],
-            end=self._rested(end, history),
-        )
+        per_number = {
+            "lag": mixed(by_lag),
+            "lag_falling": mixed(by_falling),
+            "dead_time": mixed(by_dead),
+        }
+        slowly = slow(values)
+        for channel, own in enumerate(np.eye(c)):
+            per_number[f"memory[{channel}]"] = slowly * own
+        plays = len(history.play)
+        for j in range(len(history.parts)):
+            name = f"play[{j}]" if j < plays else f"creep[{j - plays}]"
+            per_number[f"{name}.share"] = (values[:, 1 + j] - values[:, 0]) * memory
+        end = self._rested(self._start(state, pressures[-1]), history)
+        return Effective(mixed(values), per_number, mixed(by_side), end)
 
     def _rested(self, end: Start, history: History) -> Start:
         """State a while later, at the last pressures."""

@@ -10,25 +10,27 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, cast
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.identify.past import Effective, Past, Start
+from stiffopt.identify.past import Past, Start
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.sensing import Readings, readings
 from stiffopt.identify.settings import FIT
 from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.arguments import checked_measure
+from stiffopt.model.batch import InterpretedFunction
+from stiffopt.model.codegen import dense
 from stiffopt.model.compliance import Boundary
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.history import NO_HISTORY, History
-from stiffopt.model.parameters import Parameter, with_values
+from stiffopt.model.history import NO_HISTORY
+from stiffopt.model.parameters import varied, with_values
 from stiffopt.model.parametric import ParametricArm
-
-__all__ = ["Begin", "CalibrationProblem", "Noise", "Predicted", "Sample", "TrackedPoint"]
 
 Array = NDArray[np.float64]
 
@@ -44,12 +46,9 @@ class Sample:
     Attributes
     ----------
     recording : Recording
-    rows : ndarray
-        (M,), increasing.
-    weight : ndarray
-        Factor (M,) on the residuals of each row.
-    begin : str
-        State of the arm when the recording begins.
+    rows : (M,), increasing.
+    weight : factor (M,) on the residuals of each row.
+    begin : state of the arm when the recording begins.
     """
 
     recording: Recording
@@ -90,14 +89,10 @@ class Predicted:
 
     Attributes
     ----------
-    effective : ndarray
-        Pressures (M, n) of the equilibria, in Pa.
-    poses : tuple of ndarray
-        Of each point in the base frame (M, 4, 4).
-    read : tuple of Readings
-        Of each point, in the frame of the recordings.
-    errors : tuple of ndarray
-        Measured less read (M, 3), of each point; NaN where nothing was measured.
+    effective : pressures (M, n) of the equilibria, in Pa.
+    poses : of each point in the base frame (M, 4, 4).
+    read : of each point, in the frame of the recordings.
+    errors : measured less read (M, 3), of each point; NaN where nothing was measured.
     """
 
     effective: Array
@@ -111,20 +106,13 @@ class CalibrationProblem:
 
     Parameters
     ----------
-    description : RobotDescription
-        Where all unknowns are zero.
-    unknowns : Unknowns
-        What may change.
-    samples : sequence of Sample
-        In the order in which they were recorded.
-    points : sequence of TrackedPoint
-        The tip first.
-    base_in_tracker : ndarray
-        Pose (4, 4) of the base where its unknown twist is zero.
-    tables : sequence of StiffnessTable
-        Fitted together with the samples.
-    noise : Noise
-        What the residuals are divided by.
+    description : where all unknowns are zero.
+    unknowns : what may change.
+    samples : in the order in which they were recorded.
+    points : the tip first.
+    base_in_tracker : pose (4, 4) of the base where its unknown twist is zero.
+    tables : fitted together with the samples.
+    noise : what the residuals are divided by.
     """
 
     def __init__(
@@ -219,88 +207,39 @@ class CalibrationProblem:
             value, jacobian = self.of_table(table, x)
             values.append(value)
             jacobians.append(jacobian)
-        for value, jacobian in (self._too_much_memory(x), self._too_soft(x)):
-            values.append(value)
-            jacobians.append(jacobian)
+        excess, per_parameter, *_ = self._of_parameters(x)
+        jacobian = np.zeros((len(excess), self.size))
+        jacobian[:, : len(self._parameters)] = per_parameter
+        values.append(excess[:, 0])
+        jacobians.append(jacobian)
         return np.concatenate(values), np.concatenate(jacobians) * self.scale
 
-    def _too_much_memory(self, x: Array) -> tuple[Array, Array]:
-        """By how much the shares of each channel's history exceed what is sensible, (n,)."""
-        n = self.description.n_pressures
-        value, slope = np.zeros(n), np.zeros((n, self.size))
-        row = 0
-        for s, segment in enumerate(self.description.segments):
-            history = self._history(s, x * self.scale)
-            prefix = f"segments[{s}].history"
-            total = sum(part.share for part in history.parts)
-            for c in range(segment.n_channels):
-                memory = history.memory_of(c)
-                if memory * total > FIT.most_memory:
-                    value[row] = (memory * total - FIT.most_memory) / FIT.memory_slack
-                    for key, i in self._index.items():
-                        if key.startswith(prefix) and key.endswith("share"):
-                            slope[row, i] = memory / FIT.memory_slack
-                        elif key == f"{prefix}.memory[{c}]":
-                            slope[row, i] = memory * total / FIT.memory_slack
-                row += 1
-        return value, slope
+    def _of_parameters(self, x: Array) -> list[Array]:
+        """`_excess` and `_met_by_a_quick_push` at scaled coordinates (d,), each with its slopes."""
+        return self._parameter_function((x * self.scale)[: len(self._parameters)])
 
-    def _too_soft(self, x: Array) -> tuple[Array, Array]:
-        """By how much pressure softens each segment more than within its limits it may, (s,)."""
-        segments = self.description.segments
-        value, slope = np.zeros(len(segments)), np.zeros((len(segments), self.size))
-        first = 0
-        for s, segment in enumerate(segments):
-            channels = range(first, first + segment.n_channels)
-            first += segment.n_channels
-            compensation = segment.compensation
-            if compensation is None:
-                continue
-            prefix = f"segments[{s}]"
-            keys = (
-                f"{prefix}.material.youngs_modulus",
-                f"{prefix}.compensation.modulus_per_pressure",
-            )
-            modulus, per_pressure = (self._value(key, x) for key in keys)
-            norm, per_unknown = self._farthest(prefix, channels, x)
-            change = per_pressure * norm / modulus  # of the modulus, relative, at the most
-            slopes = {self._index.get(key): each for key, each in per_unknown.items()}
-            slopes = {i: each * per_pressure / modulus for i, each in slopes.items()}
-            slopes[self._index.get(keys[0])] = -change
-            slopes[self._index.get(keys[1])] = norm / modulus
-            if compensation.modulus_law == "linear":
-                sign, excess = -1.0, FIT.least_modulus - (1 + change)
-            else:  # beyond, more pressure would bend less
-                sign, excess = 1.0, change - FIT.most_stiffening
-            if excess > 0:
-                value[s] = excess / FIT.modulus_slack
-                for i, each in slopes.items():
-                    if i is not None:
-                        slope[s, i] = sign * each / FIT.modulus_slack
-        return value, slope
+    @cached_property
+    def _parameter_function(self) -> InterpretedFunction:
+        coordinates = ca.SX.sym("coordinates", len(self._parameters))
+        robot = varied(self.description, self._parameters, coordinates)
+        outputs: list[ca.SX] = []
+        for value in (_excess(robot), self._met_by_a_quick_push(robot, coordinates)):
+            outputs += [value, ca.jacobian(value, coordinates)]
+        return InterpretedFunction(dense(ca.Function("parameters", [coordinates], outputs)))
 
-    def _value(self, key: str, x: Array) -> float:
-        """Value of a number of the robot file at scaled coordinates (d,)."""
-        parameter, i = Parameter(key), self._index.get(key)
-        nominal = parameter.value(self.description)
-        return nominal if i is None else float(parameter.at(nominal, x[i] * self.scale[i]))
+    def _met_by_a_quick_push(self, robot: RobotDescription, coordinates: ca.SX) -> ca.SX:
+        """Coordinates (k,) of the parameters as a quick push meets them.
 
-    def _farthest(self, prefix: str, channels: range, x: Array) -> tuple[float, dict[str, float]]:
-        """Largest norm of a segment's acting pressures within the robot's limits, in Pa.
-
-        And its slopes by the coordinates of gains and offsets, by their keys.
+        What the histories hold on to adds to the factor on the stiffness: a table is measured
+        with quick small pushes.  Under gravity that factor would move the arm too; there a table
+        is compared with the stiffness of equilibrium.
         """
-        limits = np.maximum(
-            np.abs(self.description.pressure_min), np.abs(self.description.pressure_max)
-        )
-        acting, slopes = [], {}
-        for c, channel in enumerate(channels):
-            gain, offset = (f"{prefix}.corrections.{name}[{c}]" for name in ("gain", "offset"))
-            own, added = self._value(gain, x) * limits[channel], self._value(offset, x)
-            acting.append(own + abs(added))
-            slopes[gain], slopes[offset] = acting[-1] * own, acting[-1] * np.sign(added)
-        norm = float(np.linalg.norm(acting))
-        return norm, {key: float(each) / norm for key, each in slopes.items()}
+        met = ca.SX(coordinates)
+        for s, segment in enumerate(robot.segments):
+            stiffness = self._index.get(f"segments[{s}].compensation.stiffness")
+            if stiffness is not None and segment.history and not any(robot.gravity):
+                met[stiffness] -= ca.log(segment.history.quick_share)
+        return met
 
     def predict(self, x: Array) -> Predicted:
         """What the model says at scaled coordinates (d,)."""
@@ -364,13 +303,17 @@ class CalibrationProblem:
         starts, n = self.starts, self.description.n_pressures
         effective = np.zeros((starts[-1], n))
         slopes = np.zeros((starts[-1], n, self.size))
+        robot = varied(self.description, self._parameters, coordinates)
         first = 0
-        for s, (segment, past) in enumerate(
-            zip(self.description.segments, self._pasts, strict=True)
-        ):
+        for s, (segment, past) in enumerate(zip(robot.segments, self._pasts, strict=True)):
             channels = slice(first, first + segment.n_channels)
             first += segment.n_channels
-            history = self._history(s, coordinates)
+            history, prefix = segment.history or NO_HISTORY, f"segments[{s}].history."
+            varying = [
+                (i, each.key.removeprefix(prefix), each.per_coordinate(each.value(robot)))
+                for i, each in enumerate(self._parameters)
+                if each.key.startswith(prefix)
+            ]
             end: Start | None = None
             owner = slice(0, 0)  # the sides on which this and the logs before it depend
             for i, sample in enumerate(self.samples):
@@ -391,65 +334,13 @@ class CalibrationProblem:
                 end = found.end
                 rows = slice(starts[i], starts[i + 1])
                 effective[rows, channels] = found.pressures
-                self._enter(slopes[rows, channels], s, history, found)
+                for place, name, per_coordinate in varying:
+                    slopes[rows, channels, place] = found.per_number[name] * per_coordinate
                 if owner.stop > owner.start:
                     for c in range(channels.start, channels.stop):
                         local = c - channels.start
                         slopes[rows, c, owner.start + c] = found.per_side[:, local]
         return effective, slopes
-
-    def _enter(self, slopes: Array, s: int, history: History, found: Effective) -> None:
-        """Write the slopes (M, c, d) by a segment's history."""
-        prefix = f"segments[{s}].history"
-        lag = self._index.get(f"{prefix}.lag")
-        if lag is not None:
-            slopes[:, :, lag] = found.per_lag * history.lag
-        falling = self._index.get(f"{prefix}.lag_falling")
-        if falling is not None:
-            slopes[:, :, falling] = found.per_lag_falling * history.lag_falling
-        for c in range(slopes.shape[1]):
-            memory = self._index.get(f"{prefix}.memory[{c}]")
-            if memory is not None:
-                slopes[:, c, memory] = found.per_memory[:, c] * history.memory_of(c)
-        dead_time = self._index.get(f"{prefix}.dead_time")
-        if dead_time is not None:
-            slopes[:, :, dead_time] = found.per_dead_time
-        names = [f"play[{j}]" for j in range(len(history.play))]
-        names += [f"creep[{j}]" for j in range(len(history.creep))]
-        for j, name in enumerate(names):
-            share = self._index.get(f"{prefix}.{name}.share")
-            if share is not None:
-                slopes[:, :, share] = found.per_share[:, :, j]
-
-    def _history(self, s: int, coordinates: Array) -> History:
-        """History of a segment with the values of these coordinates."""
-        history = self.description.segments[s].history or NO_HISTORY
-        prefix = f"segments[{s}].history"
-
-        def value(name: str, nominal: float) -> float:
-            i = self._index.get(f"{prefix}.{name}")
-            if i is None:
-                return nominal
-            return float(self._parameters[i].at(nominal, coordinates[i]))
-
-        return history.model_copy(
-            update={
-                "dead_time": value("dead_time", history.dead_time),
-                "lag": value("lag", history.lag),
-                "lag_falling": value("lag_falling", history.lag_falling),
-                "memory": tuple(
-                    value(f"memory[{c}]", factor) for c, factor in enumerate(history.memory)
-                ),
-                "play": tuple(
-                    play.model_copy(update={"share": value(f"play[{j}].share", play.share)})
-                    for j, play in enumerate(history.play)
-                ),
-                "creep": tuple(
-                    creep.model_copy(update={"share": value(f"creep[{j}].share", creep.share)})
-                    for j, creep in enumerate(history.creep)
-                ),
-            }
-        )
 
     def _measurements(self, point: TrackedPoint) -> tuple[Array, Array | None]:
         """Positions (M, 3) and rotations (M, 3, 3) of a point in the rows of all samples."""
@@ -463,38 +354,9 @@ class CalibrationProblem:
                 rotations.append(track.rotation[sample.rows])
         return np.concatenate(positions), np.concatenate(rotations) if point.turns else None
 
-    def _quick(self, coordinates: Array) -> tuple[Array, Array]:
-        """Coordinates (k,) of the parameters as a quick push meets them, and their slopes (k, k).
-
-        What the histories hold on to adds to the factor on the stiffness: a table is measured
-        with quick small pushes.  Under gravity that factor would move the arm too; there a table
-        is compared with the stiffness of equilibrium.
-        """
-        k = len(self._parameters)
-        found, slopes = coordinates[:k].copy(), np.eye(k)
-        if any(self.description.gravity):
-            return found, slopes
-        for s in range(len(self.description.segments)):
-            stiffness = self._index.get(f"segments[{s}].compensation.stiffness")
-            history = self._history(s, coordinates)
-            if stiffness is None or not history.parts:
-                continue
-            quick = history.quick_share
-            found[stiffness] -= np.log(quick)
-            total = sum(part.share for part in history.parts)
-            channels = len(history.memory)
-            memory = sum(history.memory) / channels if channels else 1.0
-            for key, i in self._index.items():
-                if key.startswith(f"segments[{s}].history") and key.endswith("share"):
-                    slopes[stiffness, i] = memory / quick
-                elif key.startswith(f"segments[{s}].history.memory"):
-                    own = history.memory_of(int(key[:-1].rpartition("[")[2]))
-                    slopes[stiffness, i] = own / channels * total / quick
-        return found, slopes
-
     def of_table(self, table: StiffnessTable, x: Array) -> tuple[Array, Array]:
         """Residuals (r,) of a table over its sigmas, and their slopes (r, d)."""
-        coordinates, by_history = self._quick(x * self.scale)
+        _, _, coordinates, by_history = self._of_parameters(x)
         value, slope = np.zeros(len(table)), np.zeros((len(table), self.size))
         known = np.isfinite(table.stiffness) & np.isfinite(table.sigma) & (table.sigma > 0)
         kinds = list(zip(map(tuple, table.directions.tolist()), table.boundaries, strict=True))
@@ -502,12 +364,41 @@ class CalibrationProblem:
             rows = known & np.array([kind == (direction, boundary) for kind in kinds])
             measure = checked_measure(direction, "translation", cast(Boundary, boundary), "base")
             k, _, per_coordinate = self._arm.stiffnesses(
-                table.pressures[rows], coordinates, measure
+                table.pressures[rows], coordinates[:, 0], measure
             )
             value[rows] = (table.stiffness[rows] - k) / table.sigma[rows]
             change = per_coordinate @ by_history
             slope[rows, : len(coordinates)] = -change / table.sigma[rows, np.newaxis]
         return value, slope
+
+
+def _excess(robot: RobotDescription) -> ca.SX:
+    """By how much a robot, in symbols, exceeds what is sensible, in deviations (n + s,).
+
+    The shares of each channel's history may not add up to all of the pressure, and pressures within
+    the robot's limits may neither take nearly all of a segment's modulus nor, of an exponential
+    law, raise it so that more pressure would bend less.
+    """
+    limits = iter(np.maximum(np.abs(robot.pressure_min), np.abs(robot.pressure_max)).tolist())
+    memory, modulus = [], []
+    for segment in robot.segments:
+        history, compensation = segment.history or NO_HISTORY, segment.compensation
+        corrections = segment.corrections
+        assert compensation is not None
+        assert corrections is not None
+        shares = sum(part.share for part in history.parts)
+        acting = []
+        for c in range(segment.n_channels):
+            memory.append((history.memory_of(c) * shares - FIT.most_memory) / FIT.memory_slack)
+            acting.append(corrections.gain[c] * next(limits) + ca.fabs(corrections.offset[c]))
+        change = compensation.modulus_per_pressure * ca.norm_2(ca.vertcat(*acting))
+        change = change / segment.material.youngs_modulus  # of the modulus, relative, at the most
+        if compensation.modulus_law == "linear":
+            excess = FIT.least_modulus - (1 + change)
+        else:
+            excess = change - FIT.most_stiffening
+        modulus.append(excess / FIT.modulus_slack)
+    return ca.fmax(ca.vertcat(*memory, *modulus), 0)
 
 
 def _rounded(value: float) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NoReturn
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,6 @@ from stiffopt.identify.tracker_faults import (
 )
 from stiffopt.logs import Body, Log
 from stiffopt.model.description import RobotDescription
-
-__all__ = ["Recording", "Track", "prepare"]
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -80,13 +78,7 @@ class Recording:
     remarks: tuple[str, ...]
 
     def track(self, name: str) -> Track:
-        """Return the track of this name.
-
-        Raises
-        ------
-        InputError
-            There is none.
-        """
+        """Return the track of this name, which must be there."""
         for track in self.tracks:
             if track.name == name:
                 return track
@@ -108,34 +100,29 @@ def prepare(
 
     Parameters
     ----------
-    log :
-        In SI units.
-    name :
-        Of the file, for messages.
-    description :
-        The robot whose arm was recorded; its length and its limits say what is plausible.
-    channels :
-        For each channel of the robot the log's column, from 1; None for the same order.
-    frame :
-        Body that does not move and in whose frame everything is expressed; None for the tracker's.
-        Where its orientation was not recorded, positions are counted from it along the tracker's
-        axes.
-    bodies :
-        Further bodies to keep as tracks.
-    pressures :
-        Which ones; a missing one is as the last before it (commanded) or on the line between its
-        neighbours (measured).
+    log : in SI units.
+    name : of the file, for messages.
+    description : the robot whose arm was recorded; its length and its limits say what is plausible.
+    channels : for each channel of the robot the log's column, from 1; None for the same order.
+    frame : body that does not move and in whose frame everything is expressed; None for the
+        tracker's. Where its orientation was not recorded, positions are counted from it along the
+        tracker's axes.
+    bodies : further bodies to keep as tracks.
+    pressures : which ones; a missing one is as the last before it (commanded) or on the line
+        between its neighbours (measured).
 
     Raises
     ------
     InputError
-        Columns or bodies are asked for that are not there; units are not SI; nothing moves; fewer
+        The log lacks a column or a body; units are not SI; nothing moves; fewer
         than 20 rows can be used.
     """
     columns = _columns(log.n, channels, description.n_pressures)
     for body in (*bodies, *([frame] if frame is not None else [])):
         if body not in log.bodies:
-            _no_body(name, body, log)
+            others = ", ".join(log.bodies)
+            there = f"the bodies there are {others}" if others else "there is none but the tip"
+            raise FileError(name, f"there is no body {shown(body)}; {there}")
     if len(set(bodies)) < len(tuple(bodies)):
         raise InputError(f"a body is asked for twice: {', '.join(bodies)}")
     remarks = _check_time(name, log.time)
@@ -190,12 +177,6 @@ def _columns(there: int, channels: Sequence[int] | None, wanted: int) -> list[in
                 "expected each once"
             )
     return [column - 1 for column in chosen]
-
-
-def _no_body(name: str, body: str, log: Log) -> NoReturn:
-    others = ", ".join(log.bodies)
-    there = f"the bodies there are {others}" if others else "there is none but the tip"
-    raise FileError(name, f"there is no body {shown(body)}; {there}")
 
 
 def _pressures(
@@ -350,13 +331,7 @@ def _counted(
 
 
 def _check_time(name: str, time: Array) -> tuple[str, ...]:
-    """Return a remark if times look like milliseconds.
-
-    Raises
-    ------
-    InputError
-        There are too few rows.
-    """
+    """Refuse too few rows, and return a remark if times look like milliseconds."""
     if len(time) < PLAUSIBLE.least_rows:
         raise FileError(name, f"has {len(time)} rows; expected at least {PLAUSIBLE.least_rows}")
     step = float(np.median(np.diff(time)))
@@ -368,13 +343,7 @@ def _check_time(name: str, time: Array) -> tuple[str, ...]:
 
 
 def _check_lengths(name: str, log: Log, frame: str | None, length: float) -> None:
-    """Refuse positions that cannot be in m.
-
-    Raises
-    ------
-    InputError
-        The tip moves over 10 lengths of the arm, or is 100 away from the body that is the frame.
-    """
+    """Refuse positions that cannot be in m, by the range of the tip and its distance."""
     tip = log.tip_position
     seen = whole(tip) & np.any(tip != 0, axis=1)  # zeros may stand for none
     if not seen.any():
@@ -396,13 +365,7 @@ def _mm(length: float) -> str:
 
 
 def _check_pressures(name: str, pressures: Array, description: RobotDescription) -> tuple[str, ...]:
-    """Return remarks on pressures (N, n) beyond the limits and on channels that are not used.
-
-    Raises
-    ------
-    InputError
-        They do not look like Pa; no channel is used.
-    """
+    """Refuse pressures (N, n) that are not in Pa or never move, and remark on what is odd."""
     low, high = np.array(description.pressure_min), np.array(description.pressure_max)
     limit = np.maximum(np.abs(low), np.abs(high))
     share = float(np.max(np.max(np.abs(pressures), axis=0) / limit))
@@ -442,13 +405,7 @@ def _check_pressures(name: str, pressures: Array, description: RobotDescription)
 def _check_excitation(
     name: str, time: Array, pressures: Array, tip: Array, description: RobotDescription
 ) -> None:
-    """Refuse a recording (N rows) in which too little can be used or the tip does not move.
-
-    Raises
-    ------
-    InputError
-        Fewer than 20 positions of the tip (N, 3) are left, or they are noise.
-    """
+    """Refuse a recording in which too few positions (N, 3) are left or the tip does not move."""
     seen = whole(tip)
     if seen.sum() < PLAUSIBLE.least_rows:
         raise FileError(

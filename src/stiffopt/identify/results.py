@@ -15,10 +15,6 @@ from stiffopt.identify.settings import REPORT
 from stiffopt.identify.unknowns import BASE, SENSOR
 from stiffopt.model.parameters import Parameter
 
-__all__ = [
-    "TIED", "Comparison", "Errors", "FittedEstimate", "doubts", "estimates", "outliers", "together",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 TIED = "hardly told apart"
@@ -113,16 +109,10 @@ class Comparison:
 
     def rows(self, wanted: NDArray[np.bool_]) -> Comparison:
         """Some rows (N,) of it."""
-        return replace(
-            self,
-            time=self.time[wanted],
-            pressures=self.pressures[wanted],
-            effective=self.effective[wanted],
-            measured=self.measured[wanted],
-            predicted=self.predicted[wanted],
-            angle=None if self.angle is None else self.angle[wanted],
-            inside=self.inside[wanted],
-        )
+        names = ("time", "pressures", "effective", "measured", "predicted", "angle", "inside")
+        columns = {name: getattr(self, name) for name in names}
+        kept = {name: column[wanted] for name, column in columns.items() if column is not None}
+        return replace(self, **kept)
 
 
 def together(comparisons: Sequence[Comparison]) -> Errors:
@@ -167,7 +157,7 @@ def estimates(found: Fit) -> tuple[FittedEstimate, ...]:
         ends = [max(middle - half, unknown.low), middle, min(middle + half, unknown.high)]
         before, unit, key = 0.0, unknown.unit, ""
         if unknown.parameter is not None:
-            key, unit = unknown.parameter.key, unknown.parameter.unit
+            key, unit = unknown.parameter.key, unknown.parameter.number.unit
             before = unknown.parameter.value(found.problem.description)
             ends = [float(unknown.parameter.at(before, end)) for end in ends]
         listed.append(

@@ -1,4 +1,4 @@
-"""What a tracker says of a point of the arm, and how that depends on where the tracker is."""
+"""Measurement model of a tracker: pose of a sensor on the arm, and its Jacobian by the frames."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from stiffopt import lie
 from stiffopt.model.batch import InterpretedFunction
 from stiffopt.model.codegen import dense
 
-__all__ = ["Readings", "readings", "turned_by"]
-
 Array = NDArray[np.float64]
 
 
@@ -27,15 +25,11 @@ class Readings:
 
     Attributes
     ----------
-    position : ndarray
-        (N, 3), in m.
-    per_twist : ndarray
-        (N, 3, 18), of the position.
-    turn : ndarray or None
-        (N, 3): the rotation from what was measured to what is read, as the sine of its angle
+    position : (N, 3), in m.
+    per_twist : (N, 3, 18), of the position.
+    turn : (N, 3): the rotation from what was measured to what is read, as the sine of its angle
         along its axis, in the axes of the sensor; None if no rotation was measured.
-    turn_per_twist : ndarray or None
-        (N, 3, 18).
+    turn_per_twist : (N, 3, 18).
     """
 
     position: Array

@@ -11,17 +11,6 @@ from pydantic import Field
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration
 
-__all__ = [
-    "CHOICE",
-    "FIT",
-    "PLAUSIBLE",
-    "REPORT",
-    "SAMPLING",
-    "START",
-    "TRACKER",
-    "CalibrationSettings",
-]
-
 
 class CalibrationSettings(Schema):
     """How logs are read, and what is fitted to them.

@@ -1,4 +1,4 @@
-"""From a robot, logs and a model structure to a least-squares problem."""
+"""From a robot, logs and a model structure to the least-squares problem of a calibration."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -34,12 +35,6 @@ from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
 from stiffopt.registration import Placement
 
-__all__ = [
-    "NOISE", "LogSource", "RobotSource", "Setup", "TableSource", "begins", "chosen_rows",
-    "description_of", "nothing_unknown", "oriented", "placements", "points_of", "recordings_of",
-    "sample", "tables_of", "thinned",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
@@ -53,6 +48,8 @@ LogSource = _Path | Log | tuple[str, Log]
 """The path of a log (CSV or ``.mcap``), a log, or a log with its name."""
 TableSource = _Path | StiffnessTable
 """The path of a table of measured stiffness, or the table."""
+Beginnings = tuple[tuple[Unknown, ...], ...]
+"""Unknowns of each recording."""
 
 
 def description_of(robot: RobotSource) -> RobotDescription:
@@ -100,21 +97,39 @@ def _named(logs: Sequence[LogSource]) -> list[tuple[str, Log]]:
     return found
 
 
+def recordings_of(
+    description: RobotDescription,
+    logs: Sequence[LogSource],
+    settings: CalibrationSettings,
+) -> list[Recording]:
+    """Return logs as recordings of this robot, read as its file and the settings say."""
+    given = description.recordings or Recordings()
+    return [
+        prepare(
+            log,
+            name,
+            description,
+            channels=given.channels or None,
+            frame=given.frame,
+            bodies=tuple(given.bodies),
+            pressures=settings.pressures,
+        )
+        for name, log in _named(logs)
+    ]
+
+
 @dataclass(frozen=True, eq=False)
 class Setup:
     """What stays the same while models are compared: the robot, the recordings and the settings.
 
     Attributes
     ----------
-    description : RobotDescription
-        As the robot file has it.
+    description : as the robot file has it.
     recordings : tuple of Recording
     tables : tuple of StiffnessTable
     settings : CalibrationSettings
-    base : ndarray
-        Pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
-    points : tuple of TrackedPoint
-        That are tracked.
+    base : pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
+    points : that are tracked.
     """
 
     description: RobotDescription
@@ -132,10 +147,30 @@ class Setup:
         tables: Sequence[StiffnessTable],
         settings: CalibrationSettings,
     ) -> Setup:
-        """Return the setup, with bodies turned to what the robot file says of them."""
-        base = placements(description).registration.tracker_in_base.inverse()
-        points = points_of(description, recordings) if recordings else ()
-        return cls(description, tuple(recordings), tuple(tables), settings, base, points)
+        """Setup of a robot, with base and sensors where its file has them."""
+        given = description.recordings or Recordings()
+        places: dict[str, tuple[float | None, Placement]] = {
+            "tip": (None, given.registration.tip_in_sensor)
+        }
+        places |= {name: (body.at, body.point_in_sensor) for name, body in given.bodies.items()}
+        points = tuple(
+            TrackedPoint(
+                name,
+                at,
+                placement.inverse(),
+                turns=all(recording.track(name).rotation is not None for recording in recordings),
+            )
+            for name, (at, placement) in places.items()
+        )
+        base = given.registration.tracker_in_base.inverse()
+        return cls(
+            description,
+            tuple(recordings),
+            tuple(tables),
+            settings,
+            base,
+            points if recordings else (),
+        )
 
     @property
     def span(self) -> Array:
@@ -159,67 +194,85 @@ class Setup:
         """How well the robot file is known."""
         return self.description.tolerances or Tolerances()
 
+    @property
+    def begins(self) -> list[Begin]:
+        """State of the arm at the beginning of each recording."""
+        return begins(self.recordings, self.span, self.settings.sequence)
+
     def samples(self, rows: int) -> list[Sample]:
         """At most so many rows of all recordings, each with its share."""
         if any(self.description.gravity):
             rows = min(rows, SAMPLING.loaded_fit_rows)
         total = sum(len(recording.time) for recording in self.recordings)
-        states = begins(self.recordings, self.span, self.settings.sequence)
-        return [
-            sample(recording, self.span, max(10, rows * len(recording.time) // total), begin)
-            for recording, begin in zip(self.recordings, states, strict=True)
-        ]
+        found = []
+        for recording, begin in zip(self.recordings, self.begins, strict=True):
+            most = max(10, rows * len(recording.time) // total)
+            found.append(sampled(recording, chosen_rows(recording, most), self.span, begin))
+        return found
 
     def problem(self, structure: ModelStructure, rows: int) -> CalibrationProblem:
         """The problem of fitting a structure to so many rows."""
         description = structure.applied(self.description, self.seen, self.is_fine)
-        samples = oriented(description, self.samples(rows), self.points, self.base)
+        samples = self.oriented(description, self.samples(rows))
         noise = Noise(START.position_noise * description.length, START.angle_noise)
-        unknowns = self.unknowns(structure, description, samples)
+        tolerances = self.tolerances
+        parameters = shape_unknowns(description, structure.shape, tolerances)
+        parameters += history_unknowns(description, tolerances)
+        turn = np.array([tolerances.base_tilt, tolerances.base_tilt, tolerances.base_turn])
+        position = np.full(3, tolerances.base_position)
+        zeros, sides = self.beginnings(description, samples)
+        unknowns = Unknowns(
+            parameters=tuple(
+                unknown
+                for unknown in parameters
+                if unknown.parameter is None or unknown.parameter.key not in self.settings.fixed
+            ),
+            base=tuple(placement_unknowns(BASE, position, turn, turns=True)) if samples else (),
+            sensors=tuple(self._sensor(point) for point in self.points),
+            zeros=zeros,
+            sides=sides,
+        )
         return CalibrationProblem(
             description, unknowns, samples, self.points, self.base, noise, self.tables
         )
 
-    def unknowns(
-        self, structure: ModelStructure, description: RobotDescription, samples: Sequence[Sample]
-    ) -> Unknowns:
-        """What a structure may change."""
-        tolerances = self.tolerances
-        shape = shape_unknowns(description, structure.shape, tolerances)
-        histories = history_unknowns(description, tolerances)
-        parameters = [
-            unknown
-            for unknown in (*shape, *histories)
-            if unknown.parameter is None or unknown.parameter.key not in self.settings.fixed
-        ]
-        remembers = any(
-            segment.history and segment.history.play for segment in description.segments
+    def beginnings(
+        self, description: RobotDescription, samples: Sequence[Sample]
+    ) -> tuple[Beginnings, Beginnings]:
+        """Unknown zero of each recording's positions, and unknown sides of the plays then."""
+        plays = any(segment.history and segment.history.play for segment in description.segments)
+        zeros, sides = [], []
+        for each in samples:
+            name = each.recording.name
+            zero = zero_unknowns(name, self.tolerances) if self.settings.rezero else []
+            side = side_unknowns(description, name) if each.begin == "unknown" and plays else []
+            zeros.append(tuple(zero))
+            sides.append(tuple(side))
+        return tuple(zeros), tuple(sides)
+
+    def oriented(self, description: RobotDescription, samples: Sequence[Sample]) -> list[Sample]:
+        """Turn bodies whose markers look alike after quarter turns to what a model predicts."""
+        if not any(point.turns for point in self.points):
+            return list(samples)
+        nothing: Beginnings = ((),)
+        unknowns = Unknowns(
+            (), (), nothing * len(self.points), nothing * len(samples), nothing * len(samples)
         )
-        turn = [tolerances.base_tilt, tolerances.base_tilt, tolerances.base_turn]
-        nothing: tuple[Unknown, ...] = ()
-        return Unknowns(
-            parameters=tuple(parameters),
-            base=tuple(
-                placement_unknowns(
-                    BASE, np.full(3, tolerances.base_position), np.array(turn), turns=True
-                )
-                if samples
-                else nothing
-            ),
-            sensors=tuple(self._sensor(point) for point in self.points),
-            zeros=tuple(
-                tuple(zero_unknowns(each.recording.name, tolerances))
-                if self.settings.rezero
-                else nothing
-                for each in samples
-            ),
-            sides=tuple(
-                tuple(side_unknowns(description, each.recording.name))
-                if each.begin == "unknown" and remembers
-                else nothing
-                for each in samples
-            ),
-        )
+        problem = CalibrationProblem(description, unknowns, samples, self.points, self.base, NOISE)
+        predicted = problem.predict(np.zeros(0))
+        found = []
+        for each, (begin, end) in zip(samples, pairwise(problem.starts), strict=True):
+            tracks: list[Track] = []
+            for track in each.recording.tracks:
+                k = [point.name for point in self.points].index(track.name)
+                if self.points[k].turns and track.rotation is not None:
+                    expected = self.base[:3, :3] @ predicted.poses[k][begin:end, :3, :3]
+                    expected = expected @ self.points[k].sensor[:3, :3]
+                    track = replace(track, rotation=_turned(track.rotation, each.rows, expected))
+                tracks.append(track)
+            recording = replace(each.recording, tracks=tuple(tracks))
+            found.append(replace(each, recording=recording))
+        return found
 
     def _sensor(self, point: TrackedPoint) -> tuple[Unknown, ...]:
         """Where a sensor is; of the tip's only if it tells turns, as moves and tilts trade off."""
@@ -297,9 +350,8 @@ def thinned(recording: Recording, wanted: Rows, span: Array) -> tuple[Recording,
     return smaller, position[wanted]
 
 
-def sample(recording: Recording, span: Array, most: int, begin: Begin) -> Sample:
-    """Sample of at most so many rows of a recording."""
-    rows = chosen_rows(recording, most)
+def sampled(recording: Recording, rows: Rows, span: Array, begin: Begin) -> Sample:
+    """Sample of some rows (M,) of a recording, thinned elsewhere."""
     smaller, places = thinned(recording, rows, span)
     return Sample(smaller, places, np.ones(len(places)), begin)
 
@@ -316,82 +368,6 @@ def begins(recordings: Sequence[Recording], span: Array, sequence: bool) -> list
     return found
 
 
-# tracked points -----------------------------------------------------------------------------------
-
-
-def recordings_of(
-    description: RobotDescription,
-    logs: Sequence[LogSource],
-    settings: CalibrationSettings,
-) -> list[Recording]:
-    """Return logs as recordings of this robot, read as its file and the settings say."""
-    given = placements(description)
-    return [
-        prepare(
-            log,
-            name,
-            description,
-            channels=given.channels or None,
-            frame=given.frame,
-            bodies=tuple(given.bodies),
-            pressures=settings.pressures,
-        )
-        for name, log in _named(logs)
-    ]
-
-
-def placements(description: RobotDescription) -> Recordings:
-    """Return how the robot's logs are read; the defaults where its file does not say."""
-    return description.recordings or Recordings()
-
-
-def points_of(
-    description: RobotDescription, recordings: Sequence[Recording]
-) -> tuple[TrackedPoint, ...]:
-    """Tracked points of an arm, the tip first, with their sensors where the robot file has them."""
-    given = placements(description)
-    places: dict[str, tuple[float | None, Placement]] = {
-        "tip": (None, given.registration.tip_in_sensor)
-    }
-    places |= {name: (body.at, body.point_in_sensor) for name, body in given.bodies.items()}
-    return tuple(
-        TrackedPoint(
-            name,
-            at,
-            placement.inverse(),
-            turns=all(recording.track(name).rotation is not None for recording in recordings),
-        )
-        for name, (at, placement) in places.items()
-    )
-
-
-def oriented(
-    description: RobotDescription,
-    samples: Sequence[Sample],
-    points: Sequence[TrackedPoint],
-    base: Array,
-) -> list[Sample]:
-    """Turn bodies whose markers look alike after quarter turns to what the model predicts."""
-    if not any(point.turns for point in points):
-        return list(samples)
-    predicted = CalibrationProblem(
-        description, nothing_unknown(samples, points), samples, points, base, NOISE
-    ).predict(np.zeros(0))
-    starts = np.cumsum([0, *(len(sample.rows) for sample in samples)])
-    found = []
-    for sample, begin, end in zip(samples, starts[:-1], starts[1:], strict=True):
-        tracks: list[Track] = []
-        for track in sample.recording.tracks:
-            k = [point.name for point in points].index(track.name)
-            if points[k].turns and track.rotation is not None:
-                expected = base[:3, :3] @ predicted.poses[k][begin:end, :3, :3]
-                expected = expected @ points[k].sensor[:3, :3]
-                track = replace(track, rotation=_turned(track.rotation, sample.rows, expected))
-            tracks.append(track)
-        found.append(replace(sample, recording=replace(sample.recording, tracks=tuple(tracks))))
-    return found
-
-
 def _turned(rotation: Array, rows: NDArray[np.intp], expected: Array) -> Array:
     """The version of rotations (N, 3, 3) whose wanted rows are nearest to what is expected."""
     between = np.swapaxes(expected, 1, 2) @ rotation[rows]
@@ -400,10 +376,3 @@ def _turned(rotation: Array, rows: NDArray[np.intp], expected: Array) -> Array:
     version = np.swapaxes(between, 1, 2) @ aligned(between, np.eye(3))
     known = np.isfinite(version).all(axis=(1, 2))
     return np.asarray(rotation @ version[known][0])
-
-
-def nothing_unknown(samples: Sequence[Sample], points: Sequence[TrackedPoint]) -> Unknowns:
-    """Return the unknowns of a problem in which nothing may change."""
-    nothing: tuple[tuple[Unknown, ...], ...] = ((),)
-    each = nothing * len(samples)
-    return Unknowns((), (), nothing * len(points), each, each)

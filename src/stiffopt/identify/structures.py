@@ -22,10 +22,6 @@ from stiffopt.model.description import Compensation, Corrections, RobotDescripti
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.laws import law_class, strain_laws
 
-__all__ = [
-    "STRUCTURES", "Candidate", "ModelStructure", "best", "held_back_errors", "other_laws",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
@@ -65,12 +61,9 @@ class ModelStructure:
 
         Parameters
         ----------
-        description : RobotDescription
-            What it already has of the structure is where the fit begins.
-        seen : float
-            Highest recorded pressure, in Pa.
-        fine : bool
-            Whether the logs can tell a dead time from a lag.
+        description : what it already has of the structure is where the fit begins.
+        seen : highest recorded pressure, in Pa.
+        fine : whether the logs can tell a dead time from a lag.
         """
         segments = tuple(self._segment(segment, seen, fine) for segment in description.segments)
         return description.model_copy(update={"segments": segments, "calibration": None})
@@ -203,10 +196,8 @@ class Candidate:
     Attributes
     ----------
     structure : ModelStructure
-    fit : Fit
-        To all rows of the trial.
-    folds : dict of str to Errors
-        Errors of what was held back, by what that was.
+    fit : to all rows of the trial.
+    folds : errors of what was held back, by what that was.
     """
 
     structure: ModelStructure
@@ -224,11 +215,9 @@ def held_back_errors(found: Fit, settle: float, tell: Callable[[], None]) -> dic
 
     Parameters
     ----------
-    found : Fit
-        To all of them; the other fits begin there.
-    settle : float
-        Of a log that begins in an unknown state this many s at its beginning still count, as they
-        would if it were predicted.
+    found : to all of them; the other fits begin there.
+    settle : of a log that begins in an unknown state this many s at its beginning still count, as
+        they would if it were predicted.
     """
     problem = found.problem
     errors = {}
@@ -256,8 +245,7 @@ def best(candidates: Sequence[Candidate]) -> Candidate:
 
     Parameters
     ----------
-    candidates : sequence of Candidate
-        The simplest first.
+    candidates : the simplest first.
     """
     leader = min(candidates, key=lambda candidate: candidate.score)
     reference = _means(leader)

@@ -21,11 +21,6 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.identify.settings import TRACKER
 
-__all__ = [
-    "MEDIAN_NORM", "Unflipped", "aligned", "dropouts", "jumps", "mean_rotation", "norms", "repeats",
-    "rotations", "roughness", "unflipped", "unit_quaternions", "whole",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
@@ -61,10 +56,8 @@ def dropouts(position: Array, length: float) -> Rows:
 
     Parameters
     ----------
-    position :
-        In m; NaN where it is missing.
-    length :
-        Of the arm, in m.
+    position : in m; NaN where it is missing.
+    length : of the arm, in m.
     """
     zero = np.all(position == 0, axis=1)
     seen = whole(position) & ~zero
@@ -94,14 +87,10 @@ def jumps(time: Array, position: Array, reach: Array, length: float) -> Rows:
 
     Parameters
     ----------
-    time :
-        (N,), in s.
-    position :
-        (N, 3), in m; NaN where it is not to be used.
-    reach :
-        (N,), how far changes of pressure until then may have moved the tip altogether, in m.
-    length :
-        Of the arm, in m.
+    time : (N,), in s.
+    position : (N, 3), in m; NaN where it is not to be used.
+    reach : (N,), how far changes of pressure until then may have moved the tip altogether, in m.
+    length : of the arm, in m.
     """
     bad = np.zeros(len(time), dtype=bool)
     seen = np.flatnonzero(whole(position))
@@ -211,12 +200,9 @@ def unflipped(quaternion: Array, position: Array, length: float) -> Unflipped:
 
     Parameters
     ----------
-    quaternion :
-        (N, 4), of length 1; NaN where it is missing.
-    position :
-        (N, 3), of the body, in m; NaN where it is missing.
-    length :
-        Of the arm, in m.
+    quaternion : (N, 4), of length 1; NaN where it is missing.
+    position : (N, 3), of the body, in m; NaN where it is missing.
+    length : of the arm, in m.
     """
     rows = np.flatnonzero(whole(quaternion))
     stray = np.zeros(len(quaternion), dtype=bool)
@@ -245,10 +231,8 @@ def aligned(track_rotation: Array, reference: Array) -> Array:
 
     Parameters
     ----------
-    track_rotation :
-        (N, 3, 3), NaN where there is none.
-    reference :
-        (3, 3), for example the mean of another recording of the same body.
+    track_rotation : (N, 3, 3), NaN where there is none.
+    reference : (3, 3), for example the mean of another recording of the same body.
 
     Returns
     -------

@@ -18,11 +18,6 @@ from stiffopt.model.description import RobotDescription, Tolerances
 from stiffopt.model.laws import law_class
 from stiffopt.model.parameters import Parameter
 
-__all__ = [
-    "BASE", "SENSOR", "Unknown", "Unknowns", "history_unknowns", "placement_unknowns",
-    "shape_unknowns", "side_unknowns", "zero_unknowns",
-]  # fmt: skip
-
 Array = NDArray[np.float64]
 
 _AXES = ("x", "y", "z")
@@ -49,10 +44,6 @@ class Unknown:
     low: float = -math.inf
     high: float = math.inf
     parameter: Parameter | None = None
-
-    def bounded(self, coordinate: float) -> float:
-        """Nearest coordinate within the bounds."""
-        return min(max(coordinate, self.low), self.high)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,14 +90,11 @@ def shape_unknowns(
 
     Parameters
     ----------
-    description : RobotDescription
-        The robot from which the fit begins.
-    names : sequence of str
-        Keys of a segment without indices, such as ``corrections.gain``. Of the material and the
+    description : the robot from which the fit begins.
+    names : keys of a segment without indices, such as ``corrections.gain``. Of the material and the
         compensation those count that the segment's strain law lets be fitted; the law's own numbers
         come after them.
-    tolerances : Tolerances
-        How well the robot file is known.
+    tolerances : how well the robot file is known.
     """
     found = []
     for s, segment in enumerate(description.segments):

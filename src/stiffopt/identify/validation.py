@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import cast
 
 import numpy as np
@@ -11,31 +12,26 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import StiffoptError
 from stiffopt.identify.fit import fit
-from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample, TrackedPoint
+from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Comparison
 from stiffopt.identify.settings import SAMPLING, CalibrationSettings
 from stiffopt.identify.setup import (
     NOISE,
+    Beginnings,
     LogSource,
     RobotSource,
-    begins,
+    Setup,
     chosen_rows,
     description_of,
-    nothing_unknown,
-    oriented,
-    placements,
-    points_of,
     recordings_of,
-    thinned,
+    sampled,
 )
-from stiffopt.identify.unknowns import Unknowns, side_unknowns, zero_unknowns
+from stiffopt.identify.unknowns import Unknowns
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.compliance import Boundary
-from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
-
-__all__ = ["StiffnessComparison", "compare", "compare_stiffness", "validate"]
 
 Array = NDArray[np.float64]
 
@@ -71,114 +67,71 @@ def validate(
     recordings = recordings_of(description, logs, settings)
     if progress is not None:
         progress(1, 2, "comparing")
-    return compare(
-        description,
-        recordings,
-        sequence=settings.sequence,
-        rezero=settings.rezero,
-        settle=settings.settle,
-    )
+    return compare(Setup.of(description, recordings, (), settings))
 
 
 def compare(
-    description: RobotDescription,
-    recordings: Sequence[Recording],
-    *,
-    sequence: bool = False,
-    rezero: bool = False,
-    settle: float = 2.0,
-    most: int = SAMPLING.rows,
+    setup: Setup,
     known: Mapping[str, float] | None = None,
     tell: Callable[[], None] = lambda: None,
 ) -> tuple[Comparison, ...]:
-    """Run a model along recordings.
+    """Run the robot of a setup along its recordings.
 
     Parameters
     ----------
-    description : RobotDescription
-    recordings : sequence of Recording
-        In the order in which they were made.
-    sequence : bool
-        Whether each begins in the state in which the one before ended.
-    rezero : bool
-        Whether positions are counted anew in each recording.
-    settle : float
-        Time in s at the beginning of a recording from which its zero and its state are estimated.
-    most : int
-        Rows of a recording that are compared.
-    known : dict of str to float, optional
-        Scaled coordinates of zeros and states by name, where a fit has found them already.
+    setup : Setup
+    known : scaled coordinates of zeros and states by name, where a fit has found them already.
+    tell : is called at every evaluation.
     """
-    span = np.subtract(description.pressure_max, description.pressure_min)
-    points = points_of(description, recordings)
-    base = placements(description).registration.tracker_in_base.inverse()
-    states = begins(recordings, span, sequence)
-    if any(description.gravity):
-        most = min(most, SAMPLING.loaded_rows)
+    description, recordings = setup.description, setup.recordings
+    most = SAMPLING.loaded_rows if any(description.gravity) else SAMPLING.rows
     samples, kept = [], []
-    for recording, begin in zip(recordings, states, strict=True):
+    for recording, begin in zip(recordings, setup.begins, strict=True):
         every = np.arange(len(recording.time))
         rows = every if len(every) <= most else chosen_rows(recording, most)
-        smaller, places = thinned(recording, rows, span)
-        samples.append(Sample(smaller, places, np.ones(len(places)), begin))
+        samples.append(sampled(recording, rows, setup.span, begin))
         kept.append(rows)
-    samples = oriented(description, samples, points, base)
-    unknowns, x = _beginnings(description, samples, points, base, rezero, settle, known or {}, tell)
-    predicted = CalibrationProblem(description, unknowns, samples, points, base, NOISE).predict(x)
-    starts = np.cumsum([0, *(len(sample.rows) for sample in samples)])
+    samples = setup.oriented(description, samples)
+    unknowns, x = _beginnings(setup, samples, known or {}, tell)
+    problem = CalibrationProblem(description, unknowns, samples, setup.points, setup.base, NOISE)
+    predicted = problem.predict(x)
     return tuple(
-        _comparison(
-            description, recording, rows, sample, predicted, slice(begin, end), base, points[0]
-        )
-        for recording, rows, sample, begin, end in zip(
-            recordings, kept, samples, starts[:-1], starts[1:], strict=True
+        _comparison(setup, recording, rows, sample, predicted, slice(begin, end))
+        for recording, rows, sample, (begin, end) in zip(
+            recordings, kept, samples, pairwise(problem.starts), strict=True
         )
     )
 
 
 def _beginnings(
-    description: RobotDescription,
-    samples: Sequence[Sample],
-    points: Sequence[TrackedPoint],
-    base: Array,
-    rezero: bool,
-    settle: float,
-    known: Mapping[str, float],
-    tell: Callable[[], None],
+    setup: Setup, samples: Sequence[Sample], known: Mapping[str, float], tell: Callable[[], None]
 ) -> tuple[Unknowns, Array]:
     """Zeros and states of the recordings, as known or as estimated from their beginnings."""
-    tolerances = description.tolerances or Tolerances()
-    remembers = any(segment.history and segment.history.play for segment in description.segments)
-    all_zeros, all_sides, found = [], [], []
-    for sample in samples:
-        name = sample.recording.name
-        zeros = tuple(zero_unknowns(name, tolerances)) if rezero else ()
-        unknown = sample.begin == "unknown" and remembers
-        sides = tuple(side_unknowns(description, name)) if unknown else ()
-        all_zeros.append(zeros)
-        all_sides.append(sides)
+    all_zeros, all_sides = setup.beginnings(setup.description, samples)
+    sensors: Beginnings = ((),) * len(setup.points)
+    found_zeros, found_sides = [np.zeros(0)], [np.zeros(0)]
+    for sample, zeros, sides in zip(samples, all_zeros, all_sides, strict=True):
         names = [each.name for each in (*zeros, *sides)]
         x = np.array([known.get(each, 0.0) for each in names])
-        told = all(each in known for each in names)
         time = sample.recording.time[sample.rows]
-        first = sample.rows[time <= time[0] + settle] if len(time) else sample.rows
-        if not told and len(first):
+        first = sample.rows[time <= time[0] + setup.settings.settle] if len(time) else sample.rows
+        if len(first) and not all(each in known for each in names):
             begun = replace(sample, rows=first, weight=np.ones(len(first)) / np.sqrt(len(first)))
             if begun.begin == "previous":
                 begun = replace(begun, begin="rest")
-            own = replace(nothing_unknown([begun], points), zeros=(zeros,), sides=(sides,))
             problem = CalibrationProblem(
-                description, own, [begun], points, base, _noise(description)
+                setup.description,
+                Unknowns((), (), sensors, (zeros,), (sides,)),
+                [begun],
+                setup.points,
+                setup.base,
+                _noise(setup.description),
             )
             x = fit(problem, [x], tell, rounds=0).x
-        found.append(x)
-    unknowns = replace(
-        nothing_unknown(samples, points), zeros=tuple(all_zeros), sides=tuple(all_sides)
-    )
-    # zeros of all recordings come before all sides
-    zeros_first = [x[: len(zeros)] for x, zeros in zip(found, all_zeros, strict=True)]
-    sides_last = [x[len(zeros) :] for x, zeros in zip(found, all_zeros, strict=True)]
-    return unknowns, np.concatenate([np.zeros(0), *zeros_first, *sides_last])
+        found_zeros.append(x[: len(zeros)])
+        found_sides.append(x[len(zeros) :])
+    unknowns = Unknowns((), (), sensors, all_zeros, all_sides)
+    return unknowns, np.concatenate([*found_zeros, *found_sides])
 
 
 def _noise(description: RobotDescription) -> Noise:
@@ -190,20 +143,20 @@ def _noise(description: RobotDescription) -> Noise:
 
 
 def _comparison(
-    description: RobotDescription,
+    setup: Setup,
     recording: Recording,
     rows: NDArray[np.intp],
     sample: Sample,
     predicted: Predicted,
     own: slice,
-    base: Array,
-    tip: TrackedPoint,
 ) -> Comparison:
+    """A recording's rows, which are some of those of a sample, and what was predicted for them."""
+    description, tip = setup.description, setup.points[0]
     angle = None
     track = sample.recording.track(tip.name)
     if track.rotation is not None:
         there = track.rotation[sample.rows] @ tip.sensor[:3, :3].T[:, 2]
-        expected = base[:3, :3] @ predicted.poses[0][own, :3, 2, np.newaxis]
+        expected = setup.base[:3, :3] @ predicted.poses[0][own, :3, 2, np.newaxis]
         cosine = np.einsum("ni,ni->n", there, expected[..., 0])
         angle = np.arccos(np.clip(cosine, -1, 1))
     pressures = recording.pressures[rows]

@@ -1,9 +1,9 @@
 """From channel pressures to the strain and the compliance of a section (eqs 8-10).
 
-A strain law says what a segment does without any load: the strain of its backbone and the
-compliance of its section, both constant along the segment.  Laws use different length
-conventions on paper; here both results are **per length at rest**, so that the rest of the model
-need not know.  The laws themselves stand in `stiffopt.model.laws`, one file each.
+A strain law maps the pressures of a segment to the strain of its unloaded backbone and to the
+compliance of its section, both constant along the segment.  Publications count them per length at
+rest or per deformed length; here both are **per length at rest**.  The laws themselves are in
+`stiffopt.model.laws`, one file each.
 """
 
 from __future__ import annotations
@@ -27,14 +27,12 @@ NORM_SMOOTHING = 0.01
 
 @dataclass(frozen=True)
 class Section:
-    """What a strain law answers for one segment, per length at rest.
+    """Free strain and compliance of the section of one segment, per length at rest.
 
     Attributes
     ----------
-    strain : casadi.SX
-        Backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
-    compliance : casadi.SX
-        Section compliance (6, 6): extra strain per internal wrench, in section axes.
+    strain : backbone strain (6,), linear part first: the pose obeys ``dT/dS = T strain^``.
+    compliance : section compliance (6, 6): extra strain per internal wrench, in section axes.
     """
 
     strain: ca.SX
@@ -47,16 +45,12 @@ class SectionGeometry:
 
     Attributes
     ----------
-    area : float
-        Silicone area A, wall less core less chambers, in m^2.
-    centroid : ndarray
-        Centroid (2,) in section axes, in m; zero for symmetric layouts.
-    second_moment : ndarray
-        ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of eq. 10.
-    channel_force : ndarray
-        Chamber area of each channel (c,), in m^2: axial force per unit pressure.
-    channel_moment : ndarray
-        ``int r dA`` over each channel's chambers (c, 2), in m^3.
+    area : silicone area A, wall less core less chambers, in m^2.
+    centroid : centroid (2,) in section axes, in m; zero for symmetric layouts.
+    second_moment : ``int r r^T dA`` (2, 2) about the centroid, in m^4; its [1, 1] entry is I_x of
+        eq. 10.
+    channel_force : chamber area of each channel (c,), in m^2: axial force per unit pressure.
+    channel_moment : ``int r dA`` over each channel's chambers (c, 2), in m^3.
 
     All may be symbols too, see `stiffopt.model.layout`.
     """
@@ -69,7 +63,7 @@ class SectionGeometry:
 
     @property
     def is_eccentric(self) -> bool:
-        """Whether the centroid may lie beside the axis."""
+        """Whether the centroid may lie off the axis."""
         return not ca.SX(self.centroid).is_zero()
 
     def turned(self, azimuth: NDArray[np.float64]) -> SectionGeometry:
@@ -77,8 +71,7 @@ class SectionGeometry:
 
         Parameters
         ----------
-        azimuth :
-            Of each channel (c,), from x towards y, in rad; empty for none.
+        azimuth : of each channel (c,), from x towards y, in rad; empty for none.
         """
         if not azimuth.any():
             return self

@@ -1,14 +1,13 @@
-"""Checking of what callers of the model pass in."""
+"""Checks of what callers of the model pass in, and lengths that neither over- nor underflow."""
 
-from typing import NamedTuple, get_args
+import operator
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.compliance import Boundary, Frame, Kind
-from stiffopt.model.numeric import checked_vector, length_and_unit
-from stiffopt.model.screws import Wrench
 
 Vector = NDArray[np.float64]
 
@@ -41,13 +40,75 @@ def check_choice(name: str, value: object, choices: tuple[str, ...]) -> None:
         raise InputError(f"unknown {name} {value!r}; choose one of {', '.join(choices)}")
 
 
-def checked_wrench(value: "ArrayLike | Wrench") -> Vector:
-    """Coordinates (6,) of a wrench, force first."""
-    return checked_vector("wrench", value.coordinates if isinstance(value, Wrench) else value, 6)
+def real_numbers(value: ArrayLike) -> Vector:
+    """Array of an argument's numbers; text, truth values and complex numbers are none.
+
+    Raises
+    ------
+    ValueError
+        If there is anything but real numbers, or rows differ in length.
+    """
+    numbers = np.asarray(value)
+    if numbers.dtype.kind not in "iuf":
+        raise ValueError(f"expected real numbers, not {numbers.dtype}")
+    return numbers.astype(float)
 
 
-def dead_and_follower(wrench: Vector, frame: Frame) -> Vector:
-    """Wrench (6,) as `Loads` has it (12,): dead where its frame is the base, else follower."""
-    check_choice("frame", frame, get_args(Frame))
-    none = np.zeros(6)
-    return np.concatenate([wrench, none] if frame == "base" else [none, wrench])
+def checked_number(name: str, value: ArrayLike) -> float:
+    """Finite number from an argument."""
+    try:
+        number = real_numbers(value)
+    except ValueError as error:
+        raise InputError(f"{name} must be a number; got {value!r}") from error
+    if number.ndim != 0 or not np.isfinite(number):
+        raise InputError(f"{name} must be a finite number; got {value!r}")
+    return float(number)
+
+
+def checked_integer(name: str, value: Any, least: int) -> int:
+    """Integer, Python's or NumPy's, from an argument."""
+    try:
+        number = None if isinstance(value, bool | np.bool_) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or number < least:
+        raise InputError(f"{name} must be an integer of at least {least}; got {value!r}")
+    return number
+
+
+def checked_vector(name: str, value: ArrayLike, size: int = 3) -> Vector:
+    """Finite vector (size,) from an argument."""
+    try:
+        vector = real_numbers(value)
+    except ValueError as error:
+        raise InputError(f"{name} must be {size} numbers; got {value!r}") from error
+    if vector.shape != (size,) or not np.isfinite(vector).all():
+        raise InputError(f"{name} must be {size} finite numbers; got {value!r}")
+    return vector
+
+
+def checked_motion(name: str, value: ArrayLike) -> Vector:
+    """Rigid motion (4, 4) from an argument."""
+    problem = f"{name} must be a rigid motion (4, 4), a rotation and a position over 0 0 0 1"
+    try:
+        T = real_numbers(value)
+    except ValueError as error:
+        raise InputError(f"{problem}; got {value!r}") from error
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError(f"{problem}; got {value!r}")
+    R = T[:3, :3]
+    if np.abs(R).max() < 2 and np.linalg.det(R) > 0:
+        off = np.abs(R.T @ R - np.eye(3)).max() + np.abs(T[3] - (0, 0, 0, 1)).max()
+        if off < 1e-3:
+            return T
+    raise InputError(f"{problem}; got {value!r}")
+
+
+def length_and_unit(vector: Vector) -> tuple[float, Vector]:
+    """Length of a vector and the unit vector along it; zero for zero."""
+    largest = float(np.abs(vector).max())
+    if largest == 0:
+        return 0.0, np.zeros_like(vector)
+    scaled = vector / largest
+    length = float(np.linalg.norm(scaled))
+    return largest * length, scaled / length

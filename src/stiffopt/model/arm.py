@@ -1,7 +1,7 @@
-"""The numerical side of an arm: compiled functions, equilibria and checks.
+"""Evaluation of functions of an arm's shape, free or in equilibrium under loads.
 
-`Arm` knows how to evaluate any function of an arm's shape, without and with loads;
-`stiffopt.model.manipulator.Manipulator` builds on it what users call.
+`Arm` checks pressures, finds equilibria and keeps the functions that were made of the arm;
+`stiffopt.model.manipulator.Manipulator` adds pose, Jacobian, compliance and stiffness.
 """
 
 from collections.abc import Callable, Hashable
@@ -15,22 +15,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError, PressureError, shown
-from stiffopt.model.arguments import dead_and_follower
-from stiffopt.model.batch import BatchFunction, InterpretedFunction
-from stiffopt.model.codegen import dense
-from stiffopt.model.compiled import checkpoint
-from stiffopt.model.compliance import Frame
-from stiffopt.model.description import RobotDescription
-from stiffopt.model.equilibrium import Equilibrium, EquilibriumState, Loads
-from stiffopt.model.kinematics import Actuation
-from stiffopt.model.laws import strain_law
-from stiffopt.model.layout import free_tip_function, layout_of, numbers_of
-from stiffopt.model.numeric import (
+from stiffopt.model.arguments import (
     checked_integer,
     checked_number,
     checked_vector,
     real_numbers,
 )
+from stiffopt.model.batch import BatchFunction, InterpretedFunction
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import checkpoint
+from stiffopt.model.compliance import Frame
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.equilibrium import Equilibrium, EquilibriumState, Loads, dead_and_follower
+from stiffopt.model.kinematics import Actuation
+from stiffopt.model.laws import strain_law
+from stiffopt.model.layout import free_tip_function, layout_of, numbers_of
 from stiffopt.model.shape import FreeShape, Shape
 from stiffopt.model.shooting import SAME_STATION, Shooting
 from stiffopt.model.tip_functions import TipFunctions
@@ -57,12 +56,11 @@ class Arm:
         self.description = description
         self.resolution = checked_integer("resolution", resolution, 1)
         self._tip_load = _tip_load(force, moment, load_frame)
-        self._functions: dict[Hashable, InterpretedFunction] = {}
-        self._shared: dict[str, Equilibrium] = {}
         self._kept: dict[Hashable, Any] = {}
         self.layout, self.numbers = layout_of(description), numbers_of(description)
         self._tip = TipFunctions(self.layout, self.numbers)
-        for corner in (self.pressure_min, self.pressure_max, self._farthest_pressures()):
+        low, high = self.pressure_min, self.pressure_max
+        for corner in (low, high, np.where(np.abs(low) > np.abs(high), low, high)):
             self._check_margin(corner[np.newaxis], " within the robot's pressure limits")
 
     # -- what the arm is --------------------------------------------------------------------
@@ -160,7 +158,7 @@ class Arm:
         )
 
     def kept(self, key: Hashable, make: Callable[[], Kept]) -> Kept:
-        """What others made of this arm, or of the same under another load, or make now."""
+        """Something made of this arm once: whatever the load, it is kept under its key."""
         if key not in self._kept:
             self._kept[key] = make()
         found: Kept = self._kept[key]
@@ -176,12 +174,12 @@ class Arm:
     def _loads(self) -> Loads:
         return Loads(np.array(self.description.gravity), self._tip_load, np.zeros(12))
 
-    @property
-    def _equilibrium(self) -> Equilibrium:
-        if "equilibrium" not in self._shared:
-            shooting = Shooting(self.description, self._actuation, self.resolution)
-            self._shared["equilibrium"] = Equilibrium(shooting)
-        return self._shared["equilibrium"]
+    def _equilibrium(self, at: float | None = None) -> Equilibrium:
+        """Equilibria with an additional load at a station."""
+        shooting = self.kept(
+            "shooting", lambda: Shooting(self.description, self._actuation, self.resolution)
+        )
+        return self.kept(("equilibrium", at), lambda: Equilibrium(shooting, at))
 
     @cached_property
     def _section_parts(self) -> ca.Function:
@@ -192,26 +190,22 @@ class Arm:
             [section.strain for section in sections] + [section.compliance for section in sections],
         )
 
-    def _section_compliances(self, p: Vector) -> list[Vector]:
-        """Compliance (6, 6) of each segment's section at pressures (n,)."""
-        return [part.full() for part in self._section_parts(p)[self.n_segments :]]
-
     def _symbolic(self, at: float | None) -> Shape:
         """Shape of a station, without or with loads."""
         if self.is_loaded:
-            return self._equilibrium.shooting.chain(at)
+            return self._equilibrium().shooting.chain(at)
         return FreeShape.of(self.description, self._actuation, at)
 
     def _function(
         self, key: Hashable, outputs: Callable[[Shape], list[Any]], at: float | None = None
     ) -> InterpretedFunction:
-        full_key = (key, at, self.is_loaded)
-        if full_key not in self._functions:
+        def make() -> InterpretedFunction:
             shape = self._symbolic(at)
-            self._functions[full_key] = InterpretedFunction(
+            return InterpretedFunction(
                 dense(ca.Function("shape", list(shape.inputs), outputs(shape)))
             )
-        return self._functions[full_key]
+
+        return self.kept((key, at, self.is_loaded), make)
 
     def _evaluate(
         self, key: Hashable, value: Values, p: ArrayLike, at: float | None = None
@@ -219,14 +213,12 @@ class Arm:
         """Value of a shape for one or many pressures, as (..., rows, columns)."""
         batch, single = self._pressures(p)
         function = self._function(key, lambda shape: [value(shape)], at)
-        results = (
-            _stacked(
-                [self._at_equilibrium(function, row) for row in batch],
-                function.signature.outputs[0],
-            )
-            if self.is_loaded
-            else function.many(batch)[0]
-        )
+        if not self.is_loaded:
+            results = function.many(batch)[0]
+        else:
+            arguments = self._equilibrium().arguments
+            rows = [function(*arguments(self.settle(row)))[0] for row in batch]
+            results = _stacked(rows, function.signature.outputs[0])
         return results[0] if single else results
 
     def _checked_tip(self, evaluate: Callable[[Vector], list[Vector]], p: ArrayLike) -> Vector:
@@ -245,10 +237,6 @@ class Arm:
             self._check_margin(np.atleast_2d(values), "")
         return result
 
-    def _at_equilibrium(self, function: InterpretedFunction, p: Vector) -> Vector:
-        """Value of a function of the loaded shape at pressures (n,)."""
-        return function(*self._equilibrium.arguments(self.settle(p)))[0]
-
     def settle(self, p: Vector, nearby: EquilibriumState | None = None) -> EquilibriumState:
         """Equilibrium of the loaded arm at pressures (n,), from rest or from a nearby one.
 
@@ -260,9 +248,9 @@ class Arm:
             If there is none that is reached continuously (and, from rest, stable).
         """
         if nearby is None:
-            return self._equilibrium.settle(p, self._loads)
+            return self._equilibrium().settle(p, self._loads)
         end = nearby._replace(pressures=p, loads=self._loads)
-        path = self._equilibrium.follow(nearby, end, shortest=0.1, stable=False)
+        path = self._equilibrium().follow(nearby, end, shortest=0.1, stable=False)
         if path.share < 1.0:
             raise EquilibriumError("no equilibrium was found on the way from the nearby one")
         return path.state
@@ -276,7 +264,7 @@ class Arm:
     def _shape(self, p: Vector, stations: Vector) -> Vector:
         """Poses (k, 4, 4) at arc lengths (k,)."""
         if self.is_loaded:
-            return self._equilibrium.shape(self._equilibrium.settle(p, self._loads), stations)
+            return self._equilibrium().shape(self.settle(p), stations)
         strains = [part.full()[:, 0] for part in self._section_parts(p)[: self.n_segments]]
         poses = np.empty((len(stations), 4, 4))
         for k, station in enumerate(stations):
@@ -360,10 +348,6 @@ class Arm:
             f"{law.limit}; lower the pressure or its limit"
         )
 
-    def _farthest_pressures(self) -> Vector:
-        low, high = self.pressure_min, self.pressure_max
-        return np.where(np.abs(low) > np.abs(high), low, high)
-
     def _station(self, at: float | None) -> float | None:
         if at is None:
             return None
@@ -382,7 +366,7 @@ class Arm:
 
 
 class Evaluator:
-    """A compiled function of the tip's shape that stays close to where it was last asked.
+    """A function of the tip's shape that starts each equilibrium from the previous one.
 
     With loads the equilibrium at new pressures is found from the previous one; `restart`
     forgets it, and the next is found from rest.
@@ -412,7 +396,7 @@ class Evaluator:
         parameters = parameters or (self._arm.numbers,)
         if self._arm.is_loaded:
             self._state = self._arm.settle(p, self._state)
-            inputs = self._arm._equilibrium.arguments(self._state)
+            inputs = self._arm._equilibrium().arguments(self._state)
         else:
             inputs = (p,)
         return self._function(*inputs, *parameters)

@@ -5,6 +5,7 @@ import os
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import casadi as ca
@@ -174,9 +175,8 @@ class Buffer:
 
     Attributes
     ----------
-    targets, results : list of ndarray
-        Views (rows, r, c) of what goes in and comes out; no leading axis for one row, no last
-        one for a column that goes in.
+    targets, results : views (rows, r, c) of what goes in and comes out; no leading axis for one
+        row, no last one for a column that goes in.
     evaluate : callable
     """
 
@@ -236,27 +236,28 @@ def in_parallel(
     if count <= 1:
         work(iter(items))
         return
-    queue = _Queue(items)
-    failures: list[BaseException] = []
+    queue, lock, stop = iter(items), threading.Lock(), threading.Event()
+
+    def taken() -> Iterator[int]:
+        while not stop.is_set():
+            with lock:
+                item = next(queue, None)
+            if item is None:
+                return
+            yield item
 
     def guarded() -> None:
         try:
-            work(queue)
-        except BaseException as error:
-            failures.append(error)
-            queue.stop()
+            work(taken())
+        except BaseException:
+            stop.set()
+            raise
 
-    helpers = [threading.Thread(target=guarded, daemon=True) for _ in range(count - 1)]
-    try:
-        for helper in helpers:
-            helper.start()
-        work(queue)
-    finally:
-        queue.stop()
-        for helper in helpers:
-            helper.join()
-    if failures:
-        raise failures[0]
+    with ThreadPoolExecutor(count - 1) as pool:
+        helpers = [pool.submit(guarded) for _ in range(count - 1)]
+        guarded()
+    for helper in helpers:
+        helper.result()
 
 
 def available_cores() -> int:
@@ -264,25 +265,6 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-class _Queue(Iterator[int]):
-    """Items that several threads take, each once."""
-
-    def __init__(self, items: Sequence[int]) -> None:
-        self._items = iter(items)
-        self._lock = threading.Lock()
-        self._stopped = False
-
-    def stop(self) -> None:
-        """Give out no more."""
-        self._stopped = True
-
-    def __next__(self) -> int:
-        with self._lock:
-            if self._stopped:
-                raise StopIteration
-            return next(self._items)
 
 
 def is_shared(argument: Array, shape: tuple[int, int]) -> bool:

@@ -1,4 +1,4 @@
-"""How well the numbers of a robot file are known: before a calibration, and after one."""
+"""Covariance of the numbers of a calibrated robot file, and what a calibration may fit."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from pydantic import Field, model_validator
 from stiffopt.errors import shown
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Angle, Length, Number, Pressure
-
-__all__ = ["Calibration", "FittedNumber", "FittedParameter", "SIUnit"]
 
 Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
@@ -35,19 +33,13 @@ class FittedNumber:
 
     Attributes
     ----------
-    words : str
-        What people call it.
-    unit : str
-        Of the value, in SI; empty for a plain number.
-    tolerance : float or str
-        Standard deviation of the coordinate before the fit: relative for what is positive, else in
-        the unit of the value. Text is the key of a robot file's `tolerances` that has it.
-    positive : bool
-        Whether the coordinate is a logarithm; the fit must then begin above zero.
-    low, high : float
-        Bounds of the value; of what is positive they have no effect.
-    experiment : str
-        What recordings would tell the number, as the end of a sentence.
+    words : what people call it.
+    unit : of the value, in SI; empty for a plain number.
+    tolerance : standard deviation of the coordinate before the fit: relative for what is positive,
+        else in the unit of the value. Text is the key of a robot file's `tolerances` that has it.
+    positive : whether the coordinate is a logarithm; the fit must then begin above zero.
+    low, high : bounds of the value; of what is positive they have no effect.
+    experiment : what recordings would tell the number, as the end of a sentence.
     """
 
     words: str
@@ -114,8 +106,7 @@ class Calibration(Schema):
 
         Parameters
         ----------
-        channels :
-            Number of channels of each segment.
+        channels : number of channels of each segment.
         pressures : (N, n)
             In Pa.
         """

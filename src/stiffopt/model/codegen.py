@@ -5,7 +5,7 @@ Beside each function ``NAME`` as CasADi generates it (dense matrices, column by 
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Self
 
 import casadi as ca
@@ -67,17 +67,13 @@ class Signature:
 
     @classmethod
     def from_mapping(cls, mapping: dict[str, Any]) -> Self:
-        """Signature from what `as_mapping` made, after a passage through JSON."""
+        """Signature from its fields, after a passage through JSON."""
 
         def shapes(key: str) -> tuple[tuple[int, int], ...]:
             return tuple((int(rows), int(columns)) for rows, columns in mapping[key])
 
         sizes = (int(mapping[key]) for key in ("sz_arg", "sz_res", "sz_iw", "sz_w"))
         return cls(shapes("inputs"), shapes("outputs"), *sizes)
-
-    def as_mapping(self) -> dict[str, Any]:
-        """What JSON can hold of it."""
-        return asdict(self)
 
 
 def dense(function: ca.Function) -> ca.Function:

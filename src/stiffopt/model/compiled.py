@@ -15,12 +15,14 @@ import json
 import math
 import os
 import pickle
+import sys
 import threading
 import time
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -28,23 +30,8 @@ import casadi as ca
 
 from stiffopt.errors import SlowWarning
 from stiffopt.model import compiler as build
-from stiffopt.model.batch import BatchFunction, CompiledFunction, InterpretedFunction
+from stiffopt.model.batch import CompiledFunction, InterpretedFunction
 from stiffopt.model.codegen import HEADER_NAME, Signature, c_code, dense, header
-
-__all__ = [
-    "BatchFunction",
-    "CodeReadyError",
-    "CompiledFunction",
-    "InterpretedFunction",
-    "Library",
-    "checkpoint",
-    "compilation_is_held_off",
-    "compiling_at_once",
-    "interpreted",
-    "library",
-    "make_in_background",
-    "until_ready",
-]
 
 Make = Callable[[], Sequence[ca.Function]]
 
@@ -57,10 +44,8 @@ class Library:
 
     Attributes
     ----------
-    path : Path
-        Its file, for messages.
-    cdll : ctypes.CDLL
-        For what hand-written sources add; calls through it free the interpreter lock.
+    path : its file, for messages.
+    cdll : for what hand-written sources add; calls through it free the interpreter lock.
     """
 
     def __init__(self, path: Path, signatures: dict[str, Signature]) -> None:
@@ -75,6 +60,46 @@ class Library:
     def function(self, name: str) -> CompiledFunction:
         """One of the CasADi functions in it."""
         return self._functions[name]
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """Functions of which machine code is wanted; see `library` for the fields."""
+
+    text: str
+    make: Make
+    sources: tuple[str, ...]
+    daqp: bool
+
+    def key(self, compiler: build.Compiler) -> str:
+        """What the code depends on, as a name of files."""
+        files = [Path(source) for source in self.sources]
+        headers = {found for file in files for found in file.parent.glob("*.h")}
+        parts = [
+            self.text,
+            _own_code(),
+            ca.__version__,
+            f"{sys.platform} {os.uname().machine} {sys.maxsize}",
+            repr(compiler.identity),
+            repr(build.FLAGS),
+            *(hashlib.sha256(file.read_bytes()).hexdigest() for file in (*files, *sorted(headers))),
+            str(build.daqp_parts()[1]) if self.daqp else "",
+        ]
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
+
+
+@lru_cache(maxsize=1)
+def _own_code() -> str:
+    """Hash of the code that functions come from; the version is part of it."""
+    root = Path(__file__).parent.parent
+    files = list(root.glob("*.py"))
+    for folder in ("model", "optimise"):
+        files += (root / folder).rglob("*.py")
+    total = hashlib.sha256()
+    for file in sorted(files):
+        total.update(f"{file.relative_to(root)}\0".encode())
+        total.update(hashlib.sha256(file.read_bytes()).digest())
+    return total.hexdigest()
 
 
 _lock = threading.RLock()
@@ -94,7 +119,7 @@ class CodeReadyError(Exception):
 
 @contextmanager
 def compiling_at_once() -> Iterator[None]:
-    """Have `library` wait for the compiler in here, rather than have code made in the background.
+    """While this context lasts, `library` waits for the compiler.
 
     ``STIFFOPT_COMPILE=wait`` in the environment does so everywhere.
     """
@@ -129,7 +154,7 @@ def until_ready(is_ready: Callable[[], bool]) -> Iterator[None]:
 
 
 def checkpoint() -> None:
-    """Be interrupted here if `until_ready` says so."""
+    """Raise `CodeReadyError` if code that `until_ready` waits for is there."""
     look = _watch.get()
     if look is not None:
         look()
@@ -144,25 +169,21 @@ def library(
 ) -> Library | None:
     """Machine code of CasADi functions, from the cache or newly compiled.
 
-    Code that is not in the cache is made by a process in the background (see
-    `stiffopt.model.build_process`), and None is returned until it is there.  The process outlives
+    Code that is not in the cache is made by a process in the background
+    (`make_in_background`), and None is returned until it is there.  The process outlives
     this one, and there is one for each library, however many processes ask for it.
 
     Parameters
     ----------
     content : str or sequence
-        What identifies the functions, beside stiffopt's own code: text, or values whose `repr`
-        says it all.
-    make : callable
-        Makes the functions; called only if they are not in the cache.  Their names are the names
+        What identifies the functions, in addition to stiffopt's own code: text, or values
+        whose `repr` is complete.
+    make : makes the functions; called only if they are not in the cache.  Their names are the names
         in C and must be told apart in capitals too.  What cannot be pickled is compiled at once.
-    sources : sequence of str, optional
-        Paths of C files compiled with them, which find prototypes and sizes in ``functions.h``
-        (see `codegen.header`) and their own headers beside them.
-    daqp : bool
-        Whether those need the DAQP that comes with CasADi.
-    build_missing : bool
-        False: only look into the cache.
+    sources : paths of C files compiled with them, which find prototypes and sizes in
+        ``functions.h`` (see `codegen.header`) and headers in their own folders.
+    daqp : whether those need the DAQP that comes with CasADi.
+    build_missing : false: only look into the cache.
 
     Returns
     -------
@@ -171,14 +192,15 @@ def library(
         `SlowWarning` says why.
     """
     text = content if isinstance(content, str) else repr(tuple(content))
-    request = (text, tuple(sources), daqp, *map(os.environ.get, _ENVIRONMENT))
+    wanted = _Wanted(text, make, tuple(sources), daqp)
+    request = (text, wanted.sources, daqp, *map(os.environ.get, _ENVIRONMENT))
     with _lock:
         if _awaited.get(request, 0.0) > time.monotonic() and not _at_once():
             return None
         try:
             cache = build.cache_directory()
-            compiler = build.find_compiler(cache)
-            key = _key(text, compiler, sources, daqp)
+            compiler = build.find_compiler()
+            key = wanted.key(compiler)
         except build.BuildError as error:
             if build_missing:
                 _notify(error)
@@ -191,10 +213,13 @@ def library(
                 return None
             if not _at_once():
                 _awaited[request] = time.monotonic() + _LOOK_AGAIN
-                if not _is_made_in_background(cache, key, text, make, sources, daqp):
+                if not _is_made_in_background(cache, key, wanted):
                     _loaded[cache, key] = None
                 return _loaded.get((cache, key))
-            found = _built(cache, key, compiler, make, sources, daqp)
+            try:
+                found = _make(cache, key, compiler, wanted)
+            except build.BuildError as error:
+                _notify(error)
         _loaded[cache, key] = found
         _awaited.pop(request, None)
         return found
@@ -204,9 +229,7 @@ def _at_once() -> bool:
     return _in_foreground.get() or os.environ.get("STIFFOPT_COMPILE") == "wait"
 
 
-def _is_made_in_background(
-    cache: Path, key: str, text: str, make: Make, sources: Sequence[str], daqp: bool
-) -> bool:
+def _is_made_in_background(cache: Path, key: str, wanted: _Wanted) -> bool:
     """Begin to compile in another process, unless one does already; False where it has failed."""
     failure = cache / f"{key}.failed"
     with suppress(OSError, ValueError):
@@ -221,10 +244,10 @@ def _is_made_in_background(
     if build.is_held_off(cache) or time.monotonic() < begun + _BEGUN_AGAIN_AFTER:
         return True
     try:
-        request = pickle.dumps((text, make, tuple(sources), daqp))
+        request = pickle.dumps(wanted)
     except Exception:  # made of what only this process knows
         with compiling_at_once():
-            return library(text, make, sources, daqp) is not None
+            return library(wanted.text, wanted.make, wanted.sources, wanted.daqp) is not None
     try:
         build.start_background(request, cache)
     except OSError as error:
@@ -242,62 +265,30 @@ def compilation_is_held_off() -> bool:
     return False
 
 
-def make_in_background(request: bytes) -> None:
-    """Compile what another process asked for; one process at a time does so for one library."""
-    text, make, sources, daqp = pickle.loads(request)
+def make_in_background() -> None:
+    """Compile what another process asks for on standard input, at low priority.
+
+    One process at a time does so for one library.
+    """
+    with suppress(OSError):
+        os.nice(10)
+    wanted: _Wanted = pickle.load(sys.stdin.buffer)
     cache = build.cache_directory()
-    compiler = build.find_compiler(cache)
-    key = _key(text, compiler, sources, daqp)
+    compiler = build.find_compiler()
+    key = wanted.key(compiler)
     lock = cache / f"{key}.lock"
     if build.is_locked(lock) or build.is_held_off(cache) or _from_cache(cache, key) is not None:
         return
     try:
-        _make(cache, key, compiler, make, sources, daqp)
-    except (build.BuildError, OSError) as error:
-        build.write_atomically(cache / f"{key}.failed", str(error).encode())
+        _make(cache, key, compiler, wanted)
+    except build.BuildError as error:
+        with suppress(OSError):
+            build.write_atomically(cache / f"{key}.failed", str(error).encode())
 
 
 def interpreted(make: Make) -> dict[str, InterpretedFunction]:
     """The same functions in the CasADi VM, by name."""
     return {function.name(): InterpretedFunction(dense(function)) for function in make()}
-
-
-# -- keys -----------------------------------------------------------------------------------
-
-
-def _key(text: str, compiler: build.Compiler, sources: Sequence[str], daqp: bool) -> str:
-    parts = [
-        text,
-        _own_code(),
-        ca.__version__,
-        build.platform(),
-        repr(compiler.identity),
-        repr(build.FLAGS),
-        *(hashlib.sha256(text).hexdigest() for text in _source_texts(sources)),
-        str(build.daqp_parts()[1]) if daqp else "",
-    ]
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
-
-
-def _source_texts(sources: Sequence[str]) -> list[bytes]:
-    """The sources and the headers beside them."""
-    files = [Path(source) for source in sources]
-    headers = {found for file in files for found in file.parent.glob("*.h")}
-    return [file.read_bytes() for file in (*files, *sorted(headers))]
-
-
-@lru_cache(maxsize=1)
-def _own_code() -> str:
-    """Hash of the code that functions come from; the version is part of it."""
-    root = Path(__file__).parent.parent
-    files = list(root.glob("*.py"))
-    for folder in ("model", "optimise"):
-        files += (root / folder).rglob("*.py")
-    total = hashlib.sha256()
-    for file in sorted(files):
-        total.update(f"{file.relative_to(root)}\0".encode())
-        total.update(hashlib.sha256(file.read_bytes()).digest())
-    return total.hexdigest()
 
 
 # -- cache ----------------------------------------------------------------------------------
@@ -324,47 +315,30 @@ def _code_path(cache: Path, key: str, digest: str) -> Path:
     return cache / f"{key}-{digest[:16]}.so"
 
 
-def _built(
-    cache: Path,
-    key: str,
-    compiler: build.Compiler,
-    make: Make,
-    sources: Sequence[str],
-    daqp: bool,
-) -> Library | None:
-    try:
-        return _make(cache, key, compiler, make, sources, daqp)
-    except build.BuildError as error:
-        _notify(error)
-    except OSError as error:
-        _notify(
-            build.BuildError(
-                f"the directory of compiled code {cache} cannot be written "
-                f"({error.strerror}); name another in STIFFOPT_CACHE_DIR"
-            )
-        )
-    return None
-
-
-def _make(
-    cache: Path,
-    key: str,
-    compiler: build.Compiler,
-    make: Make,
-    sources: Sequence[str],
-    daqp: bool,
-) -> Library:
+def _make(cache: Path, key: str, compiler: build.Compiler, wanted: _Wanted) -> Library:
     """Compile, enter into the cache and load, while others who want the same wait."""
-    with build.turn(cache / f"{key}.lock"):
-        found = _from_cache(cache, key)  # another process may have come first
-        if found is not None:
-            return found
-        functions = [dense(function) for function in make()]
-        signatures = {function.name(): Signature.of(function) for function in functions}
-        texts = {f"{function.name()}.c": c_code(function) for function in functions}
-        texts[HEADER_NAME] = header(signatures)
-        code = build.compile_library(compiler, texts, sources, daqp, cache)
-        _enter(cache, key, code, signatures)
+    try:
+        with build.locked(cache / f"{key}.lock"):
+            found = _from_cache(cache, key)  # another process may have come first
+            if found is not None:
+                return found
+            functions = [dense(function) for function in wanted.make()]
+            signatures = {function.name(): Signature.of(function) for function in functions}
+            texts = {f"{function.name()}.c": c_code(function) for function in functions}
+            texts[HEADER_NAME] = header(signatures)
+            code = build.compile_library(compiler, texts, wanted.sources, wanted.daqp, cache)
+            digest = hashlib.sha256(code).hexdigest()
+            build.write_atomically(_code_path(cache, key, digest), code)
+            entry = {
+                "sha256": digest,
+                "functions": {name: asdict(each) for name, each in signatures.items()},
+            }
+            build.write_atomically(cache / f"{key}.json", json.dumps(entry).encode())
+    except OSError as error:
+        raise build.BuildError(
+            f"the directory of compiled code {cache} cannot be written ({error.strerror}); name "
+            "another in STIFFOPT_CACHE_DIR"
+        ) from error
     found = _from_cache(cache, key)
     if found is None:
         raise build.BuildError(f"compiled code cannot be loaded from {cache}")
@@ -372,14 +346,6 @@ def _make(
         with suppress(OSError):
             os.unlink(cache / name)
     return found
-
-
-def _enter(cache: Path, key: str, code: bytes, signatures: dict[str, Signature]) -> None:
-    digest = hashlib.sha256(code).hexdigest()
-    build.write_atomically(_code_path(cache, key, digest), code)
-    functions = {name: signature.as_mapping() for name, signature in signatures.items()}
-    entry = json.dumps({"sha256": digest, "functions": functions})
-    build.write_atomically(cache / f"{key}.json", entry.encode())
 
 
 def _notify(error: build.BuildError) -> None:

@@ -3,7 +3,6 @@
 Everything that fails here fails with a `BuildError` whose text a user can act on.
 """
 
-import hashlib
 import os
 import shlex
 import shutil
@@ -54,28 +53,24 @@ def cache_directory() -> Path:
     BuildError
         If it would be in a home directory, and there is none.
     """
+    if given := os.environ.get("STIFFOPT_CACHE_DIR"):
+        place = given
+    elif sys.platform == "darwin":
+        place = "~/Library/Caches/stiffopt"
+    else:
+        place = str(Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "stiffopt")
     try:
-        return _cache_directory()
+        return Path(place).expanduser().absolute()
     except RuntimeError as error:
         raise BuildError(
             f"there is no place to keep it ({error}); name one in STIFFOPT_CACHE_DIR"
         ) from None
 
 
-def _cache_directory() -> Path:
-    if given := os.environ.get("STIFFOPT_CACHE_DIR"):
-        return Path(given).expanduser().absolute()
-    if sys.platform == "darwin":
-        base = Path("~/Library/Caches").expanduser()
-    else:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-    return base.absolute() / "stiffopt"
-
-
 # -- compiler -------------------------------------------------------------------------------
 
 
-def find_compiler(cache: Path) -> Compiler:
+def find_compiler() -> Compiler:
     """The compiler that ``STIFFOPT_COMPILER`` or ``CC`` names, or the first in ``PATH``."""
     if os.name != "posix":
         raise BuildError("code is compiled on Linux and macOS only")
@@ -88,10 +83,10 @@ def find_compiler(cache: Path) -> Compiler:
         found = shutil.which(words[0])
         if found is None:
             raise BuildError(f"the C compiler {words[0]!r} that {variable} names was not found")
-        return _identified([found, *words[1:]], cache)
+        return _identified([found, *words[1:]])
     for name in _DEFAULT_COMPILERS:
         if (found := shutil.which(name)) is not None:
-            return _identified([found], cache)
+            return _identified([found])
     raise BuildError(
         "no C compiler was found; install one (Debian and Ubuntu: apt install gcc) or name one in "
         "STIFFOPT_COMPILER"
@@ -106,37 +101,23 @@ def _words(variable: str) -> list[str]:
         raise BuildError(f"{variable} cannot be read as a command: {value!r}") from error
 
 
-def _identified(command: list[str], cache: Path) -> Compiler:
+def _identified(command: list[str]) -> Compiler:
+    """A compiler told from others, and from its other versions, by its file."""
     command[0] = os.path.abspath(command[0])
-    identity = (*command, os.path.realpath(command[0]), _version(command[0], cache))
-    return Compiler(tuple(command), identity)
+    stat = os.stat(command[0])
+    file = (os.path.realpath(command[0]), str(stat.st_mtime_ns), str(stat.st_size))
+    return Compiler(tuple(command), (*command, *file))
 
 
-def _version(compiler: str, cache: Path) -> str:
-    """First line of ``--version``, asked once per compiler and then read from the cache."""
-    stat = os.stat(compiler)
-    text = f"{compiler}\n{os.path.realpath(compiler)}\n{stat.st_mtime_ns}\n{stat.st_size}"
-    note = cache / f"compiler-{hashlib.sha256(text.encode()).hexdigest()[:16]}.txt"
-    with suppress(OSError, UnicodeError):
-        lines = note.read_text(encoding="utf-8").split("\n")
-        if len(lines) == 2:  # the line break comes last: the file is whole
-            return lines[0]
-    output = _run([[compiler, "--version"]], Path(tempfile.gettempdir()), timeout=10.0)
-    version = next(iter(output.splitlines()), "")
-    with suppress(OSError):
-        write_atomically(note, f"{version}\n".encode())
-    return version
-
-
-def _run(commands: Sequence[Sequence[str]], directory: Path, timeout: float = _TIMEOUT) -> str:
-    """Output of commands that run side by side; none outlives this call."""
+def _run(commands: Sequence[Sequence[str]], directory: Path, timeout: float = _TIMEOUT) -> None:
+    """Run commands side by side; none outlives this call."""
     processes = []
     end = time.monotonic() + timeout
     try:
         for command in commands:
             processes.append(_started(command, directory))
-        name = commands[0][0]
-        return "".join(_output(name, process, end, timeout) for process in processes)
+        for process in processes:
+            _check(commands[0][0], process, end, timeout)
     finally:
         for process in processes:
             if process.returncode is None:
@@ -162,7 +143,8 @@ def _started(command: Sequence[str], directory: Path) -> "subprocess.Popen[str]"
         raise BuildError(f"the C compiler {command[0]} cannot be run: {error.strerror}") from error
 
 
-def _output(name: str, process: "subprocess.Popen[str]", end: float, timeout: float) -> str:
+def _check(name: str, process: "subprocess.Popen[str]", end: float, timeout: float) -> None:
+    """Raise unless a compiler ends well, and before its time is over."""
     try:
         output, complaint = process.communicate(timeout=max(0.0, end - time.monotonic()))
     except subprocess.TimeoutExpired as error:
@@ -173,7 +155,6 @@ def _output(name: str, process: "subprocess.Popen[str]", end: float, timeout: fl
             f"the C compiler {name} failed with exit code {process.returncode}"
             + (f":\n{first}" if first else "")
         )
-    return output
 
 
 # -- DAQP -----------------------------------------------------------------------------------
@@ -191,11 +172,6 @@ def daqp_parts() -> tuple[Path, Path]:
 
 
 # -- building -------------------------------------------------------------------------------
-
-
-def platform() -> str:
-    """What machine code made here is for."""
-    return f"{sys.platform} {os.uname().machine} {sys.maxsize}"
 
 
 def compile_library(
@@ -258,7 +234,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def turn(path: Path, longest: float = _TIMEOUT) -> Iterator[None]:
+def locked(path: Path, longest: float = _TIMEOUT) -> Iterator[None]:
     """Wait while another process holds this lock file, but no longer than that.
 
     The system frees the lock of a process that ends in whatever way.  It only saves work done
@@ -289,7 +265,7 @@ def turn(path: Path, longest: float = _TIMEOUT) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Whether a process has its `turn` now."""
+    """Whether a process holds this lock file now."""
     import fcntl
 
     try:
@@ -331,7 +307,7 @@ def is_held_off(cache: Path) -> bool:
 
 
 def start_background(request: bytes, cache: Path) -> None:
-    """Start `stiffopt.model.build_process` with a pickled request; it outlives this process."""
+    """Start `stiffopt.model.compiled.make_in_background` in a process that outlives this one."""
     root = str(Path(__file__).parents[2])
     path = os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH", "")]))
     environment = {**os.environ, "PYTHONPATH": path, "STIFFOPT_CACHE_DIR": str(cache)}
@@ -341,7 +317,10 @@ def start_background(request: bytes, cache: Path) -> None:
         stream.write(request)
         stream.seek(0)
         stream.flush()
-        command = [sys.executable, "-m", "stiffopt.model.build_process"]
+        command = [
+            *(sys.executable, "-c"),
+            "from stiffopt.model.compiled import make_in_background; make_in_background()",
+        ]
         actions = [
             (os.POSIX_SPAWN_DUP2, stream.fileno(), 0),
             (os.POSIX_SPAWN_DUP2, nowhere.fileno(), 1),

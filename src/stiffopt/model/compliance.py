@@ -81,7 +81,7 @@ def segment_compliance(section: Section, arc_length: float, half: ca.SX) -> ca.S
 def segment_flexibility(section: Section, arc_length: float, wrench: ca.SX) -> ca.SX:
     """Twice the strain energy of a wrench (6,) at the middle of a segment, in axes of that.
 
-    ``int w' C_S w dS`` with w the wrench as it is met at S.
+    ``int w' C_S w dS`` with w the wrench that the section at S carries.
     """
     force, moment = wrench[:3], wrench[3:]
     total = ca.SX(0)

@@ -46,19 +46,6 @@ from stiffopt.units import (
 if TYPE_CHECKING:
     from stiffopt.model.actuation import StrainLaw
 
-__all__ = [
-    "Chambers",
-    "Compensation",
-    "Corrections",
-    "Material",
-    "Recordings",
-    "RegulatorLimits",
-    "RobotDescription",
-    "Segment",
-    "Tolerances",
-    "TrackedBody",
-]
-
 _SLACK = 1e-9  # m; two circles that touch may overlap by rounding
 _INDEX = re.compile(r"\[(\d{1,4})\]")
 

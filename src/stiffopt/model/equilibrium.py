@@ -4,9 +4,17 @@ Newton's method on the shooting problem (`stiffopt.model.shooting`), along a pat
 weight grows on the unpressurised arm, then pressures and loads grow together.  Steps are halved
 where Newton's method does not contract at once or stability is lost, and where that no longer
 helps the path has ended: the arm buckles or falls over there.
+
+Integrating a long hanging arm from its tip magnifies the smallest turn there by many orders, and
+plain shooting then converges only from very near.  So the states after every step (orientation
+and moment) are unknowns of their own, and each step's defect (its end less the state meant to be
+there) is driven to zero together with the turn of the base: multiple shooting.  The linear
+system is solved at the cost of single shooting by carrying the changes per turn of the tip and
+the defects along (the lifted Newton method, J. Albersmeyer and M. Diehl, SIAM J. Optim. 20, 2010).
 """
 
-from typing import NamedTuple
+from functools import cached_property
+from typing import NamedTuple, get_args
 
 import casadi as ca
 import numpy as np
@@ -14,7 +22,8 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError
-from stiffopt.model.lifted import newton_step
+from stiffopt.model.arguments import check_choice
+from stiffopt.model.compliance import Frame, inverse_3x3
 from stiffopt.model.shooting import SAME_STATION, Shooting
 
 Vector = NDArray[np.float64]
@@ -42,11 +51,18 @@ class Loads(NamedTuple):
         return not (self.tip[3:].any() or self.station[3:].any())
 
 
+def dead_and_follower(wrench: Vector, frame: Frame) -> Vector:
+    """Wrench (6,) as `Loads` has it (12,): dead where its frame is the base, else follower."""
+    check_choice("frame", frame, get_args(Frame))
+    none = np.zeros(6)
+    return np.concatenate([wrench, none] if frame == "base" else [none, wrench])
+
+
 class EquilibriumState(NamedTuple):
     """An equilibrium: the tip's orientation (w, x, y, z), from which all else follows.
 
     `states` (7, k) hold orientation and moment after each integration step, which Newton's
-    method starts from (`stiffopt.model.lifted`).
+    method starts from.
     """
 
     pressures: Vector
@@ -60,12 +76,9 @@ class Path(NamedTuple):
 
     Attributes
     ----------
-    state : EquilibriumState
-        The last one that was found.
-    share : float
-        Of the way that it is at; 1.0 means arrived.
-    unstable : bool
-        Whether the path ends because stability is lost there.
+    state : the last one that was found.
+    share : of the way that it is at; 1.0 means arrived.
+    unstable : whether the path ends because stability is lost there.
     """
 
     state: EquilibriumState
@@ -74,41 +87,44 @@ class Path(NamedTuple):
 
 
 class Equilibrium:
-    """Numerical equilibria of one shooting problem."""
+    """Numerical equilibria of one shooting problem.
 
-    def __init__(self, shooting: Shooting) -> None:
+    Parameters
+    ----------
+    shooting : the arm.
+    at : arc length of the station that the loads of `Loads.station` act at; None is the tip.
+    """
+
+    def __init__(self, shooting: Shooting, at: float | None = None) -> None:
         self.shooting = shooting
-        self._functions: dict[tuple[str, float | None], ca.Function] = {}
-        self._rest: dict[tuple[bytes, float | None], Path] = {}
+        self.at = at
+        self._rest: dict[bytes, Path] = {}
 
     def arguments(self, state: EquilibriumState) -> tuple[Vector, ...]:
         """Numbers for the inputs of a `Chain` at an equilibrium."""
         x = np.concatenate([np.zeros(3), state.pressures, np.zeros(6)])
         return (state.quaternion, x, *state.loads)
 
-    def _function(self, name: str, at: float | None) -> ca.Function:
-        """Newton's step or the stability condition, for one station."""
-        if (name, at) not in self._functions:
-            if name == "newton":
-                function = newton_step(self.shooting, at)
-            else:
-                chain = self.shooting.chain(at)
-                function = ca.Function(
-                    name, chain.inputs, [chain.rotational_compliances, chain.base_turn]
-                )
-            self._functions[name, at] = function
-        return self._functions[name, at]
+    @cached_property
+    def _newton(self) -> ca.Function:
+        return newton_step(self.shooting, self.at)
 
-    def correct(self, guess: EquilibriumState, at: float | None = None) -> EquilibriumState | None:
+    @cached_property
+    def _stability(self) -> ca.Function:
+        chain = self.shooting.chain(self.at)
+        return ca.Function(
+            "stability", chain.inputs, [chain.rotational_compliances, chain.base_turn]
+        )
+
+    def correct(self, guess: EquilibriumState) -> EquilibriumState | None:
         """Newton's method from a nearby state; None if that is not near.
 
         "Near" means that the first correction turns no part of the arm by more than a radian
         and later ones shrink: then the path from the guess to the answer has no fold in between.
         """
-        newton = self._function("newton", at)
         state, previous = guess, _LARGEST_TURN
         for iteration in range(_MOST_ITERATIONS):
-            quaternion, states, largest = newton(
+            quaternion, states, largest = self._newton(
                 state.quaternion, state.states, state.pressures, *state.loads
             )
             size = float(largest)
@@ -121,16 +137,14 @@ class Equilibrium:
             previous = size
         return None
 
-    def is_stable(self, state: EquilibriumState, at: float | None = None) -> bool:
+    def is_stable(self, state: EquilibriumState) -> bool:
         """Whether an equilibrium is a minimum of the energy (Jacobi's condition).
 
         Follower loads and moments have no energy.  There what counts is that the arm has not
         passed a divergence, where turns of the tip leave the base unturned and beyond which they
         turn it the wrong way round.  Flutter is not looked for.
         """
-        blocks, base_turn = (
-            part.full() for part in self._function("stability", at)(*self.arguments(state))
-        )
+        blocks, base_turn = (part.full() for part in self._stability(*self.arguments(state)))
         if not (np.isfinite(blocks).all() and np.isfinite(base_turn).all()):
             return False
         compliances = blocks.T.reshape(-1, 3, 3)  # from the tip to the base
@@ -144,7 +158,6 @@ class Equilibrium:
         self,
         start: EquilibriumState,
         end: EquilibriumState,
-        at: float | None = None,
         shortest: float = _SHORTEST_STEP,
         stable: bool = True,
     ) -> "Path":
@@ -158,8 +171,8 @@ class Equilibrium:
         while share < 1.0:
             target = min(1.0, share + step)
             pressures, loads = _between(start, end, target)
-            corrected = self.correct(state._replace(pressures=pressures, loads=loads), at)
-            unstable = corrected is not None and stable and not self.is_stable(corrected, at)
+            corrected = self.correct(state._replace(pressures=pressures, loads=loads))
+            unstable = corrected is not None and stable and not self.is_stable(corrected)
             if corrected is None or unstable:
                 step, halved = step / 2, True
                 if step < shortest:
@@ -169,7 +182,7 @@ class Equilibrium:
                 step, halved = step if halved else 2 * step, False
         return Path(state, 1.0, False)
 
-    def settle(self, pressures: Vector, loads: Loads, at: float | None = None) -> EquilibriumState:
+    def settle(self, pressures: Vector, loads: Loads) -> EquilibriumState:
         """Equilibrium reached from rest: first the arm's weight, then pressures and loads.
 
         Raises
@@ -177,9 +190,9 @@ class Equilibrium:
         EquilibriumError
             If the arm buckles or falls over on the way; the message says where.
         """
-        hanging = self._at_rest(loads.gravity, at)
+        hanging = self._at_rest(loads.gravity)
         end = hanging._replace(pressures=pressures, loads=loads)
-        state, share, unstable = self.follow(hanging, end, at)
+        state, share, unstable = self.follow(hanging, end)
         what = "its pressures"
         if loads.tip.any() or loads.station.any():
             what += " and load"
@@ -192,18 +205,18 @@ class Equilibrium:
             raise EquilibriumError(_lost(share, what))
         return state
 
-    def _at_rest(self, gravity: Vector, at: float | None = None) -> EquilibriumState:
+    def _at_rest(self, gravity: Vector) -> EquilibriumState:
         """The unpressurised arm under its own weight and payload."""
-        key = (gravity.tobytes(), at)
+        key = gravity.tobytes()
         if key not in self._rest:
             none = Loads(np.zeros(3), np.zeros(12), np.zeros(12))
             upright = np.array([1.0, 0.0, 0.0, 0.0])
-            steps = self._function("newton", at).size2_in(1)
+            steps = self._newton.size2_in(1)
             states = np.repeat(np.concatenate([upright, np.zeros(3)])[:, np.newaxis], steps, 1)
             pressures = np.zeros(self.shooting.n_variables)
             straight = EquilibriumState(pressures, upright, states, none)
             weighted = straight._replace(loads=none._replace(gravity=gravity))
-            self._rest[key] = self.follow(straight, weighted, at)
+            self._rest[key] = self.follow(straight, weighted)
         path = self._rest[key]
         if path.unstable:
             raise EquilibriumError(
@@ -215,11 +228,11 @@ class Equilibrium:
             raise EquilibriumError(_lost(path.share, "its own weight and payload"))
         return path.state
 
-    def shape(self, state: EquilibriumState, stations: Vector, at: float | None = None) -> Vector:
-        """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium with its load at `at`."""
+    def shape(self, state: EquilibriumState, stations: Vector) -> Vector:
+        """Poses (k, 4, 4) at arc lengths (k,) of an equilibrium."""
         sections = [np.asarray(part) for part in self.shooting.sections(state.pressures)]
         length = self.shooting.description.length
-        station_at = length if at is None else at
+        station_at = length if self.at is None else self.at
         tip, station = state.loads.tip, state.loads.station
         q, r = state.quaternion, np.zeros(3)
         R = lie.rotation_from_quaternion(q)
@@ -274,3 +287,123 @@ def _between(start: EquilibriumState, end: EquilibriumState, share: float) -> tu
 
     loads = Loads(*(mix(a, b) for a, b in zip(start.loads, end.loads, strict=True)))
     return mix(start.pressures, end.pressures), loads
+
+
+# Newton's method --------------------------------------------------------------------------------
+
+_CARRIED = 4  # changes carried along: three turns of the tip, and the defects
+
+
+class _Carried:
+    """A value with its changes (k, 4) along the carried directions."""
+
+    def __init__(self, value: ca.MX, changes: ca.MX) -> None:
+        self.value = value
+        self.changes = changes
+
+    def __add__(self, other: "_Carried | ca.MX") -> "_Carried":
+        if isinstance(other, _Carried):
+            return _Carried(self.value + other.value, self.changes + other.changes)
+        return _Carried(self.value + other, self.changes)
+
+
+def _constant(value: ca.MX) -> _Carried:
+    return _Carried(value, ca.MX.zeros(value.size1(), _CARRIED))
+
+
+def _apply(function: ca.Function, *arguments: _Carried) -> list[_Carried]:
+    """Outputs of a function with their changes, by forward differentiation."""
+    values = [argument.value for argument in arguments]
+    outputs = function.call(values)
+    seeds = [argument.changes for argument in arguments]
+    changes = function.forward(_CARRIED).call([*values, *outputs, *seeds])
+    return [_Carried(value, change) for value, change in zip(outputs, changes, strict=True)]
+
+
+def _applied_wrench() -> ca.Function:
+    """Force and moment in base axes of a dead and a follower wrench (12,) at orientation q."""
+    q, load = ca.SX.sym("q", 4), ca.SX.sym("load", 12)
+    R = lie.rotation_from_quaternion(q)
+    force, moment = load[:3] + R @ load[6:9], load[3:6] + R @ load[9:]
+    return ca.Function("applied", [q, load], [force, moment])
+
+
+def _rigid_step() -> ca.Function:
+    """Moment added by a rigid connector of a length at orientation q under a force."""
+    q, force, length = ca.SX.sym("q", 4), ca.SX.sym("n", 3), ca.SX.sym("c")
+    axis = lie.rotation_from_quaternion(q)[:, 2]
+    return ca.Function("rigid", [q, force, length], [length * ca.cross(axis, force)])
+
+
+def newton_step(shooting: Shooting, at: float | None = None) -> ca.Function:
+    """One step of the lifted Newton method, with the load's station at `at` (None: the tip).
+
+    Maps (tip quaternion (4,), states (7, k), pressures, gravity, tip load, station load) to
+    (quaternion, states, largest turn of the tip or a state in rad).
+    """
+    pieces = shooting.pieces([] if at is None else [at])
+    count = sum(piece.steps for piece in pieces if not piece.rigid)
+    q, states = ca.MX.sym("q", 4), ca.MX.sym("states", 7, count)
+    p, gravity = ca.MX.sym("p", shooting.n_variables), ca.MX.sym("g", 3)
+    tip, station = ca.MX.sym("tip", 12), ca.MX.sym("station", 12)
+    sections = shooting.sections.call([p])
+    applied, rigid = _applied_wrench(), _rigid_step()
+    steps = [_lifted_step(step) for step in shooting.step]
+
+    per_turn = [lie.quaternion_product(q, ca.DM([0, *row])) / 2 for row in ca.DM.eye(3).full()]
+    orientation = _Carried(q, ca.horzcat(*per_turn, ca.MX.zeros(4)))
+    force, moment = _apply(applied, orientation, _constant(tip))
+    force = force + shooting.description.tip_mass * gravity
+    length = shooting.description.length
+    met: list[ca.MX] = []  # changes of the states after each step
+    for piece in pieces:
+        if abs(piece.distal - (length if at is None else at)) <= SAME_STATION * length:
+            added_force, added_moment = _apply(applied, orientation, _constant(station))
+            force, moment = force + added_force, moment + added_moment
+        if piece.rigid:
+            (added,) = _apply(rigid, orientation, force, _constant(ca.MX(piece.length)))
+            moment = moment + added
+            continue
+        strain, compliance = sections[2 * piece.segment : 2 * piece.segment + 2]
+        weight = shooting.weight(piece.segment) * gravity
+        h = piece.length / piece.steps
+        for _ in range(piece.steps):
+            lifted = states[:, len(met)]
+            changes = steps[piece.segment](
+                orientation.value, orientation.changes, moment.value, moment.changes,
+                force.value, force.changes, strain, compliance, weight, h, lifted,
+            )  # fmt: skip
+            orientation = _Carried(lifted[:4], changes[:4, :])
+            moment = _Carried(lifted[4:], changes[4:, :])
+            force = force + h * weight
+            met.append(changes)
+    base = orientation.changes[1:, :]
+    turn = -inverse_3x3(base[:, :3]) @ (orientation.value[1:] + base[:, 3])
+    moves = [changes @ ca.vertcat(turn, 1) for changes in met]
+    turned = lie.quaternion_product(q, ca.vertcat(1, turn / 2))
+    largest = ca.norm_2(turn)
+    for move in moves:
+        largest = ca.fmax(largest, 2 * ca.norm_2(move[:4]))
+    return ca.Function(
+        "newton",
+        [q, states, p, gravity, tip, station],
+        [turned / ca.norm_2(turned), states + ca.horzcat(*moves), largest],
+    )
+
+
+def _lifted_step(step: ca.Function) -> ca.Function:
+    """Integration step with changes carried along and the lifted state in place of its end.
+
+    Maps orientation, moment and force, each followed by its changes, the section (strain,
+    compliance), weight, length and lifted state (7,) to the changes of the latter: those of the
+    step's end, the defect added to the last of them.
+    """
+    q, m, n = ca.SX.sym("q", 4), ca.SX.sym("m", 3), ca.SX.sym("n", 3)
+    dq, dm, dn = (ca.SX.sym("d", size, _CARRIED) for size in (4, 3, 3))
+    strain, C = ca.SX.sym("strain", 6), ca.SX.sym("C", step.sparsity_in(2))
+    f, h, lifted = ca.SX.sym("f", 3), ca.SX.sym("h"), ca.SX.sym("lifted", 7)
+    end = step(ca.vertcat(q, ca.SX.zeros(3), m), strain, C, n, f, h)
+    end = ca.vertcat(end[:4], end[7:])
+    changes = ca.jtimes(end, ca.vertcat(q, m, n), ca.vertcat(dq, dm, dn))
+    changes[:, 3] += end - lifted
+    return ca.Function("lifted", [q, dq, m, dm, n, dn, strain, C, f, h, lifted], [changes])

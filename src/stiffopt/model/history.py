@@ -13,7 +13,7 @@ for the shape that it has are, in this order,
 and ``u = x + sum_j share_j (y_j - x) + sum_k share_k (z_k - x)``.
 
 Settled, and in the middle between loading and unloading, ``u = p``: a history says nothing about
-equilibrium, which is the business of the strain law.  After a long monotone way u differs from p
+equilibrium, which the strain law describes.  After a long monotone way u differs from p
 by ``sum_j share_j width_j``, the most that it can.
 
 This module knows nothing of the rest of the model, so that a simulated plant, an estimator and a
@@ -34,8 +34,6 @@ from pydantic import Field, model_validator
 from stiffopt.errors import InputError
 from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Pressure, Ratio
-
-__all__ = ["Creep", "History", "Memory", "Play"]
 
 Array = NDArray[np.float64]
 

@@ -21,12 +21,9 @@ class Actuation:
 
     Attributes
     ----------
-    pressures : casadi.SX
-        All channel pressures (n,), proximal segment first, in Pa.
-    sections : tuple of Section
-        One per segment, proximal first.
-    margin : casadi.SX
-        One positive number per segment while its strain law holds.
+    pressures : all channel pressures (n,), proximal segment first, in Pa.
+    sections : one per segment, proximal first.
+    margin : one positive number per segment while its strain law holds.
     """
 
     pressures: ca.SX

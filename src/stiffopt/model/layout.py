@@ -5,7 +5,7 @@ and corrections.  These numbers are arguments of the formulas of the unloaded sh
 section functions of the loaded rod, so that one compiled library serves every arm of a layout.
 
 Some formulas are left out where an arm does not need them: a connector, a dead band, a centroid
-beside the axis, an inclined section; and, together, gains and offsets of channels and the limits
+off the axis, an inclined section; and, together, gains and offsets of channels and the limits
 of bending that a calibration finds.  What is left out belongs to the layout.  So a layout has one
 library for arms as drawn and one for calibrated arms, which are about a tenth slower.
 """
@@ -31,22 +31,12 @@ from stiffopt.model.parameters import explicit
 from stiffopt.model.shape import FreeShape
 from stiffopt.schema import Schema
 
-__all__ = [
-    "Layout",
-    "SymbolicArm",
-    "free_tip_function",
-    "layout_of",
-    "numbers_of",
-    "symbolic_arm",
-]
-
 Vector = NDArray[np.float64]
 
 _NOT_IN_FORMULAS = {"chambers", "channels", "density", "history", "inner_radius"}
 """Keys of a segment that act through its section's geometry, or not on statics at all."""
 _SWITCHES = {"connector", "dead_band"}
 """Keys that leave formulas out where they are zero."""
-_NUMBER = "number"
 
 
 @dataclass(frozen=True)
@@ -55,10 +45,8 @@ class Layout:
 
     Attributes
     ----------
-    skeleton : str
-        The arm's segments with their numbers left out; equal for arms of the same layout.
-    example : RobotDescription
-        Some arm of this layout.
+    skeleton : the arm's segments with their numbers left out; equal for arms of the same layout.
+    example : some arm of this layout.
     """
 
     skeleton: str
@@ -71,14 +59,10 @@ class SymbolicArm:
 
     Attributes
     ----------
-    numbers : casadi.SX
-        The arm's numbers (k,), see `numbers_of`.
-    actuation : Actuation
-        Sections and margins as functions of the pressures and these numbers.
-    centroids : tuple of casadi.SX
-        Of each segment's section (2,), in m; sparse where it lies on the axis.
-    tip : FreeShape
-        The unloaded arm up to its tip.
+    numbers : the arm's numbers (k,), see `numbers_of`.
+    actuation : sections and margins as functions of the pressures and these numbers.
+    centroids : of each segment's section (2,), in m; sparse where it lies on the axis.
+    tip : the unloaded arm up to its tip.
     """
 
     numbers: ca.SX
@@ -92,7 +76,10 @@ def layout_of(description: RobotDescription) -> Layout:
     drawn = is_as_drawn(description)
     segments = [
         [
-            _skeleton(segment, drawn),
+            [
+                (path, "number" if is_number else value)
+                for path, value, is_number in _leaves(segment, drawn)
+            ],
             [name for name, _ in _geometry_numbers(geometry)],
             segment.n_channels,
         ]
@@ -106,7 +93,7 @@ def numbers_of(description: RobotDescription) -> Vector:
     found: list[float] = []
     drawn = is_as_drawn(description)
     for segment, geometry in _parts(description):
-        found += _numbers(segment, drawn)
+        found += [value for _, value, is_number in _leaves(segment, drawn) if is_number]
         for _, values in _geometry_numbers(geometry):
             found += np.ravel(values).tolist()
     return np.array(found)
@@ -144,8 +131,7 @@ def free_tip_function(
 
     Parameters
     ----------
-    outputs :
-        Makes them from the shape of the tip and the symbols of the caller's own parameters.
+    outputs : makes them from the shape of the tip and the symbols of the caller's own parameters.
     """
     arm = symbolic_arm(layout)
     own = ca.SX.sym("own", n_parameters)
@@ -191,26 +177,21 @@ def _fields(schema: Schema) -> Iterator[tuple[str, Any]]:
             yield name, getattr(schema, name)
 
 
-def _skeleton(node: Any, drawn: bool, key: str = "") -> Any:
-    """A segment with its numbers left out."""
+def _leaves(node: Any, drawn: bool, path: str = "") -> Iterator[tuple[str, Any, bool]]:
+    """What stands in a segment at each path, and whether it is a number of the arm."""
     if isinstance(node, Schema):
-        return {name: _skeleton(value, drawn, name) for name, value in _fields(node)}
-    if isinstance(node, tuple):
-        return [_skeleton(item, drawn, key) for item in node]
-    return _NUMBER if _is_number(key, node, drawn) else node
-
-
-def _numbers(node: Any, drawn: bool, key: str = "") -> list[float]:
-    """Numbers of a segment."""
-    if isinstance(node, Schema):
-        return [found for name, value in _fields(node) for found in _numbers(value, drawn, name)]
-    if isinstance(node, tuple):
-        return [found for item in node for found in _numbers(item, drawn, key)]
-    return [node] if _is_number(key, node, drawn) else []
+        for name, value in _fields(node):
+            yield from _leaves(value, drawn, f"{path}.{name}")
+    elif isinstance(node, tuple):
+        for index, item in enumerate(node):
+            yield from _leaves(item, drawn, f"{path}[{index}]")
+    else:
+        key = path.rpartition(".")[2].partition("[")[0]
+        yield path, node, _is_number(key, node, drawn)
 
 
 def _with_symbols(node: Any, symbol: Any, drawn: bool, key: str = "") -> Any:
-    """Copy with a symbol for each number, in the order of `_numbers`; not validated."""
+    """Copy with a symbol for each number, in the order of `_leaves`; not validated."""
     if isinstance(node, Schema):
         update = {name: _with_symbols(value, symbol, drawn, name) for name, value in _fields(node)}
         return node.model_copy(update=update)

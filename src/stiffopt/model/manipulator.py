@@ -14,17 +14,16 @@ from stiffopt.errors import InputError
 from stiffopt.model.arguments import (
     DirectionalMeasure,
     check_choice,
+    checked_integer,
     checked_measure,
-    checked_wrench,
-    dead_and_follower,
 )
 from stiffopt.model.arm import Arm, Values
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import Compensation, RobotDescription
+from stiffopt.model.equilibrium import dead_and_follower
 from stiffopt.model.history import NO_HISTORY
-from stiffopt.model.numeric import checked_integer
 from stiffopt.model.robot_files import load_description
-from stiffopt.model.screws import Twist, Wrench
+from stiffopt.model.screws import Twist, Wrench, checked_wrench
 from stiffopt.model.shape import Shape, stiffness_along
 from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
 
@@ -284,8 +283,8 @@ class Manipulator(Arm):
         self, p: Vector, wrench: Vector, at: float | None, frame: Frame
     ) -> Vector:
         loads = self._loads._replace(station=dead_and_follower(wrench, frame))
-        state = self._equilibrium.settle(p, loads, at)
-        (tip,) = self._equilibrium.shape(state, np.array([self.length]), at)
+        equilibrium = self._equilibrium(at)
+        (tip,) = equilibrium.shape(equilibrium.settle(p, loads), np.array([self.length]))
         return np.asarray(tip)
 
     def _elementwise(self, p: Vector, local: Vector, at: float) -> Vector:
@@ -306,7 +305,7 @@ class Manipulator(Arm):
         middles = (marks[1:] + marks[:-1]) / 2
         poses = self._shape(p, np.concatenate([marks, middles, [at]]))
         T_end, T_middle, T_at = poses[: len(marks)], poses[len(marks) : -1], poses[-1]
-        compliances = self._section_compliances(p)
+        compliances = [part.full() for part in self._section_parts(p)[self.n_segments :]]
         T = np.eye(4)
         for i, segment_index in enumerate(soft):
             near, middle, far = T_end[i], T_middle[i], T_end[i + 1]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError, shown
 from stiffopt.model.actuation import Section
-from stiffopt.model.calibration import FittedNumber, SIUnit
+from stiffopt.model.calibration import FittedNumber
 from stiffopt.model.description import (
     Compensation,
     Corrections,
@@ -31,8 +31,6 @@ from stiffopt.model.history import History
 from stiffopt.model.kinematics import Actuation
 from stiffopt.model.laws import law_class, strain_laws
 from stiffopt.schema import Schema
-
-__all__ = ["Parameter", "fitted_numbers", "parametric", "with_values"]
 
 Vector = NDArray[np.float64]
 _SchemaT = TypeVar("_SchemaT", bound=Schema)
@@ -157,16 +155,6 @@ class Parameter:
         return index
 
     @property
-    def unit(self) -> SIUnit:
-        """SI unit of its value; empty for a plain number."""
-        return self.number.unit
-
-    @property
-    def is_positive(self) -> bool:
-        """Whether its coordinate is the logarithm of its value over the nominal one."""
-        return self.number.positive
-
-    @property
     def is_history(self) -> bool:
         """Whether it concerns the way to an equilibrium only."""
         return self._path[2] == "history"
@@ -190,19 +178,23 @@ class Parameter:
         InputError
             The robot has no such number.
         """
-        found: Any = explicit(description)
+        return self._read(explicit(description))
+
+    def _read(self, robot: RobotDescription) -> float:
+        """Value in a robot whose defaults are written out."""
+        found: Any = robot
         for step in self._path:
             try:
                 found = found[step] if isinstance(step, int) else getattr(found, step)
             except (AttributeError, IndexError, TypeError):
                 found = None
         if not isinstance(found, int | float):
-            raise InputError(f"robot '{description.name}' has no parameter {shown(self.key)}")
+            raise InputError(f"robot '{robot.name}' has no parameter {shown(self.key)}")
         return float(found)
 
     def at(self, nominal: float, coordinate: Any) -> Any:
         """Value of a coordinate, both numbers or both symbols."""
-        if self.is_positive:
+        if self.number.positive:
             factor = ca.exp(coordinate) if isinstance(coordinate, ca.SX) else np.exp(coordinate)
             return nominal * factor
         return nominal + coordinate
@@ -215,7 +207,7 @@ class Parameter:
         InputError
             Only what is positive has a logarithm.
         """
-        if not self.is_positive:
+        if not self.number.positive:
             return value - nominal
         return math.log(self._checked(value) / self._checked(nominal))
 
@@ -229,7 +221,7 @@ class Parameter:
 
     def per_coordinate(self, value: float) -> float:
         """Change of the value per change of the coordinate."""
-        return value if self.is_positive else 1.0
+        return value if self.number.positive else 1.0
 
 
 def explicit(description: RobotDescription) -> RobotDescription:
@@ -272,6 +264,26 @@ def with_values(
     return RobotDescription(**changed.model_dump())
 
 
+def varied(
+    description: RobotDescription, parameters: Sequence[Parameter], coordinates: Any
+) -> RobotDescription:
+    """Robot, not validated, with its parameters at coordinates (k,), numbers or symbols.
+
+    Raises
+    ------
+    InputError
+        The robot has no such number, or one that is zero where it must be positive to be varied.
+    """
+    robot = explicit(description)
+    changes: dict[_Path, Any] = {}
+    for index, parameter in enumerate(parameters):
+        nominal = parameter._read(robot)
+        if parameter.number.positive:
+            parameter._checked(nominal)
+        changes[parameter._path] = parameter.at(nominal, coordinates[index])
+    return _replaced(robot, changes)
+
+
 def parametric(
     description: RobotDescription, parameters: Sequence[Parameter]
 ) -> tuple[Actuation, ca.SX]:
@@ -279,31 +291,22 @@ def parametric(
 
     Rest lengths act by stretching the section, which is the same: all stays per length at rest
     *in the description*, and so does the segment's mass.
-
-    Raises
-    ------
-    InputError
-        The robot has no such number, or one that is zero where it must be positive to be varied.
     """
     coordinates = ca.SX.sym("coordinates", len(parameters))
-    changes: dict[_Path, Any] = {}
-    stretch: dict[int, Any] = {}
-    for index, parameter in enumerate(parameters):
-        nominal = parameter.value(description)
-        if parameter.is_positive:
-            parameter._checked(nominal)
-        value = parameter.at(nominal, coordinates[index])
-        if parameter._path[2:] == ("length",):
-            stretch[parameter.segment] = value / nominal
-        elif not parameter.is_history:
-            changes[parameter._path] = value
-    actuation = Actuation.of(_replaced(explicit(description), changes))
-    sections = [
-        Section(section.strain * stretch[s], section.compliance * stretch[s])
-        if s in stretch
-        else section
-        for s, section in enumerate(actuation.sections)
+    robot = varied(description, parameters, coordinates)
+    drawn = [
+        segment.model_copy(update={"length": nominal.length})
+        for segment, nominal in zip(robot.segments, description.segments, strict=True)
     ]
+    actuation = Actuation.of(robot.model_copy(update={"segments": tuple(drawn)}))
+    sections = []
+    for section, segment, nominal in zip(
+        actuation.sections, robot.segments, description.segments, strict=True
+    ):
+        if isinstance(segment.length, ca.SX):
+            stretch = segment.length / nominal.length
+            section = Section(section.strain * stretch, section.compliance * stretch)
+        sections.append(section)
     return replace(actuation, sections=tuple(sections)), coordinates
 
 

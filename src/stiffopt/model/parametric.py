@@ -19,8 +19,6 @@ from stiffopt.model.parameters import Parameter, parametric
 from stiffopt.model.shape import FreeShape, Shape, stiffness_along
 from stiffopt.model.shooting import Shooting
 
-__all__ = ["ParametricArm", "Poses"]
-
 Vector = NDArray[np.float64]
 
 
@@ -30,12 +28,9 @@ class Poses:
 
     Attributes
     ----------
-    transforms : ndarray
-        (N, 4, 4), in the base frame.
-    per_pressure : ndarray
-        Twists (N, 6, n) per Pa.
-    per_coordinate : ndarray
-        Twists (N, 6, k) per unit of a parameter's coordinate.
+    transforms : (N, 4, 4), in the base frame.
+    per_pressure : twists (N, 6, n) per Pa.
+    per_coordinate : twists (N, 6, k) per unit of a parameter's coordinate.
     """
 
     transforms: Vector
@@ -48,12 +43,9 @@ class ParametricArm:
 
     Parameters
     ----------
-    description : RobotDescription
-        Where the parameters have the coordinate zero.
-    parameters : sequence of Parameter
-        What varies, k in number; those of histories have no effect here.
-    tip_load : sequence of float
-        Dead and follower wrench (12,) on the tip, see `stiffopt.model.equilibrium.Loads`.
+    description : where the parameters have the coordinate zero.
+    parameters : what varies, k in number; those of histories have no effect here.
+    tip_load : dead and follower wrench (12,) on the tip, see `stiffopt.model.equilibrium.Loads`.
     """
 
     def __init__(
@@ -63,17 +55,16 @@ class ParametricArm:
         tip_load: Sequence[float] = (0.0,) * 12,
     ) -> None:
         self.description = description
-        self.parameters = tuple(parameters)
-        self._actuation, self._coordinates = parametric(description, parameters)
+        actuation, coordinates = parametric(description, parameters)
+        # the parameters travel with the pressures: derivatives are taken by both
+        variables = ca.vertcat(actuation.pressures, coordinates)
+        self._actuation = replace(actuation, pressures=variables)
         self._functions: dict[Hashable, InterpretedFunction] = {}
-        self._near: dict[Hashable, list[EquilibriumState]] = {}
-        self._equilibrium: Equilibrium | None = None
+        self._near: dict[int, list[EquilibriumState]] = {}
         self._loads = Loads(np.array(description.gravity), np.array(tip_load), np.zeros(12))
+        self._equilibrium: Equilibrium | None = None
         if any(description.gravity) or any(tip_load):
-            # the parameters travel with the pressures; both have their derivatives there
-            variables = ca.vertcat(self._actuation.pressures, self._coordinates)
-            actuation = replace(self._actuation, pressures=variables)
-            self._equilibrium = Equilibrium(Shooting(description, actuation))
+            self._equilibrium = Equilibrium(Shooting(description, self._actuation))
 
     def poses(self, pressures: Vector, coordinates: Vector, at: float | None = None) -> Poses:
         """Poses at pressures (N, n) and coordinates (k,), of the tip or at an arc length in m.
@@ -86,8 +77,7 @@ class ParametricArm:
 
         def outputs(shape: Shape) -> list[ca.SX | ca.MX]:
             if isinstance(shape, FreeShape):
-                variables = ca.vertcat(self._actuation.pressures, self._coordinates)
-                return [shape.transform, body_jacobian(shape.transform, variables)]
+                return [shape.transform, body_jacobian(shape.transform, shape.pressures)]
             return [shape.transform, shape.jacobian]
 
         transforms, twists = self._evaluate("pose", outputs, pressures, coordinates, at)
@@ -107,9 +97,6 @@ class ParametricArm:
                 kind=measure.kind,
                 boundary=measure.boundary,
             )
-            if isinstance(shape, FreeShape):
-                variables = ca.vertcat(self._actuation.pressures, self._coordinates)
-                return [k, ca.jacobian(k, variables)]
             return [k, shape.total_jacobian(k)]
 
         key = ("stiffness", measure)
@@ -127,20 +114,18 @@ class ParametricArm:
     ) -> list[Vector]:
         if (key, at) not in self._functions:
             shape = self._shape(at)
-            inputs = list(shape.inputs)
-            if isinstance(shape, FreeShape):
-                inputs.append(self._coordinates)
             found = [ca.densify(value) for value in outputs(shape)]
             if isinstance(shape, FreeShape):
                 found = ca.cse(found)
-            self._functions[key, at] = InterpretedFunction(
-                dense(ca.Function("parametric", inputs, found))
-            )
-        function = self._functions[key, at]
+            function = ca.Function("parametric", list(shape.inputs), found)
+            self._functions[key, at] = InterpretedFunction(dense(function))
+        evaluate = self._functions[key, at]
+        repeated = np.broadcast_to(coordinates, (len(pressures), len(coordinates)))
+        variables = np.hstack([pressures, repeated])
         if self._equilibrium is None:
-            return function.many(pressures, coordinates)
-        states = self._states(pressures, coordinates)
-        rows = [function(*self._equilibrium.arguments(state)) for state in states]
+            return evaluate.many(variables)
+        arguments = map(self._equilibrium.arguments, self._states(self._equilibrium, variables))
+        rows = [evaluate(*each) for each in arguments]
         return [np.array(column) for column in zip(*rows, strict=True)]
 
     def _shape(self, at: float | None) -> Shape:
@@ -148,20 +133,17 @@ class ParametricArm:
             return self._equilibrium.shooting.chain(at)
         return FreeShape.of(self.description, self._actuation, at)
 
-    def _states(self, pressures: Vector, coordinates: Vector) -> list[EquilibriumState]:
+    def _states(self, equilibrium: Equilibrium, variables: Vector) -> list[EquilibriumState]:
         """Equilibria (N,), each found from the one that this row had the last time."""
-        assert self._equilibrium is not None
-        loads = self._loads
-        near = self._near.get(len(pressures), [])
+        near = self._near.get(len(variables), [])
         states: list[EquilibriumState] = []
-        for row, p in enumerate(pressures):
-            variables = np.concatenate([p, coordinates])
+        for row, own in enumerate(variables):
             start = near[row] if near else (states[-1] if states else None)
             state = None
             if start is not None:
-                end = start._replace(pressures=variables, loads=loads)
-                path = self._equilibrium.follow(start, end, shortest=0.1, stable=False)
+                end = start._replace(pressures=own, loads=self._loads)
+                path = equilibrium.follow(start, end, shortest=0.1, stable=False)
                 state = path.state if path.share == 1.0 else None
-            states.append(state or self._equilibrium.settle(variables, loads))
-        self._near[len(pressures)] = states
+            states.append(state or equilibrium.settle(own, self._loads))
+        self._near[len(variables)] = states
         return states

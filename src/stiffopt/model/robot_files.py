@@ -12,8 +12,6 @@ from stiffopt.errors import InputError, shown
 from stiffopt.files import read_file, save_file
 from stiffopt.model.description import RobotDescription
 
-__all__ = ["builtin_robots", "load_description", "robot_path", "save_robot"]
-
 
 @cache
 def builtin_robots() -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
 from stiffopt.errors import InputError, shown
-from stiffopt.model.numeric import (
+from stiffopt.model.arguments import (
     checked_motion,
     checked_number,
     checked_vector,
@@ -141,3 +141,8 @@ class Wrench(_Screw):
 
     def _along_and_about(self) -> tuple[Vector, Vector]:
         return self.force, self.moment
+
+
+def checked_wrench(value: ArrayLike | Wrench) -> Vector:
+    """Coordinates (6,) of a wrench, force first."""
+    return checked_vector("wrench", value.coordinates if isinstance(value, Wrench) else value, 6)

@@ -72,10 +72,8 @@ class PointOfArm:
 
     Attributes
     ----------
-    position : casadi.SX or casadi.MX
-        In the base frame, (3,).
-    rotation : casadi.SX or casadi.MX
-        Axes (3, 3) of the section in the base frame.
+    position : in the base frame, (3,).
+    rotation : axes (3, 3) of the section in the base frame.
     """
 
     position: ca.SX | ca.MX
@@ -88,16 +86,11 @@ class ShapePiece:
 
     Attributes
     ----------
-    motion : casadi.SX
-        Pose (4, 4) of its far end in its near end.
-    half : casadi.SX
-        Pose of its far end in its middle.
-    pressures : casadi.SX
-        Those (c,) that it depends on.
-    section : Section or None
-        None if it is rigid.
-    length : float or casadi.SX
-        At rest, in m.
+    motion : pose (4, 4) of its far end in its near end.
+    half : pose of its far end in its middle.
+    pressures : those (c,) that it depends on.
+    section : none if it is rigid.
+    length : at rest, in m.
     """
 
     motion: ca.SX
@@ -113,10 +106,8 @@ class FreeShape:
 
     Attributes
     ----------
-    pressures : casadi.SX
-        Those (n,) of the whole arm.
-    pieces : tuple of ShapePiece
-        From the base to the station.
+    pressures : those (n,) of the whole arm.
+    pieces : from the base to the station.
     """
 
     pressures: ca.SX

@@ -150,18 +150,15 @@ def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
     return ca.Function("step", [start, strain, compliance, n, f, h], [end])
 
 
-def _soft_point(
-    step: ca.Function, start: ca.MX, strain: ca.MX, compliance: ca.MX, force: ca.MX, weight: ca.MX,
-    distance: float,
-) -> tuple[ca.MX, ca.MX]:  # fmt: skip
-    state = step(start, strain, compliance, force, weight, distance)
-    return state[:4], state[4:7]
-
-
 def _rigid_point(
     quaternion: ca.MX, position: ca.MX, axis: ca.MX, distance: float
 ) -> tuple[ca.MX, ca.MX]:
     return quaternion, position - distance * axis
+
+
+def _soft_point(step: Callable[[float], ca.MX], distance: float) -> tuple[ca.MX, ca.MX]:
+    state = step(distance)
+    return state[:4], state[4:7]
 
 
 def _turn_between(q: ca.MX, dq: ca.MX) -> ca.MX:
@@ -180,8 +177,8 @@ class Stretch:
     Attributes
     ----------
     proximal, distal : float
-    towards_base : callable
-        Quaternion and position, from the tip, at a distance from its distal end towards the base.
+    towards_base : quaternion and position, from the tip, at a distance from its distal end towards
+        the base.
     """
 
     proximal: float
@@ -325,12 +322,9 @@ class Shooting:
 
     Parameters
     ----------
-    description : RobotDescription
-        The arm; its gravity and tip mass are part of every equilibrium.
-    actuation : Actuation
-        Its strain law, per segment.
-    resolution : int
-        Multiplies the number of integration steps.
+    description : the arm; its gravity and tip mass are part of every equilibrium.
+    actuation : its strain law, per segment.
+    resolution : multiplies the number of integration steps.
     """
 
     def __init__(
@@ -398,10 +392,10 @@ class Shooting:
             h = piece.length / piece.steps
             for _ in range(piece.steps):
                 start = ca.vertcat(orientation, position, moment)
-                given = (self.step[piece.segment], start, strain, compliance, force, weight)
-                stretches.append(Stretch(distal - h, distal, partial(_soft_point, *given)))
+                step = partial(self.step[piece.segment], start, strain, compliance, force, weight)
+                stretches.append(Stretch(distal - h, distal, partial(_soft_point, step)))
                 distal -= h
-                state = self.step[piece.segment](*given[1:], h)
+                state = step(h)
                 orientation, position, moment = state[:4], state[4:7], state[7:]
                 force = force + h * weight
                 nodes.append(orientation)

@@ -15,15 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.arguments import DirectionalMeasure
-from stiffopt.model.batch import is_shared
+from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.codegen import dense
-from stiffopt.model.compiled import (
-    BatchFunction,
-    CompiledFunction,
-    InterpretedFunction,
-    Library,
-    library,
-)
+from stiffopt.model.compiled import Library, library
 from stiffopt.model.compliance import held_stiffness
 from stiffopt.model.layout import Layout, symbolic_arm
 
@@ -36,9 +30,7 @@ COMPILED_FROM = 50_000
 """Rows, of all batches so far, from which code is compiled if there is none: as long as that
 takes, about a second, has then been spent in the VM or is about to be."""
 
-
 _BLOCK = 65_536  # rows
-_WAITING_BLOCK = 8192  # rows, while there is no machine code
 
 _Call = Callable[..., list[Vector]]
 _Ends = tuple[list[ca.SX], list[ca.SX]]  # symbols and expressions
@@ -47,8 +39,7 @@ _Ends = tuple[list[ca.SX], list[ca.SX]]  # symbols and expressions
 class TipFunctions:
     """Functions of an arm's tip by name (see the methods of `TipFormulas`).
 
-    Values from machine code and from the VM are the same to the last bit, so that nobody needs
-    to know which it was.
+    Values from machine code and from the VM are the same to the last bit.
     """
 
     def __init__(self, layout: Layout, numbers: Vector) -> None:
@@ -59,49 +50,21 @@ class TipFunctions:
         self._rows = 0
         self._lock = threading.Lock()
 
-    def one(self, name: str, *arguments: Vector) -> list[Vector]:
-        """Results, each (r, c), for one set of arguments."""
-        if self._library is not None:
-            return self._library.function(name)(*arguments)
-        return self.interpreted(name)(*arguments)
-
-    def many(self, name: str, *arguments: Vector) -> list[Vector]:
-        """Results, each (N, r, c), for rows of arguments; see `BatchFunction.many`.
-
-        While machine code is made in the background, blocks of rows go to the VM.
-        """
-        count = len(arguments[0])
-        best = self._best(name, count)
-        if isinstance(best, CompiledFunction) or count <= _WAITING_BLOCK:
-            return best.many(*arguments)
-        shapes = best.signature.inputs
-        blocks = []
-        for start in range(0, count, _WAITING_BLOCK):
-            rows = min(_WAITING_BLOCK, count - start)
-            own = [
-                argument if is_shared(argument, shape) else argument[start : start + rows]
-                for argument, shape in zip(arguments, shapes, strict=True)
-            ]
-            blocks.append(self._best(name, rows).many(*own))
-        return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
-
     def evaluate(self, name: str, p: Vector, *parameters: Vector) -> list[Vector]:
         """Value (..., r, c) and margins (..., segments, 1) at pressures (n,) or (N, n)."""
-        if p.ndim == 1:
-            return self.one(name, p, self._numbers, *parameters)
-        return self.many(name, p, self._numbers, *parameters)
+        return self._in_blocks(lambda call, q: call(name, q, self._numbers, *parameters), p)
 
     def stiffness(self, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
         """A directional stiffness (..., 1, 1), and margins (..., segments, 1)."""
         if measure.boundary == "free":
             return self.evaluate("stiffness", p, _load(measure))
-        return self._in_blocks(self._held, p, measure)
+        return self._in_blocks(lambda call, q: self._held(call, q, measure), p)
 
     def stiffness_gradient(self, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
         """Its derivative (..., 1, n) by the pressures, and margins (..., segments, 1)."""
         if measure.boundary == "free":
             return self.evaluate("stiffness_gradient", p, _load(measure), np.ones(1))
-        return self._in_blocks(self._held_gradient, p, measure)
+        return self._in_blocks(lambda call, q: self._held_gradient(call, q, measure), p)
 
     def _held(self, call: _Call, p: Vector, measure: DirectionalMeasure) -> list[Vector]:
         compliance, margins = call("tip_compliance", p, self._numbers)
@@ -124,17 +87,28 @@ class TipFunctions:
         return [gradient, margins]
 
     def _in_blocks(
-        self,
-        formula: Callable[[_Call, Vector, DirectionalMeasure], list[Vector]],
-        p: Vector,
-        measure: DirectionalMeasure,
+        self, formula: Callable[[_Call, Vector], list[Vector]], p: Vector
     ) -> list[Vector]:
-        """A formula of several functions, with little memory for what goes between them."""
+        """A formula of several functions, for one set of pressures (n,) or blocks of rows (N, n).
+
+        Blocks need little memory for what goes between the functions, and machine code that was
+        made in the background serves from the next block on.
+        """
         if p.ndim == 1:
-            return formula(self.one, p, measure)
-        ends = range(0, max(len(p), 1), _BLOCK)
-        blocks = [formula(self.many, p[start : start + _BLOCK], measure) for start in ends]
+            return formula(self._one, p)
+        starts = range(0, max(len(p), 1), _BLOCK)
+        blocks = [formula(self._many, p[start : start + _BLOCK]) for start in starts]
+        if len(blocks) == 1:
+            return blocks[0]
         return [np.concatenate(parts) for parts in zip(*blocks, strict=True)]
+
+    def _one(self, name: str, *arguments: Vector) -> list[Vector]:
+        if self._library is not None:
+            return self._library.function(name)(*arguments)
+        return self.interpreted(name)(*arguments)
+
+    def _many(self, name: str, *arguments: Vector) -> list[Vector]:
+        return self._best(name, len(arguments[0])).many(*arguments)
 
     def _best(self, name: str, rows: int) -> BatchFunction:
         if rows < LOOKED_UP_FROM:

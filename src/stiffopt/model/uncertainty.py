@@ -31,8 +31,6 @@ from stiffopt.model.history import NO_HISTORY, History
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 
-__all__ = ["Part", "TipUncertainty", "Uncertainty", "settled_range"]
-
 Vector = NDArray[np.float64]
 Part = Literal["parameters", "hysteresis", "residual"]
 
@@ -108,10 +106,8 @@ class Uncertainty:
 
     Parameters
     ----------
-    description : RobotDescription
-        With a calibration.
-    tip_load : sequence of float
-        Load on the tip, as in `Manipulator.tip_load`.
+    description : with a calibration.
+    tip_load : load on the tip, as in `Manipulator.tip_load`.
 
     Raises
     ------
@@ -191,14 +187,10 @@ def settled_range(
 
     Parameters
     ----------
-    history :
-        Of the channel's segment.
-    channel :
-        Of the segment, from 0.
-    pressure :
-        In Pa.
-    low, high :
-        Limits, in Pa.
+    history : of the channel's segment.
+    channel : of the segment, from 0.
+    pressure : in Pa.
+    low, high : limits, in Pa.
     """
     low, high = min(low, 0.0, pressure), max(high, 0.0, pressure)
     ends = np.array([pressure, pressure])

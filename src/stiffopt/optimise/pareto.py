@@ -5,8 +5,8 @@ from math import pi
 import numpy as np
 
 from stiffopt.errors import InputError, shown
+from stiffopt.model.arguments import checked_integer
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.numeric import checked_integer
 from stiffopt.optimise.settings import ANSWER
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import EquilibriumError, InputError, shown
+from stiffopt.model.arguments import checked_integer, checked_vector
 from stiffopt.model.compiled import (
     CodeReadyError,
     compilation_is_held_off,
@@ -16,7 +17,6 @@ from stiffopt.model.compiled import (
     until_ready,
 )
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.numeric import checked_integer, checked_vector
 from stiffopt.optimise import diagnosis
 from stiffopt.optimise.fast import CompiledAnswer, FastSolver
 from stiffopt.optimise.local import LocalResult, descend

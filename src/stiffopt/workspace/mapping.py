@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import FileError, InputError, require_package
+from stiffopt.model.arguments import checked_integer
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.numeric import checked_integer
 from stiffopt.workspace.map import WorkspaceMap
 from stiffopt.workspace.plan import TUNING, MapPlan
 from stiffopt.workspace.store import MapStore, is_vacant

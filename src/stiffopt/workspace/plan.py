@@ -20,11 +20,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.directions import direction_name
 from stiffopt.errors import EquilibriumError, InputError
-from stiffopt.model.arguments import DirectionalMeasure, checked_measure
-from stiffopt.model.compiled import BatchFunction, compiling_at_once, interpreted, library
+from stiffopt.model.arguments import (
+    DirectionalMeasure,
+    checked_integer,
+    checked_measure,
+    checked_number,
+)
+from stiffopt.model.batch import BatchFunction
+from stiffopt.model.compiled import compiling_at_once, interpreted, library
 from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.numeric import checked_integer, checked_number
 from stiffopt.model.shape import Shape
 from stiffopt.workspace.table import FARTHEST, CellTable, MapPart, cell_indices, cell_keys
 

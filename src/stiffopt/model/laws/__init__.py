@@ -14,8 +14,6 @@ from stiffopt.errors import InputError, shown
 from stiffopt.model.actuation import SectionGeometry, StrainLaw
 from stiffopt.model.description import Segment
 
-__all__ = ["law_class", "strain_law", "strain_laws"]
-
 
 def strain_laws() -> dict[str, type[StrainLaw]]:
     """Return every law by its name in robot files, the simplest first."""

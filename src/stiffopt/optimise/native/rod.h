@@ -166,7 +166,7 @@ static void multiply_3x3(const double *A, const double *B, double *C) {
         }
 }
 
-/* Quaternion after a small turn (rotation vector, body axes), as `stiffopt.model.lifted` has it. */
+/* Quaternion after a small turn (rotation vector, body axes), as `stiffopt.model.equilibrium` has it. */
 static void turn_quaternion(double *q, const double *turn) {
     double x = turn[0] / 2, y = turn[1] / 2, z = turn[2] / 2;
     double p[4] = {q[0] - q[1] * x - q[2] * y - q[3] * z, q[0] * x + q[1] + q[2] * z - q[3] * y,
@@ -360,7 +360,7 @@ static void weight_of(const RodPiece *piece, const Condition *at, double *weight
 
 /* -- equilibrium ---------------------------------------------------------------------------- */
 
-/* One step of the lifted Newton method (`stiffopt.model.lifted`) on a state, in place; the
+/* One step of the lifted Newton method (`stiffopt.model.equilibrium`) on a state, in place; the
  * largest turn of the tip or a state in rad, or NaN. */
 static double newton_step(const Work *work, const Rod *rod, const Condition *at, const double *a,
                           double *state) {
