@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import pickle
-import select
 import socket
 import threading
 from collections.abc import Iterator
@@ -43,8 +42,8 @@ class Ends:
         return self.theirs.request()
 
     def close(self) -> None:
-        self.ours.close()
-        self.theirs._connection.close()
+        self.ours.connection.close()
+        self.theirs.connection.close()
 
 
 @pytest.fixture
@@ -98,10 +97,10 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
     sent: list[bytes] = []
 
     def news(line: PlannerEnd, request: PlanRequest) -> set[str]:
-        send = line._connection.send_bytes
-        line._connection.send_bytes = lambda data: (sent.append(data), send(data))  # type: ignore[method-assign, assignment, func-returns-value]
+        send = line.connection.send_bytes
+        line.connection.send_bytes = lambda data: (sent.append(data), send(data))  # type: ignore[method-assign, assignment, func-returns-value]
         line.send(request)
-        del line._connection.send_bytes
+        del line.connection.send_bytes
         return set(pickle.loads(sent.pop()))
 
     everything = {"serial", "task", "target", "offset", "pressure_offset", "search"}
@@ -129,10 +128,7 @@ def test_plans_arrive_as_they_were(ends: Ends) -> None:
         assert found.stiffness == pytest.approx(stiffness, abs=0, nan_ok=True)
 
 
-@pytest.mark.parametrize("poll", [True, False])
-def test_it_says_whether_there_is_an_answer(monkeypatch: pytest.MonkeyPatch, poll: bool) -> None:
-    if not poll:
-        monkeypatch.delattr(select, "poll", raising=False)
+def test_it_says_whether_there_is_an_answer() -> None:
     ends = Ends()
     assert not ends.ours.has_answer()
     ends.theirs.answer(None)
@@ -142,13 +138,13 @@ def test_it_says_whether_there_is_an_answer(monkeypatch: pytest.MonkeyPatch, pol
     assert ends.ours.has_answer()
     assert ends.ours.receive() == "no luck"
     assert not ends.ours.has_answer()
-    ends.theirs._connection.close()
+    ends.theirs.connection.close()
     assert ends.ours.has_answer()
     with pytest.raises((EOFError, ConnectionError)):
         ends.ours.receive()
     with pytest.raises(OSError, match=r"."):
         ends.ours.send(PlanRequest(1, task(), task().target, OFFSET, BESIDE))
-    ends.ours.close()
+    ends.ours.connection.close()
 
 
 @pytest.mark.skipif(not hasattr(os, "SCHED_BATCH"), reason="the system has no SCHED_BATCH")

@@ -388,7 +388,7 @@ def test_an_accident_while_a_request_is_checked_is_a_refusal(
     def fail(*_: object) -> None:
         raise ZeroDivisionError("oh")
 
-    monkeypatch.setattr(checks, "understood", fail)
+    monkeypatch.setattr(checks, "validated", fail)
     with pytest.raises(CommandError, match="nothing has changed: unexpected ZeroDivisionError"):
         getattr(armed.loop, request_for)(given_)
     assert not ask(armed, lambda: getattr(armed.loop, request_for)(given_))

@@ -32,7 +32,7 @@ from stiffopt.experiments import (
     run_kinematics,
     run_stiffness,
 )
-from stiffopt.experiments.coverage import round_count
+from stiffopt.experiments.coverage import coverage_for, round_count
 from stiffopt.experiments.folder import (
     alone_in,
     check_same,
@@ -43,7 +43,6 @@ from stiffopt.experiments.folder import (
 from stiffopt.experiments.kinematics import (
     missing_repetitions,
     missing_rounds,
-    poses_for,
     sequence_for,
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
@@ -160,7 +159,7 @@ def _planned(
     rig.supply.check_arming()
     if isinstance(settings, KinematicsSettings):
         sequence_for(rig, settings)
-        poses_for(rig, settings)
+        coverage_for(rig, settings.poses, settings.settle, settings.max)
     else:
         check_stiffness(rig, settings)
         by_hand = rig.probe is not None and rig.probe.needs_a_person

@@ -13,8 +13,8 @@ reliable: OSQP answers 2e9 to a contradiction, and NaN for ever after one NaN; D
 with a flag of success.
 
 The slew also limits the reference (as a whole, so that its path stays straight) and the gate (each
-channel, by the time that has passed, whoever commands). Here it is a bound of the program, which so
-finds the best pressures that the gate will pass on unchanged; a test holds it to that.
+channel, by the time since the last command). Here it is a bound of the program, which so finds the
+best pressures that the gate will pass on unchanged; a test holds it to that.
 """
 
 from __future__ import annotations
@@ -109,20 +109,9 @@ SOLVERS: dict[str, type[QuadraticSolver]] = {"daqp": DaqpSolver, "osqp": OsqpSol
 class Allocation:
     """The quadratic program of an arm with n channels.
 
-    Parameters
-    ----------
-    law :
-        J, v and G, in symbols.
-    low, high :
-        Limits of the commands (n,), in Pa.
-    step :
-        Greatest change from tick to tick (n,), in Pa.
-    tip_step :
-        Greatest displacement of the tip along each axis from tick to tick, in m.
-    solver :
-        See `SOLVERS`.
-    tuning :
-        Its `posture_weight` is W and epsilon.
+    The feedback law has J, v and G, the tuning W and epsilon. Commands stay between `low` and
+    `high` (n,), in Pa, and change by `step` (n,) at most from tick to tick; the tip moves by
+    `tip_step` at most along each axis, in m.
     """
 
     def __init__(
@@ -149,14 +138,7 @@ class Allocation:
     def solve(
         self, inputs: Sequence[ArrayLike], reference: Array, last: Array
     ) -> tuple[Array | None, NDArray[np.bool_], float]:
-        """Solve the program.
-
-        Parameters
-        ----------
-        inputs :
-            Of the feedback law.
-        reference, last :
-            r and the last pressures (n,), in Pa.
+        """Solve the program for inputs of the feedback law, r and the last pressures (n,), in Pa.
 
         Returns
         -------

@@ -1,7 +1,7 @@
 """Checks of requests before they reach the control thread, and of the rig before it is armed.
 
-They refuse a request whoever makes it: a program in Python, a client of the daemon or the command
-line. `InputError` says why, with the key and, for a pressure, the channel; nothing has changed.
+They apply to all requests: of a program in Python, a client of the daemon or the command line. The
+`InputError` of a refusal names the key and, for a pressure, the channel; nothing has changed then.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _LISTED = 5  # keys that an error names
 
 @contextmanager
 def refusing(what: str) -> Iterator[None]:
-    """Raise any error of the body, which checks or prepares something, as a refusal of that.
+    """Context that checks or prepares a thing; any error in it becomes an `InputError`.
 
-    A refusal is an `InputError`, and nothing has changed.
+    Such a refusal means that nothing has changed.
     """
     try:
         yield
@@ -54,13 +54,13 @@ def refusing(what: str) -> Iterator[None]:
 def check_task(task: Task, limits: PressureLimits) -> None:
     """Refuse a task that is not valid or needs pressures beyond the limits."""
     with refusing("task"):
-        limited_range(understood(task, Task).pressure, limits)
+        limited_range(validated(task, Task).pressure, limits)
 
 
 def check_target(target: Target) -> None:
     """Refuse a target that is not valid."""
     with refusing("target"):
-        understood(target, Target)
+        validated(target, Target)
 
 
 def check_trajectory(trajectory: Trajectory) -> None:
@@ -69,8 +69,8 @@ def check_trajectory(trajectory: Trajectory) -> None:
         if not isinstance(trajectory, Trajectory):
             raise InputError(f"expected a Trajectory, not {type(trajectory).__name__}")
         # one by one: all at once would hold Python's lock, and so the control thread, for too long
-        waypoints = tuple(understood(waypoint, Waypoint) for waypoint in trajectory.waypoints)
-        understood(trajectory.model_copy(update={"waypoints": waypoints[:1]}), Trajectory)
+        waypoints = tuple(validated(waypoint, Waypoint) for waypoint in trajectory.waypoints)
+        validated(trajectory.model_copy(update={"waypoints": waypoints[:1]}), Trajectory)
         Trajectory(waypoints=waypoints)
 
 
@@ -228,7 +228,7 @@ def listed(places: list[str]) -> str:
     return ", ".join(places[:_LISTED]) + more
 
 
-def understood(given: object, model: type[ModelT]) -> ModelT:
+def validated(given: object, model: type[ModelT]) -> ModelT:
     """Return a description as an instance of exactly this model.
 
     It is refused if it is no such description, a value is not valid, or a key would be lost.

@@ -172,7 +172,7 @@ class TipController:
         limited = _within_limits(task, self.robot, self.limits)
         lower, upper = limited.pressure_bounds(self.robot.description)
         self.replanner.pursue(Pursuit.of(task, limited, course))
-        self._allocation.limit(lower, upper)  # does not fail: what follows a change must not
+        self._allocation.limit(lower, upper)  # last, since it cannot fail: the pursuit has changed
 
     def _pursue_target(self, target: Target, course: Course | None = None) -> None:
         """Go to a target, with goal and limits of the task, if there is one."""

@@ -83,17 +83,6 @@ class TipEstimator:
         The arm's first bending mode, or None for an arm that does not vibrate.
     tuning :
         Noise and outlier rejection.
-
-    Attributes
-    ----------
-    omega : float
-        Angular frequency of the vibration, in rad/s; infinite before it is known.
-    soft_plane : ndarray
-        Projection (3, 3) on the directions in which the tip is soft.
-    offset : ndarray
-        Tip pose relative to the model's (6,): d in m, and a rotation vector.
-    sample : PoseSample or None
-        The latest that was used.
     """
 
     def __init__(
@@ -104,7 +93,7 @@ class TipEstimator:
         self._predict = _prediction(mode, n, tuning.damping)
         self._correct = _correction(tuning, mode is not None)
         self._orientation = _orientation()
-        self.omega = math.inf
+        self.omega = math.inf  # of the vibration, in rad/s; infinite before it is known
         self._times = np.array([1.0, period])  # omega, and since the step before
         self.begin()
 
@@ -112,8 +101,8 @@ class TipEstimator:
         """Start anew, with an arm at rest."""
         self._past.clear()
         self._free = np.zeros((2, 3))
-        self.offset = np.zeros(6)
-        self.soft_plane = np.diag([1.0, 1.0, 0.0])
+        self.offset = np.zeros(6)  # tip pose relative to the model's: d in m, and a rotation vector
+        self.soft_plane = np.diag([1.0, 1.0, 0.0])  # projection on the directions of low stiffness
         self._lean: Array = np.zeros((3, 3))  # rotation of the tip per vibration
         self._pressures: Array | None = None
         deviations = (0.1, 0.05, 0.1) if self._mode is not None else (0.0, 0.0, 0.1)
@@ -123,7 +112,7 @@ class TipEstimator:
         self._displacements = np.zeros(2)  # of the model's tip, and of what drives the vibration
         self._used_until = -math.inf
         self._ticks = 0
-        self.sample: PoseSample | None = None
+        self.sample: PoseSample | None = None  # the latest that was used
         self._first: PoseSample | None = None
         self._unchanged: tuple[Array, Array] | None = None  # a sample, and the model's tip with it
         self._last_sample, self._rejected = -math.inf, 0
@@ -149,14 +138,9 @@ class TipEstimator:
         return self.sample is not None and self.sample.quaternion is not None
 
     def advance(self, now: float, pressures: Array, tip: TipAt) -> None:
-        """Predict the state at the end of a step.
+        """Predict the state at the end of a step, at a time in s.
 
-        Parameters
-        ----------
-        now :
-            Time then, in s.
-        pressures, tip :
-            Effective pressures (n,) in Pa, and the model's tip at these.
+        Pressures (n,) are effective ones, in Pa, and `tip` is the model's tip there.
         """
         if self._mode is not None:
             self._update_mode(tip)

@@ -122,16 +122,7 @@ def tracking_rows(
 class GainSchedule:
     """Gains K (3,) of the linear-quadratic regulator over the frequency of the vibration.
 
-    Parameters
-    ----------
-    period :
-        Of the loop, in s.
-    lag :
-        Of the regulators, in s.
-    damping :
-        Damping ratio of the arm itself.
-    effort :
-        Weight of effort against error.
+    The arguments are those of `lqr_gains`.
     """
 
     def __init__(self, period: float, lag: float, damping: float, effort: float) -> None:
@@ -149,7 +140,10 @@ class GainSchedule:
 
 
 def lqr_gains(omega: float, damping: float, lag: float, period: float, effort: float) -> Array:
-    """Gains (3,) of the linear-quadratic regulator at one frequency, sampled at the period."""
+    """Gains (3,) of the linear-quadratic regulator at one frequency, sampled at the loop's period.
+
+    The arm has an angular frequency, in rad/s, and a damping ratio, its regulators a lag, in s.
+    """
     A = np.array(
         [[-1 / lag, 0, 0], [0, 0, 1], [omega**2, -(omega**2), -2 * damping * omega]], dtype=float
     )

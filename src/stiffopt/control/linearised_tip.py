@@ -46,13 +46,7 @@ class LinearisedTip:
         return self._model.is_fast
 
     def at(self, pressures: Array) -> TipAt:
-        """Return the tip at pressures (n,), in Pa.
-
-        Raises
-        ------
-        StiffoptError
-            The model has no equilibrium there.
-        """
+        """Return the tip at pressures (n,), in Pa; `StiffoptError` without an equilibrium there."""
         tip, there = self._tip, self._operating_point
         if tip is None:
             p, _, _ = self._linearisation(pressures, there, np.eye(4), np.zeros((6, len(there))))

@@ -102,8 +102,8 @@ class ControlLoop:
     def arm(self) -> None:
         """Check the vented arm and activate the controller; pressures stay until there is a task.
 
-        The loop must have ticked for some time before, to learn the rhythm of the tracker. Refused
-        as by `configure`.
+        The loop must have ticked for some time before, to learn the rhythm of the tracker. A
+        refusal names the check that failed, as that of `configure`.
         """
         requester = current_requester()  # checks may take long
         self._request(lambda now: self._supervisor.arm(now, lambda: requester.gone))
@@ -192,10 +192,6 @@ class ControlLoop:
 
     # -- time -----------------------------------------------------------------------------------
 
-    def tick(self) -> None:
-        """Tick once, now."""
-        self._tick(None)
-
     def run(self, stop: threading.Event) -> None:
         """Tick until `stop` is set, then let the pressures down and vent.
 
@@ -235,10 +231,11 @@ class ControlLoop:
             text = f"unexpected {type(error).__name__}: {error}"
             self._supervisor.fault(clock.now(), "internal", text)
             time.sleep(self.period)
-        self._tick(due)
+        self.tick(due)
         return self._timing.next_due(due, clock.now())
 
-    def _tick(self, due: float | None) -> None:
+    def tick(self, due: float | None = None) -> None:
+        """Tick once, now; it may have been due at a time, in s."""
         began = time.perf_counter()
         clock, supervisor, timing = self.rig.clock, self._supervisor, self._timing
         with self._requests.turn:

@@ -17,7 +17,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -102,7 +101,7 @@ class ProcessPlanner:
         self._end = PlannerEnd(ours.detach())
         self._busy_since: float | None = math.inf  # until the process is ready
         self._started_at = time.monotonic()
-        self._end.begin(self._robot)
+        self._end.connection.send(self._robot)
 
     def request(self, request: PlanRequest) -> None:
         """Have a plan made as soon as the process is free; it replaces a request that waits."""
@@ -135,7 +134,7 @@ class ProcessPlanner:
     def close(self) -> None:
         """End the process."""
         self._closed = True
-        self._end.close()  # which ends the process
+        self._end.connection.close()  # which ends the process
         try:
             self._process.wait(timeout=1.0)
         except subprocess.TimeoutExpired:
@@ -165,7 +164,7 @@ class ProcessPlanner:
         self._failure = "the planner died and is started again; the last plan stays"
         if time.monotonic() - self._started_at < _RESTART_AFTER:
             return
-        self._end.close()
+        self._end.connection.close()
         self._process.kill()
         self._process.wait()
         self._start()
@@ -183,20 +182,17 @@ def _set_batch_policy(process: int) -> None:
 
 
 class PlannerEnd:
-    """The control loop's end of the connection; a call raises `OSError` if the other is closed.
-
-    It is made from a file descriptor, which it closes. `has_answer` returns whether there is
-    something to receive, if only that the other end is closed.
-    """
+    """The control loop's end of the connection; a call raises `OSError` if the other is closed."""
 
     def __init__(self, handle: int) -> None:
-        self._connection = Connection(handle)
-        self.has_answer = _readiness(self._connection)
+        self.connection = Connection(handle)
+        self._poll = select.poll()  # `Connection.poll` is slow: it makes a selector each time
+        self._poll.register(handle, select.POLLIN)  # errors are reported in any case
         self._sent: PlanRequest | None = None
 
-    def begin(self, robot: Manipulator) -> None:
-        """Send the arm to plan for; the first answer is None."""
-        self._connection.send(robot)
+    def has_answer(self) -> bool:
+        """Whether there is something to receive, if only that the other end is closed."""
+        return bool(self._poll.poll(0))
 
     def send(self, request: PlanRequest) -> None:
         """Send a request; the one before must have been answered."""
@@ -208,12 +204,12 @@ class PlannerEnd:
         }
         for name in _ARRAYS:  # as lists: pickling an array takes twenty times as long
             news[name] = getattr(request, name).tolist()
-        self._connection.send_bytes(pickle.dumps(news, pickle.HIGHEST_PROTOCOL))
+        self.connection.send_bytes(pickle.dumps(news, pickle.HIGHEST_PROTOCOL))
         self._sent = request
 
     def receive(self) -> Plan | str | None:
         """Receive a plan, or why there is none; None when the process is ready."""
-        answer: dict[str, Any] | str | None = self._connection.recv()
+        answer: dict[str, Any] | str | None = self.connection.recv()
         request = self._sent
         if request is None or answer is None or isinstance(answer, str):
             return None if answer is None else str(answer)
@@ -225,64 +221,39 @@ class PlannerEnd:
             **answer,
         )
 
-    def close(self) -> None:
-        """Close the connection, which ends the process."""
-        self._connection.close()
-
 
 class PlanningEnd:
     """The process's end of the connection; `EOFError` and `OSError`: the other end is closed."""
 
     def __init__(self, handle: int) -> None:
-        self._connection = Connection(handle)
+        self.connection = Connection(handle)
         self._fields: dict[str, Any] = {}
-
-    def robot(self) -> Manipulator:
-        """Receive the arm to plan for."""
-        robot: Manipulator = self._connection.recv()
-        return robot
-
-    def has_request(self, patience: float) -> bool:
-        """Whether a request comes within so many seconds."""
-        return self._connection.poll(patience)
 
     def request(self) -> PlanRequest:
         """Receive a request."""
-        self._fields.update(self._connection.recv())
+        self._fields.update(self.connection.recv())
         arrays = {name: np.array(self._fields[name]) for name in _ARRAYS}
         return PlanRequest(**{**self._fields, **arrays})
 
     def answer(self, answer: Plan | str | None) -> None:
         """Send the plan for the last request, or why there is none; None: the process is ready."""
         if isinstance(answer, Plan):
-            self._connection.send(
-                {
-                    "pressures": answer.pressures.tolist(),
-                    "reached": answer.reached,
-                    "stiffness": answer.stiffness,
-                    "message": answer.message,
-                }
-            )
+            own = {name: getattr(answer, name) for name in ("reached", "stiffness", "message")}
+            self.connection.send({"pressures": answer.pressures.tolist(), **own})
         else:
-            self._connection.send(answer)
-
-
-def _readiness(connection: Connection) -> Callable[[], bool]:
-    """Return a function that returns whether a connection has something to receive."""
-    if not hasattr(select, "poll"):
-        return connection.poll  # makes a selector each time, which takes many times as long
-    poll = select.poll()
-    poll.register(connection.fileno(), select.POLLIN)  # errors are reported in any case
-    return lambda: bool(poll.poll(0))
+            self.connection.send(answer)
 
 
 def main(end: PlanningEnd) -> None:
-    """Answer requests with plans, or with the reason why there is none, until the end is closed."""
-    robot = end.robot()
+    """Receive the arm, answer None, then each request with a plan or the reason why there is none.
+
+    It ends when the other end is closed.
+    """
+    robot: Manipulator = end.connection.recv()
     planning = Planning(robot)
     end.answer(None)
     while True:
-        while not end.has_request(_IDLE):
+        while not end.connection.poll(_IDLE):
             planning.ask_for_code()
         request = end.request()
         try:

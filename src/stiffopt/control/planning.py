@@ -28,9 +28,7 @@ from stiffopt.optimise.tip import TipModel
 Array = NDArray[np.float64]
 
 _BAR = 1e5
-_EXACT = Tolerance(
-    position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance
-)  # with which plans are made
+_EXACT = Tolerance(position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance)
 
 
 @dataclass(frozen=True)
@@ -185,7 +183,7 @@ class Planning:
 
 
 def model_target(target: Target, offset: Array) -> Target:
-    """Return what the model has to reach for the arm, whose tip is off by (6,), to reach a target.
+    """Return the target of the model that puts an arm with an offset (6,) on a target.
 
     The offset is that of `PlanRequest`.
     """

@@ -33,27 +33,9 @@ Array = NDArray[np.float64]
 
 
 class RegulatorModel:
-    """Pressures behind the regulators of n channels, estimated in equal steps.
+    """Pressures behind the regulators of n channels, estimated in steps of a period, in s.
 
-    Parameters
-    ----------
-    period :
-        Of the steps, in s.
-    lag, dead_time :
-        Of the regulators (n,), in s.
-    slew :
-        Greatest rate of change (n,), in Pa/s.
-    tuning :
-        Observer gains.
-
-    Attributes
-    ----------
-    pressures : ndarray
-        Now (n,), in Pa.
-    ahead : ndarray
-        A dead time from now (n,), in Pa; no further command can change them.
-    offset : ndarray
-        Offset b (n,), in Pa: settled pressures relative to commands.
+    The regulators have a lag (n,) and a dead time, in s, and a greatest slew (n,), in Pa/s.
     """
 
     def __init__(
@@ -73,16 +55,15 @@ class RegulatorModel:
 
     def begin(self, pressures: Array) -> None:
         """Start anew, settled at pressures (n,)."""
-        self.pressures, self.offset = pressures.copy(), np.zeros_like(pressures)
-        self.ahead = self.pressures
+        self.pressures = pressures.copy()  # now, in Pa
+        self.offset = np.zeros_like(pressures)  # b, in Pa: settled pressures relative to commands
+        self.ahead = self.pressures  # a dead time from now; no further command can change them
         self._sent = np.tile(pressures, (self._depth, 1))  # the next to arrive comes first
 
     def advance(self, commanded: Array, reading: Array) -> Array:
         """Take a step with commands (n,) and, at its end, readings (n,); NaN: not measured.
 
-        Returns
-        -------
-        Pressures (n,) at the end of the step, in Pa.
+        Return the pressures (n,) then, in Pa.
         """
         sent = self._sent
         sent[:-1] = sent[1:]
@@ -94,28 +75,9 @@ class RegulatorModel:
 
 
 class PressureEstimator:
-    """Commanded, chamber and effective pressures of an arm, step by step.
+    """Commanded, chamber and effective pressures of an arm, in steps of a period, in s.
 
-    Parameters
-    ----------
-    robot :
-        Its history, if it has one: hysteresis, creep, and a lag that replaces the regulators'.
-    control :
-        Lag and dead time of the regulators.
-    period :
-        Of the steps, in s.
-    slew :
-        Greatest rate of change (n,), in Pa/s.
-    tuning :
-        Of the regulators' model.
-
-    Attributes
-    ----------
-    lag, dead_time : float
-        Mean lag of all channels, and dead time, in s.
-    command, chamber, effective : ndarray
-        Pressures (n,) that were commanded last, that are in the chambers, and that would give a
-        settled arm its present shape, in Pa.
+    The robot may have a history: hysteresis, creep, and a lag that replaces that of the regulators.
     """
 
     def __init__(
@@ -127,7 +89,7 @@ class PressureEstimator:
         tuning: RegulatorTuning,
     ) -> None:
         lag, self.dead_time = _regulation(robot, control)
-        self.lag = float(np.mean(lag))
+        self.lag = float(np.mean(lag))  # of all channels, in s
         self._robot, self._period = robot, period
         self._max_compensation = tuning.max_compensation
         self._regulators = RegulatorModel(period, lag, self.dead_time, slew, tuning)
@@ -138,7 +100,9 @@ class PressureEstimator:
         zero = np.zeros(self._robot.n_pressures)
         self._memory = _memory(self._robot)
         self._regulators.begin(zero)
-        self.command, self.chamber, self.effective = zero, zero, zero
+        self.command = zero  # pressures that were commanded last, in Pa
+        self.chamber = zero  # those in the chambers
+        self.effective = zero  # those that would give a settled arm its present shape
 
     def advance(self, steps: int, commanded: Array, reading: Array) -> None:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""

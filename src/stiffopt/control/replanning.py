@@ -60,23 +60,7 @@ class Pursuit:
 class Replanner:
     """Has plans made for what is pursued, at intervals, and keeps the newest.
 
-    Parameters
-    ----------
-    planner :
-        Makes the plans.
-    tuning :
-        Interval, and how quickly plans follow the offset.
-    period :
-        Of the loop, in s.
-    dead_time :
-        Of the regulators, in s.
-
-    Attributes
-    ----------
-    pursuit : Pursuit
-        What plans are made for.
-    plan : Plan or None
-        The newest, which may be of the task before.
+    The period of the loop and the dead time of the regulators are in s.
     """
 
     def __init__(
@@ -94,7 +78,7 @@ class Replanner:
     def begin(self) -> None:
         """Start anew, with nothing to pursue."""
         self.pursuit = Pursuit()
-        self.plan: Plan | None = None
+        self.plan: Plan | None = None  # the newest, which may be of the task before
         self._offset = np.zeros(6)
         self._renew()
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from concurrent.futures import Future, wait
+from contextlib import contextmanager
 from contextvars import ContextVar
 
 from stiffopt.errors import CommandError
@@ -60,21 +61,12 @@ def current_requester() -> Requester:
     return _requester.get() or Requester()
 
 
-class _QueuedRequest:
-    """A request whose outcome a thread waits for."""
-
-    def __init__(self, action: Action) -> None:
-        self.action = action
-        self.done = threading.Event()
-        self.error: BaseException | None = None
-
-
 class RequestQueue:
     """Has requests carried out by the thread that serves them, or at once where none does."""
 
     def __init__(self) -> None:
-        self.turn = threading.RLock()  # held by whatever works on what requests change
-        self._queue: deque[_QueuedRequest] = deque()
+        self.turn = threading.RLock()  # held during a tick, and while a request is carried out
+        self._queue: deque[tuple[Future[None], Action]] = deque()
         self._server: threading.Thread | None = None
 
     def begin(self) -> None:
@@ -94,16 +86,19 @@ class RequestQueue:
         """Carry out the waiting requests, or refuse them for a reason."""
         while True:
             try:
-                queued = self._queue.popleft()
+                outcome, action = self._queue.popleft()
             except IndexError:
                 return
+            if not outcome.set_running_or_notify_cancel():
+                continue  # it was given up
             try:
                 if refusing:
                     raise CommandError(refusing)
-                queued.action()
+                action()
             except BaseException as error:  # raised in the thread that made the request
-                queued.error = error
-            queued.done.set()
+                outcome.set_exception(error)
+            else:
+                outcome.set_result(None)
 
     def submit(self, action: Action) -> None:
         """Have a request carried out, wait for it, and raise what it raises.
@@ -120,15 +115,14 @@ class RequestQueue:
         if not self._served() or threading.current_thread() is self._server:
             self._in_turn(carry_out, requester)
             return
-        queued = _QueuedRequest(carry_out)
-        self._queue.append(queued)
-        while not queued.done.wait(_CHECK_EVERY):
-            if requester.gone:
-                self._withdraw(queued)
-            if not self._served() and queued in self._queue:
+        outcome: Future[None] = Future()
+        self._queue.append((outcome, carry_out))
+        while not wait([outcome], _CHECK_EVERY).done:
+            if requester.gone and outcome.cancel():  # which fails once it is being carried out
+                raise CommandError(_GIVEN_UP)
+            if not self._served():
                 self.serve(refusing="the loop has ended")
-        if queued.error is not None:
-            raise queued.error
+        outcome.result()
 
     def _in_turn(self, action: Action, requester: Requester) -> None:
         while not self.turn.acquire(timeout=_CHECK_EVERY):
@@ -138,13 +132,6 @@ class RequestQueue:
             action()
         finally:
             self.turn.release()
-
-    def _withdraw(self, queued: _QueuedRequest) -> None:
-        """Take a request out of the queue, unless it is being carried out."""
-        with suppress(ValueError, IndexError):  # it is not in the queue, or the queue is changing
-            self._queue.remove(queued)
-            queued.error = CommandError(_GIVEN_UP)
-            queued.done.set()
 
     def _served(self) -> bool:
         return self._server is not None and self._server.is_alive()

@@ -1,4 +1,4 @@
-"""The state of the control loop: every field of it is defined here, and only here.
+"""The state of the control loop: the one definition of each of its fields.
 
 A field's definition is its line in one of the dataclasses below: its type, and a `Shown` that says
 what it means, in which unit, and where it is shown. The HTTP and WebSocket interface, the client,
@@ -36,8 +36,8 @@ class State(StrEnum):
     """Where in its life a control loop is.
 
     ``unconfigured``: nothing was checked yet. ``inactive``: vented, ready to be armed. ``active``:
-    steers. ``holding``: pressures stay, or are let down, until what was wrong is well again.
-    ``fault``: vented; only an explicit reset leaves it.
+    steers. ``holding``: pressures stay, or are let down, while something stands in the way of
+    control. ``fault``: vented; only an explicit reset leaves it.
     """
 
     UNCONFIGURED = "unconfigured"
@@ -233,9 +233,9 @@ class ControllerStatus:
 class Snapshot(ControllerStatus):
     """The state of the control loop at the end of a tick.
 
-    SI units; poses in the base frame; gauge pressures. NaN is what is not known, None what nobody
-    asks for. Beside the fields that are shown, `samples` are all that the tracker has delivered
-    since the last tick, in order of arrival, used or not.
+    SI units; poses in the base frame; gauge pressures. NaN is what is not known, None what is not
+    prescribed. The last field is not shown: all `samples` that the tracker has delivered since the
+    last tick, in order of arrival, used or not.
     """
 
     time: Annotated[float, Shown("on the rig's clock", "s")]

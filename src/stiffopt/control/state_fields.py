@@ -1,4 +1,4 @@
-"""How the fields of the control loop's state are defined, and how the definitions are read.
+"""The form in which fields of the control loop's state are defined, and its reader.
 
 `stiffopt.control.state` has the definitions themselves.
 """
@@ -25,7 +25,7 @@ _DECIMALS = {"s": 6, "Pa": 1, "m": 7, "rad": 7, "": 7, "N/m": 4, "N": 5}
 class Shown:
     """What a field of the state means, and how it is shown in each place."""
 
-    about: str  # what it is
+    about: str  # its meaning
     # SI unit; the JSON name ends in it. Of several, the field `unit_field` says which holds, and
     # each has a JSON name of its own
     unit: str | tuple[str, ...] = ""
@@ -64,7 +64,7 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Entry:
-    """A field as its definition has it, with the defaults filled in."""
+    """A field's definition, with the defaults filled in."""
 
     name: str  # of the field
     kind: Kind  # of its value

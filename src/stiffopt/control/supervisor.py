@@ -51,7 +51,7 @@ class Supervisor:
     """Supervises a controller: state, faults, holds, letting down and venting.
 
     Requests raise `InputError` with the reason when they are refused; nothing has changed then.
-    Whatever fails while something changes is a fault. `ControlLoop` has checked their arguments.
+    A failure while something changes is a fault. `ControlLoop` has checked their arguments.
     `now` is the time on the rig's clock, in s.
     """
 

@@ -25,9 +25,8 @@ from stiffopt.optimise.tip import TipAt
 
 Array = NDArray[np.float64]
 
-_KEPT = 30.0
-"""Weight of an inequality that is missed against errors, in least squares: it is kept but for
-about a thousandth of the error that remains."""
+_INEQUALITY_WEIGHT = 30.0
+"""Of an inequality, in least squares; it may be missed by about a thousandth of the error."""
 
 
 class TipErrors:
@@ -38,11 +37,9 @@ class TipErrors:
         self._weighted: dict[Hashable, Formula] = {}
 
     def at(self, target: Target | None, position: Array, rotation: Array) -> tuple[float, float]:
-        """Return the errors of a tip at a position (3,) with axes (3, 3).
+        """Return the position error, in m, and angle error of a tip (3,) with axes (3, 3).
 
-        Returns
-        -------
-        Position error in m and angle error in rad; NaN where the target prescribes nothing.
+        NaN where the target prescribes nothing.
         """
         if target is None:
             return math.nan, math.nan
@@ -57,25 +54,10 @@ class TipErrors:
     def weighted(
         self, target: Target, tip: TipAt, lever: float
     ) -> tuple[Array, Array, float, float]:
-        """Return the error of a tip as one vector of lengths, for least squares.
+        """Return the error of the model's tip as one vector of lengths (t,), for least squares.
 
-        Parameters
-        ----------
-        target :
-            Prescribes one component at least.
-        tip :
-            The model's tip.
-        lever :
-            Weight of angles, in m/rad.
-
-        Returns
-        -------
-        error : (t,)
-            In m.
-        jacobian : (t, n)
-            Its derivative by the pressures, in m/Pa.
-        position_error, angle_error : float
-            In m and rad; 0 where the target prescribes nothing.
+        Angles count by a lever, in m/rad. With the error, in m, come its Jacobian (t, n) in m/Pa,
+        and the position and angle errors, in m and rad; 0 where the target prescribes nothing.
         """
         terms, n = _terms_of_tip(target), tip.jacobian.shape[1]
         key = (n, lever, *(term.structure for term in terms))
@@ -122,7 +104,7 @@ def _residuals(
     found = []
     for term, values in zip(terms, parameters, strict=True):
         residual = term.residual(tip, values)
-        found.append(_KEPT * ca.fmin(residual, 0) if term.is_inequality else residual)
+        found.append(_INEQUALITY_WEIGHT * ca.fmin(residual, 0) if term.is_inequality else residual)
     return found
 
 
@@ -151,16 +133,9 @@ def stiffness_function(task: Task) -> Callable[[Array, Array], float] | None:
 
 
 def wrench_at(tip: TipAt, offset: Array, turn: Array | None) -> Array:
-    """Return the wrench (6,), base axes, that would displace a tip by its offset.
+    """Return the wrench (6,), base axes, that would displace the model's tip by an offset (3,).
 
-    Parameters
-    ----------
-    tip :
-        The model's tip, with its compliance.
-    offset :
-        Of the position (3,), in m.
-    turn :
-        Of the orientation, as a rotation vector (3,); None if it is unknown: then a force alone.
+    Without a `turn` of the orientation, a rotation vector (3,), it is a force alone.
     """
     rotation = tip.pose[:3, :3]
     if turn is not None:

@@ -28,10 +28,8 @@ class Sight(Enum):
 class TrackerWatch:
     """Watches for how long the tip has not been seen, and whether it seems to jump.
 
-    What counts are samples that were used and are newer than all before, not those that are
-    missing, not visible, rejected, out of order, or of the same frame again. The usual interval and
-    age of samples are learned until the loop is armed; a sample is overdue by its age beyond the
-    usual.
+    Only samples count that were used and are newer than all before. The usual interval and age of
+    samples are learned until the loop is armed; a sample is overdue by its age beyond the usual.
 
     A tip that was missing is seen again after `TrackerTuning.back` ticks with new samples in which
     none was overdue: single samples must not switch control on and off. It is lost when no sample

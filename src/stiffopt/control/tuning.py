@@ -156,13 +156,7 @@ class TrackerTuning:
 
 @dataclass(frozen=True)
 class ControlTuning:
-    """Tuning of `TipController`, by part.
-
-    Attributes
-    ----------
-    regulators, estimator, reference, feedback, replanning : see their classes; noise, speed and
-        damping of the estimator are those of the rig file.
-    """
+    """Tuning of `TipController`, by part; the rig file has noise, speed and damping of the tip."""
 
     regulators: RegulatorTuning = field(default_factory=RegulatorTuning)
     estimator: EstimatorTuning = field(default_factory=EstimatorTuning)

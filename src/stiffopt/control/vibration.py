@@ -65,14 +65,7 @@ class BendingMode:
 def transition(omega: Symbols, damping: float, duration: Symbols) -> Symbols:
     """Transition matrix (2, 2) of a free vibration and its speed.
 
-    Parameters
-    ----------
-    omega :
-        Angular frequency, in rad/s.
-    damping :
-        Damping ratio.
-    duration :
-        In s; may be negative.
+    omega is in rad/s, the duration in s; it may be negative.
     """
     damped = omega * (1 - damping**2) ** 0.5
     decay = ca.exp(-damping * omega * duration)

@@ -31,26 +31,17 @@ _RECENT = 200  # ticks among which that of a frame is looked for
 
 @dataclass(frozen=True)
 class ConductorTuning:
-    """How the conductor moves the arm and judges what it sees.
+    """How the conductor moves the arm and judges what it sees."""
 
-    Attributes
-    ----------
-    gentle : rate at which pressures are brought to a new pose, in Pa/s.
-    first_sight : time in which a tracker must see the tip for the first time, in s.
-    near : greatest time between a frame and the readings that belong to it, in s.
-    settle_look : time between two looks at whether something has settled, in s.
-    slowest_lag : time constant, in s, up to which regulators count as healthy. The arm of an
-        experiment need not be identified yet, so this is far above a usual `regulator_lag`.
-    bad_readings : impossible readings in a row that end an experiment; fewer are ignored.
-    ramp_patience : a ramp ends in an error if it takes so many times the expected number of ticks.
-    """
-
-    gentle: float = 5e4
-    first_sight: float = 5.0
-    near: float = 0.1
-    settle_look: float = 0.1
+    gentle: float = 5e4  # rate at which pressures are brought to a new pose, in Pa/s
+    first_sight: float = 5.0  # time in which a tracker must see the tip for the first time, in s
+    near: float = 0.1  # greatest time between a frame and the readings that belong to it, in s
+    settle_look: float = 0.1  # time between two looks at whether something has settled, in s
+    # time constant, in s, up to which regulators count as healthy. The arm of an experiment need
+    # not be identified yet, so this is far above a usual `regulator_lag`
     slowest_lag: float = 2.0
-    bad_readings: int = 3
+    bad_readings: int = 3  # impossible readings in a row that end an experiment; fewer are ignored
+    # a ramp ends in an error if it takes so many times the expected number of ticks
     ramp_patience: int = 10
 
 
@@ -59,24 +50,14 @@ CONDUCTOR = ConductorTuning()
 
 @dataclass(frozen=True)
 class TrackedFrame:
-    """A frame of the tracker with the pressures and probe readings of that moment.
+    """A frame of the tracker with the pressures and probe readings of that moment."""
 
-    Attributes
-    ----------
-    time : when the frame was captured, on the rig's clock, in s.
-    position : of the tip in the base frame (3,), in m; NaN if it was not seen.
-    quaternion : of the tip in the base frame (w, x, y, z); None if it is not tracked.
-    commanded : set-points (n,) that held then, in Pa.
-    measured : pressures (n,) that were measured nearest to then, in Pa; NaN if not near.
-    force, stage : force in N and position in m of the probe; NaN while it is not in use.
-    """
-
-    time: float
-    position: Array
-    quaternion: Array | None
-    commanded: Array
-    measured: Array
-    force: float
+    time: float  # when the frame was captured, on the rig's clock, in s
+    position: Array  # of the tip in the base frame (3,), in m; NaN if it was not seen
+    quaternion: Array | None  # of the tip in the base frame (w, x, y, z); None if it is not tracked
+    commanded: Array  # set-points (n,) that held then, in Pa
+    measured: Array  # pressures (n,) that were measured nearest to then, in Pa; NaN if not near
+    force: float  # force in N and position in m of the probe; NaN while it is not in use
     stage: float
 
     @property
@@ -112,8 +93,9 @@ class Conductor:
     """Steps a rig at a fixed rate: command, read all devices, wait for the next tick.
 
     The safety gate limits every command; a loop that was held up makes no jump. The experiment ends
-    with `DeviceError` where the pressure monitor finds a fault, and where the arm was let down
-    because the loop had stood still; the caller then closes the rig, which vents it.
+    with `DeviceError` where a device fails, the tracker loses the tip, the pressure monitor finds a
+    fault, or the arm was let down because the loop had stood still; the caller then closes the rig,
+    which vents it.
 
     Parameters
     ----------
@@ -123,15 +105,6 @@ class Conductor:
         Ticks a second.
     check : callable, optional
         Called in each tick; raises to stop the experiment.
-
-    Attributes
-    ----------
-    rows : deque of TrackedFrame
-        The latest frames of the tracker.
-    sink : callable or None
-        Called with every new frame.
-    probing : bool
-        Whether the probe is read in each tick.
     """
 
     def __init__(self, rig: Rig, rate: float, check: Callable[[], None] = lambda: None) -> None:
@@ -142,9 +115,9 @@ class Conductor:
         self.rig = rig
         self.tracker = rig.tracker
         self.clock = rig.clock
-        self.rows: deque[TrackedFrame] = deque(maxlen=_KEPT)
-        self.sink: Callable[[TrackedFrame], None] | None = None
-        self.probing = False
+        self.rows: deque[TrackedFrame] = deque(maxlen=_KEPT)  # the latest
+        self.sink: Callable[[TrackedFrame], None] | None = None  # is given every new frame
+        self.probing = False  # whether the probe is read in each tick
         self._period = 1.0 / rate
         self._check = check
         safety = Safety() if rig.settings is None else rig.settings.safety
@@ -167,13 +140,7 @@ class Conductor:
         return self.rig.supply.n
 
     def start(self) -> None:
-        """Arm the supply and wait for the tracker.
-
-        Raises
-        ------
-        DeviceError
-            The tracker does not see the tip.
-        """
+        """Arm the supply and wait until the tracker sees the tip."""
         self.rig.supply.arm()
         self._monitor.clear()
         self._target = self._commanded = np.zeros(self.n)
@@ -189,12 +156,7 @@ class Conductor:
     def tick(self, target: ArrayLike) -> None:
         """Command pressures (n,), in Pa, which the gate approaches, and wait for the next tick.
 
-        Raises
-        ------
-        CommandError
-            The pressures are outside the limits.
-        DeviceError
-            A device fails, the tracker has lost the tip, or the arm was let down meanwhile.
+        `CommandError`: the pressures are outside the limits.
         """
         self._check()
         now = self.clock.now()
@@ -305,13 +267,7 @@ class Conductor:
         self.tick(limits.clamp(np.where((target == 0) & outside, 0.0, near)))
 
     def ramp(self, target: ArrayLike) -> None:
-        """Bring the pressures (n,), in Pa, to a target gently, see `ConductorTuning`.
-
-        Raises
-        ------
-        DeviceError
-            The set-points do not get there.
-        """
+        """Bring the pressures (n,), in Pa, to a target gently, see `ConductorTuning`."""
         limits = self.rig.supply.limits
         target = limits.clamp(np.asarray(target, dtype=float))
         span = np.maximum(limits.high, 0.0) - np.minimum(limits.low, 0.0)
@@ -377,13 +333,7 @@ def split_window(
 
 
 def check_pressures(rig: Rig, pressures: ArrayLike, channels: Sequence[int]) -> None:
-    """Refuse pressures (any number) that channels (counted from 0) may not have, one at a time.
-
-    Raises
-    ------
-    InputError
-        It names the channel and its limits.
-    """
+    """Refuse pressures (any number) that channels (counted from 0) may not have, one at a time."""
     limits = rig.supply.limits
     for channel in channels:
         for p in np.ravel(pressures):

@@ -6,7 +6,7 @@ what happens above its peaks; a model fitted to it alone would have to extrapola
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,51 +43,23 @@ def spread_pressures(count: int, low: ArrayLike, high: ArrayLike) -> Array:
     low, high = np.array(low, dtype=float), np.array(high, dtype=float)
     if count == 1:
         return high[np.newaxis]
-    numbers = range(_SKIPPED + 1, _SKIPPED + 1 + count)
-    sequence = np.array(
-        [[_mirrored(k, base) for base, _ in zip(_primes(), low, strict=False)] for k in numbers]
-    ).reshape(count, len(low))
+    from scipy.stats.qmc import Halton
+
+    sequence = Halton(len(low), scramble=False).fast_forward(_SKIPPED + 1).random(count)
+    numbers = np.arange(_SKIPPED + 1, _SKIPPED + 1 + count)
     share = np.argsort(np.argsort(sequence, axis=0), axis=0) / max(count - 1, 1)
-    mixed = np.argsort(np.array(numbers) ** 2 * np.sqrt(2.0) % 1.0)  # the sequence rises in steps
+    mixed = np.argsort(numbers**2 * np.sqrt(2.0) % 1.0)  # the sequence rises in steps
     return np.asarray(np.clip(low + share[mixed] * (high - low), low, high))
-
-
-def _mirrored(number: int, base: int) -> float:
-    """Return the radical inverse of a number: its digits mirrored at the point."""
-    value, digit = 0.0, 1.0
-    while number:
-        digit /= base
-        number, rest = divmod(number, base)
-        value += digit * rest
-    return value
-
-
-def _primes() -> Iterator[int]:
-    found: list[int] = []
-    number = 2
-    while True:
-        if all(number % prime for prime in found):
-            found.append(number)
-            yield number
-        number += 1
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """Combined poses within the limits of a rig.
+    """Combined poses within the limits of a rig."""
 
-    Attributes
-    ----------
-    base : pressures (n,) between rounds, in Pa: the allowed ones nearest to 0.
-    poses : pressures (N, n), in Pa.
-    speed : rates (n,) at which pressures change, in Pa/s.
-    settle : time that the arm may take to come to rest in a pose, in s.
-    """
-
-    base: Array
-    poses: Array
-    speed: Array
-    settle: float
+    base: Array  # pressures (n,) between rounds, in Pa: the allowed ones nearest to 0
+    poses: Array  # pressures (N, n), in Pa
+    speed: Array  # rates (n,) at which pressures change, in Pa/s
+    settle: float  # time that the arm may take to come to rest in a pose, in s
 
     @property
     def rounds(self) -> list[Array]:
@@ -117,21 +89,18 @@ class Coverage:
 
         Parameters
         ----------
-        conductor : Conductor
+        conductor :
             Has seen the tip; the arm is at `base`.
-        folder : Path
-            Gets the files `round_name`, with ``.part`` in their names until they are complete.
-        number : int
+        folder, about :
+            As for `recorded`; the files have the name of the round, `round_name`.
+        number :
             Which round, counted from 1.
-        about : dict of str to str
-            Kept in the MCAP file.
-        tell : callable
+        tell :
             Is told seconds done and what goes on.
 
         Returns
         -------
-        int
-            In how many poses the arm was not at rest in time.
+        In how many poses the arm was not at rest in time.
         """
         poses, before = self.rounds[number - 1], sum(map(len, self.rounds[: number - 1]))
         durations = self._durations(poses)
@@ -150,22 +119,9 @@ class Coverage:
 
 
 def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = None) -> Coverage:
-    """Return combined poses that cover the limits of a rig.
+    """Return combined poses that cover the limits of a rig, with a time to settle in each, in s.
 
-    Parameters
-    ----------
-    rig : Rig
-    count : int
-        How many poses.
-    settle : float
-        Time that the arm may take to come to rest in each, in s.
-    highest : float, optional
-        No channel goes higher, in Pa.
-
-    Raises
-    ------
-    InputError
-        A channel cannot be as low as `highest`.
+    No channel goes above the `highest` pressure, in Pa; `InputError` if one cannot be as low.
     """
     limits = rig.supply.limits
     high = limits.high if highest is None else np.minimum(limits.high, highest)
@@ -184,13 +140,7 @@ def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = No
 
 
 def _shortened(rig: Rig, pose: Array) -> Array:
-    """Scale pressures (n,) down to the total force that the rig allows.
-
-    Raises
-    ------
-    InputError
-        That is below a channel's low limit.
-    """
+    """Scale pressures (n,) down to the total force that the rig allows, if it is exceeded."""
     force = rig.force(pose)
     if rig.max_force is None or force <= rig.max_force:
         return pose

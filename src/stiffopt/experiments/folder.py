@@ -43,13 +43,7 @@ class ExperimentSettings(Schema):
 
 
 def create_folder(path: Path, settings: Schema) -> None:
-    """Make the folder of a new experiment and write its settings there.
-
-    Raises
-    ------
-    FileError
-        It cannot be made, or is there and not empty.
-    """
+    """Make the folder of a new experiment and write its settings there."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         if (path / SETTINGS).exists():
@@ -62,13 +56,7 @@ def create_folder(path: Path, settings: Schema) -> None:
 
 
 def open_folder(path: Path, schema: type[SchemaT]) -> SchemaT:
-    """Return the settings of an experiment that was begun.
-
-    Raises
-    ------
-    FileError
-        There is none, or one of another kind.
-    """
+    """Return the settings of an experiment that was begun."""
     if not (path / SETTINGS).is_file():
         raise FileError(path, f"holds no experiment; expected a folder with {SETTINGS} in it")
     return read_file(path / SETTINGS, "experiment", schema)
@@ -76,13 +64,7 @@ def open_folder(path: Path, schema: type[SchemaT]) -> SchemaT:
 
 @contextmanager
 def alone_in(path: Path) -> Iterator[None]:
-    """Context in which no other process may work in the folder of an experiment.
-
-    Raises
-    ------
-    InputError
-        Another process does.
-    """
+    """Context in which no other process works in the folder; `InputError` if another one does."""
     try:
         import fcntl
     except ImportError:  # Windows
@@ -105,13 +87,7 @@ def remove_folder(path: Path) -> None:
 
 
 def check_same(name: str, now: object, then: object) -> None:
-    """Refuse to resume an experiment with something that has changed.
-
-    Raises
-    ------
-    InputError
-        It has.
-    """
+    """Refuse to resume an experiment with something that has changed."""
     if now != then:
         raise InputError(f"the experiment was begun with {name} {then}, not {now}")
 

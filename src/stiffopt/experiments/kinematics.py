@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -17,18 +18,8 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from stiffopt.errors import FileError
-from stiffopt.experiments.conductor import (
-    Array,
-    Conductor,
-    at_rest,
-    check_pressures,
-)
-from stiffopt.experiments.coverage import (
-    Coverage,
-    coverage_for,
-    round_count,
-    round_name,
-)
+from stiffopt.experiments.conductor import Array, Conductor, at_rest, check_pressures
+from stiffopt.experiments.coverage import coverage_for, round_count, round_name
 from stiffopt.experiments.folder import ExperimentSettings, Progress, recorded
 from stiffopt.logs import read_log
 from stiffopt.rig.interface import Rig
@@ -69,18 +60,10 @@ class KinematicsSettings(ExperimentSettings):
 
 @dataclass(frozen=True, eq=False)
 class PressureSequence:
-    """Pressures that change linearly between moments.
+    """Pressures that change linearly between moments."""
 
-    Attributes
-    ----------
-    times : ndarray
-        (K,), in s, increasing from 0.
-    pressures : ndarray
-        (K, n), in Pa.
-    """
-
-    times: Array
-    pressures: Array
+    times: Array  # (K,), in s, increasing from 0
+    pressures: Array  # (K, n), in Pa
 
     @classmethod
     def sawtooth(
@@ -124,28 +107,11 @@ class PressureSequence:
 
 
 def sequence_for(rig: Rig, settings: KinematicsSettings) -> PressureSequence:
-    """Return the sequence within the limits and slew of a rig.
-
-    Raises
-    ------
-    InputError
-        A pressure is beyond the rig's limits.
-    """
+    """Return the sequence on a rig; `InputError` if a pressure is beyond its limits."""
     limits = rig.supply.limits
     check_pressures(rig, settings.pressures, range(limits.n))
     base = limits.clamp(np.clip(0.0, limits.low, limits.high))
     return PressureSequence.sawtooth(base, settings.pressures, settings.period, effective_slew(rig))
-
-
-def poses_for(rig: Rig, settings: KinematicsSettings) -> Coverage:
-    """Return the combined poses within the limits of a rig.
-
-    Raises
-    ------
-    InputError
-        A channel cannot be as low as the settings want it.
-    """
-    return coverage_for(rig, settings.poses, settings.settle, settings.max)
 
 
 def recording_name(repetition: int) -> str:
@@ -212,7 +178,8 @@ def run_kinematics(
     DeviceError
         A device fails; what was recorded is kept.
     """
-    sequence, coverage = sequence_for(rig, settings), poses_for(rig, settings)
+    sequence = sequence_for(rig, settings)
+    coverage = coverage_for(rig, settings.poses, settings.settle, settings.max)
     conductor = Conductor(rig, rate, check)
     todo, rounds = missing_repetitions(folder, settings), missing_rounds(folder, settings)
     total = sequence.duration * len(todo) + sum(map(coverage.duration, rounds))
@@ -226,27 +193,25 @@ def run_kinematics(
             notes.append(f"before {what} the arm was not at rest within {SETTLE:g} s")
 
     done = 0.0
+
+    def tell(t: float, text: str) -> None:
+        progress(done + t, total, text)
+
     for repetition in todo:
         text = f"repetition {repetition} of {settings.repetitions}"
-
-        def tell(t: float, done: float = done, text: str = text) -> None:
-            progress(done + t, total, text)
-
-        tell(0.0)
+        tell(0.0, text)
         rest(sequence.at(0.0), f"repetition {repetition}")
         about = {"experiment": "kinematics", "repetition": str(repetition), "rig": settings.rig}
-        _record(conductor, sequence, folder, recording_name(repetition), about, tell)
+        name = recording_name(repetition)
+        _record(conductor, sequence, folder, name, about, partial(tell, text=text))
         done += sequence.duration
     restless = 0
     for number in rounds:
-
-        def say(t: float, text: str, done: float = done) -> None:
-            progress(done + t, total, text)
-
-        say(0.0, f"round {number} of combined poses")
-        rest(coverage.base, f"round {number} of combined poses")
+        text = f"round {number} of combined poses"
+        tell(0.0, text)
+        rest(coverage.base, text)
         about = {"experiment": "kinematics", "poses": str(number), "rig": settings.rig}
-        restless += coverage.record(conductor, folder, number, about, say)
+        restless += coverage.record(conductor, folder, number, about, tell)
         done += coverage.duration(number)
     if restless:
         notes.append(

@@ -6,8 +6,9 @@ poses; `doubts` finds what is suspicious in a complete recording.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -25,62 +26,26 @@ _EVERY = 2  # points of the grid at which a loaded arm is evaluated
 
 @dataclass(frozen=True)
 class EvaluationRules:
-    """What counts as a pose, a gap and a doubt when recordings are evaluated.
+    """What counts as a pose, a gap and a doubt when recordings are evaluated."""
 
-    Attributes
-    ----------
-    gap : longest time between two samples, in s, across which the tip is interpolated.
-    held : time for which a command must not change to be a pose, in s.
-    window : time at the end of a pose over which tip and pressures are averaged, in s.
-    regulator_time : time in which a regulator should have followed a command, in s.
-    pressure_error : error of the pressure after that time that gives rise to a doubt, in Pa.
-    worse_share : share of the samples that may have a greater error.
-    hidden : longest time for which the tip may be out of sight, in s.
-    lost_share : share of the tracker's frames that may be missing.
-    """
-
-    gap: float = 0.3
-    held: float = 0.9
-    window: float = 1.0
-    regulator_time: float = 0.5
+    gap: float = 0.3  # longest time between two samples, in s, across which the tip is interpolated
+    held: float = 0.9  # time for which a command must not change to be a pose, in s
+    window: float = 1.0  # time at the end of a pose over which tip and pressures are averaged, in s
+    regulator_time: float = 0.5  # time in which a regulator should have followed a command, in s
+    # error of the pressure after that time that gives rise to a doubt, in Pa
     pressure_error: float = 5e3
-    worse_share: float = 0.01
-    hidden: float = 0.5
-    lost_share: float = 0.1
+    worse_share: float = 0.01  # share of the samples that may have a greater error
+    hidden: float = 0.5  # longest time for which the tip may be out of sight, in s
+    lost_share: float = 0.1  # share of the tracker's frames that may be missing
 
 
 RULES = EvaluationRules()
 
 
-@dataclass(frozen=True, eq=False)
-class KinematicsResult:
-    """Comparison of recordings with the model, on a common grid of times (K,).
+class DistanceStatistics:
+    """Statistics of `errors`: distances between measured and modelled tip, in m."""
 
-    Attributes
-    ----------
-    repetitions : how many recordings there are.
-    time : grid, in s.
-    pressures : mean over the repetitions (K, n), in Pa; measured, or commanded where not.
-    low, high : extremes of the measured tip over the repetitions (K, 3), in m.
-    model : tip that the model says, mean over the repetitions (K, 3), in m.
-    error : largest distance between measured and modelled tip over the repetitions (K,), in m.
-    component_error : the mean of modelled less measured tip over the repetitions (K, 3), in m.
-    errors : distances at all samples of all recordings (M,), in m.
-    length : of the arm at rest, in m.
-    doubts : what is suspicious in the recordings, in sentences.
-    """
-
-    repetitions: int
-    time: Array
-    pressures: Array
-    low: Array
-    high: Array
-    model: Array
-    error: Array
-    component_error: Array
     errors: Array
-    length: float
-    doubts: tuple[str, ...] = ()
 
     @property
     def mean(self) -> float:
@@ -89,13 +54,32 @@ class KinematicsResult:
 
     @property
     def p95(self) -> float:
-        """Error that 95 % of the samples do not exceed, in m."""
+        """Error that 95 % of the samples or poses do not exceed, in m."""
         return float(np.quantile(self.errors, 0.95))
 
     @property
     def worst(self) -> float:
         """Largest error, in m."""
         return float(self.errors.max())
+
+
+@dataclass(frozen=True, eq=False)
+class KinematicsResult(DistanceStatistics):
+    """Comparison of recordings with the model, on a common grid of times (K,)."""
+
+    repetitions: int  # how many recordings there are
+    time: Array  # grid, in s
+    pressures: Array  # mean over the repetitions (K, n), in Pa; measured, or commanded where not
+    low: Array  # least coordinates of the measured tip over the repetitions (K, 3), in m
+    high: Array  # greatest
+    model: Array  # tip that the model says, mean over the repetitions (K, 3), in m
+    # largest distance between measured and modelled tip over the repetitions (K,), in m
+    error: Array
+    # the mean of modelled less measured tip over the repetitions (K, 3), in m
+    component_error: Array
+    errors: Array  # distances at all samples of all recordings (M,), in m
+    length: float  # of the arm at rest, in m
+    doubts: tuple[str, ...] = ()  # what is suspicious in the recordings, in sentences
 
     @property
     def repeatability(self) -> float:
@@ -135,8 +119,10 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
     each = [_compared(log, model, grid, tip) for log in logs]
     tips = np.stack([one.tip for one in each])
     models = np.stack([one.model for one in each])
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of moments at which no tip was seen
         distances = np.linalg.norm(models - tips, axis=2)
+        component_error = np.nanmean(models - tips, axis=0)
     return KinematicsResult(
         repetitions=len(logs),
         time=grid,
@@ -145,7 +131,7 @@ def evaluate_kinematics(logs: Sequence[Log], model: Manipulator) -> KinematicsRe
         high=np.fmax.reduce(tips),
         model=models.mean(axis=0),
         error=np.fmax.reduce(distances),
-        component_error=_mean_of_known(models - tips),
+        component_error=component_error,
         errors=np.concatenate([one.errors for one in each]),
         length=model.length,
         doubts=doubts(logs),
@@ -190,57 +176,23 @@ def _on_grid(grid: Array, time: Array, values: Array, gap: float) -> Array:
     return found
 
 
-def _mean_of_known(values: Array) -> Array:
-    """Mean over the first axis of what is not NaN."""
-    known = np.isfinite(values)
-    total = np.where(known, values, 0.0).sum(axis=0)
-    count = known.sum(axis=0)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
 # combined poses ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
-class CoverageResult:
-    """Comparison of M combined poses with the model, by means over the last second of each.
+class CoverageResult(DistanceStatistics):
+    """Comparison of M combined poses with the model, by means over the last second of each."""
 
-    Attributes
-    ----------
-    pressures : (M, n), in Pa; measured, or commanded where not.
-    tip : measured tip (M, 3), in m.
-    model : tip of the model (M, 3), in m.
-    speed : speed at which the tip still moved (M,), in m/s, including noise.
-    length : of the arm at rest, in m.
-    doubts : what is suspicious in the recordings, in sentences.
-    """
+    pressures: Array  # (M, n), in Pa; measured, or commanded where not
+    tip: Array  # measured tip (M, 3), in m
+    model: Array  # tip of the model (M, 3), in m
+    speed: Array  # speed at which the tip still moved (M,), in m/s, including noise
+    length: float  # of the arm at rest, in m
+    doubts: tuple[str, ...] = ()  # what is suspicious in the recordings, in sentences
+    errors: Array = field(init=False)  # distances (M,) between measured and modelled tip, in m
 
-    pressures: Array
-    tip: Array
-    model: Array
-    speed: Array
-    length: float
-    doubts: tuple[str, ...] = ()
-
-    @property
-    def errors(self) -> Array:
-        """Distances (M,) between measured and modelled tip, in m."""
-        return np.asarray(np.linalg.norm(self.model - self.tip, axis=1))
-
-    @property
-    def mean(self) -> float:
-        """Mean error, in m."""
-        return float(self.errors.mean())
-
-    @property
-    def p95(self) -> float:
-        """Error that 95 % of the poses do not exceed, in m."""
-        return float(np.quantile(self.errors, 0.95))
-
-    @property
-    def worst(self) -> float:
-        """Largest error, in m."""
-        return float(self.errors.max())
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "errors", np.linalg.norm(self.model - self.tip, axis=1))
 
 
 def read_rounds(folder: Path, count: int) -> list[Log]:

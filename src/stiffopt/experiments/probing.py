@@ -9,11 +9,12 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import DeviceError, FileError, InputError
+from stiffopt.errors import DeviceError, FileError, InputError, os_reason
 from stiffopt.experiments.conductor import Array, Conductor, TrackedFrame, split_window
 from stiffopt.logs.table import cut_torn_end, read_table
 from stiffopt.rig.interface import ForceProbe
@@ -27,30 +28,18 @@ _FLAGS = ("touching", "settled")
 
 @dataclass(frozen=True)
 class ProbeTuning:
-    """How the probe approaches the tip, and when a force counts as settled.
+    """How the probe approaches the tip, and when a force counts as settled."""
 
-    Attributes
-    ----------
-    speed : of the stage, in m/s.
-    piece : duration of one movement at most, in s; the supply is commanded in between.
-    approach : steps in which the stage looks for the tip, in m.
-    tare : time over which the force without contact is read, in s.
-    window : time over which a force must not change at a step, in s; its second half is averaged.
-    change : share by which it may change nevertheless.
-    timeout : longest time at a step, in s.
-    touch : force, in standard deviations of its noise, that is contact.
-    least_touch : force that is contact, at least, in N.
-    """
-
-    speed: float = 0.002
-    piece: float = 0.1
-    approach: float = 1e-4
-    tare: float = 1.0
+    speed: float = 0.002  # of the stage, in m/s
+    piece: float = 0.1  # duration of one movement at most, in s; the supply is commanded in between
+    approach: float = 1e-4  # steps in which the stage looks for the tip, in m
+    tare: float = 1.0  # time over which the force without contact is read, in s
+    # time over which a force must not change at a step, in s; its second half is averaged
     window: float = 1.0
-    change: float = 0.01
-    timeout: float = 6.0
-    touch: float = 5.0
-    least_touch: float = 1e-3
+    change: float = 0.01  # share by which it may change nevertheless
+    timeout: float = 6.0  # longest time at a step, in s
+    touch: float = 5.0  # force, in standard deviations of its noise, that is contact
+    least_touch: float = 1e-3  # force that is contact, at least, in N
 
 
 PROBE = ProbeTuning()
@@ -58,58 +47,31 @@ PROBE = ProbeTuning()
 
 @dataclass(frozen=True)
 class Series:
-    """Parameters of a series.
+    """Parameters of a series."""
 
-    Attributes
-    ----------
-    direction : unit vector (3,) in the base frame, along which the probe pushes.
-    displacement : by which the stage goes beyond the first contact, and back, in m.
-    steps : in which it does so, each way.
-    reach : how far the stage looks for the tip, in m.
-    most_force : at which the series ends, in N.
-    """
-
-    direction: Array
-    displacement: float
-    steps: int
-    reach: float
-    most_force: float
+    direction: Array  # unit vector (3,) in the base frame, along which the probe pushes
+    displacement: float  # by which the stage goes beyond the first contact, and back, in m
+    steps: int  # in which it does so, each way
+    reach: float  # how far the stage looks for the tip, in m
+    most_force: float  # at which the series ends, in N
 
 
 @dataclass(frozen=True)
 class ProbePoint:
-    """A step of a series: means over a time in which the force did not change.
+    """A step of a series: means over a time in which the force did not change."""
 
-    Attributes
-    ----------
-    time : middle of that time on the rig's clock, in s.
-    force : force of the probe, less its reading without contact, in N.
-    displacement : of the tip along the direction, from its free position, in m.
-    stage : travel of the stage beyond the first contact, in m.
-    position : of the tip (3,), in m.
-    measured : pressures (n,), in Pa.
-    touching : whether the force is more than noise.
-    settled : whether the force had come to rest.
-    """
-
-    time: float
-    force: float
-    displacement: float
-    stage: float
-    position: Array
-    measured: Array
-    touching: bool
-    settled: bool
+    time: float  # middle of that time on the rig's clock, in s
+    force: float  # force of the probe, less its reading without contact, in N
+    displacement: float  # of the tip along the direction, from its free position, in m
+    stage: float  # travel of the stage beyond the first contact, in m
+    position: Array  # of the tip (3,), in m
+    measured: Array  # pressures (n,), in Pa
+    touching: bool  # whether the force is more than noise
+    settled: bool  # whether the force had come to rest
 
 
 class Probing:
-    """Does series with the probe of a rig while the pressures are held.
-
-    Parameters
-    ----------
-    conductor : Conductor
-        Conductor of a rig that has a probe.
-    """
+    """Does series with the probe of a conductor's rig while the pressures are held."""
 
     def __init__(self, conductor: Conductor) -> None:
         if conductor.rig.probe is None:
@@ -121,13 +83,8 @@ class Probing:
     def run(self, pressures: Array, series: Series) -> list[ProbePoint]:
         """Touch, displace in steps, return in the same steps, retreat; pressures (n,) are held.
 
-        The way back lets the creep of the arm, which never stops, be told from the effect of the
-        displacement.
-
-        Raises
-        ------
-        DeviceError
-            The probe meets nothing, or a device fails.
+        The way back separates the creep of the arm, which never stops, from the effect of the
+        displacement. `DeviceError`: the probe meets nothing, or a device fails.
         """
         self._conductor.probing = True
         try:
@@ -234,13 +191,12 @@ class Probing:
         return True
 
 
-@dataclass(frozen=True)
-class _Free:
-    """Force without contact, its noise, and the free position of the tip."""
+class _Free(NamedTuple):
+    """The tip before it is touched."""
 
-    force: float
-    noise: float
-    position: Array
+    force: float  # that the probe reads, in N
+    noise: float  # of that
+    position: Array  # (3,), in m
 
 
 @dataclass(frozen=True)
@@ -267,14 +223,7 @@ class SeriesPoints:
 
 
 class PointsFile:
-    """The file with the points of all series; a series is appended as a whole.
-
-    Parameters
-    ----------
-    folder : Path
-    n : int
-        Number of channels.
-    """
+    """The file with the points of all series, of n channels; a series is appended as a whole."""
 
     def __init__(self, folder: Path, n: int) -> None:
         self.path = folder / NAME
@@ -286,13 +235,7 @@ class PointsFile:
         return (*_KEY, "point", "points", *_VALUES, *measured, *_FLAGS)
 
     def read(self) -> list[SeriesPoints]:
-        """Return the complete series, in order.
-
-        Raises
-        ------
-        FileError
-            The file cannot be read, or is of another experiment.
-        """
+        """Return the complete series, in order."""
         if not self.path.exists():
             return []
         cut_torn_end(os.fspath(self.path))
@@ -330,13 +273,7 @@ class PointsFile:
         )
 
     def append(self, key: SeriesKey, points: Sequence[ProbePoint]) -> None:
-        """Append a series and flush it to disk.
-
-        Raises
-        ------
-        FileError
-            It cannot be written.
-        """
+        """Append a series and flush it to disk."""
         lines = []
         for number, point in enumerate(points, start=1):
             values = [
@@ -354,6 +291,4 @@ class PointsFile:
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
-            raise FileError(
-                self.path, f"cannot be written: {(error.strerror or '').lower()}"
-            ) from None
+            raise FileError(self.path, f"cannot be written: {os_reason(error)}") from None

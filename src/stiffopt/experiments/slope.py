@@ -25,42 +25,24 @@ _ALIKE = 0.9  # correlation of a trend with x from which on the trend is left ou
 
 @dataclass(frozen=True)
 class LineFit:
-    """A line fitted by least squares.
+    """A line fitted by least squares."""
 
-    Attributes
-    ----------
-    slope : of the line, at x = 0.
-    sigma : standard error of the slope, from the residuals.
-    freedom : degrees of freedom of the residuals.
-    points : number of points.
-    bend : curvature at x = 0 over its standard error; 0 if none was fitted.
-    """
-
-    slope: float
-    sigma: float
-    freedom: int
-    points: int
-    bend: float = 0.0
+    slope: float  # of the line, at x = 0
+    sigma: float  # standard error of the slope, from the residuals
+    freedom: int  # degrees of freedom of the residuals
+    points: int  # number of points
+    bend: float = 0.0  # curvature at x = 0 over its standard error; 0 if none was fitted
 
 
 @dataclass(frozen=True)
 class SlopeEstimate:
-    """Mean of the slopes of several repetitions, with its uncertainty.
+    """Mean of the slopes of several repetitions, with its uncertainty."""
 
-    Attributes
-    ----------
-    value : mean of the slopes.
-    sigma : standard error of the mean.
-    half_width : half the width of its confidence interval.
-    spread : standard deviation of the slopes; NaN for one.
-    count : number of slopes.
-    """
-
-    value: float
-    sigma: float
-    half_width: float
-    spread: float
-    count: int
+    value: float  # mean of the slopes
+    sigma: float  # standard error of the mean
+    half_width: float  # half the width of its confidence interval
+    spread: float  # standard deviation of the slopes; NaN for one
+    count: int  # number of slopes
 
 
 def fit_line(
@@ -88,7 +70,7 @@ def fit_line(
     columns = [np.ones_like(u), u / size]
     if curved and len(u) > len(columns) + 2:
         columns.append((u / size) ** 2)
-    if len(u) > len(columns) + 1 and _can_be_told(u, w):
+    if len(u) > len(columns) + 1 and _is_independent(u, w):
         columns.append((w - w.mean()) / np.ptp(w))
     design = np.stack(columns, axis=1)
     found, _, rank, _ = np.linalg.lstsq(design, v)
@@ -103,8 +85,8 @@ def fit_line(
     return LineFit(float(found[1]) / size, math.sqrt(spread[1, 1]) / size, freedom, len(u), bend)
 
 
-def _can_be_told(x: Array, trend: Array) -> bool:
-    """Return whether a trend differs enough from x for both to be fitted."""
+def _is_independent(x: Array, trend: Array) -> bool:
+    """Whether a trend correlates so little with x that both can be fitted."""
     dx, dt = x - x.mean(), trend - trend.mean()
     size = math.sqrt(float(dx @ dx) * float(dt @ dt))
     return size > 0 and abs(float(dx @ dt)) < _ALIKE * size

@@ -77,13 +77,7 @@ class StiffnessSettings(ExperimentSettings):
 
 
 def check_stiffness(rig: Rig, settings: StiffnessSettings) -> None:
-    """Refuse what this rig cannot do, before anything moves.
-
-    Raises
-    ------
-    InputError
-        The rig cannot do the experiment; the message says why.
-    """
+    """Refuse what this rig cannot do, before anything moves."""
     if rig.probe is None:
         raise InputError("this rig has no probe; the stiffness experiment needs one")
     if rig.tracker is None:
@@ -167,7 +161,11 @@ def run_stiffness(
             f"{key.pressure * 1e-5:g} bar, {direction_name(key.direction)}"
         )
         progress(number, total, text)
-        run.do(key)
+        try:
+            run.do(key)
+        except BaseException:
+            run.finish()
+            raise
     run.wind_down()
     progress(total, total, "done")
     return run.notes()
@@ -201,13 +199,6 @@ class _StiffnessRun:
 
     def do(self, key: SeriesKey) -> None:
         """Do one series and store its points."""
-        try:
-            self._series(key)
-        except BaseException:
-            self.finish()
-            raise
-
-    def _series(self, key: SeriesKey) -> None:
         settings, conductor = self._settings, self._conductor
         p = settings.pressures_at(key.pressure)
         if self._raw is None or self._raw.repetition != key.repetition:
@@ -221,7 +212,7 @@ class _StiffnessRun:
             self._rest(np.zeros(settings.channels))
         self._rest(p)
         self._by_hand(partial(self._probing.probe.align, key.direction))
-        at_rest_then = self._rest(p)  # whoever aligned it may have taken long, or touched the arm
+        at_rest_then = self._rest(p)  # aligning may have taken long, or moved the arm
         points = self._probing.run(p, self._planned(p, key))
         self._restless += not at_rest_then
         self._unsettled += sum(not point.settled for point in points)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,47 +16,32 @@ from stiffopt.experiments.stiffness import StiffnessSettings
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.manipulator import Manipulator
 
+_UNKNOWN = SlopeEstimate(math.nan, math.nan, math.nan, math.nan, 0)
+
 
 @dataclass(frozen=True)
 class StiffnessCell:
-    """Stiffness at one pressure in one direction.
+    """Stiffness at one pressure in one direction."""
 
-    Attributes
-    ----------
-    pressure : of the channel, in Pa.
-    direction : unit vector in the base frame.
-    estimate : from the displacement of the tip, in N/m; None if no repetition gave a slope.
-    by_stage : the same from the position of the stage; less, since contact and sensor yield too.
-    slopes : of the repetitions, in N/m.
-    points : number of points in contact, in all repetitions.
-    model : stiffness of the model, in N/m.
-    """
-
-    pressure: float
-    direction: tuple[float, float, float]
+    pressure: float  # of the channel, in Pa
+    direction: tuple[float, float, float]  # unit vector in the base frame
+    # from the displacement of the tip, in N/m; None if no repetition gave a slope
     estimate: SlopeEstimate | None
+    # the same from the position of the stage; less, since contact and sensor yield too
     by_stage: SlopeEstimate | None
-    slopes: tuple[float, ...]
-    points: int
-    model: float
+    slopes: tuple[float, ...]  # of the repetitions, in N/m
+    points: int  # number of points in contact, in all repetitions
+    model: float  # stiffness of the model, in N/m
 
 
 @dataclass(frozen=True, eq=False)
 class StiffnessResult:
-    """Measured and modelled stiffness of an experiment.
+    """Measured and modelled stiffness of an experiment."""
 
-    Attributes
-    ----------
-    settings : of the experiment.
-    cells : one for each pressure and direction.
-    curve_pressures : pressures of the channel (K,), in Pa, of the model's curves.
-    curves : stiffness of the model (K, d) along the d directions, in N/m.
-    """
-
-    settings: StiffnessSettings
-    cells: tuple[StiffnessCell, ...]
-    curve_pressures: Array
-    curves: Array
+    settings: StiffnessSettings  # of the experiment
+    cells: tuple[StiffnessCell, ...]  # one for each pressure and direction
+    curve_pressures: Array  # pressures of the channel (K,), in Pa, of the model's curves
+    curves: Array  # stiffness of the model (K, d) along the d directions, in N/m
 
     def along(self, direction: Sequence[float]) -> list[StiffnessCell]:
         """Return the cells of one direction, in order of pressure."""
@@ -65,25 +51,21 @@ class StiffnessResult:
     def table(self) -> StiffnessTable:
         """Return the results as a table, for `write_stiffness_table`."""
         cells = self.cells
-        estimates = [cell.estimate for cell in cells]
-        by_stage = [cell.by_stage for cell in cells]
-
-        def column(values: Sequence[float | None]) -> Array:
-            return np.array([np.nan if value is None else value for value in values], dtype=float)
-
+        estimates = [cell.estimate or _UNKNOWN for cell in cells]
+        by_stage = [cell.by_stage or _UNKNOWN for cell in cells]
         return StiffnessTable(
             pressures=np.stack([self.settings.pressures_at(cell.pressure) for cell in cells]),
             directions=np.array([cell.direction for cell in cells]),
             boundaries=("free",) * len(cells),
-            stiffness=column([None if e is None else e.value for e in estimates]),
-            sigma=column([None if e is None else e.sigma for e in estimates]),
+            stiffness=np.array([e.value for e in estimates]),
+            sigma=np.array([e.sigma for e in estimates]),
             others={
-                "ci95_n_per_m": column([None if e is None else e.half_width for e in estimates]),
-                "spread_n_per_m": column([None if e is None else e.spread for e in estimates]),
-                "repetitions": column([float(len(cell.slopes)) for cell in cells]),
-                "points": column([float(cell.points) for cell in cells]),
-                "by_stage_n_per_m": column([None if e is None else e.value for e in by_stage]),
-                "model_n_per_m": column([cell.model for cell in cells]),
+                "ci95_n_per_m": np.array([e.half_width for e in estimates]),
+                "spread_n_per_m": np.array([e.spread for e in estimates]),
+                "repetitions": np.array([float(len(cell.slopes)) for cell in cells]),
+                "points": np.array([float(cell.points) for cell in cells]),
+                "by_stage_n_per_m": np.array([e.value for e in by_stage]),
+                "model_n_per_m": np.array([cell.model for cell in cells]),
             },
         )
 

@@ -10,16 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.errors import FileError, InputError
+from stiffopt.errors import FileError, InputError, require_package
 from stiffopt.model.arguments import checked_integer
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.workspace.map import WorkspaceMap
-from stiffopt.workspace.plan import TUNING, Block, MapPlan
-from stiffopt.workspace.store import Checkpoint, MapStore, is_vacant, require_zarr
-from stiffopt.workspace.table import CellTable, Gathering
-from stiffopt.workspace.workers import Cluster, Threads, Workers, results
+from stiffopt.workspace.plan import TUNING, MapPlan
+from stiffopt.workspace.store import MapStore, is_vacant
+from stiffopt.workspace.table import CellTable, Gathering, MapPart
+from stiffopt.workspace.workers import Cluster, Threads, results
 
 Vector = NDArray[np.float64]
 Report = Callable[[int, int], None]
@@ -124,7 +124,7 @@ def open_workspace_map(path: str | os.PathLike[str]) -> WorkspaceMap:
     MissingExtraError
         Zarr (extra ``map``) is not installed.
     """
-    require_zarr()
+    require_package("zarr", "map")
     store = MapStore(path)
     if not store.is_complete:
         raise FileError(path, "is not complete; run what made it again, and it goes on")
@@ -135,7 +135,7 @@ def _opened(
     path: str | os.PathLike[str], plan: MapPlan, overwrite: bool, stack: ExitStack
 ) -> MapStore:
     """Return the locked store at a path, an unfinished one or a new one."""
-    require_zarr()
+    require_package("zarr", "map")
     parent = Path(path).resolve().parent
     if not parent.is_dir():
         raise FileError(path, f"cannot be written: there is no folder '{parent}'")
@@ -157,11 +157,11 @@ class _MapRun:
     """A run of the sampling, from the last checkpoint to the end."""
 
     def __init__(
-        self, plan: MapPlan, store: MapStore | None, begun: Checkpoint | None, report: Report
+        self, plan: MapPlan, store: MapStore | None, begun: MapPart | None, report: Report
     ) -> None:
         if begun is None:
             none = CellTable.empty(len(plan.measures))
-            begun = Checkpoint(0, 0, np.full(3, np.inf), np.full(3, -np.inf), none)
+            begun = MapPart(0, 0, np.full(3, np.inf), np.full(3, -np.inf), none)
         self._plan, self._store, self._report = plan, store, report
         self._state, self._begun = begun, begun.blocks
         self._gathering = Gathering(begun.table, TUNING.most_cells)
@@ -169,7 +169,7 @@ class _MapRun:
         self._whole = True  # False while a step is half done, for interrupts
         self._next_save = monotonic() + TUNING.checkpoint
 
-    def finish(self, workers: Workers) -> WorkspaceMap:
+    def finish(self, workers: Threads | Cluster) -> WorkspaceMap:
         """Evaluate the missing blocks and complete the map."""
         plan = self._plan
         self._tell()
@@ -191,7 +191,7 @@ class _MapRun:
             self._store.finish(done)
         return done
 
-    def _take(self, block: Block) -> None:
+    def _take(self, block: MapPart) -> None:
         state, self._whole = self._state, False
         self._gathering.add(block.table)
         self._state = state._replace(
@@ -219,7 +219,7 @@ class _MapRun:
         self._next_save = monotonic() + max(TUNING.checkpoint, took / TUNING.checkpoint_share)
 
 
-def _as_map(plan: MapPlan, state: Checkpoint, path: Path | None, evaluated: int) -> WorkspaceMap:
+def _as_map(plan: MapPlan, state: MapPart, path: Path | None, evaluated: int) -> WorkspaceMap:
     low, high = (np.where(np.isfinite(end), end, np.nan) for end in (state.low, state.high))
     return WorkspaceMap(plan, state.table, state.lost, low, high, path, evaluated)
 

@@ -31,7 +31,7 @@ from stiffopt.model.compiled import compiling_at_once, interpreted, library
 from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.shape import Shape
-from stiffopt.workspace.table import FARTHEST, CellTable, cell_indices, cell_keys
+from stiffopt.workspace.table import FARTHEST, CellTable, MapPart, cell_indices, cell_keys
 
 Vector = NDArray[np.float64]
 
@@ -44,31 +44,23 @@ MOST_SAMPLES = 10**12
 
 @dataclass(frozen=True)
 class MapTuning:
-    """Sizes and times of making a map; none changes the cells' values for a given plan.
+    """Sizes and times of making a map; none changes the cells' values for a given plan."""
 
-    Attributes
-    ----------
-    samples, loaded_samples : default number of samples of a free arm, and of one with gravity or
-        loads, whose equilibria take thousands of times longer than the closed form.
-    block, loaded_block : number of samples that are evaluated at a time, likewise.
-    compiled_from : number of samples from which machine code pays for its compilation.
-    most_cells : cells that one map may fill; each takes about 0.5 kB while it is made.
-    checkpoint : time between two checkpoints on disk, in s.
-    checkpoint_share : share of the time that checkpoints may take.
-    cluster_patience : time to wait for a scheduler, and for workers while there are none, in s.
-    retries : of a block that fails for a passing reason, such as a worker that is gone.
-    """
-
+    # default number of samples of a free arm, and of one with gravity or loads, whose equilibria
+    # take thousands of times longer than the closed form
     samples: int = 1_000_000
     loaded_samples: int = 1_000
-    block: int = 1 << 15
+    block: int = 1 << 15  # number of samples that are evaluated at a time, likewise
     loaded_block: int = 16
+    # number of samples from which machine code pays for its compilation
     compiled_from: int = 50_000
+    # cells that one map may fill; each takes about 0.5 kB while it is made
     most_cells: int = 1_500_000
-    checkpoint: float = 5.0
-    checkpoint_share: float = 0.05
+    checkpoint: float = 5.0  # time between two checkpoints on disk, in s
+    checkpoint_share: float = 0.05  # share of the time that checkpoints may take
+    # time to wait for a scheduler, and for workers while there are none, in s
     cluster_patience: float = 30.0
-    retries: int = 3
+    retries: int = 3  # of a block that fails for a passing reason, such as a worker that is gone
 
 
 TUNING = MapTuning()
@@ -76,12 +68,7 @@ TUNING = MapTuning()
 
 @dataclass(frozen=True)
 class Sampling(ABC):
-    """Samples of the pressures, by number, between the limits of each channel.
-
-    Attributes
-    ----------
-    lower, upper : limits of each channel, in Pa.
-    """
+    """Samples of the pressures, by number, between the limits of each channel, in Pa."""
 
     lower: tuple[float, ...]
     upper: tuple[float, ...]
@@ -111,11 +98,6 @@ class QuasiRandom(Sampling):
 
     Sample i is ``frac(shift + (i + 1) ratio^-j)`` of the range of channel j, in fixed point; the
     seed gives the shifts.
-
-    Attributes
-    ----------
-    count : number of samples.
-    seed : shifts the sequence.
     """
 
     count: int
@@ -142,14 +124,9 @@ class QuasiRandom(Sampling):
 
 @dataclass(frozen=True)
 class Grid(Sampling):
-    """Equally spaced levels of each channel, limits included; the last channel runs fastest.
+    """Equally spaced levels of each channel, limits included; the last channel runs fastest."""
 
-    Attributes
-    ----------
-    levels : of each channel, at least 2.
-    """
-
-    levels: int
+    levels: int  # of each channel, at least 2
 
     @property
     def total(self) -> int:
@@ -167,16 +144,6 @@ class Grid(Sampling):
     def record(self) -> dict[str, Any]:
         """Kind, levels and the number of samples that they make."""
         return {"sampling": "grid", "samples": self.total, "levels": self.levels}
-
-
-def _checked_sampling(sampling: Sampling) -> Sampling:
-    """Return a sampling; raise `InputError` if it has more than `MOST_SAMPLES`."""
-    if sampling.total > MOST_SAMPLES:
-        raise InputError(
-            f"{sampling.total:.3g} samples are too many; expected at most {MOST_SAMPLES:.0e}. "
-            "Take fewer levels, or quasi-random samples"
-        )
-    return sampling
 
 
 @cache
@@ -197,38 +164,13 @@ def _shift(seed: int, channel: int) -> int:
 
 
 @dataclass(frozen=True)
-class Block:
-    """Result of a block of samples.
-
-    Attributes
-    ----------
-    table : the cells that the tip fell into.
-    lost : number of samples at which the arm has no stable equilibrium.
-    low, high : (3,) least and greatest coordinates of the tip, in m.
-    """
-
-    table: CellTable
-    lost: int
-    low: Vector
-    high: Vector
-
-
-@dataclass(frozen=True)
 class MapPlan:
-    """Everything that determines the values of a map.
+    """Everything that determines the values of a map."""
 
-    Attributes
-    ----------
-    robot : the arm, with the load at its tip.
-    measures : the stiffness measures (m,), with unit directions.
-    sampling : the pressures that are sampled.
-    cell : edge length of a cell, in m.
-    """
-
-    robot: Manipulator
-    measures: tuple[DirectionalMeasure, ...]
-    sampling: Sampling
-    cell: float
+    robot: Manipulator  # with the load at its tip
+    measures: tuple[DirectionalMeasure, ...]  # (m,), with unit directions
+    sampling: Sampling  # the pressures that are sampled
+    cell: float  # edge length of a cell, in m
 
     @classmethod
     def of(
@@ -244,13 +186,7 @@ class MapPlan:
         cell: float = 0.01,
         seed: int = 0,
     ) -> "MapPlan":
-        """Plan from arguments; see `map_workspace`.
-
-        Raises
-        ------
-        InputError
-            If an argument is wrong.
-        """
+        """Plan from arguments; see `map_workspace`. `InputError`: one of them is wrong."""
         if not isinstance(robot, Manipulator):
             raise InputError(
                 f"expected a Manipulator, as load_robot returns it, not {type(robot).__name__}"
@@ -285,7 +221,7 @@ class MapPlan:
         if not self.robot.is_loaded:
             self._function  # noqa: B018
 
-    def evaluate(self, index: int) -> Block:
+    def evaluate(self, index: int) -> MapPart:
         """Result of one block, counted from 0."""
         start, stop = self.samples_in(index), self.samples_in(index + 1)
         pressures = self.sampling.pressures(start, stop)
@@ -295,14 +231,14 @@ class MapPlan:
         good = np.isfinite(position).all(axis=1) & np.isfinite(stiffness).all(axis=0)
         if not good.all():
             position, stiffness, sample = position[good], stiffness[:, good], sample[good]
-        return Block(
-            CellTable.of_samples(
-                cell_keys(cell_indices(position, self.cell)), stiffness, sample
-            ),
-            int((~good).sum()),
-            position.min(axis=0, initial=np.inf),
-            position.max(axis=0, initial=-np.inf),
-        )  # fmt: skip
+        keys = cell_keys(cell_indices(position, self.cell))
+        return MapPart(
+            blocks=1,
+            lost=int((~good).sum()),
+            low=position.min(axis=0, initial=np.inf),
+            high=position.max(axis=0, initial=-np.inf),
+            table=CellTable.of_samples(keys, stiffness, sample),
+        )
 
     def _in_closed_form(self, pressures: Vector) -> tuple[Vector, Vector]:
         """Positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
@@ -341,7 +277,14 @@ class MapPlan:
 
     def _outputs(self, shape: Shape, _: Any) -> list[Any]:
         """Position (3, 1) of the tip and its stiffnesses (m, 1)."""
-        return [shape.position, ca.vertcat(*(_stiffness(shape, m) for m in self.measures))]
+        stiffness = (
+            directional_stiffness(
+                shape.compliance, shape.rotation, ca.DM(measure.direction),
+                frame=measure.frame, kind=measure.kind, boundary=measure.boundary,
+            )
+            for measure in self.measures
+        )  # fmt: skip
+        return [shape.position, ca.vertcat(*stiffness)]
 
     # -- record on disk ---------------------------------------------------------------------
 
@@ -381,17 +324,6 @@ class MapPlan:
         return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _stiffness(shape: Shape, measure: DirectionalMeasure) -> Any:
-    return directional_stiffness(
-        shape.compliance,
-        shape.rotation,
-        ca.DM(measure.direction),
-        frame=measure.frame,
-        kind=measure.kind,
-        boundary=measure.boundary,
-    )
-
-
 def _measures(
     directions: Iterable[ArrayLike], kind: Kind, boundary: Boundary, frame: Frame
 ) -> tuple[DirectionalMeasure, ...]:
@@ -415,10 +347,17 @@ def _sampling(robot: Manipulator, samples: int | None, levels: int | None, seed:
     if levels is not None:
         if samples is not None:
             raise InputError("give samples or levels, not both")
-        return _checked_sampling(Grid(*limits, checked_integer("levels", levels, 2)))
-    if samples is None:
-        samples = TUNING.loaded_samples if robot.is_loaded else TUNING.samples
-    return _checked_sampling(QuasiRandom(*limits, checked_integer("samples", samples, 1), seed))
+        sampling: Sampling = Grid(*limits, checked_integer("levels", levels, 2))
+    else:
+        if samples is None:
+            samples = TUNING.loaded_samples if robot.is_loaded else TUNING.samples
+        sampling = QuasiRandom(*limits, checked_integer("samples", samples, 1), seed)
+    if sampling.total > MOST_SAMPLES:
+        raise InputError(
+            f"{sampling.total:.3g} samples are too many; expected at most {MOST_SAMPLES:.0e}. "
+            "Take fewer levels, or quasi-random samples"
+        )
+    return sampling
 
 
 def _cell_size(robot: Manipulator, cell: float) -> float:

@@ -1,7 +1,7 @@
 """A workspace map on disk: a Zarr group (format 3) that can be resumed until it is complete.
 
-While a map is unfinished, ``checkpoint.npz`` in its folder holds the result of its first blocks; it
-is replaced as a whole, so that a process may be killed at any time. At the end the arrays are
+While a map is unfinished, ``checkpoint.npz`` in its folder holds what its first blocks have found;
+it is replaced as a whole, so that a process may be killed at any time. At the end the arrays are
 written, the attributes of the group are set to ``complete`` (again in one step) and the checkpoint
 is removed. The process at work holds a lock on the folder.
 """
@@ -14,16 +14,14 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import FileError, require_package, shown
+from stiffopt.errors import FileError, os_reason, require_package, shown
 from stiffopt.workspace.map import FILL, WorkspaceMap
-from stiffopt.workspace.table import CellTable, cell_keys
-
-Vector = NDArray[np.float64]
+from stiffopt.workspace.table import CellTable, MapPart, cell_keys
 
 FORMAT = "stiffopt-map/1"
 _METADATA = "zarr.json"
@@ -40,42 +38,8 @@ _WHAT = {
 }
 
 
-class Checkpoint(NamedTuple):
-    """Result of the first blocks of a map.
-
-    Attributes
-    ----------
-    blocks : number of blocks done.
-    lost : samples without an equilibrium.
-    low, high : (3,) least and greatest coordinates of the tip.
-    table : the cells.
-    """
-
-    blocks: int
-    lost: int
-    low: Vector
-    high: Vector
-    table: CellTable
-
-
-def require_zarr() -> None:
-    """Raise `MissingExtraError` if Zarr is not installed."""
-    require_package("zarr", "map")
-
-
 class MapStore:
-    """The folder of a map.
-
-    Parameters
-    ----------
-    path :
-        The folder; by custom its name ends in ``.zarr``.
-
-    Raises
-    ------
-    FileError
-        There is something else at the path, or nothing.
-    """
+    """The folder of a map; `FileError` if there is something else at the path, or nothing."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -99,7 +63,7 @@ class MapStore:
                     target.replace(old)
                 new.replace(target)
         except OSError as error:
-            raise FileError(path, f"cannot be written: {_reason(error)}") from None
+            raise FileError(path, f"cannot be written: {os_reason(error)}") from None
         return cls(target)
 
     @property
@@ -109,13 +73,7 @@ class MapStore:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Keep other processes from working on this map.
-
-        Raises
-        ------
-        FileError
-            Another process does.
-        """
+        """Keep other processes from working on this map; `FileError` if another one does."""
         try:
             import fcntl
         except ImportError:  # Windows
@@ -124,7 +82,7 @@ class MapStore:
         try:
             handle = os.open(self.path, os.O_RDONLY)
         except OSError as error:
-            raise FileError(self.path, f"cannot be opened: {_reason(error)}") from None
+            raise FileError(self.path, f"cannot be opened: {os_reason(error)}") from None
         try:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -156,30 +114,28 @@ class MapStore:
 
     # -- while it is made -------------------------------------------------------------------
 
-    def save(self, progress: Checkpoint) -> None:
+    def save(self, progress: MapPart) -> None:
         """Replace the checkpoint."""
-        columns: dict[str, Any] = dict(progress.table.arrays)
+        columns: dict[str, Any] = {**progress._asdict(), **progress.table.arrays}
+        del columns["table"]
         try:
             part = self.path / f"{_CHECKPOINT}{_PART}"
             with part.open("wb") as stream:
-                np.savez(
-                    stream, blocks=progress.blocks, lost=progress.lost, low=progress.low,
-                    high=progress.high, **columns,
-                )  # fmt: skip
+                np.savez(stream, **columns)
                 stream.flush()
                 os.fsync(stream.fileno())
             part.replace(self.path / _CHECKPOINT)
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {_reason(error)}") from None
+            raise FileError(self.path, f"cannot be written: {os_reason(error)}") from None
 
-    def load(self) -> Checkpoint | None:
-        """Checkpoint, or None if there is none yet."""
+    def load(self) -> MapPart | None:
+        """Return the checkpoint, or None if there is none yet."""
         path = self.path / _CHECKPOINT
         try:
             with np.load(path, allow_pickle=False) as saved:
                 data = {name: saved[name] for name in saved.files}
             blocks, lost = int(data.pop("blocks")), int(data.pop("lost"))
-            return Checkpoint(blocks, lost, data.pop("low"), data.pop("high"), CellTable(**data))
+            return MapPart(blocks, lost, data.pop("low"), data.pop("high"), CellTable(**data))
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
@@ -191,7 +147,7 @@ class MapStore:
 
     def finish(self, done: WorkspaceMap) -> None:
         """Write the arrays and mark the map as complete."""
-        require_zarr()
+        require_package("zarr", "map")
         attributes = {
             **self.attributes,
             "status": "complete",
@@ -208,7 +164,7 @@ class MapStore:
             self.attributes = attributes
             self.tidy()
         except OSError as error:
-            raise FileError(self.path, f"cannot be written: {_reason(error)}") from None
+            raise FileError(self.path, f"cannot be written: {os_reason(error)}") from None
 
     def tidy(self) -> None:
         """Remove the files that a complete map does not need."""
@@ -216,33 +172,27 @@ class MapStore:
             with suppress(FileNotFoundError):
                 (self.path / name).unlink()
 
-    def read(self) -> Checkpoint:
-        """Read a complete map.
-
-        Raises
-        ------
-        FileError
-            Its arrays are damaged.
-        """
-        require_zarr()
+    def read(self) -> MapPart:
+        """Read a complete map."""
+        require_package("zarr", "map")
         try:
             table = read_table(self.path, np.array(self.attributes["first_cell"]))
             low, high = (
                 np.array(self.attributes[key], dtype=float) for key in ("tip_low_m", "tip_high_m")
             )
             lost = int(self.attributes["samples_without_equilibrium"])
-        except Exception as error:  # whatever a damaged file does to whichever decoder
+        except Exception as error:  # a damaged file may raise anything in zarr's decoders
             raise FileError(
                 self.path, f"is damaged: {type(error).__name__}: {error}; begin anew (--overwrite)"
             ) from None
-        return Checkpoint(0, lost, low, high, table)
+        return MapPart(0, lost, low, high, table)
 
 
 # arrays ------------------------------------------------------------------------------------------
 
 
 def write_arrays(path: Path, done: WorkspaceMap) -> None:
-    """Write all arrays chunk by chunk, so that the whole box need not fit into memory."""
+    """Write the cells that were reached; the whole box need not fit into memory."""
     import zarr
 
     for entry in path.iterdir():  # of a run that was killed here
@@ -251,7 +201,6 @@ def write_arrays(path: Path, done: WorkspaceMap) -> None:
     group = zarr.open_group(str(path), mode="r+", zarr_format=3)
     shape, m = done.shape, len(done.plan.measures)
     cells = done.cells - done.first_cell
-    order, starts, chunks = _by_chunk(cells)
     units = {"best": done.plan.unit, "worst": done.plan.unit}
     for name, fill in FILL.items():
         values = getattr(done.table, name)
@@ -265,24 +214,10 @@ def write_arrays(path: Path, done: WorkspaceMap) -> None:
             dimension_names=("direction",) * lead + ("x", "y", "z"),
             attributes={"long_name": _WHAT[name], "units": units.get(name, "1")},
         )
-        for begin, end, corner in zip(starts[:-1], starts[1:], chunks, strict=True):
-            rows = order[begin:end]
-            size = np.minimum(_CHUNK, np.array(shape) - corner)
-            box = np.full((m,) * lead + tuple(size), fill, dtype=values.dtype)
-            box[..., *(cells[rows] - corner).T] = values[..., rows]
-            array[..., *(slice(a, a + b) for a, b in zip(corner, size, strict=True))] = box
+        for direction in np.ndindex(values.shape[:-1] if len(cells) else (0,)):
+            place = (*(np.full(len(cells), index) for index in direction), *cells.T)
+            array.vindex[place] = values[direction]
     _write_coordinates(group, done)
-
-
-def _by_chunk(cells: NDArray[np.int64]) -> tuple[NDArray[np.intp], Any, NDArray[np.int64]]:
-    """Sort rows by chunk; return the order, the start of each chunk's rows, and its corner."""
-    if not len(cells):
-        return np.empty(0, np.intp), np.zeros(1, np.int64), np.empty((0, 3), np.int64)
-    corners = cells // _CHUNK * _CHUNK
-    key = cell_keys(corners)
-    order = np.argsort(key, kind="stable")
-    firsts = np.flatnonzero(np.diff(key[order], prepend=-1))
-    return order, np.append(firsts, len(order)), corners[order[firsts]]
 
 
 def _write_coordinates(group: Any, done: WorkspaceMap) -> None:
@@ -336,7 +271,7 @@ def _read_attributes(path: Path) -> dict[str, Any]:
         reason = no_map if os.path.lexists(path) else "there is no such map"
         raise FileError(path, reason) from None
     except OSError as error:
-        raise FileError(path, f"cannot be read: {_reason(error)}") from None
+        raise FileError(path, f"cannot be read: {os_reason(error)}") from None
     except ValueError:
         raise FileError(path, no_map) from None
     attributes = data.get("attributes") if isinstance(data, dict) else None
@@ -362,7 +297,7 @@ def is_vacant(path: str | os.PathLike[str]) -> bool:
     try:
         return place.is_dir() and not place.is_symlink() and not any(place.iterdir())
     except OSError as error:
-        raise FileError(path, f"cannot be read: {_reason(error)}") from None
+        raise FileError(path, f"cannot be read: {os_reason(error)}") from None
 
 
 def _group(attributes: dict[str, Any]) -> dict[str, Any]:
@@ -379,13 +314,9 @@ def _write_json(path: Path, data: dict[str, Any]) -> None:
     part.replace(path)
 
 
-def _plain(values: Vector) -> list[float | None]:
+def _plain(values: NDArray[np.float64]) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
 
 
 def _said(value: Any) -> str:
     return f"'{value}'" if isinstance(value, str) else f"{value}"
-
-
-def _reason(error: OSError) -> str:
-    return (error.strerror or str(error)).lower()

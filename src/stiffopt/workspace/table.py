@@ -1,12 +1,13 @@
-"""Tables of cells of space with the range of stiffness in each; they merge in any order.
+"""What samples have found: tables of cells with the range of stiffness in each.
 
-Cell (i, j, k) of size c is centred at (i, j, k) c in the base frame. Merging adds up the numbers of
-samples and keeps the greatest and least stiffness, each with the lowest sample number that attains
-it, so the outcome does not depend on how samples are grouped.
+Cell (i, j, k) of size c is centred at (i, j, k) c in the base frame. Merging tables adds up the
+numbers of samples and keeps the greatest and least stiffness, each with the lowest sample number
+that attains it, so the outcome does not depend on how samples are grouped.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,22 +27,14 @@ _NO_SAMPLE = np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class CellTable:
-    """The cells that samples fell into, for m directions, in the order of their keys.
+    """The cells that samples fell into, for m directions, in the order of their keys."""
 
-    Attributes
-    ----------
-    key : (M,) packed indices of the cell, ascending.
-    count : (M,) number of samples.
-    best, worst : (m, M) greatest and least stiffness.
-    best_sample, worst_sample : (m, M) the lowest sample that has it.
-    """
-
-    key: Numbers
-    count: Numbers
-    best: Vector
-    worst: Vector
-    best_sample: Numbers
-    worst_sample: Numbers
+    key: Numbers  # (M,) packed indices of the cell, ascending
+    count: Numbers  # (M,) number of samples
+    best: Vector  # (m, M) greatest stiffness
+    worst: Vector  # (m, M) least stiffness
+    best_sample: Numbers  # (m, M) the lowest sample that has it
+    worst_sample: Numbers  # likewise
 
     @classmethod
     def empty(cls, m: int) -> "CellTable":
@@ -71,6 +64,16 @@ class CellTable:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
+class MapPart(NamedTuple):
+    """What blocks of samples have found: one of them, or the first so many."""
+
+    blocks: int  # how many
+    lost: int  # samples at which the arm has no stable equilibrium
+    low: Vector  # least coordinates (3,) of the tip, in m
+    high: Vector  # greatest coordinates (3,)
+    table: CellTable
+
+
 def cell_indices(position: Vector, cell: float) -> Numbers:
     """Indices (k, 3) of the cells that positions (k, 3) are in."""
     return np.asarray(np.floor(position / cell + 0.5), dtype=np.int64)
@@ -94,15 +97,7 @@ def merged(tables: Sequence[CellTable]) -> CellTable:
 
 
 class Gathering:
-    """A table that grows; added tables are merged once there are enough rows.
-
-    Parameters
-    ----------
-    table :
-        Table to begin with.
-    most_cells :
-        Cells that it may have.
-    """
+    """A table that grows up to `most_cells`; added tables are merged when there are enough rows."""
 
     _ENOUGH = 1 << 18  # rows
 
@@ -120,13 +115,7 @@ class Gathering:
             self.table()
 
     def table(self) -> CellTable:
-        """Table of everything that was added so far.
-
-        Raises
-        ------
-        InputError
-            If there are more cells than a map may have.
-        """
+        """Table of everything that was added so far."""
         self._table = merged([self._table, *self._waiting])
         self._waiting, self._rows = [], 0
         if len(self._table) > self._most_cells:

@@ -15,10 +15,11 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from time import monotonic
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from stiffopt.errors import InputError, StiffoptError, require_package
-from stiffopt.workspace.plan import TUNING, Block, MapPlan
+from stiffopt.workspace.plan import TUNING, MapPlan
+from stiffopt.workspace.table import MapPart
 
 _POLL = 0.2  # s
 
@@ -27,29 +28,12 @@ class ClusterError(StiffoptError):
     """The cluster cannot be reached, or failed; what was done so far is kept."""
 
 
-class Workers(Protocol):
-    """Interface of whatever evaluates blocks of a plan."""
-
-    @property
-    def width(self) -> int:
-        """Number of blocks to have in work."""
-
-    def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
-        """Start a block; `done` is called with its number and future, from any thread."""
-
-    def result(self, future: Any) -> Block:
-        """Result of a future that is done."""
-
-    def check(self) -> None:
-        """Raise if no result will ever come."""
-
-
 def results(
-    workers: Workers, blocks: range, poll: Callable[[], None] = lambda: None
-) -> Iterator[Block]:
+    workers: "Threads | Cluster", blocks: range, poll: Callable[[], None] = lambda: None
+) -> Iterator[MapPart]:
     """Yield the results of blocks in order; `poll` is called now and then while waiting."""
     finished: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
-    ready: dict[int, Block] = {}
+    ready: dict[int, MapPart] = {}
     following = blocks.start
     for index in blocks:
         while index not in ready:
@@ -69,12 +53,8 @@ def results(
 class Threads(AbstractContextManager["Threads"]):
     """Threads of this process.
 
-    Parameters
-    ----------
-    plan : MapPlan
-    count : int, optional
-        By default one for each core; one for an arm with loads, as its equilibria are found in
-        Python, which has no use for more.
+    By default there is one for each core; one for an arm with loads, whose equilibria are found in
+    Python, which has no use for more.
     """
 
     def __init__(self, plan: MapPlan, count: int | None = None) -> None:
@@ -97,37 +77,21 @@ class Threads(AbstractContextManager["Threads"]):
         return 2 * self._count
 
     def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
-        """Start a block."""
+        """Start a block; `done` is called with its number and future, from any thread."""
         future = self._pool.submit(self._plan.evaluate, index)
         future.add_done_callback(lambda finished: done(index, finished))
 
-    def result(self, future: Any) -> Block:
+    def result(self, future: Any) -> MapPart:
         """Result of a future that is done."""
-        block: Block = future.result()
-        return block
+        found: MapPart = future.result()
+        return found
 
     def check(self) -> None:
         """Threads do not get lost."""
 
 
 class Cluster(AbstractContextManager["Cluster"]):
-    """Workers of a Dask cluster; stiffopt must be installed there in the same version.
-
-    Parameters
-    ----------
-    plan : MapPlan
-    address : str
-        Of the scheduler, for example ``tcp://10.0.0.5:8786``.
-
-    Raises
-    ------
-    MissingExtraError
-        If distributed is not installed.
-    InputError
-        If the address is no address.
-    ClusterError
-        If no scheduler answers there, or it has no workers.
-    """
+    """Workers of a Dask cluster; stiffopt must be installed there in the same version."""
 
     def __init__(self, plan: MapPlan, address: str) -> None:
         self._client = _client(address)
@@ -165,7 +129,7 @@ class Cluster(AbstractContextManager["Cluster"]):
         return 3 * self._threads + 2
 
     def submit(self, index: int, done: Callable[[int, Any], None]) -> None:
-        """Start a block."""
+        """Start a block; see `Threads.submit`."""
         future = self._client.submit(
             _evaluate_on_worker, self._token, self._payload, index,
             key=f"stiffopt-map-{self._run}-{index}", pure=False, retries=TUNING.retries,
@@ -173,14 +137,8 @@ class Cluster(AbstractContextManager["Cluster"]):
         self._futures.add(future)
         future.add_done_callback(lambda finished: done(index, finished))
 
-    def result(self, future: Any) -> Block:
-        """Result of a future that is done.
-
-        Raises
-        ------
-        ClusterError
-            If the cluster gave up on it.
-        """
+    def result(self, future: Any) -> MapPart:
+        """Result of a future that is done; `ClusterError` if the cluster gave up on it."""
         self._futures.discard(future)
         try:
             token, block = future.result(timeout=TUNING.cluster_patience)
@@ -196,15 +154,13 @@ class Cluster(AbstractContextManager["Cluster"]):
                 "install the same version of stiffopt everywhere"
             )
         self._seen = monotonic()
-        result: Block = block
+        result: MapPart = block
         return result
 
     def check(self) -> None:
-        """Raise if no result will ever come."""
+        """Raise if no result will ever come; distributed reconnects for a while."""
         if self._client.status != "running" and monotonic() - self._seen > TUNING.cluster_patience:
-            raise ClusterError(
-                "the connection to the scheduler is lost"
-            )  # distributed reconnects for a while
+            raise ClusterError("the connection to the scheduler is lost")
         if monotonic() - self._seen > TUNING.cluster_patience:
             self._threads = self._count_threads(wait=0.0)
             self._seen = monotonic()
@@ -249,7 +205,7 @@ _plans_lock = threading.Lock()
 _PLANS_KEPT = 4
 
 
-def _evaluate_on_worker(token: str, payload: bytes, index: int) -> tuple[str, Block]:
+def _evaluate_on_worker(token: str, payload: bytes, index: int) -> tuple[str, MapPart]:
     """Result of a block, and the worker's name for the plan; runs on a worker.
 
     The plan with what was compiled for it is kept for the next block.
