@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 import casadi as ca
 import numpy as np
 import pytest
+from rich.console import Console
 
 import stiffopt as so
 from stiffopt.cli.solve_records import json_record, result_record
@@ -44,10 +45,21 @@ class MeanStiffness(Measure):
         return ca.log(3 / ca.trace(tip.compliance[:3, :3]))
 
 
+class MeanAtLeast(MeanStiffness):
+    """The same as a condition, in N/m."""
+
+    role: ClassVar[Role] = "at_least"
+    value: float
+
+    def holds(self, value):
+        return value >= self.value
+
+
 class MeanGoal(StiffnessGoal):
-    """A goal with that measure."""
+    """A goal with these measures."""
 
     maximise: Items[MeanStiffness]
+    at_least: Items[MeanAtLeast] = ()
 
 
 EXAMPLES = {
@@ -135,4 +147,14 @@ def test_a_measure_outside_of_the_package_is_maximised_and_told():
     solved = SolvedTask("a.yaml", robot, solution)
     assert json_record(solved)["stiffness"] == solution.stiffness
     assert result_record(solved)["stiffness"][0]["mean"] == "translation"
-    assert block(solved) is not None
+    console = Console(width=100)
+    with console.capture() as shown:
+        console.print(block(solved))
+    assert "required" not in shown.get()
+    goal = MeanGoal(
+        maximise=[{"mean": "translation"}], at_least=[{"mean": "translation", "value": 1.5}]
+    )
+    wanted = so.solve_pressure(robot, task.model_copy(update={"stiffness": goal}))
+    with console.capture() as shown:
+        console.print(block(SolvedTask("a.yaml", robot, wanted)))
+    assert "required: at least 1.500" in shown.get()

@@ -83,7 +83,8 @@ def path(tmp_path: Path) -> Path:
 
 
 def test_the_laws_of_the_package() -> None:
-    assert list(strain_laws()) == ["paper", "rest-length", "neo-hookean"]
+    ours = ["paper", "rest-length", "neo-hookean"]
+    assert [name for name in strain_laws() if name in ours] == ours
     assert all(law.words for law in strain_laws().values())
 
 
@@ -159,10 +160,12 @@ def test_the_law_of_the_documentation_is_one_file(
     page = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
     code = page.partition("## A strain law")[2].partition("```python\n")[2].partition("```")[0]
     (path.parent / "wound.py").write_text(code, encoding="utf-8")
+    before = set(strain_laws())
+    assert "wound" not in before
     monkeypatch.setattr(laws, "__path__", [*laws.__path__, str(path.parent)])
     laws._import_all.cache_clear()
     try:
-        assert set(strain_laws()) == {"paper", "rest-length", "neo-hookean", "wound"}
+        assert set(strain_laws()) == {*before, "wound"}
         pose = stiffopt.load_robot(path).tip_pose(np.full(3, 1e5))
         assert np.arctan2(pose[1, 0], pose[0, 0]) == pytest.approx(np.radians(20))
     finally:
@@ -217,6 +220,8 @@ def test_what_a_law_cannot_describe_is_not_tried(wound: type[StrainLaw]) -> None
     material = one.segments[0].material.model_copy(update={"poisson_ratio": 0.4})
     segment = one.segments[0].model_copy(update={"material": material})
     compressible = one.model_copy(update={"segments": (segment,)})
-    assert [law.name for law in other_laws(compressible)] == ["rest-length", "wound"]
+    names = [law.name for law in other_laws(compressible)]
+    assert {"rest-length", "wound"} <= set(names)
+    assert "neo-hookean" not in names
     with pytest.raises(InputError, match="incompressible"):
         type(segment)(**segment.model_dump() | {"strain_law": "neo-hookean"})

@@ -14,7 +14,8 @@ from stiffopt.cli.solve_records import priced
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.cli.tables import labelled, number_table
 from stiffopt.errors import printable
-from stiffopt.optimise.goal import AtLeast, MatchMatrix, MatchValue, StiffnessMeasure
+from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
+from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import (
@@ -195,13 +196,14 @@ def _stiffness(
     )
 
 
-def _condition(measure: StiffnessMeasure) -> str:
+def _condition(measure: Measure) -> str:
     """What the task says that the value must be."""
-    if isinstance(measure, AtLeast):
-        return f"required: at least {figures(measure.value)}"
-    if isinstance(measure, MatchValue):
-        return f"required: {figures(measure.value)} to {measure.tolerance * 100:g} %"
-    return ""
+    value, tolerance = (getattr(measure, key, None) for key in ("value", "tolerance"))
+    if value is None:
+        return ""
+    if tolerance is None:
+        return f"required: at least {figures(value)}"
+    return f"required: {figures(value)} to {tolerance * 100:g} %"
 
 
 def _worth(solution: PressureSolution) -> Iterable[Line]:

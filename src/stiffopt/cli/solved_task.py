@@ -24,7 +24,8 @@ class SolvedTask:
     plain : the task's stiffnesses at pressures that reach the target and ignore stiffness; empty
         if there are none.
     uncertainty : how well the tip is known there, or None for a robot without calibration.
-    intervals : 95 % intervals of the task's stiffnesses; empty where there is no `uncertainty`.
+    intervals : 95 % intervals of the task's stiffnesses, None for those that are not along a
+        direction; empty where there is no `uncertainty`.
     front : the trade-off between tip error and stiffness; None without --pareto or if it failed.
     no_front : why there is no trade-off although --pareto was given; else empty.
     """
@@ -34,7 +35,7 @@ class SolvedTask:
     solution: PressureSolution
     plain: tuple[float, ...] = ()
     uncertainty: TipUncertainty | None = None
-    intervals: tuple[tuple[float, float], ...] = ()
+    intervals: tuple[tuple[float, float] | None, ...] = ()
     front: tuple[PressureSolution, ...] | None = None
     no_front: str = ""
 
@@ -79,8 +80,9 @@ def _with_uncertainty(answer: SolvedTask) -> SolvedTask:
         measures = answer.solution.task.measures[: len(answer.solution.stiffnesses)]
         intervals = tuple(
             uncertainty.stiffness_interval(m.direction, m.kind, m.boundary, m.frame)
-            for m in measures
             if isinstance(m, StiffnessMeasure)
+            else None
+            for m in measures
         )
     except EquilibriumError:  # hardly an equilibrium: nothing is known of its errors
         return answer

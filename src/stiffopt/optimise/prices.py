@@ -113,7 +113,8 @@ class _Weights:
         """Weights per unit of each constraint; those of the first ones sum to one."""
         count = len(self._columns)
         A = np.array(self._columns).T
-        A /= max(float(np.abs(A[:, :terms]).max()), 1e-300)
+        peak = float(np.abs(A[:, :terms]).max())
+        A /= peak if peak > 1e-150 else 1.0  # least pressure, where there is none: no slope
         lengths = np.linalg.norm(A, axis=0)
         scale = np.where(np.arange(count) < terms, 1.0, 1 / np.maximum(lengths, 1e-300))
         A = A * scale
