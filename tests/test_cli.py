@@ -17,14 +17,14 @@ import pytest
 from typer.testing import CliRunner
 
 import stiffopt
-from stiffopt.cli import exits
+from stiffopt.cli import exits, solve_run
 from stiffopt.cli import main as entry
 from stiffopt.cli.console import plain_data
 from stiffopt.cli.solve_files import find_tasks
 from stiffopt.cli.solve_records import json_record
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.documents import read_document
-from stiffopt.errors import EquilibriumError
+from stiffopt.errors import EquilibriumError, FileError
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.history import History, Play
 from stiffopt.model.robot_files import load_description, save_robot
@@ -712,6 +712,35 @@ def test_a_reader_that_leaves_is_no_error(tmp_path: Path, write: Write) -> None:
             assert child.stderr.read() == ""
             assert child.wait() == exits.CLOSED_PIPE
     assert len(read_document(out).data["results"]) == 2  # the files are written all the same
+
+
+def test_no_error_is_written_into_the_progress_bar(
+    tmp_path: Path, write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[str] = []  # what the bar says now
+    errors = []
+
+    class Bar(solve_run.ProgressBar):
+        def report(self, done: float, total: float | None, text: str) -> None:
+            shown[:] = [text]
+
+        def hide(self) -> None:
+            shown.clear()
+
+    def report_error(message: str) -> None:
+        assert not shown
+        errors.append(message)
+
+    def fail(*_: object) -> None:
+        assert "drawing" in shown[0]
+        raise FileError("one.png", "cannot be written")
+
+    monkeypatch.setattr(solve_run, "ProgressBar", Bar)
+    monkeypatch.setattr(solve_run, "report_error", report_error)
+    monkeypatch.setattr(solve_run.solve_files, "draw", fail)
+    paths = [write("bad.yaml", "format: stiffopt-task/1"), write("one.yaml", ONE)]
+    assert entry.main(["solve", *paths, "--plot", str(tmp_path / "x.png")]) == exits.BAD_INPUT
+    assert len(errors) == 2
 
 
 def test_ctrl_c_is_130(write: Write) -> None:

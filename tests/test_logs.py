@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import os
 import signal
 import subprocess
@@ -28,6 +29,8 @@ from stiffopt.logs import (
     write_log,
     write_stiffness_table,
 )
+from stiffopt.logs.mcap_file import McapContents
+from stiffopt.logs.mcap_log import log_of_contents
 
 DATA = Path(os.environ.get("STIFFOPT_DATA", Path(__file__).resolve().parent.parent.parent)) / (
     "shared/data"
@@ -342,6 +345,36 @@ def test_a_file_without_chunks_as_earlier_versions_wrote_them_is_read(tmp_path: 
     assert np.isnan(log.tip_quaternion).all()
     assert np.isnan(log.bodies["mid"].position).all()
     np.testing.assert_array_equal(log.force, [0.5] * 3)
+
+
+def test_a_disk_that_has_failed_takes_no_further_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, rows = tmp_path / "a.mcap", list(random_log(5).rows())
+    with McapLogWriter(path, FULL) as writer:
+        for row in rows[:2]:
+            writer.append(row)
+        with monkeypatch.context() as full:
+            full.setattr(os, "write", _full)
+            with pytest.raises(FileError, match="no space left"):
+                writer.append(rows[2])
+        with pytest.raises(FileError, match="cannot be written: the file is closed"):
+            writer.append(rows[3])  # also where there is room again: a row in between is lost
+    assert len(read_mcap_log(path)) == 2
+
+
+def _full(file: int, data: bytes) -> int:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize(
+    "message", [{"commanded_pa": [0]}, {"time_s": None, "commanded_pa": [0]}, [1], 3]
+)
+def test_a_row_of_an_mcap_file_without_a_time_is_refused(message: object) -> None:
+    columns = {"columns": "time_s,p1_pa,tip_x_m,tip_y_m,tip_z_m"}
+    found = McapContents({"stiffopt-log": columns}, [("/pressure", message)], complete=True)
+    with pytest.raises(FileError, match=r"a\.mcap: is damaged"):
+        log_of_contents("a.mcap", found)
 
 
 def test_the_mcap_library_reads_the_messages(tmp_path: Path) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import itertools
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +29,7 @@ from references import (
 )
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
+from stiffopt.plant import jit
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import (
     Discretisation,
@@ -208,6 +212,17 @@ def test_a_mismatch_is_what_it_says():
     T = settled(Arm((PLAIN,)).under((3, 0, 9), 0.01), p, mismatch=mismatch)
     assert T[:3, 3] == pytest.approx(expected[:3, 3], abs=2e-5)
     assert T[:3, :3] == pytest.approx(expected[:3, :3], abs=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::stiffopt.errors.SlowWarning")
+def test_a_file_system_without_locks_is_no_error(monkeypatch):
+    def refuse(file, operation):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(jit, "_done", False)
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with jit.compiling_once():
+        pass
 
 
 @pytest.mark.long

@@ -265,6 +265,15 @@ def test_a_disk_that_hangs_holds_nobody_up_and_the_end_is_bounded(
     made.stop()  # now it does not hang any more
 
 
+def test_to_stop_twice_begins_no_other_recording(tmp_path: Path) -> None:
+    made = telemetry(FakeLoop(), tmp_path)
+    made.start()
+    made.put(snapshot(BEGIN))
+    made.stop()
+    made.stop()
+    assert len(list(tmp_path.glob("*.mcap"))) == 1
+
+
 def test_to_hand_over_a_snapshot_costs_the_loop_next_to_nothing(tmp_path: Path) -> None:
     made = telemetry(FakeLoop(), tmp_path)
     tick, costs = snapshot(BEGIN), []

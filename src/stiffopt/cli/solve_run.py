@@ -78,7 +78,10 @@ class Batch:
         """Solve one file, or report what is wrong with it."""
         begin = perf_counter()
         try:
-            solved = solve_file(file, seed=self.seed, pareto=self.pareto)
+            try:
+                solved = solve_file(file, seed=self.seed, pareto=self.pareto)
+            finally:
+                bar.hide()
             check()
         except StiffoptError as error:
             check()
@@ -89,11 +92,9 @@ class Batch:
             check()
             self._refuse(file, f"{file}: {_bug(error)}", exits.FAILED)
         else:
-            bar.hide()
             self._take(solved, perf_counter() - begin)
             if picture is not None:
-                bar.report(0, None, f"{file}: drawing")
-                self._draw(solved, picture)
+                self._draw(solved, picture, bar)
 
     def _refuse(self, file: str, message: str, code: int = exits.BAD_INPUT) -> None:
         """Report a file that could not be solved."""
@@ -123,10 +124,14 @@ class Batch:
 
             self._print(lambda: show(summary(self.rows)))
 
-    def _draw(self, solved: SolvedTask, picture: str) -> None:
+    def _draw(self, solved: SolvedTask, picture: str, bar: ProgressBar) -> None:
         """Draw a solved task; where that fails the solution is still reported."""
         try:
-            solve_files.draw(solved, picture)
+            bar.report(0, None, f"{solved.file}: drawing")
+            try:
+                solve_files.draw(solved, picture)
+            finally:
+                bar.hide()
         except StiffoptError as error:
             report_error(f"no picture of {solved.file}: {error}")
             if solved.solution.pressures is not None:

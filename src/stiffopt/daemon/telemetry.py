@@ -120,6 +120,7 @@ class Telemetry:
         self._server: Any = None
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
+        self._stopped = False
         self._working = threading.Lock()
         self._next_event = 0
         self._last_state: object = None
@@ -154,6 +155,8 @@ class Telemetry:
         If what is being written, as to a disk that hangs, is not done after `patience`, in s,
         nothing more is recorded, and it raises `TimeoutError`.
         """
+        if self._stopped:
+            return
         self._stop.set()
         if not self._working.acquire(timeout=patience):
             raise TimeoutError(f"telemetry was not written within {patience:g} s")
@@ -170,6 +173,7 @@ class Telemetry:
             self._server.stop()
             self._server = None
         self._channels.close()
+        self._stopped = True
 
     def work(self, *, last: bool = False) -> None:
         """Log what has come since the last call; with `last`, write it to the disk at once."""

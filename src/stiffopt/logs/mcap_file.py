@@ -6,6 +6,7 @@ killed process loses only what it had not committed. The reader takes such a fil
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -71,9 +72,10 @@ class McapWriter:
 
     def commit(self) -> None:
         """End the chunk and write it to the disk; raise `OSError` if that fails."""
-        if self._file >= 0:
-            self._writer.flush()
-            self._write()
+        if self._file < 0:
+            raise OSError(errno.EBADF, "the file is closed")
+        self._writer.flush()
+        self._write()
 
     def close(self) -> None:
         """Write the index and close; raise `OSError` if that fails. To close twice does nothing."""

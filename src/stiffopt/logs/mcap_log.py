@@ -126,7 +126,7 @@ def log_of_contents(path: str | os.PathLike[str], found: McapContents) -> Log:
     try:
         layout = LogLayout.of_columns(name, found.metadata[LOG_METADATA]["columns"].split(","))
         rows = list(_whole_rows(found, layout))
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise FileError(name, f"is damaged: {error}") from None
     values = np.array(rows) if rows else np.empty((0, len(layout.columns)))
     return log_of_values(values, layout)
@@ -148,6 +148,8 @@ def _whole_rows(found: McapContents, layout: LogLayout) -> Iterator[Array]:
                 where, key = place[part]
                 value = messages.get(where, {}).get(key)
                 row.append(numbers_of(part, value, len(columns)))
+            if not np.isfinite(row[0]).all():
+                raise ValueError("a row has no time")
             yield np.concatenate(row)
             messages = {}
 
