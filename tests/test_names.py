@@ -1,7 +1,12 @@
-"""Names of the project: one class for one name."""
+"""Names of the project: one class for one name, and what users see is explained."""
 
 import ast
+import dataclasses
+import inspect
+import pkgutil
+import re
 from collections import defaultdict
+from importlib import import_module
 from pathlib import Path
 
 import stiffopt
@@ -17,3 +22,23 @@ def test_no_two_classes_share_a_name():
                 places[node.name].append(str(file.relative_to(SOURCE)))
     assert len(places) > 300
     assert {name: files for name, files in places.items() if len(files) > 1} == {}
+
+
+ELSEWHERE = {"LogRow", "Twist", "Wrench"}  # explained as a `Log`, and by their methods
+
+
+def test_help_explains_each_field_of_what_packages_export():
+    """With shapes and units: comments beside fields are not in ``help()``."""
+    names = [module.name for module in pkgutil.iter_modules(stiffopt.__path__) if module.ispkg]
+    packages = [stiffopt, *(import_module(f"stiffopt.{name}") for name in names)]
+    found, missing = set(), set()
+    for package in packages:
+        for name in getattr(package, "__all__", ()):
+            kind = getattr(package, name)
+            if inspect.isclass(kind) and dataclasses.is_dataclass(kind) and name not in ELSEWHERE:
+                found.add(name)
+                words = set(re.findall(r"\w+", inspect.getdoc(kind) or ""))
+                fields = {each.name for each in dataclasses.fields(kind)}
+                missing |= {f"{name}.{each}" for each in fields - words if each[0] != "_"}
+    assert len(found) > 10
+    assert missing == set()

@@ -22,21 +22,35 @@ Progress = Callable[[float, float], None]
 
 @dataclass(frozen=True, eq=False)
 class ArmMap:
-    """Stiffness at points along an arm."""
+    """Stiffness at points along an arm.
 
-    robot: str  # name
-    length: float  # at rest, in m
-    # the channels (counted from 1) that are pressurised together, G groups
+    Attributes
+    ----------
+    robot : name.
+    length : at rest, in m.
+    groups : the channels (counted from 1) that are pressurised together, G groups.
+    pressures : to which, (P,), in Pa.
+    at : arc lengths of the points at rest (S,), in m.
+    directions : unit vectors (d, 3).
+    boundary, frame : of the stiffness.
+    stiffness : (G, P, S, d), in N/m.
+    positions : of the points in the base frame (G, P, S, 3), in m.
+    backbones : shapes of the arm (G, P, B, 3), from its base, in m.
+    hangs : whether z points down.
+    """
+
+    robot: str
+    length: float
     groups: tuple[tuple[int, ...], ...]
-    pressures: Array  # to which, (P,), in Pa
-    at: Array  # arc lengths of the points at rest (S,), in m
-    directions: Array  # unit vectors (d, 3)
-    boundary: str  # of the stiffness
+    pressures: Array
+    at: Array
+    directions: Array
+    boundary: str
     frame: str
-    stiffness: Array  # (G, P, S, d), in N/m
-    positions: Array  # of the points in the base frame (G, P, S, 3), in m
-    backbones: Array  # shapes of the arm (G, P, B, 3), from its base, in m
-    hangs: bool  # whether z points down
+    stiffness: Array
+    positions: Array
+    backbones: Array
+    hangs: bool
 
     @property
     def middle(self) -> int:
@@ -46,17 +60,28 @@ class ArmMap:
 
 @dataclass(frozen=True, eq=False)
 class TipMap:
-    """Stiffness of the tip over the pressures of two channels."""
+    """Stiffness of the tip over the pressures of two channels.
 
-    robot: str  # name
-    channels: tuple[int, int]  # the two, counted from 1
-    first: Array  # pressures (A,) of the first, in Pa
-    second: Array  # pressures (B,) of the other, in Pa
-    others: Array  # pressures (n,) of the other channels, in Pa
-    directions: Array  # unit vectors (d, 3)
-    boundary: str  # of the stiffness
+    Attributes
+    ----------
+    robot : name.
+    channels : the two, counted from 1.
+    first, second : their pressures (A,) and (B,), in Pa.
+    others : pressures (n,) of the other channels, in Pa.
+    directions : unit vectors (d, 3).
+    boundary, frame : of the stiffness.
+    stiffness : (A, B, d), in N/m; NaN where the arm has no equilibrium.
+    """
+
+    robot: str
+    channels: tuple[int, int]
+    first: Array
+    second: Array
+    others: Array
+    directions: Array
+    boundary: str
     frame: str
-    stiffness: Array  # (A, B, d), in N/m; NaN where the arm has no equilibrium
+    stiffness: Array
 
 
 def first_channels(robot: Manipulator, count: int) -> tuple[int, ...]:

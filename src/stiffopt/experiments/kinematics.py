@@ -60,10 +60,16 @@ class KinematicsSettings(ExperimentSettings):
 
 @dataclass(frozen=True, eq=False)
 class PressureSequence:
-    """Pressures that change linearly between moments."""
+    """Pressures that change linearly between moments.
 
-    times: Array  # (K,), in s, increasing from 0
-    pressures: Array  # (K, n), in Pa
+    Attributes
+    ----------
+    times : (K,), in s, increasing from 0.
+    pressures : (K, n), in Pa.
+    """
+
+    times: Array
+    pressures: Array
 
     @classmethod
     def sawtooth(

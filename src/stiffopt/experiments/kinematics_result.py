@@ -65,21 +65,33 @@ class DistanceStatistics:
 
 @dataclass(frozen=True, eq=False)
 class KinematicsResult(DistanceStatistics):
-    """Comparison of recordings with the model, on a common grid of times (K,)."""
+    """Comparison of recordings with the model, on a common grid of times (K,).
 
-    repetitions: int  # how many recordings there are
-    time: Array  # grid, in s
-    pressures: Array  # mean over the repetitions (K, n), in Pa; measured, or commanded where not
-    low: Array  # least coordinates of the measured tip over the repetitions (K, 3), in m
-    high: Array  # greatest
-    model: Array  # tip that the model says, mean over the repetitions (K, 3), in m
-    # largest distance between measured and modelled tip over the repetitions (K,), in m
+    Attributes
+    ----------
+    repetitions : how many recordings there are.
+    time : grid, in s.
+    pressures : mean over the repetitions (K, n), in Pa; measured, or commanded where not.
+    low, high : extremes of the measured tip over the repetitions (K, 3), in m.
+    model : tip that the model says, mean over the repetitions (K, 3), in m.
+    error : largest distance between measured and modelled tip over the repetitions (K,), in m.
+    component_error : the mean of modelled less measured tip over the repetitions (K, 3), in m.
+    errors : distances at all samples of all recordings (M,), in m.
+    length : of the arm at rest, in m.
+    doubts : what is suspicious in the recordings, in sentences.
+    """
+
+    repetitions: int
+    time: Array
+    pressures: Array
+    low: Array
+    high: Array
+    model: Array
     error: Array
-    # the mean of modelled less measured tip over the repetitions (K, 3), in m
     component_error: Array
-    errors: Array  # distances at all samples of all recordings (M,), in m
-    length: float  # of the arm at rest, in m
-    doubts: tuple[str, ...] = ()  # what is suspicious in the recordings, in sentences
+    errors: Array
+    length: float
+    doubts: tuple[str, ...] = ()
 
     @property
     def repeatability(self) -> float:
@@ -181,15 +193,26 @@ def _on_grid(grid: Array, time: Array, values: Array, gap: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class CoverageResult(DistanceStatistics):
-    """Comparison of M combined poses with the model, by means over the last second of each."""
+    """Comparison of M combined poses with the model, by means over the last second of each.
 
-    pressures: Array  # (M, n), in Pa; measured, or commanded where not
-    tip: Array  # measured tip (M, 3), in m
-    model: Array  # tip of the model (M, 3), in m
-    speed: Array  # speed at which the tip still moved (M,), in m/s, including noise
-    length: float  # of the arm at rest, in m
-    doubts: tuple[str, ...] = ()  # what is suspicious in the recordings, in sentences
-    errors: Array = field(init=False)  # distances (M,) between measured and modelled tip, in m
+    Attributes
+    ----------
+    pressures : (M, n), in Pa; measured, or commanded where not.
+    tip : measured tip (M, 3), in m.
+    model : tip of the model (M, 3), in m.
+    speed : speed at which the tip still moved (M,), in m/s, including noise.
+    length : of the arm at rest, in m.
+    doubts : what is suspicious in the recordings, in sentences.
+    errors : distances (M,) between measured and modelled tip, in m.
+    """
+
+    pressures: Array
+    tip: Array
+    model: Array
+    speed: Array
+    length: float
+    doubts: tuple[str, ...] = ()
+    errors: Array = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "errors", np.linalg.norm(self.model - self.tip, axis=1))

@@ -21,27 +21,44 @@ _UNKNOWN = SlopeEstimate(math.nan, math.nan, math.nan, math.nan, 0)
 
 @dataclass(frozen=True)
 class StiffnessCell:
-    """Stiffness at one pressure in one direction."""
+    """Stiffness at one pressure in one direction.
 
-    pressure: float  # of the channel, in Pa
-    direction: tuple[float, float, float]  # unit vector in the base frame
-    # from the displacement of the tip, in N/m; None if no repetition gave a slope
+    Attributes
+    ----------
+    pressure : of the channel, in Pa.
+    direction : unit vector in the base frame.
+    estimate : from the displacement of the tip, in N/m; None if no repetition gave a slope.
+    by_stage : the same from the position of the stage; less, since contact and sensor yield too.
+    slopes : of the repetitions, in N/m.
+    points : number of points in contact, in all repetitions.
+    model : stiffness of the model, in N/m.
+    """
+
+    pressure: float
+    direction: tuple[float, float, float]
     estimate: SlopeEstimate | None
-    # the same from the position of the stage; less, since contact and sensor yield too
     by_stage: SlopeEstimate | None
-    slopes: tuple[float, ...]  # of the repetitions, in N/m
-    points: int  # number of points in contact, in all repetitions
-    model: float  # stiffness of the model, in N/m
+    slopes: tuple[float, ...]
+    points: int
+    model: float
 
 
 @dataclass(frozen=True, eq=False)
 class StiffnessResult:
-    """Measured and modelled stiffness of an experiment."""
+    """Measured and modelled stiffness of an experiment.
 
-    settings: StiffnessSettings  # of the experiment
-    cells: tuple[StiffnessCell, ...]  # one for each pressure and direction
-    curve_pressures: Array  # pressures of the channel (K,), in Pa, of the model's curves
-    curves: Array  # stiffness of the model (K, d) along the d directions, in N/m
+    Attributes
+    ----------
+    settings : of the experiment.
+    cells : one for each pressure and direction.
+    curve_pressures : pressures of the channel (K,), in Pa, of the model's curves.
+    curves : stiffness of the model (K, d) along the d directions, in N/m.
+    """
+
+    settings: StiffnessSettings
+    cells: tuple[StiffnessCell, ...]
+    curve_pressures: Array
+    curves: Array
 
     def along(self, direction: Sequence[float]) -> list[StiffnessCell]:
         """Return the cells of one direction, in order of pressure."""

@@ -165,12 +165,20 @@ def _shift(seed: int, channel: int) -> int:
 
 @dataclass(frozen=True)
 class MapPlan:
-    """Everything that determines the values of a map."""
+    """Everything that determines the values of a map.
 
-    robot: Manipulator  # with the load at its tip
-    measures: tuple[DirectionalMeasure, ...]  # (m,), with unit directions
-    sampling: Sampling  # the pressures that are sampled
-    cell: float  # edge length of a cell, in m
+    Attributes
+    ----------
+    robot : the arm, with the load at its tip.
+    measures : the stiffness measures (m,), with unit directions.
+    sampling : the pressures that are sampled.
+    cell : edge length of a cell, in m.
+    """
+
+    robot: Manipulator
+    measures: tuple[DirectionalMeasure, ...]
+    sampling: Sampling
+    cell: float
 
     @classmethod
     def of(
