@@ -205,6 +205,22 @@ def test_a_failing_disk_is_told_and_what_was_written_is_whole(
     assert len(read_run(str(logger.recording.path))) == 10
 
 
+def test_a_recording_that_cannot_begin_leaves_no_file_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise RuntimeError("no writer")
+
+    logger = Logger(tmp_path)
+    monkeypatch.setattr(foxglove, "open_mcap", fail)
+    before = len(os.listdir("/proc/self/fd"))
+    for attempt in range(10):  # each comes after a while
+        logger.recording.commit(100.0 * attempt)
+        assert "no writer" in logger.recording.trouble
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     logger = Logger(tmp_path / "file" / "runs")

@@ -56,19 +56,23 @@ class McapWriter:
         self._context = context  # it closes its channels when it is collected
         self._file = file
         self._memory = _Memory()
-        self._writer = foxglove.open_mcap(
-            self._memory,
-            context=context,
-            writer_options=MCAPWriteOptions(
-                compression=MCAPCompression.Zstd,
-                compression_level=1,  # twice as fast as the default, and as small
-                compression_threads=0,
-                chunk_size=_CHUNK,
-            ),
-        )
-        for name, record in metadata.items():
-            self._writer.write_metadata(name, dict(record))
-        self._write()
+        try:
+            self._writer = foxglove.open_mcap(
+                self._memory,
+                context=context,
+                writer_options=MCAPWriteOptions(
+                    compression=MCAPCompression.Zstd,
+                    compression_level=1,  # twice as fast as the default, and as small
+                    compression_threads=0,
+                    chunk_size=_CHUNK,
+                ),
+            )
+            for name, record in metadata.items():
+                self._writer.write_metadata(name, dict(record))
+            self._write()
+        except BaseException:
+            self._release()
+            raise
 
     def commit(self) -> None:
         """End the chunk and write it to the disk; raise `OSError` if that fails."""
