@@ -29,8 +29,8 @@ def driver(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def rough(seed: int, high: float) -> Iterator[Any]:
-    """Yield what a careless or broken program may ask for."""
+def rough(seed: int, high: float, more: int = 30) -> Iterator[Any]:
+    """Yield what a careless or broken program may ask for, and so many random commands more."""
     random = np.random.default_rng(seed)
     yield np.full(N, high)
     yield np.full(N, 10 * high)
@@ -40,7 +40,7 @@ def rough(seed: int, high: float) -> Iterator[Any]:
     yield np.full(N, np.inf)
     yield -np.full(N, high)
     yield np.full(N, high)
-    for _ in range(30):
+    for _ in range(more):
         yield random.uniform(-0.2, 1.2, N) * high
 
 
@@ -171,7 +171,7 @@ def test_a_single_failure_ends_vented_and_within_the_limits(
         press(who, bench)
         assert bench.last.any()
         FAILURES[failure](who, bench)
-        for wanted in rough(2, 1.5e5):
+        for wanted in rough(2, 1.5e5, more=6):
             with suppress(StiffoptError):
                 who.push(wanted, 2 * PERIOD)
         who.finish()

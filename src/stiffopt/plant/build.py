@@ -178,7 +178,8 @@ def _lengths(robot: RobotDescription, mismatch: Mismatch) -> Array:
 
 def _legendre(places: Array, size: int) -> Array:
     """Values (m, size) of Legendre polynomials at places (m,) between 0 and 1."""
-    return np.asarray(legendre.legvander(2 * np.asarray(places) - 1, size - 1), dtype=float)
+    values = legendre.legvander(2 * np.asarray(places) - 1, size - 1)
+    return np.ascontiguousarray(values, dtype=float)  # of one layout: compiled code is for one
 
 
 def _cuts(intervals: int) -> Array:
