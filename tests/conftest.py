@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import socket
 import sys
 from collections.abc import Iterator
@@ -18,6 +19,9 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy is imported: small matrices, many processes
 os.environ["STIFFOPT_COMPILER"] = "none"  # but for tests that ask for `compiled`
 os.environ["STIFFOPT_COMPILE"] = "wait"  # but for tests of code that is made in the background
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

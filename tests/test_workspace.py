@@ -742,16 +742,19 @@ def interrupted(path: Path) -> str:
         [COMMAND, "map", "workspace", "stiff-flop-2-hanging", "--samples", "100000", "--out", path],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    end = time.monotonic() + 30
-    while not path.exists() and time.monotonic() < end:
-        time.sleep(0.01)
-    time.sleep(1.5)
-    os.kill(process.pid, signal.SIGINT)
     try:
-        out, err = process.communicate(timeout=15)
-    except subprocess.TimeoutExpired:  # on a busy machine it was still importing, and lost it
+        end = time.monotonic() + 30
+        while not path.exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        time.sleep(1.5)
         os.kill(process.pid, signal.SIGINT)
-        out, err = process.communicate(timeout=30)
+        try:
+            out, err = process.communicate(timeout=15)
+        except subprocess.TimeoutExpired:  # on a busy machine it was still importing, and lost it
+            os.kill(process.pid, signal.SIGINT)
+            out, err = process.communicate(timeout=30)
+    finally:
+        process.kill()
     assert process.returncode == 130, err
     assert not out
     return " ".join(err.split())
