@@ -1,4 +1,4 @@
-"""What `stiffopt calibrate` and `stiffopt validate` do: read, fit or compare, write, report.
+"""Run `stiffopt calibrate` and `stiffopt validate`: read recordings, fit or compare, report.
 
 What cannot be read or does not fit the robot raises `InputError` before anything is fitted.
 """

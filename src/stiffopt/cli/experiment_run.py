@@ -1,4 +1,4 @@
-"""What `stiffopt experiment` does: check all files and options, move the arm, vent it, report."""
+"""Run `stiffopt experiment`: check all files and options, move the arm, vent it, report."""
 
 import re
 import sys
@@ -56,7 +56,7 @@ Settings = KinematicsSettings | StiffnessSettings
 
 @dataclass(frozen=True)
 class _Plan:
-    """What an experiment needs, checked before anything moves."""
+    """Rig, robot and options of an experiment, checked before the arm moves."""
 
     rig: Rig
     rate: float

@@ -271,7 +271,7 @@ class Screen:
 
     @property
     def is_behind(self) -> bool:
-        """Whether something waits to be shown."""
+        """Whether text is waiting to be written."""
         return not self._waiting.empty()
 
     def post(self, show: Callable[[], object]) -> None:

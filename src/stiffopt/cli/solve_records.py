@@ -31,7 +31,7 @@ def priced(solution: PressureSolution) -> Sensitivities | None:
 
 
 def _relaxed(term: Term) -> str:
-    """What of a term can be relaxed, and has a price."""
+    """Name of the tolerance or margin of a term, whose price is reported."""
     return f"{term.name}_{'margin' if term.is_inequality else 'tolerance'}"
 
 

@@ -44,7 +44,7 @@ def compiling_once() -> Iterator[None]:
     with _lock():
         if not _done and not any(Path(_folder()).rglob("*.nbi")):
             warnings.warn(
-                "the simulator is compiled, once; that takes half a minute",
+                "the simulator is compiled, once; that takes up to a minute",
                 SlowWarning,
                 stacklevel=4,
             )
