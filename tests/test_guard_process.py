@@ -277,7 +277,7 @@ def test_a_rig_behind_a_guard(guarded: tuple[Rig, GuardLink]) -> None:
         link.inject("tracker", "rain")
     link.vent()
     wait_for(lambda: (np.array(link.ask_world("pressures")) < 1e3).all(), 3.0)
-    assert "arm" in feed(rig, link, 0.0).refused
+    wait_for(lambda: "arm" in feed(rig, link, 0.0).refused)  # its answer may come a moment later
 
 
 def test_a_supply_that_fails_is_told_and_can_be_armed_again(
@@ -383,6 +383,16 @@ def test_a_killed_guard_is_noticed(doomed: tuple[Rig, GuardLink]) -> None:
     with pytest.raises(DeviceError, match="open the link"):
         link.vent()
     link.close()  # once is enough
+
+
+def test_a_guard_that_is_just_ending_is_waited_for(doomed: tuple[Rig, GuardLink]) -> None:
+    _, link = doomed
+    exchange = link._exchange
+    assert exchange is not None
+    exchange.close()  # the guard vents and ends, but its process is still there for a moment
+    assert link.alive
+    link.vent()
+    assert not link.alive
 
 
 def test_a_stopped_guard_is_noticed(guarded: tuple[Rig, GuardLink]) -> None:

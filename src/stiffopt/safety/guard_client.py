@@ -123,6 +123,14 @@ class GuardProcess:
                 raise DeviceError("the guard process ended before it was ready")
         raise DeviceError(f"the guard process was not ready within {CLIENT.start:g} s")
 
+    def has_ended(self, wait: float) -> bool:
+        """Wait up to `wait` s for the process to end; return whether it has."""
+        try:
+            self._process.wait(wait)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
     def kill(self) -> None:
         """Kill the process at once, even if it is stopped; it does not vent then."""
         self._process.kill()
@@ -258,9 +266,14 @@ class Exchange:
         self._receive()
         return tuple(self._poses.popleft() for _ in range(len(self._poses)))
 
+    @property
+    def closed(self) -> bool:
+        """Whether the connection is closed, by the guard's end or from here."""
+        return self._channel.closed
+
     def must_live(self) -> None:
         """Raise `DeviceError` if the guard is gone."""
-        if self._channel.closed:
+        if self.closed:
             raise DeviceError(
                 "the guard process has ended; the supply is vented directly, as far as it answers"
             )
@@ -430,6 +443,13 @@ class GuardLink:
         """Whether the guard's process runs."""
         return self._process is not None and self._process.alive
 
+    def _has_ended(self) -> bool:
+        """Whether the guard has ended; waits briefly for one whose connection is closed already."""
+        if self._process is None:
+            return True
+        closed = self._exchange is None or self._exchange.closed
+        return self._process.has_ended(CLIENT.exit if closed else 0.0)
+
     @property
     def hung(self) -> bool:
         """Whether the guard runs, but has not answered for so long that it must be hung.
@@ -529,7 +549,7 @@ class GuardLink:
         try:
             self._told = self._ask("vent").trips
         except DeviceError:
-            if self.alive or self._watch is None or not self._watch.vent():
+            if not self._has_ended() or self._watch is None or not self._watch.vent():
                 raise
 
     def read(self) -> PressureReading:

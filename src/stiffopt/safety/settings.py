@@ -67,6 +67,7 @@ class ClientTiming:
     ----------
     start : until a guard is ready; the simulator may have to be compiled first.
     end : until a guard that was told to end has vented and ended; then it is terminated, killed.
+    exit : until a guard whose connection is closed has ended, before the supply is vented directly.
     answer, answer_calls : until a request is answered; number of driver calls it may wait for.
     fresh : how long a command of a stream waits for its own answer.
     silent : without an answer to a stream, after which the guard counts as silent.
@@ -81,6 +82,7 @@ class ClientTiming:
 
     start: float = 120.0
     end: float = 4.0
+    exit: float = 0.5
     answer: float = 2.0
     answer_calls: int = 4
     fresh: float = 1e-3
