@@ -242,12 +242,12 @@ def test_a_rig_behind_a_guard(guarded: tuple[Rig, GuardLink]) -> None:
     tracker = rig.tracker
     assert tracker is not None
     assert link.real_time
-    refused = feed(rig, link, 0.0)
+    refused = feed(rig, link, 0.1)
     assert "arm" in refused.refused
     assert not refused.pressures.any()
     link.arm()
     before = rig.clock.now()
-    first = feed(rig, link, 0.0)
+    first = feed(rig, link, 0.02)
     assert first.limited
     assert (first.pressures < 3e4).all()
     tracker.read()
