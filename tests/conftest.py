@@ -22,6 +22,8 @@ os.environ["STIFFOPT_COMPILE"] = "wait"  # but for tests of code that is made in
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:  # as under nohup
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -33,8 +35,12 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["STIFFOPT_LONG"] = "1"
 
 
+def is_long() -> bool:
+    return os.environ.get("STIFFOPT_LONG", "") not in ("", "0")
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    if os.environ.get("STIFFOPT_LONG", "") in ("", "0"):
+    if not is_long():
         skip = pytest.mark.skip(reason="long: run with --long or STIFFOPT_LONG=1")
         for item in items:
             if "long" in item.keywords:
@@ -54,10 +60,14 @@ def code_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def compiled(code_cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Machine code instead of the CasADi VM."""
-    if not any(shutil.which(name) for name in ("cc", "gcc", "clang")):
+    """Machine code instead of the CasADi VM; not optimised but in the long form, to save time."""
+    found = next((name for name in ("cc", "gcc", "clang") if shutil.which(name)), None)
+    if found is None:
         pytest.skip("there is no C compiler")
-    monkeypatch.delenv("STIFFOPT_COMPILER")
+    if is_long():
+        monkeypatch.delenv("STIFFOPT_COMPILER")
+    else:
+        monkeypatch.setenv("STIFFOPT_COMPILER", f"{found} -O0")
     monkeypatch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
     return code_cache
 

@@ -31,6 +31,8 @@ from stiffopt.model.description import (
     TrackedBody,
 )
 from stiffopt.model.history import Creep, History, Play
+from stiffopt.model.obstacles import OBSTACLES
+from stiffopt.model.scene import AllowedContact, Scene, SceneObject
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task
@@ -79,6 +81,7 @@ SCHEMAS: list[type[BaseModel]] = [
     *(Corrections, History, Play, Creep, Recordings, TrackedBody, Tolerances),
     *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
+    *(Scene, SceneObject, AllowedContact, *OBSTACLES.values()),
     *(RigDescription, Safety, LogSettings, Registration, Placement),
     *(ControlSettings, ServiceSettings, Trajectory, Waypoint),
     *schemas_of(simulated.PlantSettings, "stiffopt.plant"),
@@ -94,6 +97,8 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.rig": "Rig file",
     "stiffopt.plant": "Rig file",
     "stiffopt.registration": "Rig file",
+    "stiffopt.model.scene": "Scene file",
+    "stiffopt.model.obstacles": "Scene file",
     "stiffopt.model": "Robot file",
     "stiffopt.optimise": "Task file",
     "stiffopt.control": "Trajectory",
@@ -128,6 +133,8 @@ def test_yaml_example_loads(text: str, tmp_path: Path) -> None:
         rig = load_rig_description(path)
         robot = stiffopt.load_robot(rig.robot)
         assert limits_of(rig, robot.description).n == robot.n_pressures
+    elif "stiffopt-scene/" in text:
+        stiffopt.load_scene(path).check_against(stiffopt.load_robot("stiff-flop-2").description)
     else:
         pytest.fail(f"a YAML example that says nothing of its format:\n{text}")
 
@@ -138,7 +145,8 @@ def test_files_page_names_every_key(schema: type[BaseModel]) -> None:
     title = next(title for begin, title in SECTIONS.items() if schema.__module__.startswith(begin))
     found = re.search(rf"^(#+) {title}\n(.*?)(?=^\1 |^## |\Z)", page, re.M | re.S)
     assert found, title
-    keys = {name for name, info in schema.model_fields.items() if not info.exclude}
+    fields = schema.model_fields.items()
+    keys = {info.alias or name for name, info in fields if not info.exclude}
     if title.startswith("Driver"):
         keys.discard("driver")
     missing = {key for key in keys if not re.search(rf"[`.]{key}[`.]", found[2])}

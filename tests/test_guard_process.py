@@ -385,7 +385,10 @@ def test_a_killed_guard_is_noticed(doomed: tuple[Rig, GuardLink]) -> None:
     link.close()  # once is enough
 
 
-def test_a_guard_that_is_just_ending_is_waited_for(doomed: tuple[Rig, GuardLink]) -> None:
+def test_a_guard_that_is_just_ending_is_waited_for(
+    doomed: tuple[Rig, GuardLink], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(guard_client, "CLIENT", replace(CLIENT, exit=30.0))
     _, link = doomed
     exchange = link._exchange
     assert exchange is not None

@@ -489,12 +489,12 @@ def cycle(plant: Plant, top: Any, duration: float, cycles: int, samples: int = 4
 def test_bending_loops_close_enclose_area_and_know_no_rate():
     top = BAR * np.array([1.0, 0, 0, 0, 0.6, 0])
     tips = {}
-    for duration in (0.8, 8.0):
+    for duration in (0.8, 4.0):
         plant = make(TWO.under(DOWN, 0.02), material(law="yeoh", hysteresis=SLIP))
         tips[duration], ramp = cycle(plant, top, duration, 3)
     x = tips[0.8][..., 0, 3]
     assert np.ptp(x) > 0.02
-    assert tips[8.0] == pytest.approx(tips[0.8], abs=1e-6)
+    assert tips[4.0] == pytest.approx(tips[0.8], abs=1e-6)
     for later in (1, 2):
         assert x[later, -1] == pytest.approx(x[0, -1], abs=1e-5)
     assert x[2] == pytest.approx(x[1], abs=1e-5)
@@ -560,8 +560,8 @@ def drift(duration: float, step: float, dynamics: str) -> float:
 
 
 def test_a_resting_arm_stays():
-    assert drift(120.0, 0.02, "quasi-static") < 1e-6
-    assert drift(10.0, 1e-3, "full") < 1e-6
+    assert drift(30.0, 0.02, "quasi-static") < 1e-6
+    assert drift(2.0, 1e-3, "full") < 1e-6
 
 
 @pytest.mark.long

@@ -334,14 +334,17 @@ def test_the_backstop_ends_a_process_that_hangs() -> None:
         [sys.executable, "-c", ENDS, "hangs"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
     with run:
-        assert run.stdout is not None
-        assert run.stdout.readline() == b"ready\n"
-        time.sleep(1)  # without a signal it ends nothing
-        assert run.poll() is None
-        run.send_signal(signal.SIGHUP)
-        assert run.wait(10) == 5
-        assert run.stderr is not None
-        assert b"did not end in time" in run.stderr.read()
+        try:
+            assert run.stdout is not None
+            assert run.stdout.readline() == b"ready\n"
+            time.sleep(1)  # without a signal it ends nothing
+            assert run.poll() is None
+            run.send_signal(signal.SIGHUP)
+            assert run.wait(10) == 5
+            assert run.stderr is not None
+            assert b"did not end in time" in run.stderr.read()
+        finally:
+            run.kill()
 
 
 def test_what_hangs_when_all_is_over_is_left(

@@ -8,12 +8,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 pytest.importorskip("coverage", reason="coverage is not installed; it is part of stiffopt[dev]")
 
 ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "stiffopt"
 GUARDING = {
     "safety/gate.py": ("tests/test_safety.py", "tests/test_claim.py", "tests/test_goal.py"),
     "safety/goal.py": ("tests/test_goal.py",),
@@ -35,13 +37,15 @@ def lines_for_types(path: Path) -> set[int]:
     }
 
 
-@pytest.mark.parametrize("source", GUARDING)
-def test_every_line_is_run(source: str, tmp_path: Path) -> None:
-    data, report = tmp_path / "data", tmp_path / "report.json"
-    path = ROOT / "src" / "stiffopt" / source
-    pytest_ = ("-m", "pytest", "-q", "-p", "no:cacheprovider", *GUARDING[source])
+@pytest.fixture(scope="module")
+def covered(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """What coverage tells of each file after all these tests, in one process."""
+    folder = tmp_path_factory.mktemp("coverage")
+    report = folder / "report.json"
+    sources = ",".join(str(PACKAGE / source) for source in GUARDING)
+    tests = sorted({test for each in GUARDING.values() for test in each})
     coverage = (sys.executable, "-m", "coverage")
-    environment = {**os.environ, "COVERAGE_FILE": str(data)}
+    environment = {**os.environ, "COVERAGE_FILE": str(folder / "data")}
 
     def run(*command: str) -> None:
         done = subprocess.run(
@@ -49,10 +53,17 @@ def test_every_line_is_run(source: str, tmp_path: Path) -> None:
         )
         assert done.returncode == 0, done.stdout + done.stderr
 
-    run(*coverage, "run", "--branch", f"--include={path}", *pytest_)
+    pytest_ = ("-m", "pytest", "-q", "-p", "no:cacheprovider", *tests)
+    run(*coverage, "run", "--branch", f"--include={sources}", *pytest_)
     run(*coverage, "json", "-o", str(report))
-    (found,) = json.loads(report.read_text())["files"].values()
+    files: dict[str, Any] = json.loads(report.read_text())["files"]
+    return {str((ROOT / name).relative_to(PACKAGE)): found for name, found in files.items()}
+
+
+@pytest.mark.parametrize("source", GUARDING)
+def test_every_line_is_run(source: str, covered: dict[str, Any]) -> None:
+    found = covered[source]
     assert found["summary"]["num_statements"] > 40
     assert found["missing_lines"] == []
-    assert set(found["excluded_lines"]) <= lines_for_types(path)
+    assert set(found["excluded_lines"]) <= lines_for_types(PACKAGE / source)
     assert found["missing_branches"] == []

@@ -46,6 +46,9 @@ if TYPE_CHECKING:
     from stiffopt.model.manipulator import load_robot as load_robot
     from stiffopt.model.robot_files import builtin_robots as builtin_robots
     from stiffopt.model.robot_files import save_robot as save_robot
+    from stiffopt.model.scene import Scene as Scene
+    from stiffopt.model.scene import SceneObject as SceneObject
+    from stiffopt.model.scene import load_scene as load_scene
     from stiffopt.model.screws import Twist as Twist
     from stiffopt.model.screws import Wrench as Wrench
     from stiffopt.model.uncertainty import TipUncertainty as TipUncertainty
@@ -104,6 +107,7 @@ _NAMES = {
     "stiffopt.model.history": ("History", "Memory"),
     "stiffopt.model.manipulator": ("Manipulator", "load_robot"),
     "stiffopt.model.robot_files": ("builtin_robots", "save_robot"),
+    "stiffopt.model.scene": ("Scene", "SceneObject", "load_scene"),
     "stiffopt.model.screws": ("Twist", "Wrench"),
     "stiffopt.model.uncertainty": ("TipUncertainty",),
     "stiffopt.optimise.goal": (

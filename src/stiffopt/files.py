@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
@@ -55,8 +56,9 @@ def from_document(document: Document, kind: str, model: type[ModelT]) -> ModelT:
         if value is None:
             raise document.error(loc, "has no value; give it one or remove it")
     data = {key: value for key, value in document.data.items() if key != "format"}
+    context = {**FROM_FILE, "folder": Path(document.path).parent}
     try:
-        return model.model_validate(data, context=FROM_FILE)
+        return model.model_validate(data, context=context)
     except ValidationError as error:
         raise _file_error(document, model, error) from None
 
@@ -85,7 +87,7 @@ def file_text(kind: str, schema: Schema) -> str:
 
 
 def _as_file(kind: str, schema: Schema) -> dict[str, Any]:
-    data = _without_empty_lists(schema.model_dump(mode="json", exclude_none=True))
+    data = _without_empty_lists(schema.model_dump(mode="json", exclude_none=True, by_alias=True))
     return {"format": f"stiffopt-{kind}/{VERSIONS.get(kind, 1)}", **data}
 
 

@@ -165,7 +165,7 @@ def _unknown_key(model: type[BaseModel], raw: Loc) -> str:
                 for inner in _models(outer.model_fields[step].annotation)
             ]
     known = {
-        name: None
+        info.alias or name: None
         for each in models
         for name, info in each.model_fields.items()
         if not info.exclude

@@ -18,6 +18,9 @@ from pathlib import Path
 
 import casadi as ca
 
+NATIVE = Path(__file__).with_name("native")
+"""Headers that all C files find."""
+
 FLAGS = ("-O1", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-w")
 """No flag that changes results: they are those of the CasADi VM to the last bit."""
 
@@ -184,7 +187,7 @@ def compile_library(
     try:
         for name, text in texts.items():
             (directory / name).write_text(text, encoding="utf-8")
-        includes, libraries = [f"-I{directory}"], ["-lm"]
+        includes, libraries = [f"-I{directory}", f"-I{NATIVE}"], ["-lm"]
         for folder in dict.fromkeys(str(Path(source).parent) for source in sources):
             includes.append(f"-I{folder}")
         if daqp:
@@ -193,8 +196,10 @@ def compile_library(
             libraries = [str(shared), f"-Wl,-rpath,{shared.parent}", *libraries]
         inputs = [name for name in texts if name.endswith(".c")] + list(sources)
         objects = [f"{k}.o" for k in range(len(inputs))]
+        level = [word for word in compiler.command if word.startswith("-O")]
+        command = [*compiler.command, *FLAGS, *level]  # a level that the user names wins
         calls = [
-            [*compiler.command, *FLAGS, *includes, "-c", source, "-o", target]
+            [*command, *includes, "-c", source, "-o", target]
             for source, target in zip(inputs, objects, strict=True)
         ]
         _run(calls, directory)
@@ -202,7 +207,7 @@ def compile_library(
         symbols = ["-Wl,-Bsymbolic"] if sys.platform.startswith("linux") else []
         target = "library.so"
         link = ["-shared", *symbols, *objects, *libraries, "-o", target]
-        _run([[*compiler.command, *FLAGS, *link]], directory)
+        _run([[*command, *link]], directory)
         return (directory / target).read_bytes()
     finally:
         shutil.rmtree(directory, ignore_errors=True)

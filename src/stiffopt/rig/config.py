@@ -16,6 +16,7 @@ from stiffopt.errors import FileError, InputError, dotted
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.scene import SceneOrFile
 from stiffopt.registration import Registration
 from stiffopt.rig.device import DeviceSettings, MisfitError, RigSection
 from stiffopt.rig.interface import PressureLimits
@@ -94,6 +95,7 @@ class RigDescription(Schema):
     control : how the daemon's loop steers.
     service : where the daemon listens.
     log : recordings.
+    scene : what is around the arm, or None; checked against the robot, see `stiffopt.model.scene`.
     plant : the arm behind simulated devices, and in the virtual lab; a
         `stiffopt.plant.settings.PlantSettings`.
     lab : the devices in the virtual lab; a `stiffopt.plant.settings.LabSettings`.
@@ -109,6 +111,7 @@ class RigDescription(Schema):
     control: ControlSettings = ControlSettings()
     service: ServiceSettings = ServiceSettings()
     log: LogSettings = LogSettings()
+    scene: SceneOrFile | None = None
     plant: Annotated[SerializeAsAny[RigSection] | None, _section("plant")] = None
     lab: Annotated[SerializeAsAny[RigSection] | None, _section("lab")] = None
 
@@ -125,6 +128,8 @@ def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
     try:
         robot = load_description(description.robot, base=Path(path).parent)
         _check_against(description, robot)
+        if description.scene is not None:
+            description.scene.check_against(robot, path)
     except FileError:
         raise
     except MisfitError as error:

@@ -82,7 +82,7 @@ class ClientTiming:
 
     start: float = 120.0
     end: float = 4.0
-    exit: float = 0.5
+    exit: float = 1.0
     answer: float = 2.0
     answer_calls: int = 4
     fresh: float = 1e-3

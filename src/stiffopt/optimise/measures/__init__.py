@@ -1,6 +1,6 @@
 """The kinds of stiffness measures that a task may name: one file each, found by scanning."""
 
-from stiffopt.optimise.kinds import kinds_in
+from stiffopt.model.kinds import kinds_in
 from stiffopt.optimise.measure import Measure, Role
 
 _FOUND = kinds_in(__name__, Measure)  # type: ignore[type-abstract]

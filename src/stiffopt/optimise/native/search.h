@@ -59,8 +59,9 @@ static double distance(const Program *P, const double *pose) {
         double value = near[0];
         for (int i = 0; i < 3; i++) value += pose[i] * (near[1 + i] + near[4 + i] * pose[i]);
         if (P->turns[k]) value += dot(near + 7, pose + 3, 9);
-        value = fmax(value, 0);
-        total += fmax((near[16] != 0 ? sqrt(value) : value) - near[17], 0);
+        if (value < 0) value = 0; /* fmax is a call, once for each sample */
+        value = (near[16] != 0 ? sqrt(value) : value) - near[17];
+        if (value > 0) total += value;
     }
     return total;
 }

@@ -1,6 +1,6 @@
 """The kinds of terms that a target may have: one file each, found by scanning this folder."""
 
-from stiffopt.optimise.kinds import kinds_in
+from stiffopt.model.kinds import kinds_in
 from stiffopt.optimise.term import Term
 
 _FOUND = kinds_in(__name__, Term)  # type: ignore[type-abstract]

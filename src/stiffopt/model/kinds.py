@@ -1,4 +1,4 @@
-"""Discovery of the kinds of terms and measures in the files of a package."""
+"""Discovery of the kinds of things of which each file of a package defines one."""
 
 from importlib import import_module
 from pkgutil import iter_modules

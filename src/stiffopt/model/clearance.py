@@ -1,0 +1,252 @@
+"""How near the body of an arm comes to the objects of a scene: exact minima along it.
+
+The body is the union of spheres of the outer radius about the centre line, from base to tip. This
+is native/scene.h a second time, for where there is no machine code; a test proves them equal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import asin, inf, isfinite
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.distances import MeasuredObject
+
+Array = NDArray[np.float64]
+
+CLEARANCE_ERROR = 4e-6  # m, of a least distance at most
+_SHORTEST = 1e-6  # m of arc length, which is not divided again
+_FINE = 5e-4  # m of arc length, on which any object is as a convex one
+_STEEPEST = 1.5  # change of an interpolated distance with the way
+_MORE_CURVED = 1.25  # than the curvature that coarse stations show
+_SPACING = 1 / 20  # of coarse stations, as a share of the arm's length
+_INSET = 1e-9  # m, by which a range ends before the next begins
+
+StationOf = Callable[[Array], tuple[Array, Array, Array]]
+"""From arc lengths (k,) to positions (k, 3), unit tangents (k, 3) and radii (k,)."""
+
+
+class BodyPoint(NamedTuple):
+    """A station of the body."""
+
+    s: float
+    position: Array
+    tangent: Array
+    radius: float
+
+
+class Nearest(NamedTuple):
+    """Where a body is nearest to an object.
+
+    Attributes
+    ----------
+    distance : of the body's surface, in m.
+    s : arc length at rest, in m.
+    radius_share : 1 if the distance is less by the body's radius, else 0.
+    position : of the centre line (3,), in m.
+    normal : gradient (3,) of the distance by this position.
+    """
+
+    distance: float
+    s: float
+    radius_share: float
+    position: Array
+    normal: Array
+
+
+class Probe(NamedTuple):
+    """A station with its distance from an object, and how that changes along the body."""
+
+    point: BodyPoint
+    value: float
+    slope: float
+    normal: Array
+    piece: int
+
+
+@dataclass(frozen=True)
+class BodyRange:
+    """A stretch of the body on which the radius is constant and the tangent smooth.
+
+    Attributes
+    ----------
+    points : coarse stations, from its one end to the other.
+    speed : arc length per arc length at rest, at most.
+    turn : change of the tangent per arc length at rest, at most, in rad/m.
+    """
+
+    points: tuple[BodyPoint, ...]
+    speed: float
+    turn: float
+
+
+def range_ends(robot: RobotDescription) -> tuple[tuple[float, float, int], ...]:
+    """Arc lengths at rest at which ranges begin and end, and their numbers of coarse stations."""
+    ends, start = [], 0.0
+    for segment in robot.segments:
+        for length in (segment.length, segment.connector):
+            if length > 0:
+                count = 1 + max(1, int(np.ceil(length / (_SPACING * robot.length) - 1e-9)))
+                ends.append((start + _INSET, start + length - _INSET, count))
+            start += length
+    return tuple(ends)
+
+
+def survey(station: StationOf, ends: Sequence[tuple[float, float, int]]) -> list[BodyRange]:
+    """Coarse stations of all ranges, and how fast they advance and turn."""
+    arcs = [np.linspace(start, end, count) for start, end, count in ends]
+    found = station(np.concatenate(arcs))
+    points = [
+        BodyPoint(float(s), *row) for s, *row in zip(np.concatenate(arcs), *found, strict=True)
+    ]
+    ranges = []
+    for arc in arcs:
+        mine, points = points[: len(arc)], points[len(arc) :]
+        speed = turn = 0.0
+        for a, b in pairwise(mine):
+            half = float(np.linalg.norm(b.tangent - a.tangent)) / 2
+            bent = asin(min(half, 1.0)) / min(half, 1.0) if half > 1e-6 else 1.0
+            chord = float(np.linalg.norm(b.position - a.position))
+            speed = max(speed, bent * chord / (b.s - a.s))
+            turn = max(turn, 2 * half * bent / (b.s - a.s))
+        ranges.append(BodyRange(tuple(mine), speed, turn))
+    return ranges
+
+
+def nearest_point(
+    station: StationOf, item: MeasuredObject, ranges: Sequence[BodyRange], cutoff: float = inf
+) -> Nearest:
+    """The nearest point of an object on a body.
+
+    Parameters
+    ----------
+    station :
+        The body.
+    ranges :
+        All of it; of objects that are no rings also a part of it.
+    cutoff :
+        A distance above this, in m, is only known to be above it.
+    """
+    search = _Search(station, item, inf if item.is_ring else cutoff)
+    for each in ranges:
+        search.look_at(each)
+    assert search.best is not None  # every range has stations
+    return _of_ring(search, ranges) if item.is_ring else search.best
+
+
+class _Search:
+    """For the least distance of one object."""
+
+    def __init__(self, station: StationOf, item: MeasuredObject, cutoff: float) -> None:
+        self.station, self.item, self.cutoff = station, item, cutoff
+        self.best: Nearest | None = None
+        self._steepness = _STEEPEST if item.is_interpolated else 1.0
+
+    def point_at(self, s: float) -> BodyPoint:
+        """A station of the body."""
+        position, tangent, radius = self.station(np.array([s]))
+        return BodyPoint(s, position[0], tangent[0], float(radius[0]))
+
+    def look_at(self, stretch: BodyRange) -> None:
+        """The least distance of a range, if it is less than what the search has."""
+        points = stretch.points
+        probes = [self._probe(points[0], stretch)]
+        for index, point in enumerate(points[1:], start=1):
+            reach = self._steepness * stretch.speed * (point.s - probes[-1].point.s)
+            if index == len(points) - 1 or probes[-1].value - reach <= self._to_beat:
+                probes.append(self._probe(point, stretch))
+        for a, b in pairwise(probes):
+            self._refine(a, b, stretch)
+
+    @property
+    def _to_beat(self) -> float:
+        least = inf if self.best is None else self.best.distance
+        return min(least, self.cutoff) - CLEARANCE_ERROR
+
+    def _probe(self, point: BodyPoint, stretch: BodyRange) -> Probe:
+        values, normals, pieces = self.item.distances(point.position[None])
+        value, normal = float(values[0]) - point.radius, normals[0]
+        if not isfinite(value):
+            raise ArithmeticError("a distance is not finite")
+        if self.best is None or value < self.best.distance:
+            self.best = Nearest(value, point.s, 1.0, point.position, normal)
+        slope = stretch.speed * float(normal @ point.tangent)
+        return Probe(point, value, slope, normal, int(pieces[0]))
+
+    def _least_between(self, a: Probe, b: Probe, stretch: BodyRange) -> float:
+        """What the distance between two probes is at least; scene.h says why."""
+        h = b.point.s - a.point.s
+        least = (a.value + b.value - self._steepness * stretch.speed * h) / 2
+        m = _MORE_CURVED * stretch.speed * stretch.turn
+        if least >= self._to_beat:
+            return least
+        if self.item.along == "concave":
+            return min(a.value, b.value) - m * h * h / 8 if a.piece == b.piece else least
+        if self.item.along == "any" and h > _FINE:
+            return least
+        down, up = a.slope - m * h / 2, b.slope + m * h / 2
+        if down >= 0:
+            return max(least, a.value)
+        if up <= 0:
+            return max(least, b.value)
+        u = (b.value - a.value - up * h) / (down - up)
+        return max(least, a.value + down * min(max(u, 0.0), h))
+
+    def _refine(self, a: Probe, b: Probe, stretch: BodyRange) -> None:
+        """Look closer between two probes for as long as there may be something nearer."""
+        h, share = b.point.s - a.point.s, 0.5
+        if h < _SHORTEST or self._least_between(a, b, stretch) >= self._to_beat:
+            return
+        if a.slope < 0 < b.slope:
+            share = min(max(a.slope / (a.slope - b.slope), 0.1), 0.9)
+        middle = self._probe(self.point_at(a.point.s + share * h), stretch)
+        self._refine(a, middle, stretch)
+        self._refine(middle, b, stretch)
+
+
+def _of_ring(search: _Search, ranges: Sequence[BodyRange]) -> Nearest:
+    """A ring's distance is that of its circle; negative where the centre line is beside it."""
+    assert search.best is not None
+    points = [point for stretch in ranges for point in stretch.points]
+    seen = search.item.passages(np.stack([point.position for point in points]))
+    crossed = passed = False
+    for index in range(1, len(points)):
+        low, high = seen.heights[index - 1], seen.heights[index]
+        if high == 0 or low * high > 0:
+            continue
+        if low == 0:
+            inside = bool(seen.beyond[index - 1] <= 0)
+        else:
+            inside = _passes_between(search, points[index - 1], points[index], low, high)
+        crossed, passed = True, passed ^ inside
+    best = search.best
+    if passed:
+        return best
+    if crossed:
+        radius = search.point_at(best.s).radius
+        return best._replace(distance=-best.distance - 2 * radius, normal=-best.normal)
+    tip = points[-1]
+    return Nearest(-float(seen.from_disc[-1]), tip.s, 0.0, tip.position, -seen.normals[-1])
+
+
+def _passes_between(search: _Search, a: BodyPoint, b: BodyPoint, low: float, high: float) -> bool:
+    """Whether the centre line passes the disc where it crosses its plane between two points."""
+    s0, s1, beyond, from_below = a.s, b.s, 0.0, low <= 0
+    for turn in range(60):
+        if s1 - s0 <= _SHORTEST:
+            break
+        share = 0.5 if turn % 2 else min(max(low / (low - high), 0.01), 0.99)
+        s = s0 + share * (s1 - s0)
+        seen = search.item.passages(search.point_at(s).position[None])
+        height, beyond = float(seen.heights[0]), float(seen.beyond[0])
+        if (height <= 0) == from_below:
+            s0, low = s, height
+        else:
+            s1, high = s, height
+    return beyond <= 0

@@ -1,0 +1,185 @@
+"""Distances of points from the objects of a scene, in the CasADi VM and for C.
+
+There is one library of machine code for all kinds of objects. What a scene says are arguments of
+its functions, so that scenes never compile:
+
+* ``distance_KEY``: (point, parameters of a piece) to the distance and its gradient (3,);
+* ``cell_KEY``, of kinds that interpolate in a grid: to the cube (3,) of a point;
+* ``passage_KEY``, of rings: to height, how far beyond the circle, distance of the disc, and the
+  gradient (3,) of that.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.batch import BatchFunction
+from stiffopt.model.codegen import dense
+from stiffopt.model.compiled import Library, interpreted, library
+from stiffopt.model.obstacle import Obstacle
+from stiffopt.model.obstacles import OBSTACLES
+
+Array = NDArray[np.float64]
+
+_SOURCES = (str(Path(__file__).with_name("native") / "scene.c"),)
+_COURSES = {"convex": 0, "concave": 1, "any": 2}  # as scene.h has them
+_MEMORY, _MOST_PARAMETERS = 64, 32  # as scene.h has them
+
+_integer, _pointer = ctypes.c_int64, ctypes.c_void_p
+
+
+def scene_library() -> Library | None:
+    """Machine code of all distances; None where it is not there (yet)."""
+    return library("distances of scenes", distance_functions, _SOURCES)
+
+
+def distance_functions() -> list[ca.Function]:
+    """The functions of all kinds of objects."""
+    found = []
+    for key, kind in OBSTACLES.items():
+        point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
+        distance = kind.formula(point, q)
+        gradient = ca.gradient(distance, point)
+        found.append(_function(f"distance_{key}", point, q, [distance, gradient]))
+        if kind.is_interpolated:
+            found.append(_function(f"cell_{key}", point, q, [kind.cell(point, q)]))
+        if kind.is_ring:
+            passage = kind.passage(point, q)
+            passage.append(ca.gradient(passage[-1], point))
+            found.append(_function(f"passage_{key}", point, q, passage))
+    for function in found:
+        if function.sz_w() > _MEMORY or function.sz_iw() or function.size1_in(1) > _MOST_PARAMETERS:
+            raise NotImplementedError(f"{function.name()} needs more memory than scene.h has")
+    return found
+
+
+def _function(name: str, point: ca.SX, parameters: ca.SX, values: list[ca.SX]) -> ca.Function:
+    found = ca.cse([ca.densify(value) for value in values])
+    return dense(ca.Function(name, [point, parameters], found))
+
+
+@lru_cache(maxsize=1)
+def _interpreted() -> dict[str, BatchFunction]:
+    return dict(interpreted(distance_functions))
+
+
+class Distances(NamedTuple):
+    """Of points from an object.
+
+    Attributes
+    ----------
+    values : (k,), in m.
+    normals : their gradients (k, 3).
+    pieces : which piece of the object is the nearest, (k,).
+    """
+
+    values: Array
+    normals: Array
+    pieces: NDArray[np.int64]
+
+
+class Passages(NamedTuple):
+    """Where points are beside a ring.
+
+    Attributes
+    ----------
+    heights : above its plane, (k,), in m.
+    beyond : how far beyond its circle, (k,), in m.
+    from_disc : distances of the disc (k,), in m.
+    normals : their gradients (k, 3).
+    """
+
+    heights: Array
+    beyond: Array
+    from_disc: Array
+    normals: Array
+
+
+class SceneObjectInC(ctypes.Structure):
+    """`SceneObject` of native/scene.h."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("distance", "cell", "passage")),
+        *((name, _integer) for name in ("course", "pieces", "size")),
+        *((name, _pointer) for name in ("parameters", "grids", "shapes")),
+    ]  # fmt: skip
+
+
+class MeasuredObject:
+    """An object with its numbers, from which distances are measured.
+
+    Attributes
+    ----------
+    key : its kind.
+    along : see `Obstacle`.
+    is_ring : whether the arm passes through it.
+    is_interpolated : whether its distances come from grids.
+    """
+
+    def __init__(self, shape: Obstacle) -> None:
+        self.key, self.along = shape.key, shape.along
+        self.is_ring = shape.is_ring
+        self.is_interpolated = shape.is_interpolated
+        self._parameters = np.array(shape.pieces, dtype=float)  # (pieces, size)
+        self._grids = [grid.values for grid in shape.grids]
+        self._addresses = np.array([grid.ctypes.data for grid in self._grids], dtype=np.uint64)
+        self._shapes = np.array([grid.shape for grid in self._grids], dtype=np.int64)
+
+    def distances(self, points: Array) -> Distances:
+        """Distances of points (k, 3)."""
+        found = [self._of_piece(index, points) for index in range(len(self._parameters))]
+        values = np.stack([value for value, _ in found])  # (pieces, k)
+        normals = np.stack([normal for _, normal in found])  # (pieces, k, 3)
+        pieces, rows = values.argmax(axis=0), np.arange(len(points))
+        return Distances(values[pieces, rows], normals[pieces, rows], pieces)
+
+    def _of_piece(self, index: int, points: Array) -> tuple[Array, Array]:
+        parameters = self._parameters[index]
+        if self._grids:
+            parameters = self._with_corners(index, points)
+        value, normal = self._call("distance", points, parameters)
+        return value[:, 0, 0], normal[:, :, 0]
+
+    def _with_corners(self, index: int, points: Array) -> Array:
+        """Parameters (k, size) with the values at the corners of the points' cubes."""
+        (cells,) = self._call("cell", points, self._parameters[index])
+        i, j, k = cells[:, :, 0].astype(int).T
+        rows = np.repeat(self._parameters[index][None], len(points), axis=0)
+        for corner, (di, dj, dk) in enumerate(product((0, 1), repeat=3)):
+            rows[:, corner - 8] = self._grids[index][i + di, j + dj, k + dk]
+        return rows
+
+    def passages(self, points: Array) -> Passages:
+        """Where points (k, 3) are beside a ring."""
+        height, beyond, disc, normal = self._call("passage", points, self._parameters[0])
+        return Passages(height[:, 0, 0], beyond[:, 0, 0], disc[:, 0, 0], normal[:, :, 0])
+
+    def _call(self, what: str, points: Array, parameters: Array) -> list[Array]:
+        return _interpreted()[f"{what}_{self.key}"].many(points, parameters)
+
+    def in_c(self, code: Library) -> SceneObjectInC:
+        """What C takes; it refers to memory of this object."""
+
+        def address(what: str) -> int | None:
+            function = getattr(code.cdll, f"{what}_{self.key}")
+            return ctypes.cast(function, _pointer).value
+
+        return SceneObjectInC(
+            distance=address("distance"),
+            cell=address("cell") if self.is_interpolated else None,
+            passage=address("passage") if self.is_ring else None,
+            course=_COURSES[self.along],
+            pieces=len(self._parameters),
+            size=self._parameters.shape[1],
+            parameters=self._parameters.ctypes.data,
+            grids=self._addresses.ctypes.data,
+            shapes=self._shapes.ctypes.data,
+        )

@@ -1,0 +1,325 @@
+/* How near a body comes to objects: exact minima along ranges of arc length.
+ *
+ * A body is the union of spheres about its centre line.  It is known by a callback,
+ *
+ *     int station(const void *body, double s, double *position, double *tangent, double *radius)
+ *
+ * for any arc length s at rest: position (3), unit tangent (3) and radius there; 0 where it fails.
+ * A range is a stretch of the body on which the radius is constant and the tangent smooth: a
+ * segment, or a connector.  For pressures, survey the ranges once, then ask for each object:
+ *
+ *     BodyPoint points[n];
+ *     Range range = {n, points};
+ *     if (!survey(&line, s0, s1, &range)) ...               n >= 2 coarse stations from s0 to s1
+ *     Nearest nearest;
+ *     if (!object_nearest(&line, &object, ranges, count, cutoff, &nearest)) ...
+ *
+ * Where the distance is above `cutoff` (m; INFINITY for never), nearest.distance is only known to be
+ * above it.  A term with a row for each object and segment asks for one range at a time; a ring
+ * (`passage` is not NULL) must be asked for all ranges of the arm.  The change of a distance with
+ * the pressures is nearest.normal . d position - nearest.radius_share d radius at nearest.s, as
+ * nearest.s is a minimum or an end.  Formulas are those of `stiffopt.model.obstacles`, whose
+ * addresses the objects hold; this file has no library of its own. `stiffopt.model.clearance` is the
+ * same in Python.
+ */
+#ifndef STIFFOPT_SCENE_H
+#define STIFFOPT_SCENE_H
+
+#include <math.h>
+#include <stdint.h>
+
+enum { SCENE_MEMORY = 64, MOST_PARAMETERS = 32 };
+enum { CONVEX, CONCAVE, ANY_COURSE };
+
+#define CLEARANCE_ERROR 4e-6 /* m, of a least distance at most */
+#define SHORTEST 1e-6        /* m of arc length, which is not divided again */
+#define FINE 5e-4            /* m of arc length, on which any object is as a convex one */
+#define STEEPEST 1.5         /* change of an interpolated distance with the way */
+#define MORE_CURVED 1.25     /* than the curvature that coarse stations show */
+
+typedef int (*Formula)(const double **arg, double **res, long long int *iw, double *w, int mem);
+typedef int (*StationOf)(const void *body, double s, double *position, double *tangent,
+                         double *radius);
+
+/* Mirrored by `_SceneObject` in distances.py. */
+typedef struct {
+    Formula distance; /* (point, parameters of a piece) to the distance and its gradient (3) */
+    Formula cell;     /* of a grid: to the cube of a point (3); NULL where there is no grid */
+    Formula passage;  /* of a ring: to height, how far beyond, distance of the disc, its gradient */
+    int64_t course;   /* of the distance along a straight line */
+    int64_t pieces, size;     /* the largest of the pieces' distances counts */
+    const double *parameters; /* (pieces, size) */
+    const float *const *grids;
+    const int64_t *shapes; /* (pieces, 3) of the grids */
+} SceneObject;
+
+typedef struct {
+    double s, position[3], tangent[3], radius;
+} BodyPoint;
+
+/* `speed`: arc length per arc length at rest; `turn`: change of the tangent per that at most. */
+typedef struct {
+    int64_t count;
+    BodyPoint *points;
+    double speed, turn;
+} Range;
+
+typedef struct {
+    StationOf station;
+    const void *body;
+} CentreLine;
+
+/* Mirrored by `_Nearest` in clearance.py. */
+typedef struct {
+    double distance, s, radius_share, position[3], normal[3];
+} Nearest;
+
+typedef struct {
+    const BodyPoint *point;
+    double value, slope, normal[3];
+    int64_t piece;
+} Probe;
+
+typedef struct {
+    const CentreLine *line;
+    const SceneObject *object;
+    const Range *range;
+    double cutoff;
+    Nearest *best;
+} NearestSearch;
+
+static double scene_dot(const double *a, const double *b) {
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static double scene_far(const double *a, const double *b) {
+    double d[3] = {a[0] - b[0], a[1] - b[1], a[2] - b[2]};
+    return sqrt(scene_dot(d, d));
+}
+
+/* -- objects ------------------------------------------------------------------------------ */
+
+/* Put the values at the corners of a point's cube behind the other parameters. */
+static int put_corners(const SceneObject *o, int64_t piece, const double *point, double *q) {
+    double cell[3], w[SCENE_MEMORY];
+    const double *arg[2] = {point, q};
+    double *res[1] = {cell};
+    const int64_t *shape = o->shapes + 3 * piece;
+    if (o->cell(arg, res, 0, w, 0)) return 0;
+    for (int k = 0; k < 3; k++)
+        if (!(cell[k] >= 0 && cell[k] <= (double)(shape[k] - 2))) return 0;
+    const float *from = o->grids[piece] +
+        ((int64_t)cell[0] * shape[1] + (int64_t)cell[1]) * shape[2] + (int64_t)cell[2];
+    for (int i = 0; i < 2; i++)
+        for (int j = 0; j < 2; j++)
+            for (int k = 0; k < 2; k++)
+                q[o->size - 8 + 4 * i + 2 * j + k] = from[(i * shape[1] + j) * shape[2] + k];
+    return 1;
+}
+
+/* Distance of a point from an object, its gradient, and the piece that it is of. */
+static int object_distance(const SceneObject *o, const double *point, double *distance,
+                           double *normal, int64_t *nearest) {
+    double w[SCENE_MEMORY], with_corners[MOST_PARAMETERS];
+    *distance = -INFINITY;
+    for (int64_t i = 0; i < o->pieces; i++) {
+        const double *q = o->parameters + i * o->size;
+        if (o->cell) {
+            for (int64_t k = 0; k < o->size; k++) with_corners[k] = q[k];
+            if (!put_corners(o, i, point, with_corners)) return 0;
+            q = with_corners;
+        }
+        double value, gradient[3];
+        const double *arg[2] = {point, q};
+        double *res[2] = {&value, gradient};
+        if (o->distance(arg, res, 0, w, 0) || !isfinite(value)) return 0;
+        if (value <= *distance) continue;
+        *distance = value, *nearest = i;
+        for (int k = 0; k < 3; k++) normal[k] = gradient[k];
+    }
+    return 1;
+}
+
+/* -- the body ----------------------------------------------------------------------------- */
+
+static int body_point(const CentreLine *line, double s, BodyPoint *p) {
+    p->s = s;
+    return line->station(line->body, s, p->position, p->tangent, &p->radius);
+}
+
+/* Coarse stations of a range, and how fast they advance and turn. */
+static int survey(const CentreLine *line, double s0, double s1, Range *range) {
+    BodyPoint *p = range->points;
+    int64_t n = range->count;
+    for (int64_t i = 0; i < n; i++)
+        if (!body_point(line, i == n - 1 ? s1 : s0 + (s1 - s0) * (double)i / (double)(n - 1), p + i))
+            return 0;
+    range->speed = range->turn = 0;
+    for (int64_t i = 0; i + 1 < n; i++, p++) {
+        double step = p[1].s - p->s, half = scene_far(p[1].tangent, p->tangent) / 2;
+        double bent = half > 1e-6 ? asin(fmin(half, 1)) / fmin(half, 1) : 1; /* arc over chord */
+        range->speed = fmax(range->speed, bent * scene_far(p[1].position, p->position) / step);
+        range->turn = fmax(range->turn, 2 * half * bent / step);
+    }
+    return 1;
+}
+
+/* -- minima along a range ------------------------------------------------------------------ */
+
+static int probe_at(NearestSearch *search, const BodyPoint *point, Probe *probe) {
+    Nearest *best = search->best;
+    double distance;
+    if (!object_distance(search->object, point->position, &distance, probe->normal, &probe->piece))
+        return 0;
+    probe->point = point;
+    probe->value = distance - point->radius;
+    probe->slope = search->range->speed * scene_dot(probe->normal, point->tangent);
+    if (probe->value >= best->distance) return 1;
+    best->distance = probe->value, best->s = point->s, best->radius_share = 1;
+    for (int k = 0; k < 3; k++)
+        best->position[k] = point->position[k], best->normal[k] = probe->normal[k];
+    return 1;
+}
+
+static double to_beat(const NearestSearch *search) {
+    return fmin(search->best->distance, search->cutoff) - CLEARANCE_ERROR;
+}
+
+/* By how much a distance changes with arc length at rest at most. */
+static double steepness(const NearestSearch *search) {
+    return search->range->speed * (search->object->cell ? STEEPEST : 1);
+}
+
+/* What the distance between two probes is at least.
+ *
+ * It changes by no more than the way.  Along a centre line of speed v and curvature c, a distance
+ * that is convex along straight lines has second derivatives of at least -m, m = v^2 c.  With
+ * m u (h - u) / 2 taken away it is convex, the same at both ends, and above its tangents there; m
+ * h^2 / 8 below its chord lies what is concave along straight lines. */
+static double least_between(const NearestSearch *search, const Probe *a, const Probe *b) {
+    const Range *range = search->range;
+    int64_t course = search->object->course;
+    double h = b->point->s - a->point->s;
+    double least = (a->value + b->value - steepness(search) * h) / 2;
+    double m = MORE_CURVED * range->speed * range->turn;
+    if (least >= to_beat(search)) return least;
+    if (course == CONCAVE)
+        return a->piece == b->piece ? fmin(a->value, b->value) - m * h * h / 8 : least;
+    if (course == ANY_COURSE && h > FINE) return least;
+    double down = a->slope - m * h / 2, up = b->slope + m * h / 2;
+    if (down >= 0) return fmax(least, a->value);
+    if (up <= 0) return fmax(least, b->value);
+    double u = (b->value - a->value - up * h) / (down - up);
+    return fmax(least, a->value + down * fmin(fmax(u, 0), h));
+}
+
+/* Look closer between two probes for as long as there may be something nearer. */
+static int refine_between(NearestSearch *search, const Probe *a, const Probe *b) {
+    double h = b->point->s - a->point->s, share = 0.5;
+    if (h < SHORTEST || least_between(search, a, b) >= to_beat(search)) return 1;
+    if (a->slope < 0 && b->slope > 0)
+        share = fmin(fmax(a->slope / (a->slope - b->slope), 0.1), 0.9);
+    BodyPoint middle;
+    Probe probe;
+    return body_point(search->line, a->point->s + share * h, &middle) &&
+        probe_at(search, &middle, &probe) && refine_between(search, a, &probe) &&
+        refine_between(search, &probe, b);
+}
+
+/* The least distance of a range, if it is less than what the search has. */
+static int search_range(NearestSearch *search, const Range *range) {
+    int64_t n = range->count, used = 0;
+    const BodyPoint *p = range->points;
+    Probe probes[n];
+    search->range = range;
+    if (!probe_at(search, p, probes)) return 0;
+    for (int64_t i = 1; i < n; i++) {
+        double reach = steepness(search) * (p[i].s - probes[used].point->s);
+        if (i < n - 1 && probes[used].value - reach > to_beat(search)) continue; /* too far away */
+        if (!probe_at(search, p + i, probes + ++used)) return 0;
+    }
+    for (int64_t i = 0; i < used; i++)
+        if (!refine_between(search, probes + i, probes + i + 1)) return 0;
+    return 1;
+}
+
+/* -- rings --------------------------------------------------------------------------------- */
+
+typedef struct {
+    double height, beyond, from_disc, normal[3];
+} Passage;
+
+static int passage_of(const SceneObject *o, const double *point, Passage *passage) {
+    double w[SCENE_MEMORY];
+    const double *arg[2] = {point, o->parameters};
+    double *res[4] = {&passage->height, &passage->beyond, &passage->from_disc, passage->normal};
+    return !o->passage(arg, res, 0, w, 0);
+}
+
+/* Whether the centre line passes the disc where it crosses its plane between two points. */
+static int passes_between(const CentreLine *line, const SceneObject *o, const BodyPoint *a,
+                          const BodyPoint *b, Passage low, Passage high, int *inside) {
+    double s0 = a->s, s1 = b->s;
+    Passage middle = low;
+    for (int i = 0; i < 60 && s1 - s0 > SHORTEST; i++) {
+        BodyPoint p;
+        double share = low.height / (low.height - high.height);
+        share = i % 2 ? 0.5 : fmin(fmax(share, 0.01), 0.99);
+        if (!body_point(line, s0 + share * (s1 - s0), &p) || !passage_of(o, p.position, &middle))
+            return 0;
+        if ((middle.height <= 0) == (low.height <= 0)) s0 = p.s, low = middle;
+        else s1 = p.s, high = middle;
+    }
+    *inside = middle.beyond <= 0;
+    return 1;
+}
+
+/* A ring's distance is that of its circle; negative where the centre line is beside it. */
+static int ring_nearest(NearestSearch *search, const Range *ranges, int64_t count) {
+    const SceneObject *o = search->object;
+    Nearest *best = search->best;
+    int crossed = 0, passed = 0;
+    const BodyPoint *last = NULL;
+    Passage before, now;
+    search->cutoff = INFINITY;
+    for (int64_t r = 0; r < count; r++) {
+        if (!search_range(search, ranges + r)) return 0;
+        for (int64_t i = 0; i < ranges[r].count; i++, last = ranges[r].points + i - 1) {
+            const BodyPoint *point = ranges[r].points + i;
+            if (!passage_of(o, point->position, &now)) return 0;
+            if (last && now.height != 0 && before.height * now.height <= 0) {
+                int inside = before.height == 0 && before.beyond <= 0;
+                if (before.height != 0 &&
+                    !passes_between(search->line, o, last, point, before, now, &inside))
+                    return 0;
+                crossed = 1, passed ^= inside;
+            }
+            before = now;
+        }
+    }
+    if (passed) return 1;
+    if (crossed) {
+        BodyPoint nearest;
+        if (!body_point(search->line, best->s, &nearest)) return 0;
+        best->distance = -best->distance - 2 * nearest.radius;
+        for (int k = 0; k < 3; k++) best->normal[k] = -best->normal[k];
+        return 1;
+    }
+    best->distance = -now.from_disc, best->s = last->s, best->radius_share = 0;
+    for (int k = 0; k < 3; k++)
+        best->position[k] = last->position[k], best->normal[k] = -now.normal[k];
+    return 1;
+}
+
+/* The nearest point of an object along ranges that have been surveyed. */
+static int object_nearest(const CentreLine *line, const SceneObject *object, const Range *ranges,
+                          int64_t count, double cutoff, Nearest *nearest) {
+    NearestSearch search = {line, object, ranges, cutoff, nearest};
+    nearest->distance = INFINITY;
+    if (object->passage) return ring_nearest(&search, ranges, count);
+    for (int64_t r = 0; r < count; r++)
+        if (!search_range(&search, ranges + r)) return 0;
+    return 1;
+}
+
+#endif

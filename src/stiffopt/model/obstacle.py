@@ -1,0 +1,172 @@
+"""What an obstacle is: a shape in the base frame with a formula of its distance.
+
+The formula of a kind stands once, in CasADi, with the shape's numbers as arguments; machine code
+for all kinds is made from it once (`stiffopt.model.distances`), so that moving or adding an
+object compiles nothing.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from stiffopt.errors import InputError
+from stiffopt.schema import BadKeyError, Schema, Vector
+from stiffopt.units import Length, within
+
+if TYPE_CHECKING:
+    from stiffopt.model.description import RobotDescription
+    from stiffopt.model.distance_grid import DistanceGrid
+
+Array = NDArray[np.float64]
+Along = Literal["convex", "concave", "any"]
+
+Point = Vector[Annotated[Length, within(1e3, "m")]]
+"""A point in the base frame, in m."""
+Radius = Annotated[Length, Field(gt=0, le=1e3)]
+"""In m."""
+
+_TINY = 1e-24  # m^2 under roots, so that a gradient exists where a distance is zero
+
+
+class Obstacle(Schema, ABC):
+    """A shape that the arm keeps clear of, stays in, or passes through.
+
+    Attributes
+    ----------
+    key : its name in files.
+    along : what the distance is along a straight line: convex (that to any convex shape),
+        concave in each piece (that inside a tube), or any. Exact minima along an arm rest on it.
+    wrong_side : of it, for the arm.
+    n_parameters : how many numbers the formula takes for a piece.
+    is_interpolated : whether distances come from grids; the last eight parameters are then the
+        values at the corners of a point's cube.
+    is_ring : whether the arm passes through it.
+    """
+
+    model_config = ConfigDict(populate_by_name=True)
+
+    key: ClassVar[str]
+    along: ClassVar[Along] = "convex"
+    wrong_side: ClassVar[str] = "within"
+    n_parameters: ClassVar[int]
+    is_interpolated: ClassVar[bool] = False
+    is_ring: ClassVar[bool] = False
+
+    @staticmethod
+    @abstractmethod
+    def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
+        """Signed distance of a point (3,) in m, negative where the arm must not be."""
+
+    @staticmethod
+    def cell(point: ca.SX, parameters: ca.SX) -> ca.SX:
+        """Which cube (3,) of a grid has a point, for kinds that are interpolated."""
+        raise NotImplementedError
+
+    @staticmethod
+    def passage(point: ca.SX, parameters: ca.SX) -> list[ca.SX]:
+        """Of a ring: height above its plane, how far beyond the circle, distance of the disc."""
+        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def pieces(self) -> list[list[float]]:
+        """Parameters of each piece; the distance is the largest of the pieces' distances."""
+
+    @property
+    def grids(self) -> tuple[DistanceGrid, ...]:
+        """Grids of distances, one for each piece, or none."""
+        return ()
+
+    @abstractmethod
+    def outline(self, size: float) -> list[Array]:
+        """Surfaces (3, rows, columns) in m that show it, cut off at a size where it has no end."""
+
+    def check_against(self, robot: RobotDescription, clearance: float) -> None:
+        """Refuse what makes no sense for an arm.
+
+        Parameters
+        ----------
+        clearance :
+            What is asked of the arm's body, in m.
+
+        Raises
+        ------
+        BadKeyError
+        """
+        radius = robot.segments[0].outer_radius
+        left = self.distance_of((0.0, 0.0, 0.0)) - radius
+        if left >= clearance:
+            return
+        has = f"has {left * 1e3:.4g} mm of the clearance of {clearance * 1e3:g} mm asked for"
+        lies = f"lies {-left * 1e3:.4g} mm {self.wrong_side} it, where it can never be clear"
+        raise BadKeyError(
+            self.key,
+            f"the arm's base, a body of radius {radius * 1e3:g} mm about the origin, "
+            f"{has if left >= 0 else lies}",
+        )
+
+    def distance_of(self, point: Any) -> float:
+        """Signed distance of one point (3,), from the formula itself, in m."""
+        return max(float(self.formula(ca.DM(point), ca.DM(q))) for q in self.pieces)
+
+
+def norm(vector: ca.SX) -> ca.SX:
+    """Length of a vector whose gradient exists at zero too; exact to 1e-12."""
+    return ca.sqrt(ca.sumsqr(vector) + _TINY)
+
+
+def from_segment(point: ca.SX, start: ca.SX, end: ca.SX) -> ca.SX:
+    """Vector (3,) to a point from the nearest point of the straight line between two."""
+    way = end - start
+    share = ca.fmin(ca.fmax(ca.dot(point - start, way) / ca.sumsqr(way), 0), 1)
+    return point - start - share * way
+
+
+def from_box(excess: ca.SX) -> ca.SX:
+    """Signed distance of a box from how far a point is beyond its faces, (k,)."""
+    outside = norm(ca.fmax(excess, 0))
+    return outside + ca.fmin(ca.mmax(excess), 0)
+
+
+def check_apart(start: tuple[float, ...], end: tuple[float, ...], instead: str) -> None:
+    """Raise where two points are one."""
+    if np.linalg.norm(np.subtract(end, start)) < 1e-9:
+        raise InputError(f"begins where it ends; {instead}")
+
+
+# -- surfaces for plots ---------------------------------------------------------------------------
+
+
+def across(axis: Array) -> tuple[Array, Array]:
+    """Two unit vectors that make a right-handed frame with a unit vector."""
+    first = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)
+
+
+def revolved(origin: Any, axis: Any, heights: Any, radii: Any, sides: int = 24) -> Array:
+    """Surface (3, rows, sides + 1) of revolution with these heights along its axis and radii."""
+    axis = np.asarray(axis, dtype=float)
+    first, second = across(axis)
+    angle = np.linspace(0.0, 2 * np.pi, sides + 1)
+    ring = np.outer(first, np.cos(angle)) + np.outer(second, np.sin(angle))  # (3, sides + 1)
+    along = np.multiply.outer(axis, np.asarray(heights, dtype=float))  # (3, rows)
+    centres = np.asarray(origin, dtype=float)[:, None] + along
+    surface: Array = centres[:, :, None] + np.asarray(radii)[None, :, None] * ring[:, None, :]
+    return surface
+
+
+def rounded(start: Any, end: Any, radius: float) -> Array:
+    """Surface of a capsule; of a sphere where both ends are one."""
+    way = np.subtract(end, start).astype(float)
+    length = float(np.linalg.norm(way))
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 14)
+    heights = radius * np.sin(angle) + length * (angle > 0)
+    axis = way / length if length else np.array([0.0, 0.0, 1.0])
+    return revolved(start, axis, heights, radius * np.cos(angle))

@@ -1,0 +1,72 @@
+"""A ring that the arm passes through, at whatever arc length."""
+
+import casadi as ca
+
+from stiffopt.directions import Direction
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.obstacle import Array, Obstacle, Point, Radius, norm, revolved
+from stiffopt.schema import BadKeyError
+
+
+class Trocar(Obstacle):
+    """A ring that the arm passes through.
+
+    Its distance from the arm's centre line, which crosses its disc, is that of the circle; of a
+    centre line that crosses its plane beside the disc, the negative of it; of one that does not
+    cross the plane, the negative of the tip's distance from the disc.
+
+    Attributes
+    ----------
+    centre : in m.
+    axis : unit vector across the ring.
+    radius : of its opening, in m.
+    """
+
+    key = "trocar"
+    along = "any"
+    n_parameters = 7
+    is_ring = True
+
+    centre: Point
+    axis: Direction
+    radius: Radius
+
+    @staticmethod
+    def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
+        """Distance of the circle."""
+        height, beyond = _seen(point, parameters)
+        return norm(ca.vertcat(height, beyond))
+
+    @staticmethod
+    def passage(point: ca.SX, parameters: ca.SX) -> list[ca.SX]:
+        """See `Obstacle.passage`."""
+        height, beyond = _seen(point, parameters)
+        return [height, beyond, norm(ca.vertcat(height, ca.fmax(beyond, 0)))]
+
+    @property
+    def pieces(self) -> list[list[float]]:
+        """Centre, axis, radius."""
+        return [[*self.centre, *self.axis, self.radius]]
+
+    def check_against(self, robot: RobotDescription, clearance: float) -> None:
+        """The arm's end fits through; see `Obstacle.check_against`."""
+        width = robot.segments[-1].outer_radius
+        if self.radius < width + clearance:
+            asked = f" with {clearance * 1e3:g} mm of clearance" if clearance else ""
+            raise BadKeyError(
+                f"{self.key}.radius",
+                f"{self.radius * 1e3:g} mm is too narrow for the arm, whose outer radius is "
+                f"{width * 1e3:g} mm{asked}",
+            )
+
+    def outline(self, size: float) -> list[Array]:
+        """A flange about the opening; see `Obstacle.outline`."""
+        radii = (self.radius, 1.5 * self.radius)
+        return [revolved(self.centre, self.axis, (0.0, 0.0), radii)]
+
+
+def _seen(point: ca.SX, parameters: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """Height above the ring's plane, and how far beyond the circle."""
+    seen = point - parameters[:3]
+    height = ca.dot(parameters[3:6], seen)
+    return height, norm(seen - height * parameters[3:6]) - parameters[6]
