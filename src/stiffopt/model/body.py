@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.batch import in_parallel
-from stiffopt.model.body_functions import free_body_functions, loaded_body_functions, strain_rows
+from stiffopt.model.body_functions import free_moving_functions, loaded_body_functions, strain_rows
 from stiffopt.model.compiled import Library, checkpoint, library
 from stiffopt.model.compiler import NATIVE
 from stiffopt.model.layout import Layout
@@ -129,7 +129,7 @@ class BodyShape:
 
 def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
     """Machine code of an arm's body; None where there is none."""
-    kind, make, source = "body", _free_functions, "body.c"
+    kind, make, source = "body", free_moving_functions, "body.c"
     if arm.is_loaded:
         if rod_functions(arm.layout) is None:
             return None
@@ -146,11 +146,6 @@ def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
         return None
 
 
-def _free_functions(layout: Layout) -> list[ca.Function]:
-    names = ("frames", "moving_frames", "along", "moving_along")
-    return [each for each in free_body_functions(layout) if each.name() in names]
-
-
 def _loaded_functions(layout: Layout) -> list[ca.Function]:
     equations = rod_functions(layout)
     assert equations is not None  # or nobody would ask
@@ -165,6 +160,30 @@ class BodyModel(ctypes.Structure):
         *((name, _integer) for name in ("n", "pieces", "strains")),
         *((name, _pointer) for name in ("piece_of", "section", "ends", "numbers", "rod")),
     ]
+
+
+class ModelInC:
+    """An arm's `BodyModel`, and what it refers to.
+
+    Attributes
+    ----------
+    address : int
+    """
+
+    def __init__(self, arm: Arm, rod: LoadedArm | None) -> None:
+        pieces, numbers = Pieces(arm), arm.numbers
+        self._keep = (pieces, numbers, rod)
+        self._model = BodyModel(
+            n=arm.n_pressures,
+            pieces=len(pieces.ends),
+            strains=len(strain_rows(arm.layout)),
+            piece_of=pieces.piece_of.ctypes.data,
+            section=pieces.section.ctypes.data,
+            ends=pieces.ends.ctypes.data,
+            numbers=numbers.ctypes.data,
+            rod=rod.address if rod else None,
+        )
+        self.address = ctypes.addressof(self._model)
 
 
 class NativeBody:
@@ -187,24 +206,13 @@ class NativeBody:
 
     def __init__(self, code: Library, arm: Arm) -> None:
         self._n = arm.n_pressures
-        pieces, numbers = Pieces(arm), arm.numbers
-        rod = LoadedArm(code, arm) if arm.is_loaded else None
-        self._keep = (code, pieces, numbers, rod)  # what pointers below lead to
+        self._code = code
         size = code.cdll.stiffopt_body_model_size
         size.restype = _integer
         if size() != ctypes.sizeof(BodyModel):
             raise RuntimeError("native/body.h and this file disagree on their interface")
-        self._model = BodyModel(
-            n=self._n,
-            pieces=len(pieces.ends),
-            strains=len(strain_rows(arm.layout)),
-            piece_of=pieces.piece_of.ctypes.data,
-            section=pieces.section.ctypes.data,
-            ends=pieces.ends.ctypes.data,
-            numbers=numbers.ctypes.data,
-            rod=rod.address if rod else None,
-        )
-        self.address = ctypes.addressof(self._model)
+        self._model = ModelInC(arm, LoadedArm(code, arm) if arm.is_loaded else None)
+        self.address = self._model.address
         self._stations = code.cdll.stiffopt_stations
         self._stations.argtypes = [_pointer, _integer, _pointer, _pointer, _integer,
                                    _pointer, _pointer, _integer, _integer]  # fmt: skip

@@ -101,6 +101,12 @@ def free_body_functions(layout: Layout) -> list[ca.Function]:
     ]  # fmt: skip
 
 
+def free_moving_functions(layout: Layout) -> list[ca.Function]:
+    """Those of them that native/body.h takes."""
+    names = ("frames", "moving_frames", "along", "moving_along")
+    return [each for each in free_body_functions(layout) if each.name() in names]
+
+
 def loaded_body_functions(layout: Layout) -> list[ca.Function]:
     """Functions of the body of all arms of a layout under loads."""
     arm = symbolic_arm(layout)

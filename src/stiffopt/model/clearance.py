@@ -86,13 +86,15 @@ class BodyRange:
     turn: float
 
 
-def range_ends(robot: RobotDescription) -> tuple[tuple[float, float, int], ...]:
+def range_ends(
+    robot: RobotDescription, spacing: float = _SPACING
+) -> tuple[tuple[float, float, int], ...]:
     """Arc lengths at rest at which ranges begin and end, and their numbers of coarse stations."""
     ends, start = [], 0.0
     for segment in robot.segments:
         for length in (segment.length, segment.connector):
             if length > 0:
-                count = 1 + max(1, int(np.ceil(length / (_SPACING * robot.length) - 1e-9)))
+                count = 1 + max(1, int(np.ceil(length / (spacing * robot.length) - 1e-9)))
                 ends.append((start + _INSET, start + length - _INSET, count))
             start += length
     return tuple(ends)

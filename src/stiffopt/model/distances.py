@@ -38,7 +38,15 @@ _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
 def scene_library() -> Library | None:
     """Machine code of all distances; None where it is not there (yet)."""
-    return library("distances of scenes", distance_functions, _SOURCES)
+    if not _found:
+        code = library("distances of scenes", distance_functions, _SOURCES)
+        if code is None:
+            return None
+        _found.append(code)
+    return _found[0]
+
+
+_found: list[Library] = []  # the library, once it is there
 
 
 def distance_functions() -> list[ca.Function]:

@@ -21,6 +21,7 @@ from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import stop_flag
+from stiffopt.optimise.obstacles import ObstaclesInC
 from stiffopt.optimise.program import Program, pressure_ranges
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.search import effort
@@ -57,7 +58,7 @@ class _Setup(ctypes.Structure):
 
     _fields_ = [
         *((name, _integer) for name in (
-            "n", "rows", "balls", "terms", "floors", "values", "parameters", "near", "samples"
+            "n", "rows", "own_rows", "balls", "terms", "floors", "values", "parameters", "near", "samples"
         )),
         *((name, _pointer) for name in ("ball_rows", "one_sided", "scale", "unit", "stage")),
         ("reach", type(_REACH)),
@@ -66,12 +67,14 @@ class _Setup(ctypes.Structure):
         ("least_effort", type(_EFFORT)),
         ("most_effort", type(_EFFORT)),
         *((name, _double) for name in (
-            "covered", "same_optimum", "unlike", "price_of_floors", "precision"
+            "covered", "same_optimum", "unlike", "price_of_floors",
+            "price_of_obstacles", "precision",
         )),
         *((name, _pointer) for name in ("sample_x", "sample_poses")),
         ("state", _integer),
         ("sample_states", _pointer),
         ("rod", _pointer),
+        ("obstacles", _pointer),
     ]  # fmt: skip
 
 
@@ -144,14 +147,18 @@ class FastSolver:
             np.array([c.one_sided for c in constraints], dtype=np.int64),
             np.array([c.scale for c in constraints]),
             pressure_ranges(robot.description),
-            np.array([stages.index(c.name) for c in constraints], dtype=np.int64),
-            table.pressures / pressure_ranges(robot.description),
+            np.array(
+                [stages.index(c.name) if c.name in stages else -1 for c in constraints],
+                dtype=np.int64,
+            ),
+            table.shares,
         )
         ball_rows, one_sided, scale, unit, stage, sample_x = (a.ctypes.data for a in self._arrays)
         least, most = (effort(program.n_equal, share, arm is not None) for share in (0.0, 1.0))
         setup = _Setup(
             n=n,
             rows=program.n_rows,
+            own_rows=program.n_own_rows,
             balls=len(constraints),
             terms=program.n_terms,
             floors=program.n_floors,
@@ -173,6 +180,7 @@ class FastSolver:
             same_optimum=SEARCH.same_optimum,
             unlike=SEARCH.unlike,
             price_of_floors=SEARCH.price_of_floors,
+            price_of_obstacles=SEARCH.price_of_obstacles,
             precision=program.precision,
             sample_x=sample_x,
             sample_poses=table.flat_poses.ctypes.data,
@@ -181,6 +189,9 @@ class FastSolver:
             setup.state = arm.state_size
             setup.sample_states = table.states.ctypes.data
             setup.rod = arm.address
+        if program.obstacles is not None:
+            self._obstacles = ObstaclesInC(program.obstacles, robot, arm)
+            setup.obstacles = self._obstacles.address
         self._setup = setup
         self._address = ctypes.addressof(setup)
         self._numbers = robot.numbers

@@ -1,13 +1,16 @@
 """The functions of a task's structure on one arm: machine code where there is some, else the VM."""
 
 from collections.abc import Hashable
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 
 import casadi as ca
 
+from stiffopt.model.body_functions import free_moving_functions, loaded_body_functions
 from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.compiled import Library, library
+from stiffopt.model.distances import scene_library
 from stiffopt.model.layout import Layout, free_tip_function
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.rod import rod_functions
@@ -37,19 +40,23 @@ class Functions:
         The integrator in C, for arms under gravity or loads, knows of the tip alone.
         """
         robot, program = self._robot, self._program
-        if self._library is None and robot.is_loaded:
-            if not program.has_stations and rod_functions(robot.layout) is not None:
-                self._library = library(
-                    (robot.layout.skeleton, program.structure, "loaded"),
-                    partial(_loaded_functions, robot.layout, program),
-                    (str(_NATIVE / "loaded_solver.c"),), daqp=True,
-                )  # fmt: skip
-        elif self._library is None and len(program.measures) <= KEPT.most_measures:
-            self._library = library(
-                (robot.layout.skeleton, program.structure),
-                partial(_free_functions, robot.layout, program),
-                (str(_NATIVE / "solver.c"),), daqp=True,
-            )  # fmt: skip
+        if self._library is not None:
+            return self._library
+        among = program.obstacles is not None
+        if among and scene_library() is None:
+            return None
+        make, source = _free_functions, "scene_solver.c" if among else "solver.c"
+        if robot.is_loaded:
+            if program.has_stations or rod_functions(robot.layout) is None:
+                return None
+            make, source = _loaded_functions, f"loaded_{source}"
+        elif len(program.measures) > KEPT.most_measures:
+            return None
+        plain = replace(program, obstacles=None)  # scenes are data
+        self._library = library(
+            (robot.layout.skeleton, program.structure, source),
+            partial(make, robot.layout, plain, among), (str(_NATIVE / source),), daqp=True,
+        )  # fmt: skip
         return self._library
 
     def __getitem__(self, name: str) -> BatchFunction:
@@ -85,17 +92,20 @@ def _free_function(layout: Layout, program: Program, name: str) -> ca.Function:
     return free_tip_function(layout, name, getattr(program, name), program.n_parameters)
 
 
-def _free_functions(layout: Layout, program: Program) -> list[ca.Function]:
-    return [_free_function(layout, program, name) for name in ("pose", "point", "judge")]
+def _free_functions(layout: Layout, program: Program, among: bool) -> list[ca.Function]:
+    """Functions of a free arm; `among`: those of its body too."""
+    own = [_free_function(layout, program, name) for name in ("pose", "point", "judge")]
+    return [*own, *free_moving_functions(layout)] if among else own
 
 
-def _loaded_functions(layout: Layout, program: Program) -> list[ca.Function]:
+def _loaded_functions(layout: Layout, program: Program, among: bool) -> list[ca.Function]:
     equations = rod_functions(layout)
     assert equations is not None  # see `Functions.library`
-    return [*equations.functions, *tip_functions(program, layout)]
+    own = [*equations.functions, *tip_functions(program, layout)]
+    return [*own, *loaded_body_functions(layout)] if among else own
 
 
 def functions(robot: Manipulator, program: Program) -> Functions:
     """Functions of the program's structure; made once and kept by the robot."""
-    key = ("functions", robot.is_loaded, program.structure)
+    key = ("functions", robot.is_loaded, program.structure, program.obstacles is not None)
     return robot.kept(key, lambda: Functions(robot, program))

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
+from stiffopt.model.arm_clearance import SceneKey
 from stiffopt.model.compiled import Library
 from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
@@ -41,12 +42,16 @@ class Prepared:
         load = task.load
         self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
         self.lower, self.upper = task.pressure_bounds(robot.description)
-        self._program = Program.of(task.target, task.stiffness, robot.description)
+        self._program = Program.of(task, robot.description)
         self._floors = floor_bounds(task.stiffness)
         self.unit = task.measures[0].unit if task.measures else None
         self._seed = seed
         limits = (self.lower.tobytes(), self.upper.tobytes())
         self._key = (self.robot.tip_load, *limits, seed)
+        self._scene = None
+        if task.scene is not None:
+            task.scene.check_against(robot.description, task.source)
+            self._scene = SceneKey(task.scene)
         self._rows: dict[ProgramStructure, tuple[FastSolver, Vector] | None] = {}
 
     def program(self, target: Target) -> Program:
@@ -71,7 +76,7 @@ class Prepared:
         """Compiled solver; None for a loaded arm that does not stand at rest."""
         if not self.robot.is_loaded:
             return _recent(
-                self.robot, "fast solvers", (program.structure, self._key),
+                self.robot, "fast solvers", (program.structure, self._key, self._scene),
                 lambda: FastSolver(library, self.robot, program, self.samples),
             )  # fmt: skip
         table = _recent(self.robot, "loaded arms", self._key, lambda: self._loaded_samples(library))
@@ -103,7 +108,8 @@ def prepared(robot: Manipulator, task: Task, seed: int) -> Prepared:
     InputError
         If the task's pressure limits do not suit the robot.
     """
-    key = (task.stiffness, task.load, task.pressure, robot.tip_load, seed)
+    scene = None if task.scene is None else SceneKey(task.scene)
+    key = (task.stiffness, task.load, task.pressure, scene, robot.tip_load, seed)
     return _recent(robot, "prepared", key, lambda: Prepared(robot, task, seed))
 
 

@@ -197,7 +197,7 @@ class PressureProblem:
         self.unit = pressure_ranges(robot.description)
         self.lower, self.upper = lower / self.unit, upper / self.unit
         self.radii: dict[str, float] = {}
-        self.program = Program.of(task.target, task.stiffness, robot.description)
+        self.program = Program.of(task, robot.description)
         self.parameters = robot.parameters(self.program.parameters)
         self._functions = functions(robot, self.program)
         self._is_loaded = robot.is_loaded

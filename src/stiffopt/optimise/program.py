@@ -20,8 +20,10 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.shape import Shape
 from stiffopt.optimise.goal import StiffnessGoal
 from stiffopt.optimise.measure import Measure
-from stiffopt.optimise.settings import PROGRAM
+from stiffopt.optimise.obstacles import Obstacles
+from stiffopt.optimise.settings import OBSTACLES, PROGRAM
 from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
 from stiffopt.optimise.term import Term
 
 Vector = NDArray[np.float64]
@@ -86,6 +88,8 @@ class Program:
     n_floors : int
     reference : float
         Pressure in Pa that is one unit of mean square pressure.
+    obstacles : Obstacles or None
+        What is around the arm: rows of the residual after those of the terms.
     """
 
     terms: tuple[Term, ...]
@@ -93,18 +97,19 @@ class Program:
     aim: Aim
     n_floors: int
     reference: float = BAR
+    obstacles: Obstacles | None = None
 
     @classmethod
-    def of(
-        cls, target: Target, goal: StiffnessGoal | None, description: RobotDescription
-    ) -> "Program":
+    def of(cls, task: Task, description: RobotDescription) -> "Program":
         """Program of a task on a robot."""
+        terms, goal = task.target.terms, task.stiffness
         reference = float(pressure_ranges(description).max())
+        obstacles = None if task.scene is None else Obstacles(task.scene, description)
         if goal is None:
-            return cls(target.terms, (), "least pressure", 0, reference)
+            return cls(terms, (), "least pressure", 0, reference, obstacles)
         aim: Aim = "maximise" if goal.maximise else "match" if goal.match else "least pressure"
         measures = (*goal.first, *goal.at_least)
-        return cls(target.terms, measures, aim, len(goal.at_least), reference)
+        return cls(terms, measures, aim, len(goal.at_least), reference, obstacles)
 
     @cached_property
     def structure(self) -> ProgramStructure:
@@ -156,6 +161,8 @@ class Program:
                     Constraint(term.name, row, row + step, term.radius, scale, term.is_inequality)
                 )
             first += term.size
+        for row, name in enumerate(self.obstacles.row_names if self.obstacles else (), start=first):
+            found.append(Constraint(name, row, row + 1, OBSTACLES.margin, length, one_sided=True))
         return tuple(found)
 
     @property
@@ -167,9 +174,14 @@ class Program:
         return tuple(sorted(self.terms, key=lambda term: (not term.is_inequality, -term.order)))
 
     @property
-    def n_rows(self) -> int:
-        """Number of components m of the residual."""
+    def n_own_rows(self) -> int:
+        """Number of components of the terms' residuals."""
         return sum(term.size for term in self.terms)
+
+    @property
+    def n_rows(self) -> int:
+        """Number of components m of the residual, obstacles included."""
+        return self.n_own_rows + (len(self.obstacles.row_objects) if self.obstacles else 0)
 
     @property
     def n_equal(self) -> int:
@@ -189,6 +201,12 @@ class Program:
             found[term.name] = term.radius - max(own) if term.is_inequality else math.hypot(*own)
             start += term.size
         return found
+
+    def intruders(self, residuals: list[float]) -> dict[str, float]:
+        """Objects that are nearer than the clearance, with what is missing in m, from (m,)."""
+        if self.obstacles is None:
+            return {}
+        return self.obstacles.intruders(residuals[self.n_own_rows :])
 
     def at(self, target: Target) -> "Program":
         """The same program for another target."""

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.program import pressure_ranges
 from stiffopt.optimise.settings import SAMPLES
 from stiffopt.optimise.term import Term
 
@@ -44,7 +45,7 @@ class SampleTable:
         seed: int,
         arm: LoadedArm | None = None,
     ) -> None:
-        self.arm = arm
+        self.arm, self._ranges = arm, pressure_ranges(robot.description)
         count = SAMPLES.free
         if robot.is_loaded:
             count = SAMPLES.loaded if arm is None else SAMPLES.compiled
@@ -63,6 +64,11 @@ class SampleTable:
         else:
             poses = robot.tip_pose(x)
         self.pressures, self.poses = np.ascontiguousarray(x), poses
+
+    @cached_property
+    def shares(self) -> Vector:
+        """Pressures (N, n) as shares of the channels' ranges."""
+        return np.ascontiguousarray(self.pressures / self._ranges)
 
     @cached_property
     def flat_poses(self) -> Vector:

@@ -91,6 +91,8 @@ class SearchSettings:
     same_optimum : difference of two objectives (0.1 % of a stiffness) that count as one optimum.
     unlike : share of the diagonal of the pressure range that first starts lie apart.
     price_of_floors : weight of a stiffness that is missed, when starts are ranked.
+    price_of_obstacles : weight of what a body lacks of its clearance, over the arm's length, when
+        starts that are at the target but not clear yet are ranked.
     general_starts_loaded : starts of the general method for an arm under gravity or a load.
     """
 
@@ -102,6 +104,7 @@ class SearchSettings:
     same_optimum: float = 1e-3
     unlike: float = 0.2
     price_of_floors: float = 10.0
+    price_of_obstacles: float = 3.0
     general_starts_loaded: int = 12
 
 
@@ -125,6 +128,25 @@ class ClosestSettings:
     samples: int = 16
     same: float = 1e-7
     precision: float = 1e-10
+
+
+@dataclass(frozen=True)
+class ObstacleSettings:
+    """Rows for the objects of a scene (`stiffopt.optimise.obstacles`).
+
+    Attributes
+    ----------
+    spacing : of coarse stations, as a share of the arm's length.
+    margin : width of a row's bound in m, the scale on which the method sees it.
+    cutoff : distance beyond the clearance, in m, from which an object has no part in a step.
+    allowed : by how much an answer may be nearer than the clearance, in m: the precision of least
+        distances.
+    """
+
+    spacing: float = 1 / 12
+    margin: float = 1e-4
+    cutoff: float = 0.01
+    allowed: float = 1e-5
 
 
 @dataclass(frozen=True)
@@ -247,6 +269,7 @@ REACH = ReachSettings()
 DESCENT = DescentSettings()
 SEARCH = SearchSettings()
 CLOSEST = ClosestSettings()
+OBSTACLES = ObstacleSettings()
 SAMPLES = SampleSettings()
 PRICES = PriceSettings()
 DERIVATIVES = DerivativeSettings()

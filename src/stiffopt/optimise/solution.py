@@ -16,7 +16,7 @@ from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.program import Program
-from stiffopt.optimise.settings import ANSWER
+from stiffopt.optimise.settings import ANSWER, OBSTACLES
 from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
@@ -319,11 +319,17 @@ class Judgement(NamedTuple):
     pose_holds: bool
     limits_hold: bool
     shortfalls: tuple[str, ...]
+    intruders: dict[str, float]
 
     @property
     def holds(self) -> bool:
         """Whether everything that the task asks for is so."""
-        return self.pose_holds and self.limits_hold and not self.shortfalls
+        return self.is_clear and self.pose_holds and self.limits_hold and not self.shortfalls
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether the body keeps the clearance of the scene."""
+        return all(missing <= OBSTACLES.allowed for missing in self.intruders.values())
 
     @classmethod
     def of(
@@ -359,6 +365,7 @@ class Judgement(NamedTuple):
             pose_holds=holds,
             limits_hold=within,
             shortfalls=tuple(m.shortfall(value) for m, value in pairs if not m.holds(value)),
+            intruders=program.intruders(residuals),
         )
 
 
@@ -375,7 +382,7 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     EquilibriumError
         If the arm has no equilibrium at these pressures that is reached from rest.
     """
-    program = Program.of(task.target, task.stiffness, robot.description)
+    program = Program.of(task, robot.description)
     found = Evaluator(robot, functions(robot, program)["judge"])
     residuals, pose, compliance, values = found(pressures, robot.parameters(program.parameters))
     lower, upper = task.pressure_bounds(robot.description)

@@ -24,6 +24,7 @@ from stiffopt.errors import FileError, InputError
 from stiffopt.files import line_of, read_file
 from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.scene import SceneOrFile
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
@@ -81,6 +82,7 @@ class Task(Schema):
     stiffness : stiffness goal, or None: the pose with the least pressure.
     load : load at the tip, or None.
     pressure : limits that tighten the robot's.
+    scene : what is around the arm, or None.
     source : the file that the task was read from, or None.
     """
 
@@ -93,6 +95,7 @@ class Task(Schema):
     stiffness: StiffnessGoal | None = None
     load: Load | None = None
     pressure: PressureRange = PressureRange()
+    scene: SceneOrFile | None = None
     source: Annotated[Path | None, Field(exclude=True)] = None
 
     @field_validator("source", mode="before")

@@ -75,7 +75,7 @@ static int closest(Program *P, double *x, double *slope, Found *found) {
     int64_t count = nearest_samples(P, nearest, &effort);
     memset(found, 0, sizeof *found);
     for (int64_t k = 0; k < balls; k++) {
-        radius[k] = FREE;
+        radius[k] = own.stage[k] < 0 ? asked[k] : FREE; /* obstacles are in every stage */
         stages = own.stage[k] + 1 > stages ? own.stage[k] + 1 : stages;
     }
     Stage stage = {0, asked};

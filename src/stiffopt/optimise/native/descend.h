@@ -76,6 +76,12 @@ static int solve_qp(Program *P, int size, int constraints, double *H, double *g,
     return result.exitflag > 0 && all_finite(z, size) && all_finite(dual, constraints);
 }
 
+/* Whether nothing moves a row, as that of an obstacle far away: it has no part in the program. */
+static int is_idle(const Program *P, const Point *p, int64_t ball, int64_t row) {
+    const Setup *s = P->setup;
+    return s->one_sided[ball] && !(largest(p->J + row * s->n, s->n) > 0);
+}
+
 /* One step of the method: d (n), the promised decrease of the merit, and new multipliers.
  *
  * The variables are the step d, the largest term t (if there are several) and the floors' slack
@@ -124,6 +130,10 @@ static int quadratic_step(Program *P, const Point *p, const double *B, const int
     }
     for (int64_t ball = 0, first = 0; ball < s->balls; ball++) {
         int64_t k = s->ball_rows[ball];
+        if (is_idle(P, p, ball, first)) {
+            first += k, axes += k * k;
+            continue;
+        }
         double rho = P->radius[ball] * s->descent.inside;
         double pull = box_axes(P, p, ball, first, prices, p->df + steepest * n, axes);
         pulls[ball] = pull;
@@ -144,7 +154,8 @@ static int quadratic_step(Program *P, const Point *p, const double *B, const int
     }
     double full_H[size * size], full_g[size];
     memcpy(full_H, H, sizeof H), memcpy(full_g, g, sizeof g);
-    if (!solve_qp(P, (int)size, (int)all, H, g, A, low, high, z, dual)) return 0;
+    int used = (int)(hi - high);
+    if (!solve_qp(P, (int)size, used, H, g, A, low, high, z, dual)) return 0;
     *promised = price * violation(P, p);
     for (int64_t i = 0; i < size; i++)
         *promised -= z[i] * (full_g[i] + 0.5 * dot(full_H + i * size, z, size));
@@ -157,6 +168,11 @@ static int quadratic_step(Program *P, const Point *p, const double *B, const int
     axes = all_axes;
     for (int64_t ball = 0, first = 0; ball < s->balls; ball++) {
         int64_t k = s->ball_rows[ball];
+        if (is_idle(P, p, ball, first)) {
+            prices->balls[first] = 0;
+            first += k, axes += k * k;
+            continue;
+        }
         for (int64_t b = 0; b < k; b++) {
             double sum = 0;
             for (int64_t a = 0; a < k; a++) sum += axes[a * k + b] * weight[a];

@@ -2,6 +2,7 @@
 #ifndef STIFFOPT_FREE_H
 #define STIFFOPT_FREE_H
 
+#include "obstacles.h"
 #include "program.h"
 
 /* Derivatives (rows, n) by pressures become those by x. */
@@ -30,9 +31,11 @@ static int evaluate(Program *P, Point *p, int full) {
         bad = pose(P->arg, P->res, P->iw, P->w, 0);
         P->poses++;
     }
-    per_share(s, p->J, s->rows);
+    per_share(s, p->J, s->own_rows);
+    double *J = p->J + s->own_rows * s->n;
+    if (bad || !put_obstacles(P, pressures, NULL, p->r + s->own_rows, J)) return 0;
     int64_t size = s->n + s->rows * (1 + s->n);
-    if (bad || !all_finite(p->x, full ? value_count(s) : size)) return 0;
+    if (!all_finite(p->x, full ? value_count(s) : size)) return 0;
     measure_balls(P, p);
     if (staged) stage_term(P, p);
     return 1;
@@ -41,20 +44,19 @@ static int evaluate(Program *P, Point *p, int full) {
 /* Judge pressures by the model alone: residuals, pose, compliance and values. */
 static int judge_at(Program *P, const double *pressures, double *answer) {
     const Setup *s = P->setup;
+    P->sight = EXACT;
     P->arg[0] = pressures, P->arg[1] = P->parameters;
+    double *rows = answer + s->own_rows;
     P->res[0] = answer, answer += s->rows;
     P->res[1] = answer, answer += 16;
     P->res[2] = answer, answer += 36;
     P->res[3] = answer;
-    return !judge(P->arg, P->res, P->iw, P->w, 0);
+    return !judge(P->arg, P->res, P->iw, P->w, 0) && put_obstacles(P, pressures, NULL, rows, NULL);
 }
 
-/* What an evaluation needs beside the stack: nothing. */
-static int add_memory(Program *P) {
-    P->linear = NULL;
-    return 1;
-}
+/* What an evaluation needs beside the stack; 0 where there is no memory. */
+static int add_memory(Program *P) { return add_surroundings(P); }
 
-static void free_memory(Program *P) { (void)P; }
+static void free_memory(Program *P) { free(P->around); }
 
 #endif

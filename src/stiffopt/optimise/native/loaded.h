@@ -2,8 +2,7 @@
 #ifndef STIFFOPT_LOADED_H
 #define STIFFOPT_LOADED_H
 
-#include <stdlib.h>
-
+#include "obstacles.h"
 #include "program.h"
 #include "rod.h"
 
@@ -52,7 +51,7 @@ static int evaluate(Program *P, Point *p, int full) {
     int staged = full && P->stage;
     full = full && !staged;
     int64_t n = s->n, values = s->terms + s->floors;
-    double pressures[n], R[9], C[36], by_twist[6 * s->rows];
+    double pressures[n], R[9], C[36], by_twist[6 * s->own_rows];
     for (int64_t i = 0; i < n; i++) pressures[i] = p->x[i] * s->unit[i];
     *(full ? &P->points : &P->poses) += 1;
     if (isnan(p->state[0])) {
@@ -69,12 +68,15 @@ static int evaluate(Program *P, Point *p, int full) {
     tip_inputs(P, l, R, C);
     P->res[0] = p->r, P->res[1] = by_twist;
     if (residuals(P->arg, P->res, P->iw, P->w, 0)) return 0;
-    for (int64_t k = 0; k < s->rows; k++)
+    for (int64_t k = 0; k < s->own_rows; k++)
         for (int64_t i = 0; i < n; i++) {
             double sum = 0;
-            for (int j = 0; j < 6; j++) sum += by_twist[j * s->rows + k] * twist[6 * i + j];
+            for (int j = 0; j < 6; j++) sum += by_twist[j * s->own_rows + k] * twist[6 * i + j];
             p->J[k * n + i] = sum * s->unit[i];
         }
+    double *J = p->J + s->own_rows * n;
+    if (!put_obstacles(P, pressures, p->state, p->r + s->own_rows, J)) return 0;
+    tip_inputs(P, l, R, C);
     if (full) {
         double value[values], value_twist[values * 6], value_C[values * 36], value_p[values * n];
         P->res[0] = value, P->res[1] = value_twist, P->res[2] = value_C, P->res[3] = value_p;
@@ -105,28 +107,32 @@ static int evaluate(Program *P, Point *p, int full) {
 /* Judge pressures by the model alone, from rest: residuals, pose, compliance and values. */
 static int judge_at(Program *P, const double *pressures, double *answer) {
     const Setup *s = P->setup;
+    P->sight = EXACT;
     Linear *l = P->linear;
     Work work = work_of(P);
     double state[s->state], R[9], C[36];
     if (!settle(&work, s->rod, pressures, state) || !linearise(&work, s->rod, state, l)) return 0;
     tip_inputs(P, l, R, C);
+    double *rows = answer + s->own_rows;
     P->res[0] = answer, answer += s->rows;
     P->res[1] = answer, answer += 16;
     P->res[2] = answer, answer += 36;
     P->res[3] = answer;
-    return !judge(P->arg, P->res, P->iw, P->w, 0);
+    return !judge(P->arg, P->res, P->iw, P->w, 0) && put_obstacles(P, pressures, state, rows, NULL);
 }
 
 /* Where an evaluation keeps the last equilibrium; 0 where there is no memory. */
 static int add_memory(Program *P) {
     const Rod *rod = P->setup->rod;
     size_t numbers = (size_t)linear_size(rod) * sizeof(double);
+    if (!add_surroundings(P)) return 0;
+    if (P->linear) return 1; /* that of the body among obstacles */
     Linear *l = malloc(sizeof(Linear) + numbers);
     if (l) *l = linear_in(rod, (double *)(l + 1));
     P->linear = l;
     return l != NULL;
 }
 
-static void free_memory(Program *P) { free(P->linear); }
+static void free_memory(Program *P) { free(P->around ? P->around : P->linear); }
 
 #endif

@@ -38,6 +38,7 @@ typedef struct {
 typedef struct {
     int64_t n;     /* pressures */
     int64_t rows;  /* of all residuals */
+    int64_t own_rows; /* those of generated functions: the first, before those of obstacles */
     int64_t balls; /* constraints on them */
     int64_t terms, floors, values;
     int64_t parameters;
@@ -51,13 +52,15 @@ typedef struct {
     DescentSettings descent;
     ClosestSettings closest;
     Effort least_effort, most_effort;
-    double covered, same_optimum, unlike, price_of_floors, precision;
+    double covered, same_optimum, unlike, price_of_floors, price_of_obstacles, precision;
     const double *sample_x;     /* (samples, n) */
     const double *sample_poses; /* (samples, 12): position, rotation by columns */
     /* of an arm under gravity or loads: */
     int64_t state;               /* numbers of an equilibrium's state, else 0 */
     const double *sample_states; /* (samples, state) */
     const void *rod;             /* Rod */
+    /* of a task with a scene: */
+    const void *obstacles; /* Obstacles, else NULL */
 } Setup;
 
 /* When to give up; mirrors `StopFlag` in stopping.py. */
@@ -71,6 +74,9 @@ typedef struct {
     int64_t number;
     const double *radius; /* (balls) of the target */
 } Stage;
+
+/* How obstacles are seen: not at all, by a few stations, or by the least distance for certain. */
+enum { BLIND, QUICK, EXACT };
 
 typedef struct {
     const Setup *setup;
@@ -86,6 +92,8 @@ typedef struct {
     double *slope;      /* (n) of the Lagrangian where a descent ended, if wanted, else NULL */
     int64_t poses, points, programs; /* evaluations and quadratic programs so far */
     void *linear; /* Linear: the last equilibrium with its derivatives */
+    void *around; /* Surroundings: the body among obstacles */
+    int sight;
 } Program;
 
 typedef struct {
@@ -243,6 +251,15 @@ static double objective(const Setup *s, const Point *p) {
     double most = p->f[0];
     for (int64_t i = 1; i < s->terms; i++) most = fmax(most, p->f[i]);
     return most;
+}
+
+/* Sum by which rows of obstacles are missed, over their scale. */
+static double intrusion(const Program *P, const Point *p) {
+    const Setup *s = P->setup;
+    double sum = 0;
+    for (int64_t i = s->own_rows, k = s->balls - (s->rows - s->own_rows); i < s->rows; i++, k++)
+        sum += fmax(0, p->r[i] - P->radius[k]) / s->scale[k];
+    return sum;
 }
 
 static double violation(const Program *P, const Point *p) {

@@ -10,25 +10,31 @@
 
 /* Step d within [low, high] with |W (J d - wanted)|^2 + damping |d|^2 small.
  *
- * Components that would leave their range are put on its end and the rest is solved again.
+ * Components that would leave their range are put on its end and the rest is solved again.  Rows
+ * without a slope, as those of constraints on one side that hold, have no part in it.
  */
 static int bounded_step(const Setup *s, const double *J, const double *wanted,
                         const double *weight, double damping, const double *low,
                         const double *high, double *d) {
-    int64_t n = s->n, m = s->rows, held[n], left = n;
-    double rest[m];
-    memcpy(rest, wanted, (size_t)m * sizeof(double));
+    int64_t n = s->n, m = 0, held[n], left = n, row[s->rows];
+    double rest[s->rows];
+    for (int64_t i = 0; i < s->rows; i++)
+        if (largest(J + i * n, n) > 0) row[m] = i, rest[m++] = wanted[i];
     memset(held, 0, sizeof held);
+    if (m == 0) {
+        for (int64_t k = 0; k < n; k++) d[k] = clip(0, low[k], high[k]);
+        return 1;
+    }
     while (left > 0) {
         double A[m * m], y[m];
         for (int64_t i = 0; i < m; i++) {
             for (int64_t j = 0; j <= i; j++) {
                 double sum = 0;
                 for (int64_t k = 0; k < n; k++)
-                    if (!held[k]) sum += J[i * n + k] * J[j * n + k];
+                    if (!held[k]) sum += J[row[i] * n + k] * J[row[j] * n + k];
                 A[i * m + j] = A[j * m + i] = sum;
             }
-            A[i * m + i] += damping / (weight[i] * weight[i]);
+            A[i * m + i] += damping / (weight[row[i]] * weight[row[i]]);
             y[i] = rest[i];
         }
         if (!cholesky_solve(A, y, m)) return 0;
@@ -36,7 +42,7 @@ static int bounded_step(const Setup *s, const double *J, const double *wanted,
         for (int64_t k = 0; k < n; k++) {
             if (held[k]) continue;
             double sum = 0;
-            for (int64_t i = 0; i < m; i++) sum += J[i * n + k] * y[i];
+            for (int64_t i = 0; i < m; i++) sum += J[row[i] * n + k] * y[i];
             d[k] = sum;
             leaving += sum < low[k] || sum > high[k];
         }
@@ -44,7 +50,7 @@ static int bounded_step(const Setup *s, const double *J, const double *wanted,
         for (int64_t k = 0; k < n; k++) {
             if (held[k] || (d[k] >= low[k] && d[k] <= high[k])) continue;
             d[k] = clip(d[k], low[k], high[k]);
-            for (int64_t i = 0; i < m; i++) rest[i] -= J[i * n + k] * d[k];
+            for (int64_t i = 0; i < m; i++) rest[i] -= J[row[i] * n + k] * d[k];
             held[k] = 1, left--;
         }
     }
@@ -58,7 +64,7 @@ static double misfit(const Setup *s, const double *lacks, const double *weight) 
 }
 
 /* Bring a point, of which p->x is given, to where all constraints hold; 0 if that fails. */
-static int reach(Program *P, Point *p, int64_t most) {
+static int approach(Program *P, Point *p, int64_t most) {
     const Setup *s = P->setup;
     const ReachSettings *set = &s->reach;
     double weight[s->rows], lacks[s->rows], memory[s->rows * s->n], damping = set->damping;
@@ -102,6 +108,20 @@ static int reach(Program *P, Point *p, int64_t most) {
         }
     }
     return p->reached;
+}
+
+/* The same without a look at obstacles. */
+static int reach_blindly(Program *P, Point *p, int64_t most) {
+    int sight = P->sight;
+    P->sight = BLIND;
+    int come = approach(P, p, most);
+    P->sight = sight;
+    return come;
+}
+
+/* The same past obstacles, at which it looks when the target is reached. */
+static int reach(Program *P, Point *p, int64_t most) {
+    return reach_blindly(P, p, most) && (!P->around || approach(P, p, most));
 }
 
 /* Point near from->x + d where all constraints hold, evaluated in full; 0 if there is none. */

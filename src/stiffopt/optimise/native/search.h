@@ -137,8 +137,9 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
         Point p = point_in(s, memory + ranked * size);
         start_from_sample(P, nearest[i].index, &p);
         found->tried++;
-        if (!reach(P, &p, s->reach.iterations_of_many) || !evaluate(P, &p, 1)) continue;
-        screened[ranked] = (Ranked){objective(s, &p) + s->price_of_floors * violation(P, &p), ranked};
+        if (!reach_blindly(P, &p, s->reach.iterations_of_many) || !evaluate(P, &p, 1)) continue;
+        double value = objective(s, &p) + s->price_of_floors * violation(P, &p);
+        screened[ranked] = (Ranked){value + s->price_of_obstacles * intrusion(P, &p), ranked};
         ranked++;
     }
     found->reached = ranked;
@@ -173,6 +174,7 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
         Point from = point_in(s, memory + screened[order[i]].index * size);
         copy_point(s, &from, &p);
         measure_balls(P, &p);
+        if (!p.reached && !(reach(P, &p, s->reach.iterations_of_many) && evaluate(P, &p, 1))) continue;
         Descent now = descend(P, &p, &known);
         found->iterations += now.iterations;
         /* a descent that is stopped is at the pose: better than nothing */

@@ -27,9 +27,9 @@ static int from_guess(Program *P, const double *guess, Point *p, Descent *end, F
 /* Row of an answer: outcome, value, violation, converged, the seven numbers of Found, three
  * counts of evaluations, pressures (n) in Pa, slope (n) per unit of x of the error of the closest
  * configuration, then what judge_at writes: not of a guess alone, which is judged when it is
- * looked at.
+ * looked at, but where there are obstacles.  Returns whether a body among obstacles keeps clear.
  */
-static void solve_row(Program *P, const double *task, double *answer) {
+static int solve_by_sight(Program *P, const double *task, double *answer, int sight) {
     const Setup *s = P->setup;
     P->parameters = task, task += s->parameters;
     P->radius = task, task += s->balls;
@@ -41,6 +41,7 @@ static void solve_row(Program *P, const double *task, double *answer) {
     P->near = task, task += 18 * s->near;
     int64_t asked = (int64_t)*task++, outcome = NEEDS_GENERAL_METHOD;
     P->poses = P->points = P->programs = 0;
+    P->sight = sight;
 
     NEW_POINT(p, s);
     Descent end = {0, 0, 0, 0};
@@ -71,8 +72,17 @@ static void solve_row(Program *P, const double *task, double *answer) {
         *out++ = outcome == JUDGED ? task[i] : clip(p.x[i] * s->unit[i], least[i], most[i]);
     memcpy(out, slope, sizeof slope), out += s->n;
     int judged = outcome == GLOBAL || outcome == NEAREST || outcome == JUDGED ||
-                 (outcome == LOCAL && asked != GUESS_ALONE);
-    if (judged && !judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
+                 (outcome == LOCAL && (asked != GUESS_ALONE || P->around));
+    if (!judged) return 1;
+    if (!judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
+    return outcome == JUDGED || is_clear(P, out + s->own_rows);
+}
+
+#include <stdio.h>
+#define DBG fprintf(stderr,"EXACT again\n"),
+/* A row of an answer, with a closer look at obstacles where a quick one has not been enough. */
+static void solve_row(Program *P, const double *task, double *answer) {
+    if (!solve_by_sight(P, task, answer, QUICK)) DBG solve_by_sight(P, task, answer, EXACT);
 }
 
 /* For the caller to check that it has the same idea of a Setup. */
