@@ -30,7 +30,7 @@ from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Program
-from stiffopt.optimise.settings import DERIVATIVES, DESCENT, PRICES
+from stiffopt.optimise.settings import DERIVATIVES, DESCENT
 from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
@@ -99,23 +99,20 @@ class AnswerDerivatives:
         prices = LocalResult.at(problem, self._point).multipliers
         if prices is None:
             raise DerivativeError("the answer is no optimum, so that it has no derivatives")
-        touching, constraints = DESCENT.touching, problem.constraints
+        touching, constraints = DERIVATIVES.touching, problem.constraints
         self._active = _Active(
             np.flatnonzero(prices.terms > DERIVATIVES.least).tolist(),
             [
                 i
                 for i, (error, c) in enumerate(zip(self._point.errors, constraints, strict=True))
-                if error > c.radius * (1 - PRICES.near)
+                if error > c.radius * (1 - DERIVATIVES.near)
             ],
             np.flatnonzero(prices.floors > DERIVATIVES.least).tolist(),
             (x <= problem.lower + touching) | (x >= problem.upper - touching),
         )
-        balls = [
-            np.linalg.norm(prices.balls[i]) * constraints[i].radius for i in self._active.balls
-        ]
-        self._weights = np.concatenate(
-            [prices.terms[self._active.terms], balls, prices.floors[self._active.floors]]
-        )
+        self._snap()
+        beside = len(self._active.balls) + len(self._active.floors)
+        self._weights = np.concatenate([prices.terms[self._active.terms], np.zeros(beside)])
         for _ in range(DERIVATIVES.rounds):
             self._polish()
             if not self._changed():
@@ -123,6 +120,13 @@ class AnswerDerivatives:
         else:
             raise DerivativeError("which constraints bind at the answer is not clear")
         self.weak = tuple(self._weak_names())
+
+    def _snap(self) -> None:
+        """Put what is held onto its limits."""
+        problem, x = self._problem, self._point.x
+        nearest = np.where(x - problem.lower < problem.upper - x, problem.lower, problem.upper)
+        x = np.where(self._active.held, nearest, np.clip(x, problem.lower, problem.upper))
+        self._point = self._evaluate(x, problem.parameters)
 
     # -- derivatives ------------------------------------------------------------------------
 
@@ -304,6 +308,10 @@ class AnswerDerivatives:
         free = ~self._active.held
         n = int(free.sum())
         self._t = float(self._point.terms.max())
+        slopes, a = self._constraint_slopes()[:, free], len(self._active.terms)
+        if len(slopes) > a:  # the prices of the answer are as inexact as it is
+            pull = self._weights[:a] @ slopes[:a]
+            self._weights[a:] = np.linalg.lstsq(slopes[a:].T, -pull, rcond=None)[0]
         for _ in range(DERIVATIVES.iterations):
             self._set_matrix()
             step = np.linalg.solve(self._matrix, -self._left())
@@ -348,8 +356,7 @@ class AnswerDerivatives:
         changed = changed or bool((held != active.held).any())
         if changed:
             self._active, self._weights = now, np.array(weights)
-            x = np.clip(x, problem.lower, problem.upper)
-            self._point = self._evaluate(x, problem.parameters)
+            self._snap()
         return changed
 
     def _price(self, i: int) -> float:
