@@ -120,7 +120,7 @@ def test_derivatives_of_a_hanging_arm(code, request):
     task = so.Task(target=target, stiffness=along((1, 0, 0)))
     solution = so.solve_pressure(robot, task)
     gradient = solution.gradient("stiffness", by="target")
-    assert gradient[2] == 0
+    assert gradient[2] == pytest.approx(0, abs=1e-6)
     h, p = 2e-5, solution.pressures
     for axis in range(2):
         k = [
@@ -132,7 +132,7 @@ def test_derivatives_of_a_hanging_arm(code, request):
 
 def test_what_has_no_derivatives():
     robot = so.load_robot("stiff-flop-1")
-    task = so.Task(target=so.Target(position=(0.01, 0.01, 0.09)))
+    task = so.Task(target=so.Target(position=(0.01, 0.01, None)))
     solution = so.solve_pressure(robot, task)
     with pytest.raises(so.InputError, match="only a stiffness that is maximised"):
         solution.gradient("stiffness", by="target")

@@ -17,6 +17,7 @@ so a few steps of Newton's method come first.
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Program
-from stiffopt.optimise.settings import DERIVATIVES, DESCENT, PRICES
+from stiffopt.optimise.settings import DERIVATIVES, DESCENT
 from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
@@ -98,23 +99,20 @@ class AnswerDerivatives:
         prices = LocalResult.at(problem, self._point).multipliers
         if prices is None:
             raise DerivativeError("the answer is no optimum, so that it has no derivatives")
-        touching, constraints = DESCENT.touching, problem.constraints
+        touching, constraints = DERIVATIVES.touching, problem.constraints
         self._active = _Active(
             np.flatnonzero(prices.terms > DERIVATIVES.least).tolist(),
             [
                 i
                 for i, (error, c) in enumerate(zip(self._point.errors, constraints, strict=True))
-                if error > c.radius * (1 - PRICES.near)
+                if error > c.radius * (1 - DERIVATIVES.near)
             ],
             np.flatnonzero(prices.floors > DERIVATIVES.least).tolist(),
             (x <= problem.lower + touching) | (x >= problem.upper - touching),
         )
-        balls = [
-            np.linalg.norm(prices.balls[i]) * constraints[i].radius for i in self._active.balls
-        ]
-        self._weights = np.concatenate(
-            [prices.terms[self._active.terms], balls, prices.floors[self._active.floors]]
-        )
+        self._snap()
+        beside = len(self._active.balls) + len(self._active.floors)
+        self._weights = np.concatenate([prices.terms[self._active.terms], np.zeros(beside)])
         for _ in range(DERIVATIVES.rounds):
             self._polish()
             if not self._changed():
@@ -122,6 +120,13 @@ class AnswerDerivatives:
         else:
             raise DerivativeError("which constraints bind at the answer is not clear")
         self.weak = tuple(self._weak_names())
+
+    def _snap(self) -> None:
+        """Put what is held onto its limits."""
+        problem, x = self._problem, self._point.x
+        nearest = np.where(x - problem.lower < problem.upper - x, problem.lower, problem.upper)
+        x = np.where(self._active.held, nearest, np.clip(x, problem.lower, problem.upper))
+        self._point = self._evaluate(x, problem.parameters)
 
     # -- derivatives ------------------------------------------------------------------------
 
@@ -158,7 +163,7 @@ class AnswerDerivatives:
         """Derivatives (..., 2, n) by the lower and the upper limits; zero by those that are off."""
         problem, n = self._problem, len(self._point.x)
         found = np.zeros((2, n, n) if of == "pressures" else (2, n))
-        for i in np.flatnonzero(self._active.held):
+        for i in np.flatnonzero(self._active.held).tolist():
             upper = int(self._point.x[i] >= problem.upper[i] - DESCENT.touching)
             found[upper, i] = self._by(of, self._inward_change(i), i) / problem.unit[i]
         return np.moveaxis(found, -1, 0) if of == "pressures" else found
@@ -167,13 +172,11 @@ class AnswerDerivatives:
         """Changes by a motion of the target in base axes: in m, and in rad if it turns."""
         target = self._problem.task.target
         turns = any(term.unit == "rad" for term in target.terms)
-        changes = []
-        for axis in np.eye(6)[: 6 if turns else 3]:
-            changes.append(self._difference(lambda h, a=axis: self._moved_target(-h * a)))
-        return changes
+        axes = np.eye(6)[: 6 if turns else 3]
+        return [self._difference(partial(self._moved_target, axis)) for axis in axes]
 
-    def _moved_target(self, offset: Vector) -> Program:
-        return self._problem.program.at(self._problem.task.target.moved_back(offset))
+    def _moved_target(self, way: Vector, by: float) -> Program:
+        return self._problem.program.at(self._problem.task.target.moved_back(-by * way))
 
     def _direction_changes(self) -> Iterator[list[_Change]]:
         """Changes by each component of each direction that is maximised."""
@@ -181,10 +184,7 @@ class AnswerDerivatives:
         for k, measure in enumerate(program.measures[: program.n_terms]):
             if program.aim != "maximise" or not isinstance(measure, StiffnessMeasure):
                 raise InputError("only a stiffness that is maximised has a direction")
-            yield [
-                self._difference(lambda h, a=axis, k=k: _turned(program, k, h * a))
-                for axis in np.eye(3)
-            ]
+            yield [self._difference(partial(_turned, program, k, axis)) for axis in np.eye(3)]
 
     def _difference(self, program_at: Callable[[float], Program]) -> _Change:
         """Change by a parameter of the program."""
@@ -289,7 +289,7 @@ class AnswerDerivatives:
         n, a, k = int(free.sum()), len(active.terms), len(slopes)
         signs = np.where(np.arange(k) < k - len(active.floors), 1.0, -1.0)
         K = np.zeros((n + 1 + k, n + 1 + k))
-        for column, i in enumerate(np.flatnonzero(free)):
+        for column, i in enumerate(np.flatnonzero(free).tolist()):
             K[:n, column] = self._rates(self._change(i))[:n]
         K[:n, :n] = (K[:n, :n] + K[:n, :n].T) / 2
         K[:n, n + 1 :] = slopes.T
@@ -308,6 +308,10 @@ class AnswerDerivatives:
         free = ~self._active.held
         n = int(free.sum())
         self._t = float(self._point.terms.max())
+        slopes, a = self._constraint_slopes()[:, free], len(self._active.terms)
+        if len(slopes) > a:  # the prices of the answer are as inexact as it is
+            pull = self._weights[:a] @ slopes[:a]
+            self._weights[a:] = np.linalg.lstsq(slopes[a:].T, -pull, rcond=None)[0]
         for _ in range(DERIVATIVES.iterations):
             self._set_matrix()
             step = np.linalg.solve(self._matrix, -self._left())
@@ -334,7 +338,8 @@ class AnswerDerivatives:
             np.array([error > c.radius * (1 + tiny) for error, c in errors], dtype=bool),
             point.floors < problem.floors - tiny,
         )
-        kept, weights = [], []
+        kept: list[list[int]] = []
+        weights: list[float] = []
         for old, own, beyond in zip(
             (active.terms, active.balls, active.floors), self._split(), violated, strict=True
         ):
@@ -343,7 +348,7 @@ class AnswerDerivatives:
             kept.append(list(pushing))
             weights += pushing.values()
         held = active.held | (x < problem.lower) | (x > problem.upper)
-        for i in np.flatnonzero(active.held):
+        for i in np.flatnonzero(active.held).tolist():
             held[i] = self._price(i) > -DERIVATIVES.least
         now = _Active(kept[0], kept[1], kept[2], held)
         changed = any(getattr(now, name) != getattr(active, name)
@@ -351,8 +356,7 @@ class AnswerDerivatives:
         changed = changed or bool((held != active.held).any())
         if changed:
             self._active, self._weights = now, np.array(weights)
-            x = np.clip(x, problem.lower, problem.upper)
-            self._point = self._evaluate(x, problem.parameters)
+            self._snap()
         return changed
 
     def _price(self, i: int) -> float:
@@ -381,11 +385,13 @@ class AnswerDerivatives:
                 yield problem.robot.description.channel_name(i)
 
 
-def _turned(program: Program, which: int, by: Vector) -> Program:
-    """The program with one of its directions moved and brought back to length 1."""
+def _turned(program: Program, which: int, way: Vector, by: float) -> Program:
+    """The program with one of its directions moved along `way` and brought back to length 1."""
     measures = list(program.measures)
-    moved = unit_vector(tuple((np.array(measures[which].direction) + by).tolist()))
-    measures[which] = measures[which].model_copy(update={"direction": moved})
+    measure = measures[which]
+    assert isinstance(measure, StiffnessMeasure)  # or nobody would ask
+    moved = unit_vector(tuple((np.array(measure.direction) + by * way).tolist()))
+    measures[which] = measure.model_copy(update={"direction": moved})
     return replace(program, measures=tuple(measures))
 
 

@@ -195,6 +195,8 @@ class DerivativeSettings:
     step : of a pressure, as a share of its range, in differences of gradients.
     step_of_parameters : of a target (m, rad) or a direction.
     least : multiplier below which a constraint does not bind.
+    near, touching : error, as a share less than the tolerance, and distance from a limit at which a
+        constraint is taken to bind at first: the answer is only nearly the optimum.
     rounds : in which what binds is found out.
     iterations, longest_step, small_step : of Newton's method to the optimum.
     tiny : relative violation, or wrong push, that is rounding.
@@ -205,6 +207,8 @@ class DerivativeSettings:
     step: float = 1e-4
     step_of_parameters: float = 1e-5
     least: float = 1e-6
+    near: float = 0.1
+    touching: float = 1e-4
     rounds: int = 6
     iterations: int = 20
     longest_step: float = 0.02

@@ -271,7 +271,8 @@ class PressureSolution:
         -----
         Where `weakly_active` names a constraint, the derivative holds on one side only.
         """
-        return self._derivatives.gradient(of, by)
+        gradient: Vector = self._derivatives.gradient(of, by)
+        return gradient
 
     @property
     def weakly_active(self) -> tuple[str, ...]:
@@ -279,7 +280,8 @@ class PressureSolution:
 
         That is where the same constraints go on to bind.
         """
-        return self._derivatives.weak
+        weak: tuple[str, ...] = self._derivatives.weak
+        return weak
 
     @cached_property
     def _derivatives(self) -> Any:
