@@ -450,8 +450,14 @@ class Load:
         )
 
 
-def rod_tip(arm: Arm, p: ArrayLike, loads: Sequence[Load] = (), steps: int = 2) -> Vector:
-    """Tip pose (4, 4) of the arm in equilibrium: the rod shot from the base.
+def rod_tip(
+    arm: Arm,
+    p: ArrayLike,
+    loads: Sequence[Load] = (),
+    steps: int = 2,
+    at: float | None = None,
+) -> Vector:
+    """Pose (4, 4) of the tip, or of a station, of the arm in equilibrium: shot from the base.
 
     The unknown reaction (6,) at the base is found by Newton's method so that the tip is free,
     by continuation in `steps` from no load; integrated with rotation matrices by DOP853.
@@ -462,7 +468,7 @@ def rod_tip(arm: Arm, p: ArrayLike, loads: Sequence[Load] = (), steps: int = 2) 
     for share in np.linspace(0, 1, steps + 1)[1:]:
         for _ in range(25):
             trials = reaction + np.vstack([np.zeros(6), 1e-6 * np.diag(scale)])
-            T, missing = _shoot(arm, p, loads, trials, share)
+            T, missing = _shoot(arm, p, loads, trials, share, at)
             if np.abs(missing[0] / scale).max() < 1e-9:
                 break
             change = (missing[1:] - missing[0]).T / 1e-6
@@ -475,11 +481,16 @@ def rod_tip(arm: Arm, p: ArrayLike, loads: Sequence[Load] = (), steps: int = 2) 
 
 
 def _shoot(
-    arm: Arm, p: Vector, loads: Sequence[Load], reaction: Vector, share: float
+    arm: Arm,
+    p: Vector,
+    loads: Sequence[Load],
+    reaction: Vector,
+    share: float,
+    station: float | None = None,
 ) -> tuple[Vector, Vector]:
-    """Tip poses (b, 4, 4), and wrenches (b, 6) missing there, for reactions (b, 6) at the base."""
+    """Poses (b, 4, 4), and wrenches (b, 6) missing at the tip, for reactions (b, 6) at the base."""
     gravity = share * np.asarray(arm.gravity)
-    T = np.tile(np.eye(4), (len(reaction), 1, 1))
+    T = found = np.tile(np.eye(4), (len(reaction), 1, 1))
     n, m = reaction[:, :3], reaction[:, 3:]
     start = 0.0
     for tube, own in zip(arm.tubes, arm.split(p), strict=True):
@@ -487,16 +498,19 @@ def _shoot(
         for length, rigid in ((tube.length, False), (tube.connector, True)):
             end = start + length
             marks = [load.at for load in loads if load.at is not None]
+            marks += [] if station is None else [station]
             cuts = [start, *sorted(s for s in marks if start < s < end - 1e-12), end]
             for near, far in itertools.pairwise(cuts):
                 T, n, m = (_carry if rigid else _integrate)(law, far - near, T, n, m)
+                if station is None or abs(far - station) < 1e-12:
+                    found = T
                 for load in loads:
                     at = arm.length if load.at is None else load.at
                     if near + 1e-12 < at <= far + 1e-12:
                         force, moment = _in_space(load.scaled(share), T[:, :3, :3])
                         n, m = n - force, m - moment
             start = end
-    return T, np.hstack([n - arm.tip_mass * gravity, m])
+    return found, np.hstack([n - arm.tip_mass * gravity, m])
 
 
 def _in_space(load: Load, R: Vector) -> tuple[Vector, Vector]:

@@ -243,6 +243,13 @@ class StrainLaw(ABC):
     def margin(self, p: ca.SX) -> ca.SX:
         """Scalar that is positive where the law holds at pressures p (c,)."""
 
+    def radius(self, p: ca.SX) -> ca.SX | float:
+        """Outer radius of the free section at pressures p (c,), in m: that at rest.
+
+        A law that knows how the section swells or thins says so.
+        """
+        return self.segment.outer_radius
+
     def _acting(self, p: ca.SX) -> ca.SX:
         """Pressures (c,) that act in the chambers: ``gain onset(p) + offset``."""
         corrections = self.segment.corrections

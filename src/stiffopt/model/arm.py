@@ -13,7 +13,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError, PressureError, shown
 from stiffopt.model.arguments import (
     checked_integer,
@@ -22,6 +21,7 @@ from stiffopt.model.arguments import (
     real_numbers,
 )
 from stiffopt.model.batch import BatchFunction, InterpretedFunction
+from stiffopt.model.body import BodyShape
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import checkpoint
 from stiffopt.model.compliance import Frame
@@ -106,6 +106,7 @@ class Arm:
         """The same arm with this load at its tip, instead of any that it carries now."""
         other = self.__copy__()
         other._tip_load = _tip_load(force, moment, frame)
+        other.__dict__.pop("_body", None)
         return other
 
     def __copy__(self) -> Self:
@@ -255,27 +256,22 @@ class Arm:
             raise EquilibriumError("no equilibrium was found on the way from the nearby one")
         return path.state
 
-    def _shapes(self, p: ArrayLike, stations: Vector) -> Vector:
-        """Poses (k, 4, 4) or (N, k, 4, 4) at arc lengths (k,) for one or many pressures."""
-        batch, single = self._pressures(p)
-        shapes = _stacked([self._shape(row, stations) for row in batch], (len(stations), 4, 4))
-        return shapes[0] if single else shapes
+    @cached_property
+    def _body(self) -> BodyShape:
+        return BodyShape(self)
 
-    def _shape(self, p: Vector, stations: Vector) -> Vector:
-        """Poses (k, 4, 4) at arc lengths (k,)."""
-        if self.is_loaded:
-            return self._equilibrium().shape(self.settle(p), stations)
-        strains = [part.full()[:, 0] for part in self._section_parts(p)[: self.n_segments]]
-        poses = np.empty((len(stations), 4, 4))
-        for k, station in enumerate(stations):
-            T, left = np.eye(4), station
-            for segment, strain in zip(self.description.segments, strains, strict=True):
-                soft = min(segment.length, left)
-                rigid = min(segment.connector, left - soft)
-                left -= soft + rigid
-                T = T @ lie.exp(strain * soft) @ lie.transform(np.eye(3), np.array([0, 0, rigid]))
-            poses[k] = T
-        return poses
+    def _at_stations(
+        self, of_body: Callable[[Vector, Vector], Vector], p: ArrayLike, at: Vector
+    ) -> Vector:
+        """Something of stations at arc lengths () or (k,), for one or many pressures.
+
+        Results have axes for pressures (N,) and stations (k,) where there are several.
+        """
+        values = self._checked(p)
+        found = of_body(np.atleast_2d(values), np.atleast_1d(at))
+        if at.ndim == 0:
+            found = found[:, 0]
+        return found[0] if values.ndim == 1 else found
 
     # -- checks -----------------------------------------------------------------------------
 
@@ -354,7 +350,21 @@ class Arm:
         value = self._arc_length(at)
         return None if value == self.length else value
 
-    def _arc_length(self, at: float, base_too: bool = False) -> float:
+    def _arc_lengths(self, at: ArrayLike, base_too: bool = False) -> Vector:
+        """Arc lengths (), or (k,) of several stations."""
+        try:
+            values = real_numbers(at)
+        except ValueError:
+            return np.array(self._arc_length(at, base_too))  # says what is wrong
+        if values.ndim > 1:
+            raise InputError(f"arc lengths must be a number or (k,) numbers; got {shown(at)}")
+        slack = SAME_STATION * self.length
+        good = (values >= (0 if base_too else slack)) & (values <= self.length + slack)
+        if not good.all():
+            self._arc_length(values.flat[int(good.argmin())], base_too)
+        return np.minimum(values, self.length)
+
+    def _arc_length(self, at: ArrayLike, base_too: bool = False) -> float:
         value = checked_number("arc length", at)
         slack = SAME_STATION * self.length
         if not (0 if base_too else slack) <= value <= self.length + slack:

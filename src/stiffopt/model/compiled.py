@@ -74,7 +74,8 @@ class _Wanted:
     def key(self, compiler: build.Compiler) -> str:
         """What the code depends on, as a name of files."""
         files = [Path(source) for source in self.sources]
-        headers = {found for file in files for found in file.parent.glob("*.h")}
+        folders = {folder for file in files for folder in (file.parent, build.NATIVE)}
+        headers = {found for folder in folders for found in folder.glob("*.h")}
         parts = [
             self.text,
             _own_code(),
@@ -181,7 +182,7 @@ def library(
     make : makes the functions; called only if they are not in the cache.  Their names are the names
         in C and must be told apart in capitals too.  What cannot be pickled is compiled at once.
     sources : paths of C files compiled with them, which find prototypes and sizes in
-        ``functions.h`` (see `codegen.header`) and headers in their own folders.
+        ``functions.h`` (see `codegen.header`) and headers in their own folders and in ``native``.
     daqp : whether those need the DAQP that comes with CasADi.
     build_missing : false: only look into the cache.
 

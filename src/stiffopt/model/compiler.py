@@ -18,6 +18,9 @@ from pathlib import Path
 
 import casadi as ca
 
+NATIVE = Path(__file__).with_name("native")
+"""Headers that all C files find."""
+
 FLAGS = ("-O1", "-fPIC", "-ffp-contract=off", "-fno-math-errno", "-w")
 """No flag that changes results: they are those of the CasADi VM to the last bit."""
 
@@ -184,7 +187,7 @@ def compile_library(
     try:
         for name, text in texts.items():
             (directory / name).write_text(text, encoding="utf-8")
-        includes, libraries = [f"-I{directory}"], ["-lm"]
+        includes, libraries = [f"-I{directory}", f"-I{NATIVE}"], ["-lm"]
         for folder in dict.fromkeys(str(Path(source).parent) for source in sources):
             includes.append(f"-I{folder}")
         if daqp:

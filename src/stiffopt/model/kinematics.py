@@ -24,11 +24,13 @@ class Actuation:
     pressures : all channel pressures (n,), proximal segment first, in Pa.
     sections : one per segment, proximal first.
     margin : one positive number per segment while its strain law holds.
+    radii : outer radius of each segment's section, in m.
     """
 
     pressures: ca.SX
     sections: tuple[Section, ...]
     margin: ca.SX
+    radii: ca.SX
 
     @classmethod
     def of(
@@ -38,13 +40,14 @@ class Actuation:
         pressures = ca.SX.sym("p", description.n_pressures)
         if laws is None:
             laws = [strain_law(segment) for segment in description.segments]
-        offset, sections, margins = 0, [], []
+        offset, sections, margins, radii = 0, [], [], []
         for segment, law in zip(description.segments, laws, strict=True):
             own = pressures[offset : offset + segment.n_channels]
             offset += segment.n_channels
             sections.append(law.section(own))
             margins.append(law.margin(own))
-        return cls(pressures, tuple(sections), ca.vertcat(*margins))
+            radii.append(law.radius(own))
+        return cls(pressures, tuple(sections), ca.vertcat(*margins), ca.vertcat(*radii))
 
 
 def connector(length: ca.SX | float) -> ca.SX:

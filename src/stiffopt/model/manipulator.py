@@ -90,11 +90,37 @@ class Manipulator(Arm):
     def backbone(self, p: ArrayLike, n: int = 50) -> Vector:
         """Poses (n, 4, 4) along the arm, equally spaced at rest from the base to the tip."""
         n = checked_integer("n, the number of poses of a backbone,", n, 2)
-        return self._shapes(p, np.linspace(0.0, self.length, n))
+        stations = self.kept(("backbone", n), lambda: np.linspace(0.0, self.length, n))
+        return self._at_stations(self._body.poses, p, stations)
 
-    def pose(self, p: ArrayLike, at: float) -> Vector:
-        """Pose (4, 4) or (N, 4, 4) at arc length `at` (m, at rest, from the base)."""
-        return self._shapes(p, np.array([self._arc_length(at)]))[..., 0, :, :]
+    def pose(self, p: ArrayLike, at: ArrayLike) -> Vector:
+        """Pose (4, 4) or (N, 4, 4) at arc length `at` (m, at rest, from the base).
+
+        Several arc lengths (k,) give poses (k, 4, 4) or (N, k, 4, 4).
+        """
+        return self._at_stations(self._body.poses, p, self._arc_lengths(at))
+
+    def body_jacobian(self, p: ArrayLike, at: ArrayLike) -> Vector:
+        """Twist of a station in its own axes per pressure, (6, n) or (N, 6, n).
+
+        Linear first: m/Pa above, rad/Pa below.  `at` is an arc length in m at rest, from the base
+        on; several (k,) give (k, 6, n) or (N, k, 6, n).  Under loads it is that of the equilibrium.
+        """
+        return self._at_stations(self._body.jacobians, p, self._arc_lengths(at, base_too=True))
+
+    def body_radius(self, p: ArrayLike, at: ArrayLike) -> Any:
+        """Outer radius in m of the section at arc length `at` (m, at rest), as pressure leaves it.
+
+        The strain law `neo-hookean` has ``r lambda^-1/2`` (see `NeoHookeanLaw`), the linear ones
+        the radius at rest; a rigid connector is as wide as the segment before it.  What a load
+        does to the section is left out.
+
+        Returns
+        -------
+        float or ndarray (N,), and with arc lengths (k,) (k,) or (N, k)
+        """
+        found = self._at_stations(self._body.radii, p, self._arc_lengths(at, base_too=True))
+        return float(found) if found.ndim == 0 else found
 
     # -- compliance -------------------------------------------------------------------------
 
@@ -114,6 +140,26 @@ class Manipulator(Arm):
     def compliance(self, p: ArrayLike, at: float) -> Vector:
         """Compliance (6, 6) at arc length `at` (m, at rest), in the axes of that point."""
         return self._compliance(p, self._station(self._arc_length(at)))
+
+    def compliance_between(self, p: ArrayLike, s: ArrayLike, t: ArrayLike) -> Vector:
+        """Twist of the station at s per wrench on the one at t, (6, 6) or (N, 6, 6), in base axes.
+
+        The twist is that of the section at s: how its centre moves and how it turns; the wrench is
+        a force on the centre of the section at t and a moment, both dead.  Arc lengths are in m at
+        rest, from the base on; arrays (k,) give (k, 6, 6) or (N, k, 6, 6).  Free arms: eq. 17,
+        between two points.  Under loads: the tangent about the equilibrium, with the stiffness
+        that the loads add; ``C(s, t) = C(t, s)'`` where all loads are dead forces.
+        """
+        first, second = self._arc_lengths(s, True), self._arc_lengths(t, True)
+        try:
+            first, second = np.broadcast_arrays(first, second)
+        except ValueError:
+            raise InputError(
+                f"s and t must be single arc lengths or equally many; got {len(first)} and "
+                f"{len(second)}"
+            ) from None
+        ends = np.atleast_1d(second)
+        return self._at_stations(lambda q, at: self._body.compliances(q, at, ends), p, first)
 
     def stiffness(
         self,
@@ -230,7 +276,7 @@ class Manipulator(Arm):
         p, at = self._single(p), self._arc_length(at, base_too=True)
         T_tip = self.tip_pose(p)
         local = _in_local_axes(wrench, T_tip, frame)
-        T_at = self._shape(p, np.array([at]))[0]
+        T_at = self._body.poses(p[np.newaxis], np.array([at]))[0, 0]
         return Wrench(local).transformed(lie.inverse(T_at) @ T_tip)
 
     def loaded_tip_pose(
@@ -303,7 +349,7 @@ class Manipulator(Arm):
                 soft.append(None)
         marks = np.array(ends)
         middles = (marks[1:] + marks[:-1]) / 2
-        poses = self._shape(p, np.concatenate([marks, middles, [at]]))
+        poses = self._body.poses(p[np.newaxis], np.concatenate([marks, middles, [at]]))[0]
         T_end, T_middle, T_at = poses[: len(marks)], poses[len(marks) : -1], poses[-1]
         compliances = [part.full() for part in self._section_parts(p)[self.n_segments :]]
         T = np.eye(4)

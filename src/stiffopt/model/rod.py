@@ -7,6 +7,7 @@ of section; the steps, and what is carried along them, are loops in ``rod.h``.
 Orientation and moment are y = (q, m) (7,), padded to eight rows; position, which does not feed
 back, and a zero are four more.  Functions of kind k:
 
+* ``slope{k}``: (y, n, f, a) to (y', r') (12,);
 * ``newton{k}``: (y, n, f, a) to y' (8,) and its derivatives by y (8, 7) and n (8, 3);
 * ``linear{k}``: (y, n, f, a, da) to (y', r') (12,) and their derivatives by y (12, 7), n (12, 3)
   and the section's pressures (12, c);
@@ -146,6 +147,7 @@ def _kind(kind: int, patterns: list[ca.Sparsity], channels: int) -> list[ca.Func
     by_y, by_n, by_a, by_dy, by_dn = (ca.gradient(h, x) for x in (y, n, a, dy, dn))
     adjoint = [ca.vertcat(by_y, none), by_n, da.T @ by_a, ca.vertcat(by_dy, none), by_dn]
     return [
+        _function(f"slope{kind}", [y, n, f, a], [long]),
         _function(f"newton{kind}", [y, n, f, a], newton),
         _function(f"linear{kind}", [y, n, f, a, da], linear),
         _function(f"adjoint{kind}", [y, n, f, a, da, dy, dn, lam, dlam], adjoint),

@@ -86,6 +86,8 @@ _STAGES: tuple[dict[int, float], ...] = (
     },
 )
 _WEIGHTS: dict[int, float] = {0: 1 / 20, 7: 49 / 180, 8: 16 / 45, 9: 49 / 180, 10: 1 / 20}
+LOBATTO = (0.0, (7 - _ROOT) / 14, 0.5, (7 + _ROOT) / 14, 1.0)
+"""Where in a step the stages lie that have a weight."""
 
 STEP_LENGTH = 2.0
 """Longest integration step at resolution 1, in outer radii of the segment at rest."""
@@ -125,8 +127,11 @@ def slopes(
     return -0.5 * lie.quaternion_product(q, ca.vertcat(0, xi[3:])), tangent, moment
 
 
-def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
-    """One integration step of length h towards the base: state (10,) -> state (10,)."""
+def _step_functions(sparsity: ca.Sparsity, centroid: Vector) -> tuple[ca.Function, ca.Function]:
+    """One integration step of length h towards the base: state (10,) -> state (10,), and its notes.
+
+    See `Stretch` for the latter.
+    """
     start = ca.SX.sym("y", 10)  # q (4), r (3), m (3)
     strain = ca.SX.sym("strain", 6)
     compliance = ca.SX.sym("C", sparsity)
@@ -147,7 +152,9 @@ def _step_function(sparsity: ca.Sparsity, centroid: Vector) -> ca.Function:
     end = start
     for j, b in _WEIGHTS.items():
         end = end + h * b * found[j]
-    return ca.Function("step", [start, strain, compliance, n, f, h], [end])
+    notes = ca.horzcat(start, *(h * found[j] for j in _WEIGHTS))
+    arguments = [start, strain, compliance, n, f, h]
+    return ca.Function("step", arguments, [end]), ca.Function("notes", arguments, [notes])
 
 
 def _rigid_point(
@@ -179,11 +186,14 @@ class Stretch:
     proximal, distal : float
     towards_base : quaternion and position, from the tip, at a distance from its distal end towards
         the base.
+    notes : (10, 6) quaternion, position and moment at its distal end, and its length times their
+        slopes at the `LOBATTO` points.
     """
 
     proximal: float
     distal: float
     towards_base: Callable[[float], tuple[ca.MX, ca.MX]]
+    notes: ca.MX
 
 
 @dataclass(frozen=True)
@@ -203,6 +213,7 @@ class Chain:
     quaternion: ca.MX  # of the station
     position: ca.MX  # of the station, from the base
     tip_quaternion: ca.MX
+    force: ca.MX  # at the base
     stretches: tuple[Stretch, ...]
 
     def station(self, at: float) -> PointOfArm:
@@ -342,10 +353,12 @@ class Shooting:
                 for part in (section.strain, section.compliance)
             ],
         )
-        self.step = [
-            _step_function(section.compliance.sparsity(), geometry.centroid)
+        steps = [
+            _step_functions(section.compliance.sparsity(), geometry.centroid)
             for section, geometry in zip(actuation.sections, self._geometry, strict=True)
         ]
+        self.step = [step for step, _ in steps]
+        self._notes = [notes for _, notes in steps]
 
     @property
     def n_variables(self) -> int:
@@ -383,9 +396,12 @@ class Shooting:
             if piece.rigid:
                 axis = lie.rotation_from_quaternion(orientation)[:, 2]
                 rigid = partial(_rigid_point, orientation, position, axis)
-                stretches.append(Stretch(distal - piece.length, distal, rigid))
+                before = ca.vertcat(orientation, position, moment)
                 position = position - piece.length * axis
                 moment = moment + piece.length * ca.cross(axis, force)
+                gain = ca.vertcat(orientation, position, moment) - before
+                notes = ca.horzcat(before, ca.repmat(gain, 1, len(LOBATTO)))
+                stretches.append(Stretch(distal - piece.length, distal, rigid, notes))
                 continue
             strain, compliance = sections[2 * piece.segment : 2 * piece.segment + 2]
             weight = self.weight(piece.segment) * gravity
@@ -393,7 +409,8 @@ class Shooting:
             for _ in range(piece.steps):
                 start = ca.vertcat(orientation, position, moment)
                 step = partial(self.step[piece.segment], start, strain, compliance, force, weight)
-                stretches.append(Stretch(distal - h, distal, partial(_soft_point, step)))
+                notes = self._notes[piece.segment](start, strain, compliance, force, weight, h)
+                stretches.append(Stretch(distal - h, distal, partial(_soft_point, step), notes))
                 distal -= h
                 state = step(h)
                 orientation, position, moment = state[:4], state[4:7], state[7:]
@@ -406,6 +423,7 @@ class Shooting:
             quaternion=station_quaternion,
             position=station_position - position,
             tip_quaternion=tip_quaternion,
+            force=force,
             stretches=tuple(stretches),
         )
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.compiled import Library
+from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.fast import FastSolver
 from stiffopt.optimise.functions import functions
-from stiffopt.optimise.loaded import LoadedArm
 from stiffopt.optimise.problem import floor_bounds
 from stiffopt.optimise.program import Program, ProgramStructure
 from stiffopt.optimise.samples import SampleTable

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
+from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.optimise.loaded import LoadedArm
 from stiffopt.optimise.settings import SAMPLES
 from stiffopt.optimise.term import Term
 

@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.compiled import Library, compiling_at_once, library
 from stiffopt.model.layout import Layout
+from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.rod import rod_functions
 from stiffopt.model.tip_functions import tip_formulas
-from stiffopt.optimise.loaded import LoadedArm
 
 Vector = NDArray[np.float64]
 

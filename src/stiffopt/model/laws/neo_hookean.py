@@ -58,6 +58,10 @@ class NeoHookeanLaw(StrainLaw):
             return margin
         return ca.fmin(margin, self._modulus_margin(p))
 
+    def radius(self, p: ca.SX) -> ca.SX:
+        """Outer radius ``r lambda^-1/2`` of the stretched section, in m."""
+        return self.segment.outer_radius / ca.sqrt(neo_hookean_stretch(self._load(self._acting(p))))
+
     def section(self, p: ca.SX) -> Section:
         """Section about the stretched state; see `StrainLaw.section`."""
         geometry = self.geometry

@@ -9,6 +9,8 @@
  *   linearise      changes per turn, added wrench and pressures: pose, Jacobian and compliance,
  *   add_curvature  adjoint of a change: derivatives of the compliance by the pressures.
  *
+ * What is noted of each piece (`Carried.notes`) gives all of it anywhere on the arm, see body.h.
+ *
  * A direction is one column of changes, of eight numbers (y and a zero); they are stored one
  * after the other.  A pressure is carried only from its own segment on towards the base.
  */
@@ -18,6 +20,8 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+
+#include "work.h"
 
 #define STAGES 11
 #define TURNS 3
@@ -61,20 +65,6 @@ typedef struct {
 /* A state: pressures (n) it belongs to, quaternion of the tip (4), (q, m) after each step (7). */
 static int64_t rod_state_size(const Rod *rod) { return rod->n + 4 + 7 * rod->steps; }
 
-/* Memory of the generated functions. */
-typedef struct {
-    const double **arg;
-    double **res;
-    casadi_int *iw;
-    double *w;
-} Work;
-
-#define NEW_WORK(name)                                  \
-    const double *name##_arg[WORK_ARG];                 \
-    double *name##_res[WORK_RES], name##_w[WORK_W + 1]; \
-    casadi_int name##_iw[WORK_IW + 1];                  \
-    Work name = {name##_arg, name##_res, name##_iw, name##_w}
-
 /* Row i of the method's table: the stages that its state is made of, and where it lies. */
 typedef struct {
     double at;
@@ -113,16 +103,19 @@ static const double WEIGHT[STAGES] = {1. / 20, 0, 0, 0, 0, 0, 0,
 /* A kind that the layout does not have is never called for. */
 #ifndef NEWTON1_N_IN
 #define newton1 newton0
+#define slope1 slope0
 #define linear1 linear0
 #define adjoint1 adjoint0
 #endif
 #ifndef NEWTON2_N_IN
 #define newton2 newton0
+#define slope2 slope0
 #define linear2 linear0
 #define adjoint2 adjoint0
 #endif
 #ifndef NEWTON3_N_IN
 #define newton3 newton0
+#define slope3 slope0
 #define linear3 linear0
 #define adjoint3 adjoint0
 #endif
@@ -139,6 +132,7 @@ static const double WEIGHT[STAGES] = {1. / 20, 0, 0, 0, 0, 0, 0,
 
 SECTION_FUNCTION(newton)
 SECTION_FUNCTION(linear)
+SECTION_FUNCTION(slope)
 #ifdef RIGID_ADJOINT_N_IN /* a library may do without add_curvature */
 SECTION_FUNCTION(adjoint)
 #endif
@@ -198,7 +192,29 @@ typedef struct {
     double *Y, *X;        /* changes of y (directions, 8) and r (directions, 4) */
     const double *dn;     /* (forced, 3) */
     double *trace;        /* where stages are noted, or NULL */
+    double *notes;        /* where steps are noted, or NULL */
+    int64_t noted;        /* most directions of a note */
 } Carried;
+
+/* A note of a step or a rigid stretch is six blocks of (1 + noted) columns of 12 numbers: the value,
+ * then the directions, each (q, m, 0, r, 0).  The first block is the start, the others are the
+ * slopes at the stages with a weight, which are Lobatto's points; of a rigid stretch only the
+ * second is used, and holds the whole gain. */
+#define BLOCKS 6
+
+static int64_t block_size(int64_t noted) { return 12 * (1 + noted); }
+
+/* Where the next note begins. */
+static double *next_note(double *notes, int64_t noted) { return notes + BLOCKS * block_size(noted); }
+
+static void note(double *block, int64_t directions, const double *y, const double *r,
+                 const double *Y, const double *X) {
+    memcpy(block, y, 8 * sizeof(double)), memcpy(block + 8, r, 4 * sizeof(double));
+    for (int64_t d = 0; d < directions; d++) {
+        memcpy(block + 12 + 12 * d, Y + 8 * d, 8 * sizeof(double));
+        memcpy(block + 20 + 12 * d, X + 4 * d, 4 * sizeof(double));
+    }
+}
 
 /* Four numbers at once; compilers turn that into what the processor has. */
 typedef double Four __attribute__((vector_size(32), aligned(8), may_alias));
@@ -207,11 +223,12 @@ ROD_INLINE Four four(const double *from) { return *(const Four *)from; }
 ROD_INLINE void put(double *to, Four value) { *(Four *)to = value; }
 
 /* Changes of slopes: K = G y + Gn dn for each direction, and the columns of Gp for the last `own`
- * of them.  Matrices are stored by columns of 8 rows or, with position, 12; that part of K is
- * added to X at once, times a share (if it is not zero). */
+ * of them.  Matrices are stored by columns of 8 rows or, with position, 12; that part of K goes to
+ * `moved` and is added to X at once, times a share (if it is not zero). */
 ROD_INLINE void change_slopes(int rows, const double *restrict G, const double *restrict Gn,
                               const double *restrict Gp, int64_t own, const Carried *c,
-                              const double *restrict Y, double *restrict K, double share) {
+                              const double *restrict Y, double *restrict K,
+                              double *restrict moved, double share) {
     double *restrict X = c->X;
     int64_t D = c->directions;
     int position = rows == 12 && share != 0;
@@ -235,7 +252,7 @@ ROD_INLINE void change_slopes(int rows, const double *restrict G, const double *
             if (position) r += four(column + 8);
         }
         put(K, a), put(K + 4, b);
-        if (position) put(X + 4 * d, four(X + 4 * d) + share * r);
+        if (position) put(moved + 4 * d, r), put(X + 4 * d, four(X + 4 * d) + share * r);
     }
 }
 
@@ -249,15 +266,20 @@ ROD_INLINE void combine(int64_t numbers, const double *restrict from, int count,
     }
 }
 
-/* One step; with `rows` 12 position too.  The last `own` directions are the section's own
- * pressures. */
+/* One step; with `rows` 12 position too, and without `da` no directions then.  The last `own`
+ * directions are the section's own pressures. */
 ROD_INLINE int rod_step(const Work *work, const RodPiece *piece, const double *a, const double *da,
                         const double *weight, int rows, int64_t own, Carried *c) {
     double h = piece->length;
     int64_t D = c->directions;
     double slope[STAGES][12], G[12 * 7], Gn[12 * 3], Gp[12 * (piece->channels + 1)];
-    double y[8], n[3], Y[D * 8 + 4], change[STAGES][D * 8 + 4], share[6];
+    double y[8], n[3], Y[D * 8 + 4], change[STAGES][D * 8 + 4], moved[D * 4 + 4], share[6];
     const double *slopes[6], *changes[6];
+    double *block = c->notes;
+    if (block) {
+        note(block, D, c->y, c->r, c->Y, c->X);
+        block += block_size(c->noted), c->notes = next_note(c->notes, c->noted);
+    }
     for (int i = 0; i < STAGES; i++) {
         const Row *row = &TABLE[i];
         for (int j = 0; j < row->count; j++) {
@@ -276,12 +298,18 @@ ROD_INLINE int rod_step(const Work *work, const RodPiece *piece, const double *a
         work->arg[0] = y, work->arg[1] = n, work->arg[2] = weight, work->arg[3] = a;
         work->arg[4] = da;
         work->res[0] = slope[i], work->res[1] = G, work->res[2] = Gn, work->res[3] = Gp;
-        if (rows == 12 ? section_linear(work, piece->kind) : section_newton(work, piece->kind))
+        if (rows == 8   ? section_newton(work, piece->kind)
+            : da == NULL ? section_slope(work, piece->kind)
+                         : section_linear(work, piece->kind))
             return 0;
         double by = h * WEIGHT[i];
-        change_slopes(rows, G, Gn, Gp, own, c, Y, change[i], by);
-        if (rows == 12 && by != 0)
-            for (int j = 0; j < 4; j++) c->r[j] += by * slope[i][8 + j];
+        change_slopes(rows, G, Gn, Gp, own, c, Y, change[i], moved, by);
+        if (rows == 8 || by == 0) continue;
+        for (int j = 0; j < 4; j++) c->r[j] += by * slope[i][8 + j];
+        if (block) {
+            note(block, D, slope[i], slope[i] + 8, change[i], moved);
+            block += block_size(c->noted);
+        }
     }
     int count = 0;
     for (int i = 0; i < STAGES; i++) {
@@ -306,10 +334,16 @@ ROD_CLONES static int long_step(const Work *work, const RodPiece *piece, const d
     return rod_step(work, piece, a, da, weight, 12, own, c);
 }
 
+/* A step of the shape alone. */
+static int plain_step(const Work *work, const RodPiece *piece, const double *a,
+                      const double *weight, Carried *c) {
+    return rod_step(work, piece, a, NULL, weight, 12, 0, c);
+}
+
 /* A rigid stretch moves the force that is carried. */
 static int rigid_stretch(const Work *work, const RodPiece *piece, int rows, Carried *c) {
     int64_t D = c->directions;
-    double gain[12], G[12 * 7], Gn[12 * 3], change[D * 8 + 4], none[D * 4 + 4];
+    double gain[12], G[12 * 7], Gn[12 * 3], change[D * 8 + 4], none[D * 4 + 4], moved[D * 4 + 4];
     if (c->trace) {
         memcpy(c->trace, c->y, sizeof c->y);
         memcpy(c->trace + 8, c->n, 3 * sizeof(double));
@@ -321,7 +355,12 @@ static int rigid_stretch(const Work *work, const RodPiece *piece, int rows, Carr
     if (rigid(work->arg, work->res, work->iw, work->w, 0)) return 0;
     if (rows == 8) c->X = none;
     memset(none, 0, sizeof none);
-    change_slopes(12, G, Gn, NULL, 0, c, c->Y, change, 1);
+    if (c->notes) note(c->notes, D, c->y, c->r, c->Y, c->X);
+    change_slopes(12, G, Gn, NULL, 0, c, c->Y, change, moved, 1);
+    if (c->notes) {
+        note(c->notes + block_size(c->noted), D, gain, gain + 8, change, moved);
+        c->notes = next_note(c->notes, c->noted);
+    }
     for (int64_t k = 0; k < 8 * D; k++) c->Y[k] += change[k];
     for (int j = 0; j < 8; j++) c->y[j] += gain[j];
     for (int j = 0; j < 4; j++) c->r[j] += gain[8 + j];
@@ -350,7 +389,7 @@ static int start_at_tip(const Work *work, const Rod *rod, const Condition *at, c
     c->dn = dn;
     const double *f = at->load + 6;
     c->forced = f[0] != 0 || f[1] != 0 || f[2] != 0 ? TURNS : 0;
-    c->trace = NULL;
+    c->trace = c->notes = NULL;
     return 1;
 }
 
@@ -573,26 +612,26 @@ static int settle_nearby(const Work *work, const Rod *rod, const double *pressur
     return follow(work, rod, &start, &end, SHORTEST_NEARBY, stable, state) == 1;
 }
 
-/* Pose of the tip of a state (12): position, rotation by columns. */
-static int tip_pose(const Work *work, const Rod *rod, const double *state, double *pose) {
-    double dn[9], Y[TURNS * 8], X[TURNS * 4], a[rod->parts], da[rod->slopes];
+/* Pose of the tip of a state (12): position, rotation by columns; notes of all steps, without
+ * directions, unless `notes` is NULL. */
+static int tip_pose(const Work *work, const Rod *rod, const double *state, double *pose,
+                    double *notes) {
+    double dn[9], Y[TURNS * 8], a[rod->parts], da[rod->slopes];
     Condition at = condition_of(rod, state);
-    Carried c = {.directions = TURNS, .Y = Y, .X = X};
+    Carried c = {.directions = TURNS, .Y = Y};
     if (!sections_at(work, rod, &at, a, da)) return 0;
     if (!start_at_tip(work, rod, &at, state + rod->n, dn, pose + 3, &c)) return 0;
-    memset(X, 0, sizeof X);
-    c.directions = c.forced = 0;
+    c.directions = c.forced = 0, c.notes = notes;
     for (int64_t k = 0; k < rod->pieces; k++) {
-        RodPiece piece = rod->piece[k];
-        if (piece.kind < 0) {
-            if (!rigid_stretch(work, &piece, 12, &c)) return 0;
+        const RodPiece *piece = rod->piece + k;
+        if (piece->kind < 0) {
+            if (!rigid_stretch(work, piece, 12, &c)) return 0;
             continue;
         }
         double weight[3];
-        weight_of(&piece, &at, weight);
-        for (int64_t i = 0; i < piece.steps; i++)
-            if (!long_step(work, &piece, a + piece.parts, da + piece.slopes, weight, 0, &c))
-                return 0;
+        weight_of(piece, &at, weight);
+        for (int64_t i = 0; i < piece->steps; i++)
+            if (!plain_step(work, piece, a + piece->parts, weight, &c)) return 0;
     }
     memcpy(pose, c.r, 3 * sizeof(double));
     return 1;
@@ -612,7 +651,24 @@ typedef struct {
     double inverse[9];         /* of the base's turn by it, row by row */
     double dn[FIRST * 3];      /* force per first direction */
     double *trace;
+    double *notes; /* of all steps, if the caller sets it to memory (notes_size) */
 } Linear;
+
+/* Directions of the notes of linearise: the first, then pressures from the tip on. */
+static int64_t noted_directions(const Rod *rod) { return FIRST + rod->n; }
+
+/* The direction of a pressure. */
+static int64_t direction_of(const Rod *rod, int64_t pressure) {
+    int64_t direction = FIRST;
+    const RodPiece *piece = rod->piece;
+    for (; pressure < piece->channel || pressure >= piece->channel + piece->channels; piece++)
+        direction += piece->channels;
+    return direction + pressure - piece->channel;
+}
+
+static int64_t notes_size(const Rod *rod, int64_t noted) {
+    return BLOCKS * block_size(noted) * (rod->steps + rod->pieces);
+}
 
 static int64_t linear_size(const Rod *rod) {
     return rod_state_size(rod) + rod->parts + rod->slopes + 9 * (6 + rod->n) +
@@ -637,7 +693,7 @@ static int linearise(const Work *work, const Rod *rod, const double *state, Line
     l->known = 0;
     memcpy(l->state, state, size);
     Condition at = condition_of(rod, l->state);
-    int64_t most = FIRST + rod->n, column[rod->n + 1];
+    int64_t most = noted_directions(rod);
     double Y[8 * most], X[4 * most], R[9];
     memset(X, 0, sizeof X), memset(Y, 0, sizeof Y), memset(l->dn, 0, sizeof l->dn);
     Carried c = {.directions = FIRST, .Y = Y, .X = X};
@@ -647,6 +703,7 @@ static int linearise(const Work *work, const Rod *rod, const double *state, Line
         for (int j = 0; j < 3; j++) l->R[3 * i + j] = R[3 * j + i];
     for (int i = 0; i < 3; i++) l->dn[3 * (TURNS + i) + i] = 1, Y[8 * (TURNS + 3 + i) + 4 + i] = 1;
     c.forced = WITH_FORCE, c.trace = l->trace;
+    c.notes = l->notes, c.noted = noted_directions(rod);
     for (int64_t k = 0; k < rod->pieces; k++) {
         const RodPiece *piece = rod->piece + k;
         if (piece->kind < 0) {
@@ -655,8 +712,7 @@ static int linearise(const Work *work, const Rod *rod, const double *state, Line
         }
         double weight[3];
         weight_of(piece, &at, weight);
-        for (int64_t i = 0; i < piece->channels; i++)
-            column[piece->channel + i] = c.directions++;
+        c.directions += piece->channels;
         for (int64_t i = 0; i < piece->steps; i++)
             if (!long_step(work, piece, l->a + piece->parts, l->da + piece->slopes, weight,
                            piece->channels, &c))
@@ -668,7 +724,7 @@ static int linearise(const Work *work, const Rod *rod, const double *state, Line
             base[3 * i + j] = Y[8 * j + 1 + i], l->per_turn[3 * i + j] = X[4 * j + i];
     if (!invert_3x3(base, l->inverse)) return 0;
     for (int64_t k = 0; k < 6 + rod->n; k++) {
-        int64_t from = k < 6 ? TURNS + k : column[k - 6];
+        int64_t from = k < 6 ? TURNS + k : direction_of(rod, k - 6);
         double *turn = l->turn + 3 * k, *twist = l->twist + 6 * k;
         for (int i = 0; i < 3; i++) {
             turn[i] = 0;
@@ -808,7 +864,7 @@ int stiffopt_settle(const Rod *rod, const double *pressures, double *states, dou
     for (int64_t i = begin; i < end; i++) {
         double *state = states + i * size;
         found[i] = settle(&work, rod, pressures + i * rod->n, state) &&
-                   tip_pose(&work, rod, state, poses + 12 * i);
+                   tip_pose(&work, rod, state, poses + 12 * i, NULL);
     }
     return 0;
 }

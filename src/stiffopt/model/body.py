@@ -1,0 +1,234 @@
+"""Stations along an arm, free or loaded: poses, Jacobians, compliances and radii.
+
+Machine code (``native/body.h``) serves where it is there, and `stiffopt.model.stations` where not.
+
+The compliance between two stations is the twist at s per wrench at t, both in base axes.  Of a
+free arm it is ``X_s A(min(s, t)) X_t'`` with X the adjoint from the base to a station and
+``A(m) = int_0^m Ad_T C Ad_T' du`` (eq. 17, about the base).  Of a loaded arm it is read off the
+equations of the rod, linear about the equilibrium: what is carried from the tip along three turns
+and a wrench of it spans their solutions, so a wrench at t is a sum of them from t on towards the
+base, and a turn of the tip that keeps the base upright.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Iterator
+from functools import partial
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.batch import in_parallel
+from stiffopt.model.body_functions import free_body_functions, loaded_body_functions, strain_rows
+from stiffopt.model.compiled import Library, checkpoint, library
+from stiffopt.model.compiler import NATIVE
+from stiffopt.model.layout import Layout
+from stiffopt.model.loaded_arm import LoadedArm
+from stiffopt.model.rod import rod_functions
+from stiffopt.model.stations import FreeStations, LoadedStations, Pieces, response
+
+if TYPE_CHECKING:
+    from stiffopt.model.arm import Arm
+
+Vector = NDArray[np.float64]
+
+LOOKED_UP_FROM = 8
+"""Poses of one arm from which machine code is used if there is any."""
+
+COMPILED_FREE_FROM, COMPILED_LOADED_FROM = 2000, 64
+"""Poses from which it is made if there is none: they have taken about a second in the VM."""
+
+_CHUNK = 16  # poses that a thread takes at a time
+_POSES, _JACOBIANS, _RESPONSES = range(3)  # as body.c has them
+
+_integer, _pointer = ctypes.c_int64, ctypes.c_void_p
+
+
+class BodyShape:
+    """What is known of stations along one arm under its own loads.
+
+    Pressures are of shape (N, n), in Pa and finite; arc lengths (k,) from 0 to the arm's length.
+    Methods raise `PressureError` beyond a strain law and `EquilibriumError` where the loaded arm
+    has no stable equilibrium that is reached from rest.
+    """
+
+    def __init__(self, arm: Arm) -> None:
+        self._arm = arm
+        self._pieces = Pieces(arm)
+        self._stations = LoadedStations(arm) if arm.is_loaded else FreeStations(arm, self._pieces)
+        self._native: NativeBody | None = None
+        self._count = 0
+        self._looked_up = False
+        self._lock = threading.Lock()
+
+    def poses(self, p: Vector, at: Vector) -> Vector:
+        """Poses (N, k, 4, 4) in the base frame."""
+        return self._evaluate(_POSES, p, at).reshape(len(p), len(at), 4, 4)
+
+    def jacobians(self, p: Vector, at: Vector) -> Vector:
+        """Twists per Pa (N, k, 6, n), each in the axes of its station."""
+        return self._evaluate(_JACOBIANS, p, at).reshape(len(p), len(at), 6, p.shape[1])
+
+    def compliances(self, p: Vector, s: Vector, t: Vector) -> Vector:
+        """Twists at s (k,) per wrench at t (k,), (N, k, 6, 6), in base axes."""
+        at, place = np.unique(np.concatenate([[0.0], s, t]), return_inverse=True)
+        first, second = place[1 : 1 + len(s)], place[1 + len(s) :]
+        if isinstance(self._stations, FreeStations):
+            self._arm._check_margin(p, "")
+            return self._stations.compliances(p, at, first, second)
+        found = self._evaluate(_RESPONSES, p, at)
+        carried = found[:, :-27].reshape(len(p), len(at), 3, 3, 9)
+        return response(carried, found[:, -27:].reshape(-1, 9, 3).swapaxes(1, 2), first, second)
+
+    def radii(self, p: Vector, at: Vector) -> Vector:
+        """Outer radii (N, k) of the free sections, in m."""
+        self._arm._check_margin(p, "")
+        piece, _ = self._pieces.find(at)
+        found: Vector = self._stations.radii(p)[:, self._pieces.section[piece]]
+        return found
+
+    def _evaluate(self, what: int, p: Vector, at: Vector) -> Vector:
+        """Numbers (N, ...) of stations, by machine code if there is any."""
+        checkpoint()
+        native = self._machine_code(len(p))
+        if native is None:
+            return self._interpreted(what, p, at)
+        found, outcome = native.stations(what, p, at)
+        if outcome.any():
+            self._arm._check_margin(p, "")
+            for row in np.flatnonzero(outcome):  # says why, or finds what C did not
+                found[row] = self._interpreted(what, p[row : row + 1], at).ravel()
+        return found
+
+    def _interpreted(self, what: int, p: Vector, at: Vector) -> Vector:
+        self._arm._check_margin(p, "")
+        if what == _POSES:
+            return self._stations.poses(p, at)
+        if what == _JACOBIANS:
+            return self._stations.jacobians(p, at)
+        assert isinstance(self._stations, LoadedStations)
+        return self._stations.responses(p, at)
+
+    def _machine_code(self, rows: int) -> NativeBody | None:
+        if self._native is not None:
+            return self._native
+        with self._lock:
+            self._count += rows
+            from_now = COMPILED_LOADED_FROM if self._arm.is_loaded else COMPILED_FREE_FROM
+            missing = self._count >= from_now
+            if missing or (self._count >= LOOKED_UP_FROM and not self._looked_up):
+                self._looked_up = True
+                self._native = native_body(self._arm, build_missing=missing)
+        return self._native
+
+
+def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
+    """Machine code of an arm's body; None where there is none."""
+    kind, make, source = "body", _free_functions, "body.c"
+    if arm.is_loaded:
+        if rod_functions(arm.layout) is None:
+            return None
+        kind, make, source = "loaded body", _loaded_functions, "loaded_body.c"
+    code = library(
+        (kind, arm.layout.skeleton), partial(make, arm.layout), (str(NATIVE / source),),
+        build_missing=build_missing,
+    )  # fmt: skip
+    if code is None:
+        return None
+    try:
+        return NativeBody(code, arm)
+    except EquilibriumError:  # the VM says more
+        return None
+
+
+def _free_functions(layout: Layout) -> list[ca.Function]:
+    names = ("frames", "moving_frames", "along", "moving_along")
+    return [each for each in free_body_functions(layout) if each.name() in names]
+
+
+def _loaded_functions(layout: Layout) -> list[ca.Function]:
+    equations = rod_functions(layout)
+    assert equations is not None  # or nobody would ask
+    used = [each for each in equations.functions if "adjoint" not in each.name()]
+    return [*used, *loaded_body_functions(layout)]
+
+
+class BodyModel(ctypes.Structure):
+    """`BodyModel` of native/body.h."""
+
+    _fields_ = [
+        *((name, _integer) for name in ("n", "pieces", "strains")),
+        *((name, _pointer) for name in ("piece_of", "section", "ends", "numbers", "rod")),
+    ]
+
+
+class NativeBody:
+    """The body of an arm in machine code.
+
+    Parameters
+    ----------
+    code : library of the functions of `stiffopt.model.body_functions` with body.c.
+
+    Attributes
+    ----------
+    address : int
+        Of the `BodyModel`.
+
+    Raises
+    ------
+    EquilibriumError
+        If the unpressurised arm falls over.
+    """
+
+    def __init__(self, code: Library, arm: Arm) -> None:
+        self._n = arm.n_pressures
+        pieces, numbers = Pieces(arm), arm.numbers
+        rod = LoadedArm(code, arm) if arm.is_loaded else None
+        self._keep = (code, pieces, numbers, rod)  # what pointers below lead to
+        size = code.cdll.stiffopt_body_model_size
+        size.restype = _integer
+        if size() != ctypes.sizeof(BodyModel):
+            raise RuntimeError("native/body.h and this file disagree on their interface")
+        self._model = BodyModel(
+            n=self._n,
+            pieces=len(pieces.ends),
+            strains=len(strain_rows(arm.layout)),
+            piece_of=pieces.piece_of.ctypes.data,
+            section=pieces.section.ctypes.data,
+            ends=pieces.ends.ctypes.data,
+            numbers=numbers.ctypes.data,
+            rod=rod.address if rod else None,
+        )
+        self.address = ctypes.addressof(self._model)
+        self._stations = code.cdll.stiffopt_stations
+        self._stations.argtypes = [_pointer, _integer, _pointer, _pointer, _integer,
+                                   _pointer, _pointer, _integer, _integer]  # fmt: skip
+
+    def stations(self, what: int, p: Vector, at: Vector) -> tuple[Vector, NDArray[np.int64]]:
+        """Numbers (N, ...) of stations (k,) at pressures (N, n), and outcomes (N,): 0 is good."""
+        p, at = np.ascontiguousarray(p), np.ascontiguousarray(at)
+        width = len(at) * (16, 6 * self._n, 81)[what] + (27 if what == _RESPONSES else 0)
+        found, outcome = np.empty((len(p), width)), np.empty(len(p), dtype=np.int64)
+        call = partial(
+            self._stations, self.address, what, p.ctypes.data, at.ctypes.data, len(at),
+            found.ctypes.data, outcome.ctypes.data,
+        )  # fmt: skip
+        if len(p) <= _CHUNK:
+            failed = call(0, len(p))
+        else:
+            failed = 0
+
+            def work(starts: Iterator[int]) -> None:
+                nonlocal failed
+                for start in starts:
+                    failed |= call(start, min(start + _CHUNK, len(p)))
+
+            in_parallel(work, range(0, len(p), _CHUNK))
+        if failed:
+            raise MemoryError("no memory is left for the stations of the arm")
+        return found, outcome

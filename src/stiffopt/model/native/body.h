@@ -1,0 +1,72 @@
+/* The body of an arm: stations along it, and how they move with the pressures.
+ *
+ * Prepare a body for some pressures once, then ask for as many stations as you like:
+ *
+ *     double memory[body_size(model)];             (or malloc: under loads it is some 100 kB)
+ *     Body body = body_in(model, memory);
+ *     if (!prepare_body(&work, &body, pressures, state, 1)) ...  a law or an integration fails
+ *     station_at(&work, &body, s, &station);                         where it is
+ *     moving_station(&work, &body, s, &station, twists, slopes);     and derivatives by pressures
+ *
+ * `s` is the arc length at rest from the base in m, and is brought onto the arm.  `twists` (n, 6),
+ * row by row, has for each pressure the change of the station's position and its turn, in base
+ * axes per Pa; `slopes` (n) the changes of its radius.  prepare_body with 0 at the end is quicker,
+ * and serves station_at alone.
+ *
+ * With STIFFOPT_LOADED defined these are for an arm under gravity or loads, `state` being its
+ * settled equilibrium (see rod.h); without, `state` is not looked at.  Under loads the derivatives
+ * come from linearise, which does nothing if `body.linear` holds that state already: a solver that
+ * needs the tip too lets both use the same Linear.  Functions are those of
+ * `stiffopt.model.body_functions`, whose library must hold them.
+ */
+#ifndef STIFFOPT_BODY_H
+#define STIFFOPT_BODY_H
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+/* An arm; mirrors `_BodyModel` in body.py. */
+typedef struct {
+    int64_t n, pieces;       /* pressures; segments and connectors, from the base */
+    int64_t strains;         /* numbers of a piece's strain */
+    const int64_t *piece_of; /* (n) the piece that a pressure strains */
+    const int64_t *section;  /* (pieces) itself, or of a connector the piece before */
+    const double *ends;      /* (pieces) arc lengths at rest */
+    const double *numbers;   /* of the arm, see `stiffopt.model.layout` */
+    const void *rod;         /* Rod, of an arm under loads */
+} BodyModel;
+
+typedef struct {
+    double position[3];
+    double axes[9];    /* of the section, by columns */
+    double tangent[3]; /* of unit length */
+    double radius;
+    int64_t piece;
+} Station;
+
+/* Arc length s on the arm, from the start of its piece, which is noted. */
+static double in_piece(const BodyModel *model, double s, Station *station) {
+    int64_t piece = 0;
+    while (piece < model->pieces - 1 && s > model->ends[piece]) piece++;
+    double start = piece ? model->ends[piece - 1] : 0;
+    station->piece = piece;
+    return fmin(fmax(s, start), model->ends[piece]) - start;
+}
+
+/* The radius of a station and, unless slopes is NULL, its changes by pressures. */
+static void put_radius(const BodyModel *model, const double *radius, const double *changes,
+                       Station *station, double *slopes) {
+    int64_t section = model->section[station->piece];
+    station->radius = radius[section];
+    for (int64_t k = 0; slopes && k < model->n; k++)
+        slopes[k] = model->piece_of[k] == section ? changes[k] : 0;
+}
+
+#ifdef STIFFOPT_LOADED
+#include "loaded_body.h"
+#else
+#include "free_body.h"
+#endif
+
+#endif

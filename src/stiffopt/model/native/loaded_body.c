@@ -1,0 +1,3 @@
+/* Stations along an arm under gravity or loads. */
+#define STIFFOPT_LOADED
+#include "body.c"
