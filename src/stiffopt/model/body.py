@@ -95,7 +95,7 @@ class BodyShape:
     def _evaluate(self, what: int, p: Vector, at: Vector) -> Vector:
         """Numbers (N, ...) of stations, by machine code if there is any."""
         checkpoint()
-        native = self._machine_code(len(p))
+        native = self.machine_code(len(p))
         if native is None:
             return self._interpreted(what, p, at)
         found, outcome = native.stations(what, p, at)
@@ -114,7 +114,8 @@ class BodyShape:
         assert isinstance(self._stations, LoadedStations)
         return self._stations.responses(p, at)
 
-    def _machine_code(self, rows: int) -> NativeBody | None:
+    def machine_code(self, rows: int) -> NativeBody | None:
+        """Machine code for a number of rows more; None where there is none, or not yet."""
         if self._native is not None:
             return self._native
         with self._lock:
@@ -129,11 +130,11 @@ class BodyShape:
 
 def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
     """Machine code of an arm's body; None where there is none."""
-    kind, make, source = "body", _free_functions, "body.c"
+    kind, make, source = "body", _free_functions, "clearance.c"
     if arm.is_loaded:
         if rod_functions(arm.layout) is None:
             return None
-        kind, make, source = "loaded body", _loaded_functions, "loaded_body.c"
+        kind, make, source = "loaded body", _loaded_functions, "loaded_clearance.c"
     code = library(
         (kind, arm.layout.skeleton), partial(make, arm.layout), (str(NATIVE / source),),
         build_missing=build_missing,
@@ -172,12 +173,14 @@ class NativeBody:
 
     Parameters
     ----------
-    code : library of the functions of `stiffopt.model.body_functions` with body.c.
+    code : library of the functions of `stiffopt.model.body_functions` with clearance.c.
 
     Attributes
     ----------
     address : int
         Of the `BodyModel`.
+    code : Library
+        What it was made of, with what clearance.c adds.
 
     Raises
     ------
@@ -189,7 +192,8 @@ class NativeBody:
         self._n = arm.n_pressures
         pieces, numbers = Pieces(arm), arm.numbers
         rod = LoadedArm(code, arm) if arm.is_loaded else None
-        self._keep = (code, pieces, numbers, rod)  # what pointers below lead to
+        self.code = code
+        self._keep = (pieces, numbers, rod)  # what pointers below lead to
         size = code.cdll.stiffopt_body_model_size
         size.restype = _integer
         if size() != ctypes.sizeof(BodyModel):

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 CLEARANCE_ERROR = 4e-6  # m, of a least distance at most
 _SHORTEST = 1e-6  # m of arc length, which is not divided again
 _FINE = 5e-4  # m of arc length, on which any object is as a convex one
+_IN_PLANE = 1e-9  # m above a ring's plane that are none
 _SHARPENED = 1e-4  # m of arc length, over which a slope's change is measured
 _STEEPEST = 1.5  # change of an interpolated distance with the way
 _MORE_CURVED = 1.25  # than the curvature that coarse stations show
@@ -96,7 +97,10 @@ def range_ends(robot: RobotDescription) -> tuple[tuple[float, float, int], ...]:
                 count = 1 + max(1, int(np.ceil(length / (_SPACING * robot.length) - 1e-9)))
                 ends.append((start + _INSET, start + length - _INSET, count))
             start += length
-    return tuple(ends)
+    (_, first, count), (last, _, other) = ends[0], ends[-1]
+    if len(ends) == 1:
+        return ((0.0, start, count),)
+    return ((0.0, first, count), *ends[1:-1], (last, start, other))
 
 
 def survey(station: StationOf, ends: Sequence[tuple[float, float, int]]) -> list[BodyRange]:
@@ -214,7 +218,6 @@ class _Search:
         self._refine(a, middle, stretch)
         self._refine(middle, b, stretch)
 
-
     def sharpen(self) -> None:
         """Bring the best to where the slope is zero, so that its normal is right too."""
         stretch, best = self._within, self.best
@@ -237,9 +240,10 @@ def _of_ring(search: _Search, ranges: Sequence[BodyRange]) -> Nearest:
     assert search.best is not None
     points = [point for stretch in ranges for point in stretch.points]
     seen = search.item.passages(np.stack([point.position for point in points]))
+    heights = np.where(np.abs(seen.heights) < _IN_PLANE, 0.0, seen.heights)
     crossed = passed = False
     for index in range(1, len(points)):
-        low, high = seen.heights[index - 1], seen.heights[index]
+        low, high = heights[index - 1], heights[index]
         if high == 0 or low * high > 0:
             continue
         if low == 0:

@@ -34,6 +34,7 @@ enum { CONVEX, CONCAVE, ANY_COURSE };
 #define CLEARANCE_ERROR 4e-6 /* m, of a least distance at most */
 #define SHORTEST 1e-6        /* m of arc length, which is not divided again */
 #define FINE 5e-4            /* m of arc length, on which any object is as a convex one */
+#define IN_PLANE 1e-9        /* m above a ring's plane that are none */
 #define SHARPENED 1e-4       /* m of arc length, over which a slope's change is measured */
 #define STEEPEST 1.5         /* change of an interpolated distance with the way */
 #define MORE_CURVED 1.25     /* than the curvature that coarse stations show */
@@ -271,7 +272,9 @@ static int passage_of(const SceneObject *o, const double *point, Passage *passag
     double w[SCENE_MEMORY];
     const double *arg[2] = {point, o->parameters};
     double *res[4] = {&passage->height, &passage->beyond, &passage->from_disc, passage->normal};
-    return !o->passage(arg, res, 0, w, 0);
+    if (o->passage(arg, res, 0, w, 0)) return 0;
+    if (fabs(passage->height) < IN_PLANE) passage->height = 0;
+    return 1;
 }
 
 /* Whether the centre line passes the disc where it crosses its plane between two points. */
