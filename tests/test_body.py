@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -183,6 +184,7 @@ def test_machine_code_gives_what_the_vm_gives(case, compiled, monkeypatch):
     asked = {
         "pose": lambda: model.pose(p, at),
         "body_jacobian": lambda: model.body_jacobian(p, at),
+        "line": lambda: model._body.line(p, at),
         "compliance_between": lambda: model.compliance_between(p, at, at[::-1]),
     }
     expected = {name: ask() for name, ask in asked.items()}
@@ -224,6 +226,46 @@ def test_the_header_serves_other_libraries(case, compiled):
         by = 10.0 * np.eye(n)
         radii = [model.body_radius(p + x, s) - model.body_radius(p - x, s) for x in by]
         assert found[-n:] == pytest.approx(np.array(radii) / 20, abs=1e-12)
+
+
+@pytest.mark.parametrize("case", ["mixed", "hanging"])
+def test_casadi_functions_are_what_the_methods_give(case):
+    """With the implicit function theorem where the equilibrium is a constraint."""
+    model = robot(case)
+    p, L = pressures(model), model.length
+    start = [lie.quaternion_from_rotation(model.tip_pose(p)[:3, :3])] if model.is_loaded else []
+    for name, at in (
+        ("pose", (0.7 * L,)),
+        ("body_jacobian", (0.7 * L,)),
+        ("compliance_between", (0.3 * L, 0.8 * L)),
+        ("compliance_between", (L, 0.5 * L)),
+    ):
+        function = model.body_function(name, *at)
+        value, *residual = (np.asarray(each) for each in function.call([p, *start]))
+        expected = getattr(model, name)(p, *at)
+        assert value == pytest.approx(expected, rel=1e-4, abs=2e-6 * np.abs(expected).max())
+        assert all(np.abs(each).max() < 1e-7 for each in residual)
+    pose = model.body_function("pose", 0.7 * L)
+    x = ca.MX.sym("x", len(p) + 4 * len(start))
+    value, *residual = pose.call([x[: len(p)], *([x[len(p) :]] if start else [])])
+    rows = ca.vertcat(value[:3, 3], *residual, *([ca.sumsqr(x[len(p) :])] if start else []))
+    slope = np.asarray(ca.Function("f", [x], [ca.jacobian(rows, x)])(np.concatenate([p, *start])))
+    by_p, by_q = slope[:, : len(p)], slope[:, len(p) :]
+    total = by_p[:3] - (by_q[:3] @ np.linalg.solve(by_q[3:], by_p[3:]) if start else 0)
+    J = model.pose(p, 0.7 * L)[:3, :3] @ model.body_jacobian(p, 0.7 * L)[:3]
+    assert total == pytest.approx(J, abs=1e-5 * np.abs(J).max())
+
+
+def test_casadi_functions_have_checked_arguments():
+    model = robot("2 segments")
+    for name, at, problem in (
+        ("pose", (), "takes 1 arc length; got 0"),
+        ("compliance_between", (0.1,), "takes 2 arc lengths; got 1"),
+        ("pose", (0.3,), "is not on the arm"),
+        ("shape", (0.1,), "unknown name 'shape'; choose one of pose"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            model.body_function(name, *at)
 
 
 @pytest.mark.parametrize("case", ["neo-Hookean", "hanging"])

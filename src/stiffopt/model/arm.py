@@ -268,10 +268,11 @@ class Arm:
         Results have axes for pressures (N,) and stations (k,) where there are several.
         """
         values = self._checked(p)
-        found = of_body(np.atleast_2d(values), np.atleast_1d(at))
+        single = values.ndim == 1
+        found = of_body(values[np.newaxis] if single else values, np.atleast_1d(at))
         if at.ndim == 0:
             found = found[:, 0]
-        return found[0] if values.ndim == 1 else found
+        return found[0] if single else found
 
     # -- checks -----------------------------------------------------------------------------
 

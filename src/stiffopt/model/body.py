@@ -16,7 +16,7 @@ import ctypes
 import threading
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -44,7 +44,8 @@ COMPILED_FREE_FROM, COMPILED_LOADED_FROM = 2000, 64
 """Poses from which it is made if there is none: they have taken about a second in the VM."""
 
 _CHUNK = 16  # poses that a thread takes at a time
-_POSES, _JACOBIANS, _RESPONSES = range(3)  # as body.c has them
+_KEPT = 16  # numbers of stations for which memory is kept
+_POSES, _JACOBIANS, _RESPONSES, _LINE = range(4)  # as body.c has them
 
 _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
@@ -74,6 +75,10 @@ class BodyShape:
         """Twists per Pa (N, k, 6, n), each in the axes of its station."""
         return self._evaluate(_JACOBIANS, p, at).reshape(len(p), len(at), 6, p.shape[1])
 
+    def line(self, p: Vector, at: Vector) -> Vector:
+        """Positions, unit tangents of the centre line and outer radii, (N, k, 7) side by side."""
+        return self._evaluate(_LINE, p, at).reshape(len(p), len(at), 7)
+
     def compliances(self, p: Vector, s: Vector, t: Vector) -> Vector:
         """Twists at s (k,) per wrench at t (k,), (N, k, 6, 6), in base axes."""
         at, place = np.unique(np.concatenate([[0.0], s, t]), return_inverse=True)
@@ -88,6 +93,9 @@ class BodyShape:
     def radii(self, p: Vector, at: Vector) -> Vector:
         """Outer radii (N, k) of the free sections, in m."""
         self._arm._check_margin(p, "")
+        return self._radii(p, at)
+
+    def _radii(self, p: Vector, at: Vector) -> Vector:
         piece, _ = self._pieces.find(at)
         found: Vector = self._stations.radii(p)[:, self._pieces.section[piece]]
         return found
@@ -111,6 +119,8 @@ class BodyShape:
             return self._stations.poses(p, at)
         if what == _JACOBIANS:
             return self._stations.jacobians(p, at)
+        if what == _LINE:
+            return np.concatenate([self._stations.line(p, at), self._radii(p, at)[..., None]], -1)
         assert isinstance(self._stations, LoadedStations)
         return self._stations.responses(p, at)
 
@@ -212,27 +222,46 @@ class NativeBody:
         self._stations = code.cdll.stiffopt_stations
         self._stations.argtypes = [_pointer, _integer, _pointer, _pointer, _integer,
                                    _pointer, _pointer, _integer, _integer]  # fmt: skip
+        self._one_at_a_time = threading.Lock()
+        self._kept: dict[tuple[int, int], Any] = {}
 
     def stations(self, what: int, p: Vector, at: Vector) -> tuple[Vector, NDArray[np.int64]]:
         """Numbers (N, ...) of stations (k,) at pressures (N, n), and outcomes (N,): 0 is good."""
+        if len(p) == 1:
+            with self._one_at_a_time:
+                return self._of_one(what, p, at)
         p, at = np.ascontiguousarray(p), np.ascontiguousarray(at)
-        width = len(at) * (16, 6 * self._n, 81)[what] + (27 if what == _RESPONSES else 0)
-        found, outcome = np.empty((len(p), width)), np.empty(len(p), dtype=np.int64)
-        call = partial(
-            self._stations, self.address, what, p.ctypes.data, at.ctypes.data, len(at),
-            found.ctypes.data, outcome.ctypes.data,
-        )  # fmt: skip
-        if len(p) <= _CHUNK:
-            failed = call(0, len(p))
-        else:
-            failed = 0
+        found, outcome = self._results(what, len(p), len(at))
+        call = self._call(what, p, at, found, outcome)
 
-            def work(starts: Iterator[int]) -> None:
-                nonlocal failed
-                for start in starts:
-                    failed |= call(start, min(start + _CHUNK, len(p)))
+        def work(starts: Iterator[int]) -> None:
+            for start in starts:
+                self._run(call, start, min(start + _CHUNK, len(p)))
 
-            in_parallel(work, range(0, len(p), _CHUNK))
-        if failed:
-            raise MemoryError("no memory is left for the stations of the arm")
+        in_parallel(work, range(0, len(p), _CHUNK))
         return found, outcome
+
+    def _of_one(self, what: int, p: Vector, at: Vector) -> tuple[Vector, NDArray[np.int64]]:
+        """The same for one row, by way of memory whose addresses are known."""
+        kept = self._kept.get((what, len(at)))
+        if kept is None:
+            own = (np.empty((1, self._n)), np.empty(len(at)), *self._results(what, 1, len(at)))
+            while len(self._kept) >= _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            kept = self._kept[what, len(at)] = (own, self._call(what, *own))
+        (pressures, stations, found, outcome), call = kept
+        pressures[:], stations[:] = p, at
+        self._run(call, 0, 1)
+        return found.copy(), outcome.copy()
+
+    def _results(self, what: int, rows: int, count: int) -> tuple[Vector, NDArray[np.int64]]:
+        width = count * (16, 6 * self._n, 81, 7)[what] + (27 if what == _RESPONSES else 0)
+        return np.empty((rows, width)), np.empty(rows, dtype=np.int64)
+
+    def _call(self, what: int, *arrays: NDArray[Any]) -> tuple[int, ...]:
+        p, at, found, outcome = (array.ctypes.data for array in arrays)
+        return self.address, what, p, at, len(arrays[1]), found, outcome
+
+    def _run(self, call: tuple[int, ...], begin: int, end: int) -> None:
+        if self._stations(*call, begin, end):
+            raise MemoryError("no memory is left for the stations of the arm")

@@ -19,6 +19,7 @@ from stiffopt.model.arguments import (
 )
 from stiffopt.model.arm import Arm, Values
 from stiffopt.model.arm_clearance import ArmClearance, Clearances
+from stiffopt.model.body_symbols import Along, body_function
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import Compensation, RobotDescription
 from stiffopt.model.equilibrium import dead_and_follower
@@ -184,6 +185,31 @@ class Manipulator(Arm):
             ) from None
         ends = np.atleast_1d(second)
         return self._at_stations(lambda q, at: self._body.compliances(q, at, ends), p, first)
+
+    def body_function(self, name: Along, *at: float) -> ca.Function:
+        """CasADi function of a station or two, for an optimisation of one's own.
+
+        Parameters
+        ----------
+        name : {"pose", "body_jacobian", "compliance_between"}
+            What the method of this name gives, as a matrix.
+        at : float
+            Arc length in m at rest, above 0; of "compliance_between" two, s and t.
+
+        Returns
+        -------
+        casadi.Function
+            Of the pressures p (n,) in Pa.  With gravity or a load it is a function of p and the
+            tip's quaternion q (4,), w first, and has a second output, `residual` (3,): it is zero
+            in equilibrium only, so q is a variable more (of any length but 0, start it at the
+            quaternion of `tip_pose`) and ``residual == 0`` a constraint.  All can be
+            differentiated; Jacobians and compliances are meant where the residual is zero.
+        """
+        check_choice("name", name, get_args(Along))
+        wanted = 2 if name == "compliance_between" else 1
+        if len(at) != wanted:
+            raise InputError(f"{name} takes {wanted} arc length{'s'[: wanted - 1]}; got {len(at)}")
+        return body_function(self, name, tuple(self._arc_length(each) for each in at))
 
     def stiffness(
         self,

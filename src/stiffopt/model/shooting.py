@@ -262,7 +262,7 @@ class Chain:
     @cached_property
     def _twist_per_rest(self) -> ca.MX:
         _, twist = self._per_x
-        return twist[:, 3:] + twist[:, :3] @ self._turn_per_rest
+        return self.per_rest(twist)
 
     @property
     def jacobian(self) -> ca.MX:
@@ -280,8 +280,11 @@ class Chain:
 
     def total_jacobian(self, values: ca.MX) -> ca.MX:
         """Derivative (k, n) of values (k,) by the pressures, along the equilibrium."""
-        change = ca.jacobian(values, self.x)
-        return change[:, 3:-6] + change[:, :3] @ self._turn_per_rest[:, :-6]
+        return self.per_rest(ca.jacobian(values, self.x))[:, :-6]
+
+    def per_rest(self, change: ca.MX) -> ca.MX:
+        """Change (k, n + 6) per pressure and wrench in equilibrium, of a change (k, 3 + n + 6)."""
+        return change[:, 3:] + change[:, :3] @ self._turn_per_rest
 
     @property
     def base_turn(self) -> ca.MX:

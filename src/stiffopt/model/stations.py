@@ -68,6 +68,12 @@ class FreeStations:
         pose = self._along("along", strains, starts, at)[0]
         return _transforms(pose[..., 3:12], pose[..., :3])
 
+    def line(self, p: Vector, at: Vector) -> Vector:
+        """Positions and tangents (N, k, 6)."""
+        _, strains, starts, _ = self._functions["frames"].many(p, self._numbers)
+        pose = self._along("along", strains, starts, at)[0]
+        return np.concatenate([pose[..., :3], pose[..., 12:]], -1)
+
     def jacobians(self, p: Vector, at: Vector) -> Vector:
         """Twists beyond a pressure's piece are those of its end; on it they grow along it."""
         _, strains, starts, _, slopes, twists, _ = self._functions["moving_frames"].many(
@@ -123,13 +129,14 @@ class Carried(NamedTuple):
     Attributes
     ----------
     axes : (k, 9) by columns.
-    positions : (k, 3)
+    positions, tangents : (k, 3)
     changes : (k, 3, 3, d) turns, moments and ways from there to the tip, in base axes.
     force : (3, d) change of the force, along the whole arm.
     """
 
     axes: Vector
     positions: Vector
+    tangents: Vector
     changes: Vector
     force: Vector
 
@@ -149,6 +156,12 @@ class LoadedStations:
         rows = [self._carried(row, at, moving=False) for row in p]
         found = [_transforms(row.axes, row.positions) for row in rows]
         return np.array(found).reshape(len(p), len(at), 4, 4)
+
+    def line(self, p: Vector, at: Vector) -> Vector:
+        """Positions and tangents (N, k, 6)."""
+        rows = [self._carried(row, at, moving=False) for row in p]
+        found = [np.hstack([row.positions, row.tangents]) for row in rows]
+        return np.array(found).reshape(len(p), len(at), 6)
 
     def jacobians(self, p: Vector, at: Vector) -> Vector:
         """By the turn of the tip that keeps the base upright."""
@@ -184,19 +197,24 @@ class LoadedStations:
         notes, *changes = function(*self._arm._equilibrium().arguments(self._arm.settle(p)))
         at = np.concatenate([[0.0], at])
         proximal = np.append(distal[1:], 0.0)
-        stretch = np.minimum(np.searchsorted(-proximal, -at), len(distal) - 1)
+        stretch = np.minimum(np.searchsorted(-proximal, -at, side="right"), len(distal) - 1)
         share = np.maximum(distal[stretch] - at, 0) / (distal - proximal)[stretch]
-        weights = np.hstack([np.ones((len(at), 1)), np.vander(share, 6, increasing=True) @ DENSE.T])
-        state = np.einsum("kb,ikb->ki", weights, notes.reshape(10, -1, 6)[:, stretch])
+        powers = np.vander(share, 6, increasing=True)
+        weights = np.hstack([np.ones((len(at), 1)), powers @ DENSE.T])
+        notes = notes.reshape(10, -1, 6)[:, stretch]
+        state = np.einsum("kb,ikb->ki", weights, notes)
+        slope = powers[1:, :-1] @ (DENSE[:, 1:] * np.arange(1, 6)).T
+        tangents = -np.einsum("kb,ikb->ki", slope, notes[4:7, 1:, 1:])
+        tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
         axes, turning = self._functions["axes"].many(state[:, :4])
-        positions = state[1:, 4:7] - state[0, 4:7]
+        places = (axes[1:, :, 0], state[1:, 4:7] - state[0, 4:7], tangents)
         if not moving:
-            return Carried(axes[1:, :, 0], positions, np.zeros(0), np.zeros(0))
+            return Carried(*places, np.zeros(0), np.zeros(0))
         change, force = changes
         change = change.reshape(len(distal), 6, 10, -1)[stretch]
         change = np.einsum("kb,kbid->kid", weights, change)
         carried = np.stack([turning @ change[:, :4], change[:, 7:], -change[:, 4:7]], 1)
-        return Carried(axes[1:, :, 0], positions, carried, force)
+        return Carried(*places, carried, force)
 
     def _notes(self, moving: bool) -> tuple[InterpretedFunction, Vector]:
         """Notes (10, 6 stretches), their changes and those of the force; where stretches begin."""

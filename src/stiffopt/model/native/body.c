@@ -5,7 +5,7 @@
 #include "body.h"
 
 enum { FOUND, BEYOND_LAW, NO_EQUILIBRIUM };
-enum { POSES, JACOBIANS, CARRIED };
+enum { POSES, JACOBIANS, CARRIED, LINE };
 
 /* For the caller to check that it has the same idea of a BodyModel. */
 int64_t stiffopt_body_model_size(void) { return sizeof(BodyModel); }
@@ -21,13 +21,12 @@ static void put_pose(const Station *station, double *to) {
 
 /* Jacobian (6, n) in the station's axes, row by row. */
 static void put_jacobian(const Station *station, int64_t n, const double *twists, double *to) {
-    for (int64_t k = 0; k < n; k++)
-        for (int i = 0; i < 6; i++) {
-            double sum = 0;
-            for (int j = 0; j < 3; j++)
-                sum += station->axes[3 * (i % 3) + j] * twists[6 * k + i / 3 * 3 + j];
-            to[n * i + k] = sum;
-        }
+    for (int64_t k = 0; k < 2 * n; k++, twists += 3) {
+        double *column = to + k / 2 + (k % 2) * 3 * n;
+        const double *axis = station->axes;
+        for (int i = 0; i < 3; i++, axis += 3)
+            column[n * i] = axis[0] * twists[0] + axis[1] * twists[1] + axis[2] * twists[2];
+    }
 }
 
 #ifdef STIFFOPT_LOADED
@@ -53,27 +52,32 @@ static int64_t state_size(const BodyModel *m) { return 0; }
 #endif
 
 /* Something of stations at arc lengths (count) for pressures begin to end - 1 of rows (n): poses
- * (count, 16), Jacobians (count, 6 n) or, under loads, (count, 81) of carried_to and (9, 3) changes
- * of force; and how it went for each row.  Not 0 if memory is short. */
+ * (count, 16), Jacobians (count, 6 n), positions, tangents and radii (count, 7) or, under loads,
+ * (count, 81) of carried_to and (9, 3) changes of force; and how it went for each row.  Not 0 if
+ * memory is short. */
 int stiffopt_stations(const BodyModel *model, int64_t what, const double *pressures,
                       const double *at, int64_t count, double *found, int64_t *outcome,
                       int64_t begin, int64_t end) {
     NEW_WORK(work);
     int64_t n = model->n, states = state_size(model);
-    int64_t width = what == POSES ? 16 : what == JACOBIANS ? 6 * n : 81;
+    int64_t width = what == POSES ? 16 : what == LINE ? 7 : what == JACOBIANS ? 6 * n : 81;
     int64_t row = count * width + (what == CARRIED ? 27 : 0);
     double *memory = malloc((size_t)(body_size(model) + states + 1) * sizeof(double));
     double *state = memory, twists[6 * n], slopes[n];
     if (!memory) return 1;
     Body body = body_in(model, memory + states);
+    BodyLine line = {&work, &body};
     for (int64_t i = begin; i < end; i++) {
         double *to = found + i * row;
         Station station;
-        outcome[i] = settle_body(&work, &body, pressures + i * n, state, what != POSES);
+        int moving = what == JACOBIANS || what == CARRIED;
+        outcome[i] = settle_body(&work, &body, pressures + i * n, state, moving);
         for (int64_t k = 0; k < count && outcome[i] == FOUND; k++, to += width) {
             if (what == POSES) {
                 station_at(&work, &body, at[k], &station);
                 put_pose(&station, to);
+            } else if (what == LINE) {
+                body_line_station(&line, at[k], to, to + 3, to + 6);
             } else if (what == JACOBIANS) {
                 moving_station(&work, &body, at[k], &station, twists, slopes);
                 put_jacobian(&station, n, twists, to);

@@ -69,4 +69,21 @@ static void put_radius(const BodyModel *model, const double *radius, const doubl
 #include "free_body.h"
 #endif
 
+/* A prepared body as scene.h wants its centre line. */
+typedef struct {
+    const Work *work;
+    const Body *body;
+} BodyLine;
+
+static int body_line_station(const void *line, double s, double *position, double *tangent,
+                             double *radius) {
+    const BodyLine *of = line;
+    Station station;
+    if (!station_at(of->work, of->body, s, &station)) return 0;
+    memcpy(position, station.position, sizeof station.position);
+    memcpy(tangent, station.tangent, sizeof station.tangent);
+    *radius = station.radius;
+    return 1;
+}
+
 #endif

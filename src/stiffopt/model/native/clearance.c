@@ -2,22 +2,6 @@
 #include "body.c"
 #include "scene.h"
 
-typedef struct {
-    const Work *work;
-    const Body *body;
-} ArmLine;
-
-static int station_of_arm(const void *line, double s, double *position, double *tangent,
-                          double *radius) {
-    const ArmLine *arm = line;
-    Station found;
-    if (!station_at(arm->work, arm->body, s, &found)) return 0;
-    memcpy(position, found.position, sizeof found.position);
-    memcpy(tangent, found.tangent, sizeof found.tangent);
-    *radius = found.radius;
-    return 1;
-}
-
 /* The change (n) of a distance with the pressures. */
 static int put_gradient(const Work *work, const Body *body, const Nearest *nearest, double *to) {
     int64_t n = body->model->n;
@@ -83,8 +67,8 @@ int stiffopt_clearances(const BodyModel *model, const SceneObject *objects, int6
         ranges[r] = (Range){counts[r], points + used};
     if (!memory || !points) return free(memory), free(points), 1;
     Body body = body_in(model, memory + states);
-    ArmLine arm = {&work, &body};
-    CentreLine line = {station_of_arm, &arm};
+    BodyLine arm = {&work, &body};
+    CentreLine line = {body_line_station, &arm};
     int64_t width = gradients ? n_objects : 1;
     for (int64_t i = begin; i < end; i++) {
         Nearest *to = found + i * width;
