@@ -103,7 +103,7 @@ class BodyShape:
     def _evaluate(self, what: int, p: Vector, at: Vector) -> Vector:
         """Numbers (N, ...) of stations, by machine code if there is any."""
         checkpoint()
-        native = self._machine_code(len(p))
+        native = self.machine_code(len(p))
         if native is None:
             return self._interpreted(what, p, at)
         found, outcome = native.stations(what, p, at)
@@ -124,7 +124,8 @@ class BodyShape:
         assert isinstance(self._stations, LoadedStations)
         return self._stations.responses(p, at)
 
-    def _machine_code(self, rows: int) -> NativeBody | None:
+    def machine_code(self, rows: int) -> NativeBody | None:
+        """Machine code for a number of rows more; None where there is none, or not yet."""
         if self._native is not None:
             return self._native
         with self._lock:
@@ -139,11 +140,11 @@ class BodyShape:
 
 def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
     """Machine code of an arm's body; None where there is none."""
-    kind, make, source = "body", free_moving_functions, "body.c"
+    kind, make, source = "body", free_moving_functions, "clearance.c"
     if arm.is_loaded:
         if rod_functions(arm.layout) is None:
             return None
-        kind, make, source = "loaded body", _loaded_functions, "loaded_body.c"
+        kind, make, source = "loaded body", _loaded_functions, "loaded_clearance.c"
     code = library(
         (kind, arm.layout.skeleton), partial(make, arm.layout), (str(NATIVE / source),),
         build_missing=build_missing,
@@ -201,12 +202,14 @@ class NativeBody:
 
     Parameters
     ----------
-    code : library of the functions of `stiffopt.model.body_functions` with body.c.
+    code : library of the functions of `stiffopt.model.body_functions` with clearance.c.
 
     Attributes
     ----------
     address : int
         Of the `BodyModel`.
+    code : Library
+        What it was made of, with what clearance.c adds.
 
     Raises
     ------
@@ -216,7 +219,7 @@ class NativeBody:
 
     def __init__(self, code: Library, arm: Arm) -> None:
         self._n = arm.n_pressures
-        self._code = code
+        self.code = code
         size = code.cdll.stiffopt_body_model_size
         size.restype = _integer
         if size() != ctypes.sizeof(BodyModel):
