@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
@@ -118,15 +118,16 @@ class ArmClearance:
 
     def each(self, p: Array) -> Clearances:
         """The distances of all objects."""
-        gradients = np.empty((len(p), len(self._scene.names), self._arm.n_pressures))
-        found, missing = self._in_c(p, gradients)
+        slopes = np.empty((len(p), len(self._scene.names), self._arm.n_pressures))
+        found, missing = self._in_c(p, slopes)
         for row in missing:
-            for index, each in enumerate(self._of(p[row])):
+            nearest = self._of(p[row])
+            slopes[row] = gradients(self._arm, p[row], nearest)
+            for index, each in enumerate(nearest):
                 found[row, index] = [*each[:3], *each.position, *each.normal]
-                gradients[row, index] = self._gradient(p[row], each)
         return Clearances(
             self._scene.names, found[..., 0], found[..., 1], found[..., 3:6], found[..., 6:],
-            gradients,
+            slopes,
         )  # fmt: skip
 
     # -- without machine code ---------------------------------------------------------------
@@ -136,16 +137,6 @@ class ArmClearance:
         line = _CentreLine(self._arm, p, self._bounds)
         ranges = survey(line, self._ends)
         return [nearest_point(line, item, ranges) for item in self._scene.items]
-
-    def _gradient(self, p: Array, nearest: Nearest) -> Array:
-        """Derivative (n,) of a distance by the pressures."""
-        at = np.array([nearest.s])
-        rotation = self._arm._body.poses(p[None], at)[0, 0, :3, :3]
-        moves = rotation @ self._arm._body.jacobians(p[None], at)[0, 0, :3]  # (3, n)
-        aside = _STEP * np.eye(len(p))
-        widening = self._arm._body.radii(p + aside, at) - self._arm._body.radii(p - aside, at)
-        found: Array = nearest.normal @ moves - nearest.radius_share * widening[:, 0] / (2 * _STEP)
-        return found
 
     # -- in machine code --------------------------------------------------------------------
 
@@ -192,6 +183,31 @@ def _in_chunks(call: Callable[[int, int], int], count: int) -> None:
     in_parallel(work, range(0, count, _CHUNK))
     if failed:
         raise MemoryError("no memory is left for the stations of the arm")
+
+
+def gradients(arm: Manipulator, p: Array, nearest: Sequence[Nearest]) -> Array:
+    """Derivatives (k, n) of k distances by the pressures (n,)."""
+    at = np.array([each.s for each in nearest])
+    axes = arm._body.poses(p[None], at)[0, :, :3, :3]
+    moves = axes @ arm._body.jacobians(p[None], at)[0, :, :3]  # (k, 3, n)
+    aside = _STEP * np.eye(len(p))
+    widening = arm._body.radii(p + aside, at) - arm._body.radii(p - aside, at)  # (n, k)
+    normals = np.array([each.normal for each in nearest])
+    shares = np.array([each.radius_share for each in nearest])
+    found: Array = (normals[:, None] @ moves)[:, 0]
+    return found - (shares * widening / (2 * _STEP)).T
+
+
+class ArmBody:
+    """The body of an arm at pressures (n,)."""
+
+    def __init__(self, arm: Manipulator, p: Array) -> None:
+        self._arm, self._p = arm, p[None]
+
+    def __call__(self, at: Array) -> tuple[Array, Array, Array]:
+        """See `stiffopt.model.clearance.StationOf`."""
+        found = self._arm._body.line(self._p, at)[0]
+        return found[:, :3], found[:, 3:6], found[:, 6]
 
 
 class _CentreLine:

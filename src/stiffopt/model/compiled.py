@@ -76,7 +76,7 @@ class _Wanted:
         """What the code depends on, as a name of files."""
         files = [Path(source) for source in self.sources]
         folders = {folder for file in files for folder in (file.parent, build.NATIVE)}
-        headers = {found for folder in folders for found in folder.glob("*.h")}
+        headers = {found for folder in folders for found in folder.glob("*.[ch]")}
         parts = [
             self.text,
             _own_code(),

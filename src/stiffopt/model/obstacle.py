@@ -8,6 +8,7 @@ object compiles nothing.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import casadi as ca
@@ -113,7 +114,14 @@ class Obstacle(Schema, ABC):
 
     def distance_of(self, point: Any) -> float:
         """Signed distance of one point (3,), from the formula itself, in m."""
-        return max(float(self.formula(ca.DM(point), ca.DM(q))) for q in self.pieces)
+        formula = _function(type(self))
+        return float(np.max(formula(point, np.array(self.pieces).T)))
+
+
+@cache
+def _function(kind: type[Obstacle]) -> ca.Function:
+    point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
+    return ca.Function("distance", [point, q], [kind.formula(point, q)])
 
 
 def norm(vector: ca.SX) -> ca.SX:

@@ -7,16 +7,19 @@ Scenes are data of these rows, so that no object compiles anything.
 """
 
 import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.arm_clearance import MeasuredScene, measured_scene
+from stiffopt.model.arm_clearance import ArmBody, MeasuredScene, gradients, measured_scene
 from stiffopt.model.body import ModelInC
-from stiffopt.model.clearance import range_ends
-from stiffopt.model.distances import scene_library
+from stiffopt.model.clearance import Nearest, nearest_point, range_ends, survey
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.distances import MeasuredObject, scene_library
 from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -40,6 +43,21 @@ class _Obstacles(ctypes.Structure):
     ]
 
 
+def _quickly_nearest(
+    body: ArmBody, item: MeasuredObject, ranges: Sequence[tuple[float, float, int]]
+) -> Nearest:
+    """The nearest point of a stretch of the body: around the best of some stations, ever closer."""
+    s = np.concatenate([np.linspace(start, end, 2 * count) for start, end, count in ranges])
+    for _ in range(OBSTACLES.turns):
+        positions, _, radii = body(s)
+        seen = item.distances(positions)
+        values = seen.values - radii
+        best = int(values.argmin())
+        near = Nearest(float(values[best]), float(s[best]), 1.0, positions[best], seen.normals[best])
+        s = np.linspace(s[max(best - 1, 0)], s[min(best + 1, len(s) - 1)], OBSTACLES.closer)
+    return near
+
+
 class ObstaclesInC:
     """Obstacles around an arm as C takes them; this object holds the memory.
 
@@ -54,26 +72,38 @@ class ObstaclesInC:
     ) -> None:
         code = scene_library()
         assert code is not None  # see `Functions.library`
-        body, objects = ModelInC(arm, rod), obstacles.measured.in_c(code)
-        ranges = range_ends(arm.description, OBSTACLES.spacing)
-        ends = np.array(obstacles.range_groups, dtype=np.int64)
-        bounds = np.array([[start, end] for start, end, _ in ranges])
-        stations = np.array([count for _, _, count in ranges], dtype=np.int64)
-        self._keep = (body, objects, code, ends, bounds, stations)
+        objects = obstacles.measured.in_c(code)
+        def make() -> tuple[Any, ...]:
+            return _body_in_c(arm, rod, obstacles.range_groups)
+
+        body, *arrays = make() if rod else arm.kept("body among obstacles", make)
+        self._keep = (body, objects, code, *arrays)
+        ends, bounds, stations = (array.ctypes.data for array in arrays)
         self._structure = _Obstacles(
             body=body.address,
             objects=ctypes.addressof(objects),
             count=len(objects),
-            segments=len(ends),
-            ends=ends.ctypes.data,
-            bounds=bounds.ctypes.data,
-            stations=stations.ctypes.data,
+            segments=len(obstacles.range_groups),
+            ends=ends,
+            bounds=bounds,
+            stations=stations,
             clearance=obstacles.scene.clearance,
             margin=OBSTACLES.margin,
             cutoff=obstacles.scene.clearance + OBSTACLES.cutoff,
             allowed=OBSTACLES.allowed,
         )
         self.address = ctypes.addressof(self._structure)
+
+
+def _body_in_c(arm: Manipulator, rod: LoadedArm | None, groups: tuple[int, ...]) -> tuple[Any, ...]:
+    """The arm's body, and what is known of its ranges: ends of segments, bounds and stations."""
+    ranges = range_ends(arm.description, OBSTACLES.spacing)
+    return (
+        ModelInC(arm, rod),
+        np.array(groups, dtype=np.int64),
+        np.array([[start, end] for start, end, _ in ranges]),
+        np.array([count for _, _, count in ranges], dtype=np.int64),
+    )
 
 
 @dataclass(frozen=True)
@@ -113,6 +143,30 @@ class Obstacles:
     def row_names(self) -> tuple[str, ...]:
         """Names of the constraints, a row each."""
         return tuple(f"clearance of {self.measured.names[index]}" for index in self.row_objects)
+
+    def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
+        """Rows (k,) and their derivatives (k, n) per Pa, at pressures (n,), without machine code."""
+        body = ArmBody(arm, p)
+        ranges = range_ends(self.description, OBSTACLES.spacing)
+        groups = [ranges[begin:end] for begin, end in pairwise((0, *self.range_groups))]
+        found = [
+            nearest
+            for item in self.measured.items
+            for nearest in (
+                [nearest_point(body, item, survey(body, ranges))]
+                if item.is_ring
+                else [_quickly_nearest(body, item, group) for group in groups]
+            )
+        ]
+        distances = np.array([nearest.distance for nearest in found])
+        rows = OBSTACLES.margin - (distances - self.scene.clearance)
+        return rows, -gradients(arm, p, found)
+
+    def exact_rows(self, arm: Manipulator, p: Vector) -> list[float]:
+        """Rows (k,) for a judgement: of each segment the least distance of the whole arm."""
+        distances = arm.clearances(p, self.scene).distances[list(self.row_objects)]
+        found: list[float] = (OBSTACLES.margin - (distances - self.scene.clearance)).tolist()
+        return found
 
     def intruders(self, rows: list[float]) -> dict[str, float]:
         """Names of objects whose rows say that the body is too near, and by how much, in m."""

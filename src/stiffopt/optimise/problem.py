@@ -227,15 +227,30 @@ class PressureProblem:
             residual, jacobian = self._pose(x * self.unit, self.parameters)
         else:
             residual, jacobian = self._functions["pose"](x * self.unit, self.parameters)
-        return ProgramPoint(x, residual[:, 0], jacobian.T * self.unit, self.constraints, *_NOTHING)
+        residual, jacobian = self._with_obstacles(x, residual[:, 0], jacobian.T * self.unit)
+        return ProgramPoint(x, residual, jacobian, self.constraints, *_NOTHING)
+
+    def _with_obstacles(self, x: Vector, residual: Vector, jacobian: Vector) -> tuple[Vector, Vector]:
+        """Rows of the terms (m,), (m, n) at pressures x, and those of obstacles after them."""
+        if self.program.obstacles is None:
+            return residual, jacobian
+        rows, slopes = self.program.obstacles.rows(self.robot, x * self.unit)
+        return np.append(residual, rows), np.vstack([jacobian, slopes * self.unit])
 
     def poses(self, x: Vector) -> tuple[Vector, Vector]:
-        """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads."""
+        """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads.
+
+        Obstacles are not looked at: their rows hold.
+        """
         checkpoint()
         residuals, jacobians = self._functions["pose"].many(
             x * self.unit, self.parameters, threads=1
         )
-        return residuals[:, :, 0], jacobians.swapaxes(1, 2) * self.unit
+        missing = ((0, 0), (0, self.program.n_rows - self.program.n_own_rows))
+        return (
+            np.pad(residuals[:, :, 0], missing),
+            np.pad(jacobians.swapaxes(1, 2) * self.unit, (*missing, (0, 0))),
+        )
 
     def point(self, x: Vector) -> ProgramPoint:
         """Everything at pressures x."""
@@ -247,10 +262,11 @@ class PressureProblem:
         else:
             outputs = self._functions["point"](x * self.unit, self.parameters)
         residual, jacobian, terms, term_gradients, floors, floor_gradients = outputs
+        residual, jacobian = self._with_obstacles(x, residual[:, 0], jacobian.T * self.unit)
         return ProgramPoint(
             x,
-            residual[:, 0],
-            jacobian.T * self.unit,
+            residual,
+            jacobian,
             self.constraints,
             terms[:, 0],
             term_gradients.T * self.unit,
@@ -277,7 +293,10 @@ class PressureProblem:
     def judged(self, pressures: Vector) -> tuple[list[float], Vector, Vector, list[float]]:
         """What `Judgement.of` takes, at pressures (n,) in Pa of an arm without loads."""
         residuals, pose, compliance, values = self._functions["judge"](pressures, self.parameters)
-        return residuals.ravel().tolist(), pose.T, compliance.T, values.ravel().tolist()
+        found = residuals.ravel().tolist()
+        if self.program.obstacles is not None:
+            found += self.program.obstacles.exact_rows(self.robot, pressures)
+        return found, pose.T, compliance.T, values.ravel().tolist()
 
     # -- objectives -------------------------------------------------------------------------
 

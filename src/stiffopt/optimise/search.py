@@ -21,7 +21,7 @@ from stiffopt.optimise.local import LocalResult, descend, violation
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.reach import reach, reach_all
 from stiffopt.optimise.samples import SampleTable
-from stiffopt.optimise.settings import DESCENT, SEARCH, Effort
+from stiffopt.optimise.settings import DESCENT, OBSTACLES, REACH, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
 
 Vector = NDArray[np.float64]
@@ -214,9 +214,25 @@ def _places(
     for i in _unlike_first(problem, come[ranked]):
         at = place[ranked[i]]
         if at not in points_at:
-            points_at[at] = problem.needed(come[at])
+            points_at[at] = _past_obstacles(problem, come[at])
         point = points_at[at]
         yield len(x), point if point.is_finite and point.reached else None
+
+
+def _past_obstacles(problem: PressureProblem, x: Vector) -> ProgramPoint:
+    """All that is needed at pressures (n,) at the target or, past obstacles, near them."""
+    point = problem.needed(x)
+    if problem.program.obstacles is None or point.reached:
+        return point
+    moved = reach(problem, x, REACH.iterations_of_many)
+    return point if moved is None or not moved.reached else problem.needed(moved.x)
+
+
+def _intrusion(problem: PressureProblem, x: Vector) -> float:
+    """Sum by which the body lacks clearance at pressures (n,), over the arm's length."""
+    own = problem.program.n_own_rows
+    missing = problem.pose(x).residual[own:] - OBSTACLES.margin
+    return float(np.maximum(missing, 0.0).sum()) / problem.robot.length
 
 
 def _first_at_same_place(x: Vector) -> list[int]:
@@ -230,6 +246,8 @@ def _promise(problem: PressureProblem, x: Vector) -> float:
     """Objective at pressures (n,) with a penalty on floors that are missed; less is better."""
     point = problem.worth(x)
     value = problem.objective.value(point) + SEARCH.price_of_floors * violation(problem, point)
+    if problem.program.obstacles is not None:
+        value += SEARCH.price_of_obstacles * _intrusion(problem, x)
     return value if np.isfinite(value) else np.inf
 
 

@@ -389,7 +389,10 @@ def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
     residuals, pose, compliance, values = found(pressures, robot.parameters(program.parameters))
     lower, upper = task.pressure_bounds(robot.description)
     within = are_within(pressures, lower, upper)
-    numbers = (residuals.ravel().tolist(), pose.T, compliance.T, values.ravel().tolist())
+    rows = residuals.ravel().tolist()
+    if program.obstacles is not None:
+        rows += program.obstacles.exact_rows(robot, pressures)
+    numbers = (rows, pose.T, compliance.T, values.ravel().tolist())
     return Judgement.of(program, numbers, within)
 
 

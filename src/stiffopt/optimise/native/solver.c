@@ -78,11 +78,9 @@ static int solve_by_sight(Program *P, const double *task, double *answer, int si
     return outcome == JUDGED || is_clear(P, out + s->own_rows);
 }
 
-#include <stdio.h>
-#define DBG fprintf(stderr,"EXACT again\n"),
 /* A row of an answer, with a closer look at obstacles where a quick one has not been enough. */
 static void solve_row(Program *P, const double *task, double *answer) {
-    if (!solve_by_sight(P, task, answer, QUICK)) DBG solve_by_sight(P, task, answer, EXACT);
+    if (!solve_by_sight(P, task, answer, QUICK)) solve_by_sight(P, task, answer, EXACT);
 }
 
 /* For the caller to check that it has the same idea of a Setup. */
