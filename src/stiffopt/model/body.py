@@ -85,7 +85,9 @@ class BodyShape:
         first, second = place[1 : 1 + len(s)], place[1 + len(s) :]
         if isinstance(self._stations, FreeStations):
             self._arm._check_margin(p, "")
-            return self._stations.compliances(p, at, first, second)
+            native = self._machine_code(len(p))
+            function = native.function if native else self._stations.interpreted
+            return self._stations.compliances(function, p, at, first, second)
         found = self._evaluate(_RESPONSES, p, at)
         carried = found[:, :-27].reshape(len(p), len(at), 3, 3, 9)
         return response(carried, found[:, -27:].reshape(-1, 9, 3).swapaxes(1, 2), first, second)
@@ -157,8 +159,7 @@ def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
 
 
 def _free_functions(layout: Layout) -> list[ca.Function]:
-    names = ("frames", "moving_frames", "along", "moving_along")
-    return [each for each in free_body_functions(layout) if each.name() in names]
+    return free_body_functions(layout)
 
 
 def _loaded_functions(layout: Layout) -> list[ca.Function]:
@@ -188,6 +189,8 @@ class NativeBody:
     ----------
     address : int
         Of the `BodyModel`.
+    function : callable
+        From names to the functions of `stiffopt.model.body_functions`.
 
     Raises
     ------
@@ -218,6 +221,7 @@ class NativeBody:
         self._stations = code.cdll.stiffopt_stations
         self._stations.argtypes = [_pointer, _integer, _pointer, _pointer, _integer,
                                    _pointer, _pointer, _integer, _integer]  # fmt: skip
+        self.function = code.function
         self._one_at_a_time = threading.Lock()
         self._kept: dict[tuple[int, int], Any] = {}
 
