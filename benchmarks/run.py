@@ -22,7 +22,7 @@ import environment
 import plots
 import report
 from report import Section
-from sections import body, full_task, kinds, kinematics, pose, processes, rates
+from sections import body, calls, full_task, kinds, kinematics, pose, processes, rates
 from settings import Settings, quick
 
 HERE = Path(__file__).resolve().parent
@@ -32,6 +32,7 @@ KEPT = HERE / "results"
 
 SECTIONS: dict[str, Callable[[Settings], Section]] = {
     "full": full_task.section,
+    "calls": calls.section,
     "kinds": kinds.section,
     "without-compiler": processes.without_compiler,
     "build": processes.build,

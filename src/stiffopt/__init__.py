@@ -14,17 +14,21 @@ if TYPE_CHECKING:
     from stiffopt.control.trajectory import Trajectory as Trajectory
     from stiffopt.control.trajectory import Waypoint as Waypoint
     from stiffopt.daemon.client import Client as Client
+    from stiffopt.errors import CancelledError as CancelledError
     from stiffopt.errors import CommandError as CommandError
+    from stiffopt.errors import DerivativeError as DerivativeError
     from stiffopt.errors import DeviceError as DeviceError
     from stiffopt.errors import EquilibriumError as EquilibriumError
     from stiffopt.errors import FileError as FileError
     from stiffopt.errors import GuardTripped as GuardTripped
     from stiffopt.errors import InputError as InputError
     from stiffopt.errors import MissingExtraError as MissingExtraError
+    from stiffopt.errors import OutOfTimeError as OutOfTimeError
     from stiffopt.errors import PressureError as PressureError
     from stiffopt.errors import ServiceError as ServiceError
     from stiffopt.errors import SlowWarning as SlowWarning
     from stiffopt.errors import StiffoptError as StiffoptError
+    from stiffopt.errors import StoppedError as StoppedError
     from stiffopt.identify.calibration import CalibrationResult as CalibrationResult
     from stiffopt.identify.calibration import calibrate as calibrate
     from stiffopt.identify.results import Comparison as Comparison
@@ -63,6 +67,7 @@ if TYPE_CHECKING:
     from stiffopt.optimise.task import Load as Load
     from stiffopt.optimise.task import Task as Task
     from stiffopt.optimise.task import load_task as load_task
+    from stiffopt.optimise.warm import WarmAnswer as WarmAnswer
     from stiffopt.rig.interface import Observation as Observation
     from stiffopt.rig.interface import PoseSample as PoseSample
     from stiffopt.rig.interface import PressureCommand as PressureCommand
@@ -80,9 +85,16 @@ _NAMES = {
     "stiffopt.control.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.daemon.client": ("Client",),
     "stiffopt.errors": (
-        *("CommandError", "DeviceError", "EquilibriumError", "FileError", "GuardTripped"),
-        *("InputError", "MissingExtraError", "PressureError", "ServiceError"),
-        *("SlowWarning", "StiffoptError"),
+        *("CancelledError", "CommandError", "DerivativeError", "DeviceError", "EquilibriumError"),
+        *(
+            "FileError",
+            "GuardTripped",
+            "InputError",
+            "MissingExtraError",
+            "OutOfTimeError",
+            "PressureError",
+        ),
+        *("ServiceError", "SlowWarning", "StiffoptError", "StoppedError"),
     ),
     "stiffopt.identify.calibration": ("CalibrationResult", "calibrate"),
     "stiffopt.identify.results": ("Comparison",),
@@ -106,6 +118,7 @@ _NAMES = {
     "stiffopt.optimise.solver": ("PressureSolver", "solve_batch", "solve_pressure"),
     "stiffopt.optimise.target": ("Target", "Tolerance"),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
+    "stiffopt.optimise.warm": ("WarmAnswer",),
     "stiffopt.safety.rigs": ("open_rig",),
     "stiffopt.rig.interface": ("Observation", "PoseSample", "PressureCommand", "Rig"),
     "stiffopt.workspace": ("WorkspaceMap", "map_workspace", "open_workspace_map"),

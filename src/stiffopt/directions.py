@@ -13,7 +13,7 @@ from stiffopt.schema import Vector, items_of
 from stiffopt.units import Number
 
 
-def _unit_vector(vector: tuple[float, ...]) -> tuple[float, ...]:
+def unit_vector(vector: tuple[float, ...]) -> tuple[float, ...]:
     """Return a vector at length 1; leave it be if it has that already."""
     largest = max(map(abs, vector))
     if largest == 0:
@@ -26,24 +26,25 @@ def _unit_vector(vector: tuple[float, ...]) -> tuple[float, ...]:
     return tuple(x / norm for x in scaled)
 
 
-def _unit_quaternion(quaternion: tuple[float, ...]) -> tuple[float, ...]:
+def unit_quaternion(quaternion: tuple[float, ...]) -> tuple[float, ...]:
+    """Return a quaternion at length 1 with w >= 0; it must be nearly one already."""
     norm = math.hypot(*quaternion)
     if abs(norm - 1) > 1e-3:
         raise InputError(
             f"has norm {norm:.4g}; expected a unit quaternion (w, x, y, z) such as [1, 0, 0, 0]"
         )
     sign = math.copysign(1, quaternion[0]) if quaternion[0] else 1.0
-    return tuple(sign * x for x in _unit_vector(quaternion))
+    return tuple(sign * x for x in unit_vector(quaternion))
 
 
 Frame = Literal["base", "tip"]
 """The axes in which a vector is given."""
-Direction = Annotated[Vector[Number], AfterValidator(_unit_vector)]
+Direction = Annotated[Vector[Number], AfterValidator(unit_vector)]
 """A unit vector."""
 Quaternion = Annotated[
     tuple[Number, Number, Number, Number],
     BeforeValidator(items_of(4)),
-    AfterValidator(_unit_quaternion),
+    AfterValidator(unit_quaternion),
 ]
 """A unit quaternion (w, x, y, z) with w >= 0."""
 

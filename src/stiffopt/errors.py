@@ -74,6 +74,30 @@ class EquilibriumError(StiffoptError):
     """
 
 
+class DerivativeError(StiffoptError):
+    """An answer has no derivatives: it is no strict optimum."""
+
+
+class StoppedError(StiffoptError):
+    """What was asked for was given up before it was done.
+
+    Attributes
+    ----------
+    found :
+        What there was by then, for example the first points of a trade-off; None if nothing.
+    """
+
+    found: object = None
+
+
+class OutOfTimeError(StoppedError, TimeoutError):
+    """The time that a call was given is over."""
+
+
+class CancelledError(StoppedError):
+    """The caller no longer wants what he asked for."""
+
+
 class MissingExtraError(StiffoptError):
     """An optional package is needed that is not installed.
 

@@ -285,11 +285,11 @@ class Client:
             if rest or not (position is pointing is orientation is None):
                 raise InputError("give a task or its parts, not both")
             task = task if isinstance(task, Task) else load_task(task)
-            robot = task.resolve_robot().name
+            robot = None if task.robot is None else task.resolve_robot().name
         else:
             tolerance = {"tolerance": rest.pop("tolerance")} if "tolerance" in rest else {}
             target = _target(position, pointing, orientation, **tolerance)
-            task = Task(robot="robot", target=target, **rest)  # the one that there is
+            task = Task(target=target, **rest)
         body = TaskMessage.of(task, robot=robot).model_dump()
         self._ask("POST", "task", body=body)
 

@@ -115,6 +115,14 @@ class Arm:
         other.__dict__.update(self.__dict__)
         return other
 
+    def __repr__(self) -> str:
+        loaded = ", loaded" if self.is_loaded else ""
+        count = self.n_segments
+        return (
+            f"{type(self).__name__}({self.description.name}: {count} segment{'s' * (count > 1)}, "
+            f"{self.n_pressures} channels, {1e3 * self.length:.4g} mm{loaded})"
+        )
+
     def __reduce__(self) -> tuple[object, ...]:
         """Support pickling: compiled functions are left behind and made anew."""
         dead, follower = self._tip_load[:6], self._tip_load[6:]

@@ -30,6 +30,7 @@ import casadi as ca
 
 from stiffopt.errors import SlowWarning
 from stiffopt.model import compiler as build
+from stiffopt.model import stopping
 from stiffopt.model.batch import CompiledFunction, InterpretedFunction
 from stiffopt.model.codegen import HEADER_NAME, Signature, c_code, dense, header
 
@@ -155,7 +156,11 @@ def until_ready(is_ready: Callable[[], bool]) -> Iterator[None]:
 
 
 def checkpoint() -> None:
-    """Raise `CodeReadyError` if code that `until_ready` waits for is there."""
+    """Raise `CodeReadyError` if code that `until_ready` waits for is there, or give up.
+
+    See `stiffopt.model.stopping`.
+    """
+    stopping.checkpoint()
     look = _watch.get()
     if look is not None:
         look()

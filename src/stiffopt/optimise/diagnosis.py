@@ -30,7 +30,7 @@ def closest_configurations(
     free = {term.name: inf for term in terms}
     stage = problem.changed(problem.objective, free, floors=False)
     results: list[LocalResult] = []
-    for term in sorted(terms, key=lambda t: (not t.is_inequality, -t.order)):
+    for term in problem.program.in_order_of_approach:
         stage = stage.changed(problem.closest(term.name))
         starts = [*(result.point.x for result in results[:1]), *xs]
         tries = Effort(len(starts), CLOSEST.agreeing, CLOSEST.most_descents)
@@ -42,6 +42,17 @@ def closest_configurations(
         allowed = max(term.radius, least * (1 + 1e-6) + 1e-7)
         stage = stage.changed(stage.objective, {term.name: allowed})
     return results
+
+
+def last_stage(problem: PressureProblem, errors: dict[str, float]) -> PressureProblem:
+    """The last of the stages of `closest_configurations`, where these are the least errors."""
+    *before, last = problem.program.in_order_of_approach
+    radii = {}
+    for term in before:
+        error = errors[term.name]
+        least = term.radius - error if term.is_inequality else error
+        radii[term.name] = max(term.radius, least * (1 + 1e-6) + 1e-7)
+    return problem.changed(problem.closest(last.name), {**radii, last.name: inf}, floors=False)
 
 
 def unimproved(problem: PressureProblem, x: Vector) -> LocalResult:

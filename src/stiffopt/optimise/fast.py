@@ -7,28 +7,32 @@ method.
 """
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from itertools import chain, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import InputError
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.stopping import stop_flag
 from stiffopt.optimise.program import Program, pressure_ranges
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.search import effort
-from stiffopt.optimise.settings import DESCENT, KEPT, REACH, SEARCH, Effort
+from stiffopt.optimise.settings import CLOSEST, DESCENT, KEPT, REACH, SEARCH, Effort
 from stiffopt.optimise.solution import Confidence
 
 Vector = NDArray[np.float64]
 
 _NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
-_UNSOLVED = 0
+_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _COME, _CLOSEST = range(6)  # as solver.c has them
+_UNSOLVED, _LOCAL, _GLOBAL, _JUDGED, _CAME, _NEAREST, _NOT_FINITE = range(7)
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
@@ -43,7 +47,9 @@ def _mirrored(settings: Any) -> ctypes.Structure:
     return found
 
 
-_REACH, _DESCENT, _EFFORT = map(_mirrored, (REACH, DESCENT, SEARCH.placed))
+_REACH, _DESCENT, _CLOSEST_SETTINGS, _EFFORT = map(
+    _mirrored, (REACH, DESCENT, CLOSEST, SEARCH.placed)
+)
 
 
 class _Setup(ctypes.Structure):
@@ -53,9 +59,10 @@ class _Setup(ctypes.Structure):
         *((name, _integer) for name in (
             "n", "rows", "balls", "terms", "floors", "values", "parameters", "near", "samples"
         )),
-        *((name, _pointer) for name in ("ball_rows", "one_sided", "scale", "unit")),
+        *((name, _pointer) for name in ("ball_rows", "one_sided", "scale", "unit", "stage")),
         ("reach", type(_REACH)),
         ("descent", type(_DESCENT)),
+        ("closest", type(_CLOSEST_SETTINGS)),
         ("least_effort", type(_EFFORT)),
         ("most_effort", type(_EFFORT)),
         *((name, _double) for name in (
@@ -80,12 +87,16 @@ class CompiledAnswer(NamedTuple):
         Work that was done.
     judged : tuple
         What `Judgement.of` takes: residuals, tip pose, compliance and values at the pressures.
+    slope : ndarray (n,)
+        Of the closest configuration: that of the Lagrangian of its error, limits left out, per
+        share of a pressure's range.
     """
 
     pressures: Vector
     confidence: Confidence
     counts: dict[str, int]
     judged: tuple[list[float], Vector, Vector, list[float]]
+    slope: Vector | None = None
 
 
 class FastSolver:
@@ -100,7 +111,17 @@ class FastSolver:
         Any of that structure.
     table : SampleTable
         Where searches start; that of a loaded arm has the arm in machine code.
+
+    Attributes
+    ----------
+    targets : slice
+        Where the target's parameters are in a row.
+    guess_alone, judge :
+        What can be asked of pressures in a row: the answer next to them, which is not judged, or
+        whether they are one.
     """
+
+    guess_alone, judge = _GUESS_ALONE, _JUDGE
 
     def __init__(
         self, library: Library, robot: Manipulator, program: Program, table: SampleTable
@@ -113,18 +134,20 @@ class FastSolver:
             raise RuntimeError("the compiled solver and this file disagree on their interface")
         self._solve = library.cdll.stiffopt_solve
         self._solve.argtypes = [
-            _pointer, _pointer, _integer, _pointer, _integer, _integer, _integer
+            _pointer, _pointer, _integer, _pointer, _integer, _integer, _integer, _pointer
         ]  # fmt: skip
         n, constraints = robot.n_pressures, program.constraints(robot.length)
         self._length = robot.length
+        stages = [term.name for term in program.in_order_of_approach]
         self._arrays = (
             np.array([c.end - c.first for c in constraints], dtype=np.int64),
             np.array([c.one_sided for c in constraints], dtype=np.int64),
             np.array([c.scale for c in constraints]),
             pressure_ranges(robot.description),
+            np.array([stages.index(c.name) for c in constraints], dtype=np.int64),
             table.pressures / pressure_ranges(robot.description),
         )
-        ball_rows, one_sided, scale, unit, sample_x = (a.ctypes.data for a in self._arrays)
+        ball_rows, one_sided, scale, unit, stage, sample_x = (a.ctypes.data for a in self._arrays)
         least, most = (effort(program.n_equal, share, arm is not None) for share in (0.0, 1.0))
         setup = _Setup(
             n=n,
@@ -140,8 +163,10 @@ class FastSolver:
             one_sided=one_sided,
             scale=scale,
             unit=unit,
+            stage=stage,
             reach=_REACH,
             descent=_DESCENT,
+            closest=_CLOSEST_SETTINGS,
             least_effort=type(_EFFORT)(*least),
             most_effort=type(_EFFORT)(*most),
             covered=SEARCH.covered,
@@ -160,36 +185,35 @@ class FastSolver:
         self._address = ctypes.addressof(setup)
         self._numbers = robot.numbers
         first = len(robot.numbers)
-        self._targets = slice(first, first + len(program.target_parameters))
+        self.targets = slice(first, first + len(program.target_parameters))
         self._radii = slice(setup.parameters, setup.parameters + len(constraints))
         limits = self._radii.stop + 2 * n
-        self._near = slice(
-            limits + program.n_floors, limits + program.n_floors + _NEAR * setup.near
-        )
-        self._width = self._near.stop + 1 + n
-        ends = np.cumsum([_COUNTS + n, program.n_rows, 16, 36, len(program.measures)]).tolist()
+        self._asked = limits + program.n_floors + _NEAR * setup.near
+        self._near = slice(limits + program.n_floors, self._asked)
+        self._width = self._asked + 1 + n
+        ends = np.cumsum([_COUNTS + n, n, program.n_rows, 16, 36, len(program.measures)]).tolist()
         self._parts = [slice(start, end) for start, end in pairwise(ends)]
         self._answer_width = ends[-1]
 
     def row(self, program: Program, lower: Vector, upper: Vector, floors: Vector) -> Vector:
         """Numbers of a task, its target and guess left out."""
         row = np.zeros(self._width)
-        row[: self._targets.start] = self._numbers
-        start = self._targets.stop
+        row[: self.targets.start] = self._numbers
+        start = self.targets.stop
         row[start : self._radii.start] = program.measure_parameters
         row[self._radii.stop : self._near.start] = np.concatenate([lower, upper, floors])
         return row
 
     def with_target(self, row: Vector, program: Program, guess: Vector | None) -> Vector:
-        """The same task with a target and, if there is one, a guess (Pa)."""
+        """The same task with a target and, if there is one, a guess (Pa) to begin with."""
         row = row.copy()
-        row[self._targets] = program.target_parameters
+        row[self.targets] = program.target_parameters
         row[self._radii] = [c.radius for c in program.constraints(self._length)]
         near = [term.nearness(self._length).numbers for term in program.terms]
         row[self._near] = list(chain.from_iterable(near))
         if guess is not None:
-            row[self._near.stop] = 1.0
-            row[self._near.stop + 1 :] = guess
+            row[self._asked] = _GUESS_FIRST
+            row[self._asked + 1 :] = guess
         return row
 
     def limit(self, row: Vector, lower: Vector, upper: Vector) -> None:
@@ -198,41 +222,109 @@ class FastSolver:
 
     def solve(self, row: Vector) -> CompiledAnswer | None:
         """Answer to one task; None if the general method is needed."""
+        return self.answer(self._run_one(row))
+
+    def closest(self, row: Vector) -> CompiledAnswer | None:
+        """Configuration closest to a target out of reach; None if the general method is needed."""
+        return self.answer(self._run_one(row, _CLOSEST))
+
+    def judged(self, row: Vector, numbers: Vector) -> CompiledAnswer | None:
+        """Answer from numbers that were not judged, for a row with its pressures as a guess."""
+        judged = self._run_one(row, _JUDGE)
+        judged[1:_COUNTS] = numbers[1:_COUNTS]
+        return self.answer(judged)
+
+    def comes(self, row: Vector) -> bool:
+        """Whether one of the configurations nearest to the target is brought to it."""
+        return bool(self._run_one(row, _COME)[0] == _CAME)
+
+    def call(self, row: Vector) -> tuple[Vector, Callable[[], int]]:
+        """Numbers of an answer, and a call that finds them for a row; both stay where they are."""
         numbers = np.empty(self._answer_width)
-        self._run(row, numbers, 0, 1)
-        return self._answer(numbers)
+        call = partial(
+            self._solve, self._address, row.ctypes.data, self._width,
+            numbers.ctypes.data, self._answer_width, 0, 1, 0,
+        )  # fmt: skip
+        return numbers, call
+
+    def write(self, row: Vector, like: Vector, asked: float, pressures: Vector) -> None:
+        """Make a row like another one but for what is asked of which pressures (n,), in Pa."""
+        row[: self._asked] = like[: self._asked]
+        row[self._asked] = asked
+        row[self._asked + 1 :] = pressures
+
+    def _run_one(self, row: Vector, asked: int | None = None) -> Vector:
+        numbers = np.empty(self._answer_width)
+        if asked is not None:
+            row[self._asked] = asked
+        with stop_flag() as stop:
+            self._run(row, numbers, 0, 1, stop)
+        return numbers
 
     def solve_all(self, rows: Vector, threads: int | None = None) -> list[CompiledAnswer | None]:
         """Answers to many tasks, a row each, on all cores unless `threads` says otherwise."""
         rows = np.ascontiguousarray(rows)
+        chunk = 1 if self._setup.state else KEPT.chunk  # Ctrl-C waits for a chunk
         numbers = np.empty((len(rows), self._answer_width))
 
         def work(starts: Iterator[int]) -> None:
             for start in starts:
-                self._run(rows, numbers, start, min(start + KEPT.chunk, len(rows)))
+                self._run(rows, numbers, start, min(start + chunk, len(rows)), stop)
 
-        in_parallel(work, range(0, len(rows), KEPT.chunk), threads)
-        return [self._answer(each) for each in numbers]
+        with stop_flag() as stop:
+            in_parallel(work, range(0, len(rows), chunk), threads)
+        return [self.answer(each) for each in numbers]
 
-    def _run(self, rows: Vector, answers: Vector, begin: int, end: int) -> None:
+    def _run(self, rows: Vector, answers: Vector, begin: int, end: int, stop: int) -> None:
         failed = self._solve(
             self._address, rows.ctypes.data, self._width,
-            answers.ctypes.data, self._answer_width, begin, end,
+            answers.ctypes.data, self._answer_width, begin, end, stop,
         )  # fmt: skip
         if failed:
             raise MemoryError("no memory is left for the compiled solver")
 
-    def _answer(self, numbers: Vector) -> CompiledAnswer | None:
-        outcome, _, _, _, tried, reached, descents, agreeing, optima, complete, *work = map(
+    def pressures(self, numbers: Vector) -> Vector:
+        """Pressures (n,) of an answer, in Pa."""
+        return numbers[_COUNTS : self._parts[0].start]
+
+    @staticmethod
+    def is_local(numbers: Vector) -> bool:
+        """Whether an answer was found next to a guess.
+
+        Raises
+        ------
+        InputError
+            If a number of the row was not finite.
+        """
+        outcome = numbers.item(0)
+        if outcome == _NOT_FINITE:
+            raise InputError("the target and the guess must be finite numbers")
+        return outcome == _LOCAL
+
+    def judgement(self, numbers: Vector) -> tuple[list[float], Vector, Vector, list[float]] | None:
+        """What `Judgement.of` takes, of the numbers of an answer; None if there is none."""
+        if numbers.item(0) not in (_LOCAL, _GLOBAL, _JUDGED, _NEAREST):
+            return None
+        _, residuals, pose, compliance, values = self._parts
+        return (
+            numbers[residuals].tolist(),
+            numbers[pose].reshape(4, 4),
+            numbers[compliance].reshape(6, 6),
+            numbers[values].tolist(),
+        )
+
+    def answer(self, numbers: Vector) -> CompiledAnswer | None:
+        """Answer from the numbers of a call, which become its own; None if there is none."""
+        judgement = self.judgement(numbers)
+        if judgement is None:
+            return None
+        _, _, _, _, tried, reached, descents, agreeing, optima, complete, *work = map(
             int, numbers[:_COUNTS].tolist()
         )
-        if outcome == _UNSOLVED:
-            return None
         numbers.flags.writeable = False
-        residuals, pose, compliance, values = self._parts
         iterations, poses, points, programs = work
         return CompiledAnswer(
-            numbers[_COUNTS : residuals.start],
+            self.pressures(numbers),
             Confidence(tried, descents, agreeing, optima, complete == 1),
             {
                 "starts": tried,
@@ -243,10 +335,6 @@ class FastSolver:
                 "points": points,
                 "programs": programs,
             },
-            (
-                numbers[residuals].tolist(),
-                numbers[pose].reshape(4, 4),
-                numbers[compliance].reshape(6, 6),
-                numbers[values].tolist(),
-            ),
+            judgement,
+            numbers[self._parts[0]],
         )

@@ -73,6 +73,14 @@ class StiffnessGoal(Schema):
     at_least: OneOrMore[_Floor] = ()
     match: _Match | None = None
 
+    def __repr__(self) -> str:
+        places = (("maximise", self.maximise), ("match", self.first[len(self.maximise) :]),
+                  ("at least", self.at_least))  # fmt: skip
+        parts = [f"{place} {measure.words()}" for place, found in places for measure in found]
+        return f"StiffnessGoal({'; '.join(parts)})"
+
+    __str__ = __repr__
+
     @property
     def first(self) -> tuple[Measure, ...]:
         """What is maximised or matched."""

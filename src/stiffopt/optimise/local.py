@@ -139,9 +139,10 @@ def descend(
     B = B + 1e-8 * np.trace(B) * np.eye(len(B))
     radius, price = DESCENT.first_radius, 10.0
     weights: Vector | None = None
+    held = np.zeros(len(point.x), dtype=bool)
     converged = False
     for _ in range(DESCENT.iterations):
-        step = subproblem.step(here, B, radius, price, weights)
+        step = subproblem.step(here, B, held, radius, price, weights)
         if step is None:
             break
         d, promised, weights = step
@@ -159,7 +160,10 @@ def descend(
             continue
         there = _Place(problem, trial)
         gained = here.value - there.value + price * (here.missed - there.missed)
-        _update(B, trial.x - here.point.x, weights @ (there.slopes - here.slopes))
+        moved, slope = trial.x - here.point.x, weights @ there.slopes
+        held |= _pushed_back(problem, here.point.x, moved * slope)
+        held &= not gained > 0
+        _update(B, moved, slope - weights @ here.slopes)
         share = gained / promised
         if share < 0.25:
             radius = 0.4 * length
@@ -175,6 +179,15 @@ def descend(
             break
     here = _snapped(problem, here)
     return LocalResult(problem, here.point, here.value, here.missed, converged)
+
+
+def _pushed_back(problem: PressureProblem, x: Vector, rise: Vector) -> NDArray[np.bool_]:
+    """Which steps off a limit, if they gained nothing, met a slope back to it.
+
+    There is a kink at the limit then, as in the norm law where a segment is unpressurised.
+    """
+    pushed: NDArray[np.bool_] = (rise > 0) & ((x <= problem.lower) | (x >= problem.upper))
+    return pushed
 
 
 def _last_step(problem: PressureProblem, here: _Place, d: Vector, price: float) -> _Place:
@@ -314,9 +327,19 @@ class _Subproblem:
         return float(weights[self._floors].max()) if self._floored else 0.0
 
     def step(
-        self, here: _Place, B: Vector, radius: float, price: float, weights: Vector | None
+        self,
+        here: _Place,
+        B: Vector,
+        held: NDArray[np.bool_],
+        radius: float,
+        price: float,
+        weights: Vector | None,
     ) -> tuple[Vector, float, Vector] | None:
-        """Step (n,), promised decrease of the merit, and multipliers of the slopes."""
+        """Step (n,), promised decrease of the merit, and multipliers of the slopes.
+
+        Pressures that are held (n,) stay as they are.  What holds the step back is the box around
+        a ball and the ball's curvature; both are in the multipliers.
+        """
         problem, point, n, size = self._problem, here.point, self._n, self._size
         H, g, A, low, high = self._H, self._g, self._A, self._low, self._high
         jacobian = here.slopes[self._balls :]
@@ -325,6 +348,8 @@ class _Subproblem:
         H[:n, :n] = B + (jacobian.T * self._curvature) @ jacobian
         np.maximum(problem.lower - point.x, -radius, out=low[:n])
         np.minimum(problem.upper - point.x, radius, out=high[:n])
+        low[:n][held] = 0.0
+        high[:n][held] = 0.0
         if self._several:
             high[size : size + len(here.values)] = here.value - here.values
         else:
@@ -347,7 +372,7 @@ class _Subproblem:
         promised = price * here.missed - float(g.dot(z) + 0.5 * z.dot(H.dot(z)))
         new = np.ones(len(here.slopes))
         new[self._skipped :] = dual[size:]
-        new[self._balls :] = new[self._balls :] @ self._axes
+        new[self._balls :] = new[self._balls :] @ self._axes + self._curvature * (jacobian @ z[:n])
         return z[:n], promised, new
 
     def _turn_boxes(

@@ -4,17 +4,25 @@ from math import pi
 
 import numpy as np
 
-from stiffopt.errors import InputError, shown
+from stiffopt.errors import InputError, StoppedError, shown
 from stiffopt.model.arguments import checked_integer
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.stopping import Cancel, checkpoint, giving_up
 from stiffopt.optimise.settings import ANSWER
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
+from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 
 
 def pareto_front(
-    robot: Manipulator, task: Task, n: int, *, seed: int = 0
+    robot: Manipulator,
+    task: Task,
+    n: int,
+    *,
+    seed: int = 0,
+    timeout: float | None = None,
+    cancel: Cancel | None = None,
 ) -> list[PressureSolution]:
     """Stiffest solutions at `n` growing tolerances, from the task's own to a quarter of the arm.
 
@@ -26,6 +34,8 @@ def pareto_front(
     ------
     InputError
         If the task maximises no stiffness, or `n` is less than 2.
+    OutOfTimeError, CancelledError
+        If it was given up, see `PressureSolver.solve`; `found` of the error is the front so far.
     """
     if not isinstance(task, Task):
         raise InputError(f"task must be a Task, see load_task; got {shown(task)}")
@@ -40,19 +50,29 @@ def pareto_front(
     own: float = getattr(task.target.tolerance, which)
     largest = ANSWER.largest_tolerance * robot.length if which == "position" else pi
     front: list[PressureSolution] = []
-    for size in np.geomspace(own, max(own, largest), n):
-        tolerance = task.target.tolerance.model_copy(update={which: float(size)})
-        target = task.target.model_copy(update={"tolerance": tolerance})
-        candidates = [solver.solve(target)]
-        if front:  # what was found for a smaller tolerance is a start for this one
-            candidates.append(solver.solve(target, guess=front[-1].pressures))
-        found = [solution for solution in candidates if solution.found]
-        if not found:
-            continue
-        best = max(found, key=_smallest)
-        if not front or _smallest(best) > _smallest(front[-1]) * (1 + 1e-9):
-            front.append(best)
+    with giving_up(timeout, cancel):
+        for size in np.geomspace(own, max(own, largest), n):
+            tolerance = task.target.tolerance.model_copy(update={which: float(size)})
+            _extend(front, solver, task.target.model_copy(update={"tolerance": tolerance}))
+            try:
+                checkpoint()
+            except StoppedError as error:
+                error.found = front
+                raise
     return front
+
+
+def _extend(front: list[PressureSolution], solver: PressureSolver, target: Target) -> None:
+    """Add the stiffest solution of a target, if it is stiffer than those before."""
+    candidates = [solver.solve(target)]
+    if front:  # what was found for a smaller tolerance is a start for this one
+        candidates.append(solver.solve(target, guess=front[-1].pressures))
+    found = [solution for solution in candidates if solution.found]
+    if not found:
+        return
+    best = max(found, key=_smallest)
+    if not front or _smallest(best) > _smallest(front[-1]) * (1 + 1e-9):
+        front.append(best)
 
 
 def _smallest(solution: PressureSolution) -> float:

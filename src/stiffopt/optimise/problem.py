@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.goal import StiffnessGoal
 from stiffopt.optimise.program import BAR, Constraint, Program, pressure_ranges
-from stiffopt.optimise.settings import DESCENT
+from stiffopt.optimise.settings import CLOSEST, DESCENT
 from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
@@ -221,6 +222,7 @@ class PressureProblem:
 
     def pose(self, x: Vector) -> ProgramPoint:
         """The balls alone at pressures x; cheaper than `point`."""
+        checkpoint()
         if self._is_loaded:
             residual, jacobian = self._pose(x * self.unit, self.parameters)
         else:
@@ -229,6 +231,7 @@ class PressureProblem:
 
     def poses(self, x: Vector) -> tuple[Vector, Vector]:
         """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads."""
+        checkpoint()
         residuals, jacobians = self._functions["pose"].many(
             x * self.unit, self.parameters, threads=1
         )
@@ -236,6 +239,7 @@ class PressureProblem:
 
     def point(self, x: Vector) -> ProgramPoint:
         """Everything at pressures x."""
+        checkpoint()
         if self._is_loaded:
             self._full.restart(self._pose.state)
             outputs = self._full(x * self.unit, self.parameters)
@@ -321,7 +325,7 @@ class PressureProblem:
             return scale / max(math.hypot(*error(point).tolist()), 1e-12)
 
         (unit,) = {term.unit for term in self.program.terms if term.name == name}
-        return Objective(terms, curvature, 1e-10, unit, gain, of_pose=True, held=held)
+        return Objective(terms, curvature, CLOSEST.precision, unit, gain, of_pose=True, held=held)
 
     def best_floors(self) -> Objective:
         """The most by which a floor is missed: what brings all floors as close as they come."""

@@ -159,6 +159,14 @@ class Program:
         return tuple(found)
 
     @property
+    def in_order_of_approach(self) -> tuple[Term, ...]:
+        """The terms, in the order in which what cannot be reached is approached.
+
+        First inequalities, then others, the position last.
+        """
+        return tuple(sorted(self.terms, key=lambda term: (not term.is_inequality, -term.order)))
+
+    @property
     def n_rows(self) -> int:
         """Number of components m of the residual."""
         return sum(term.size for term in self.terms)

@@ -58,6 +58,18 @@ def reach(
     return point
 
 
+def comes(problem: PressureProblem, candidates: list[Vector]) -> bool:
+    """Whether one of some pressures (n,) is brought to the pose."""
+    if not problem.robot.is_loaded:
+        return bool((reach_all(problem, np.array(candidates))[1] <= 1).any())
+    for x in candidates:
+        problem.restart()
+        point = reach(problem, x)
+        if point is not None and point.reached:
+            return True
+    return False
+
+
 def reach_all(
     problem: PressureProblem, x: Vector, most_iterations: int = REACH.iterations_of_many
 ) -> tuple[Vector, Vector]:

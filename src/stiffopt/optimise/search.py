@@ -16,6 +16,7 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import StoppedError
 from stiffopt.optimise.local import LocalResult, descend, violation
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.reach import reach, reach_all
@@ -105,6 +106,18 @@ def search(
     `same` is the difference of values below which optima count as one.
     """
     trail = _Trail(same, tries.agreeing)
+    try:
+        _descend_from(problem, candidates, tries, trail)
+    except StoppedError:
+        if problem.robot.is_loaded or not trail.optima:
+            raise  # to judge what there is takes long as well, or there is nothing
+    return trail.outcome()
+
+
+def _descend_from(
+    problem: PressureProblem, candidates: Iterable[Vector], tries: Effort, trail: "_Trail"
+) -> None:
+    """Descend from candidates, until enough has been seen; the trail keeps what is found."""
     ends: dict[int, LocalResult] = {}
     for tried, point in _places(problem, candidates):
         trail.starts = tried
@@ -114,18 +127,17 @@ def search(
             trail.nearest.append(point)
             continue
         if id(point) not in ends:
-            ends[id(point)] = descend(problem, point, trail.optima, same)
+            ends[id(point)] = descend(problem, point, trail.optima, trail.same)
         trail.add(ends[id(point)])
         if trail.is_complete or trail.descents >= tries.most_descents:
             break
-    return trail.outcome()
 
 
 class _Trail:
     """Results of the descents of a search so far."""
 
     def __init__(self, same: float, agreeing: int) -> None:
-        self._same, self._agreeing = same, agreeing
+        self.same, self._agreeing = same, agreeing
         self.starts = self.descents = self._nothing_new = 0
         self.nearest: list[ProgramPoint] = []
         self.optima: list[LocalResult] = []
@@ -154,7 +166,7 @@ class _Trail:
         return self._nothing_new >= self._agreeing
 
     def _agree(self, a: LocalResult, b: LocalResult) -> bool:
-        return abs(a.value - b.value) < self._same and abs(a.violation - b.violation) < self._same
+        return abs(a.value - b.value) < self.same and abs(a.violation - b.violation) < self.same
 
     def outcome(self) -> Search:
         """All of it, the best first."""

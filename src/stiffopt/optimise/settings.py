@@ -112,12 +112,19 @@ class ClosestSettings:
     Attributes
     ----------
     most_descents, agreeing : as those of `Effort`.
+    compiled_descents, compiled_agreeing : the same in machine code.
+    samples : that descents start from, the nearest to the target; twice as many are any.
     same : difference of two objectives (half a squared error over a scale) that count as one.
+    precision : decrease of an objective that no longer matters.
     """
 
     most_descents: int = 16
     agreeing: int = 4
+    compiled_descents: int = 24
+    compiled_agreeing: int = 8
+    samples: int = 16
     same: float = 1e-7
+    precision: float = 1e-10
 
 
 @dataclass(frozen=True)
@@ -155,6 +162,38 @@ class PriceSettings:
     slack: float = 10.0
     beyond: float = 7e-4
     least: float = 1e-9
+
+
+@dataclass(frozen=True)
+class DerivativeSettings:
+    """Derivatives of an answer (`stiffopt.optimise.derivatives`).
+
+    Attributes
+    ----------
+    step : of a pressure, as a share of its range, in differences of gradients.
+    step_of_parameters : of a target (m, rad) or a direction.
+    least : multiplier below which a constraint does not bind.
+    near, touching : error, as a share less than the tolerance, and distance from a limit at which a
+        constraint is taken to bind at first: the answer is only nearly the optimum.
+    rounds : in which what binds is found out.
+    iterations, longest_step, small_step : of Newton's method to the optimum.
+    tiny : relative violation, or wrong push, that is rounding.
+    weak : multiplier, or relative distance, below which a constraint is about to let go, or bind.
+    largest_condition : of the system, above which an answer is not alone.
+    """
+
+    step: float = 1e-4
+    step_of_parameters: float = 1e-5
+    least: float = 1e-6
+    near: float = 0.1
+    touching: float = 1e-4
+    rounds: int = 6
+    iterations: int = 20
+    longest_step: float = 0.02
+    small_step: float = 1e-9
+    tiny: float = 1e-7
+    weak: float = 1e-6
+    largest_condition: float = 1e11
 
 
 @dataclass(frozen=True)
@@ -214,6 +253,7 @@ SEARCH = SearchSettings()
 CLOSEST = ClosestSettings()
 SAMPLES = SampleSettings()
 PRICES = PriceSettings()
+DERIVATIVES = DerivativeSettings()
 PROGRAM = ProgramSettings()
 ANSWER = AnswerSettings()
 KEPT = KeptSettings()

@@ -4,12 +4,14 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.errors import DerivativeError
 from stiffopt.model.arm import Evaluator
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.functions import functions
@@ -124,7 +126,7 @@ class Explanation(NamedTuple):
     sensitivities: Sensitivities | None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PressureSolution:
     """Answer to a task.  Errors and stiffness are computed from the model at `pressures`.
 
@@ -165,6 +167,8 @@ class PressureSolution:
     errors : dict of str to float
         By name of each term of the target: the length of its residual or, of an inequality, the
         margin by which it holds, in the term's unit.
+    robot : Manipulator or None
+        The arm, which carries the task's load.
     """
 
     status: Status
@@ -186,6 +190,7 @@ class PressureSolution:
     counts: dict[str, int] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
+    robot: Manipulator | None = None
 
     def __post_init__(self) -> None:
         _protect(self, "pressures", "tip_pose", "compliance")
@@ -204,7 +209,8 @@ class PressureSolution:
             with _explaining:  # several threads may ask at once
                 own = self.__dict__
                 if name not in own and "_explain" in own:
-                    own.update(own["_explain"]()._asdict())
+                    explained = own["_explain"]()._asdict()
+                    own.update({key: explained[key] for key in explained if key not in own})
                     del own["_explain"]
                 if name in own:
                     return own[name]
@@ -212,8 +218,78 @@ class PressureSolution:
 
     def __getstate__(self) -> dict[str, Any]:
         """Support pickling and copying: explain now."""
-        _ = self.message
-        return dict(self.__dict__)
+        _ = self.sensitivities
+        return {key: value for key, value in self.__dict__.items() if key != "_derivatives"}
+
+    def __repr__(self) -> str:
+        if self.pressures is None or self.tip_position is None:
+            return f"PressureSolution({self.status}: {self.message})"
+        parts = [
+            f"{self.status}: ({', '.join(f'{p / 1e5:.3g}' for p in self.pressures)}) bar",
+            f"tip at ({', '.join(f'{1e3 * x + 0.0:.4g}' for x in self.tip_position)}) mm",
+        ]
+        if self.position_error is not None:
+            parts.append(f"{1e3 * self.position_error:.3g} mm off")
+        if self.stiffness is not None:
+            parts.append(f"{self.stiffness:.4g} {(self.stiffness_unit or '').replace('*', ' ')}")
+        return f"PressureSolution({', '.join(parts)})"
+
+    def gradient(
+        self,
+        of: Literal["stiffness", "pressures"],
+        by: Literal["target", "direction", "limits"],
+    ) -> Vector:
+        """Derivative of the optimum at this answer by what was asked for.
+
+        Parameters
+        ----------
+        of : {"stiffness", "pressures"}
+            The stiffness that is maximised (of several the smallest), in N/m or N m/rad, or the
+            pressures (n,) in Pa.
+        by : {"target", "direction", "limits"}
+            What is moved, the rest held:
+
+            - the target, in base axes: (3,), per m; with a pointing or an orientation (6,), the
+              last three per rad of turning it about the axes;
+            - the direction that is maximised (3,), along which its length does not change; of m
+              directions (m, 3);
+            - the limits of pressure (2, n), lower and upper, per Pa: zero by those that are off.
+
+        Returns
+        -------
+        ndarray
+            Of the shape of `by`, for pressures with a leading axis n.
+
+        Raises
+        ------
+        DerivativeError
+            If other pressures next to the answer are as good, or it is no optimum.
+        InputError
+            If the task maximises nothing along a direction, where that is needed.
+
+        Notes
+        -----
+        Where `weakly_active` names a constraint, the derivative holds on one side only.
+        """
+        gradient: Vector = self._derivatives.gradient(of, by)
+        return gradient
+
+    @property
+    def weakly_active(self) -> tuple[str, ...]:
+        """Constraints just about to bind or to let go: `gradient` then holds on one side only.
+
+        That is where the same constraints go on to bind.
+        """
+        weak: tuple[str, ...] = self._derivatives.weak
+        return weak
+
+    @cached_property
+    def _derivatives(self) -> Any:
+        from stiffopt.optimise.derivatives import AnswerDerivatives  # which needs this module
+
+        if self.robot is None or self.pressures is None or not self.found:
+            raise DerivativeError("only a solution that was found has derivatives")
+        return AnswerDerivatives(self.robot, self.task, self.pressures)
 
     @property
     def found(self) -> bool:

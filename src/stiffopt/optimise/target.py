@@ -73,6 +73,12 @@ class Target(_Keys):
             }
         )
 
+    def __repr__(self) -> str:
+        parts = [f"{term.key} {term.asked()}" for term in self.terms]
+        return f"Target({', '.join(parts)})"
+
+    __str__ = __repr__
+
     @model_validator(mode="after")
     def _check(self) -> Target:
         known: dict[str, str] = {}

@@ -3,7 +3,6 @@
 Everything is in SI: m, rad, Pa, N, N m. Built in code::
 
     Task(
-        robot="stiff-flop-2",
         target=Target(position=(0, 0, 0.18)),
         stiffness=StiffnessGoal(maximise=StiffnessMeasure(direction=(1, 0, 0))),
     )
@@ -64,12 +63,20 @@ class PressureRange(Schema):
     max: PerChannelLimit | None = None
 
 
+def _robot_name(value: Any, info: ValidationInfo) -> Any:
+    """Let a path stand for its text; refuse a file that names no robot."""
+    if value is None and read_from_file(info):
+        raise PydanticKnownError("missing")
+    return os.fspath(value) if isinstance(value, Path) else value
+
+
 class Task(Schema):
     """Where an arm's tip should be, and how stiff.
 
     Attributes
     ----------
-    robot : name of a built-in robot, or path of a robot file relative to the task file.
+    robot : name of a built-in robot, or path of a robot file relative to the task file.  In code it
+        may be left out: the robot is the one that the task is given to a solver with.
     target : tip pose.
     stiffness : stiffness goal, or None: the pose with the least pressure.
     load : load at the tip, or None.
@@ -78,10 +85,10 @@ class Task(Schema):
     """
 
     robot: Annotated[
-        str,
-        BeforeValidator(lambda value: os.fspath(value) if isinstance(value, Path) else value),
-        Field(min_length=1),
-    ]
+        Annotated[str, Field(min_length=1)] | None,
+        BeforeValidator(_robot_name),
+        Field(validate_default=True),
+    ] = None
     target: Target
     stiffness: StiffnessGoal | None = None
     load: Load | None = None
@@ -94,6 +101,19 @@ class Task(Schema):
         if read_from_file(info):
             raise PydanticKnownError("extra_forbidden")
         return value
+
+    def __repr__(self) -> str:
+        parts = [] if self.robot is None else [self.robot]
+        parts.append(repr(self.target))
+        if self.stiffness is not None:
+            parts.append(repr(self.stiffness))
+        if self.load is not None:
+            parts.append("with a load")
+        if self.pressure != PressureRange():
+            parts.append("with pressure limits")
+        return f"Task({', '.join(parts)})"
+
+    __str__ = __repr__
 
     @property
     def measures(self) -> tuple[StiffnessMeasure, ...]:
@@ -110,8 +130,10 @@ class Task(Schema):
         Raises
         ------
         InputError
-            There is no such robot, or its file is wrong.
+            There is no such robot, or its file is wrong; or the task names none.
         """
+        if self.robot is None:
+            raise InputError("Task.robot: the task names no robot; name one, or load it yourself")
         here = self.source
         try:
             return load_description(self.robot, base=None if here is None else here.parent)

@@ -14,6 +14,7 @@ import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
+from copy import copy
 from functools import cache
 from typing import Annotated, Any, ClassVar, NamedTuple
 
@@ -142,6 +143,12 @@ class Term(ABC):
         return (self.key, self.variant, self.is_inequality, self.radius * self.is_inequality,
                 _version(type(self)))  # fmt: skip
 
+    def like(self, value: Any) -> "Term":
+        """The same term with another value."""
+        other = copy(self)
+        other.value = value
+        return other
+
     # -- how searches and controllers see it --------------------------------------------------
 
     def nearness(self, length: float) -> Nearness:
@@ -172,10 +179,20 @@ class Term(ABC):
         unit, factor, _ = _SHOWN.get(self.unit, (self.unit, 1.0, 4))
         return value * factor, unit
 
+    def asked(self) -> str:
+        """What is asked for, as people read it: ``(-30, free, 190) mm within 0.1 mm``."""
+        return f"{numbers_shown(self.value)} within {self.words(self.radius)}"
+
     def words(self, value: float) -> str:
         """An error or margin as people read it: ``0.35 mm``."""
         unit, factor, digits = _SHOWN.get(self.unit, (self.unit, 1.0, 4))
         return f"{value * factor:.{digits}g} {unit}"
+
+
+def numbers_shown(values: Any) -> str:
+    """Some numbers as people read them: ``(-30, free, 190)``; None is free."""
+    shown = ("free" if value is None else f"{round(value, 3) + 0.0:g}" for value in values)
+    return f"({', '.join(shown)})"
 
 
 @cache

@@ -87,7 +87,7 @@ def plot_solution(
     if front is not None:
         _draw_pareto(figure.add_subplot(grid[1, 2]), front, plain)
     source = solution.task.source
-    name = solution.task.robot if source is None else source.stem
+    name = robot.description.name if source is None else source.stem
     message = shorten(printable(solution.message), _LONGEST_NOTE, placeholder=" ...")
     style.draw_head(figure, title or name, _key_numbers(solution, plain), message)
     figure.text(

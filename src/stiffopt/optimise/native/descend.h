@@ -79,10 +79,12 @@ static int solve_qp(Program *P, int size, int constraints, double *H, double *g,
 /* One step of the method: d (n), the promised decrease of the merit, and new multipliers.
  *
  * The variables are the step d, the largest term t (if there are several) and the floors' slack
- * (if there are any); each ball is a box whose curvature enters the Hessian.
+ * (if there are any); each ball is a box whose curvature enters the Hessian.  What holds the step
+ * back is the box and that curvature, and both are in the new multipliers.  Pressures that are
+ * held stay as they are.
  */
-static int quadratic_step(Program *P, const Point *p, const double *B, double radius,
-                          double price, Multipliers *prices, double *d, double *promised) {
+static int quadratic_step(Program *P, const Point *p, const double *B, const int64_t *held,
+                          double radius, double price, Multipliers *prices, double *d, double *promised) {
     const Setup *s = P->setup;
     int64_t n = s->n, terms = s->terms > 1 ? s->terms : 0, floors = s->floors;
     int64_t size = n + (terms > 0) + (floors > 0), last = size - 1;
@@ -91,12 +93,12 @@ static int quadratic_step(Program *P, const Point *p, const double *B, double ra
     int64_t axis_count = 0;
     for (int64_t ball = 0; ball < s->balls; ball++)
         axis_count += s->ball_rows[ball] * s->ball_rows[ball];
-    double all_axes[axis_count], *axes = all_axes;
+    double all_axes[axis_count], *axes = all_axes, pulls[s->balls];
     memset(H, 0, sizeof H), memset(g, 0, sizeof g), memset(A, 0, sizeof A);
     for (int64_t i = 0; i < n; i++) {
         memcpy(H + i * size, B + i * n, (size_t)n * sizeof(double));
-        low[i] = fmax(P->lower[i] - p->x[i], -radius);
-        high[i] = fmin(P->upper[i] - p->x[i], radius);
+        low[i] = held[i] ? 0 : fmax(P->lower[i] - p->x[i], -radius);
+        high[i] = held[i] ? 0 : fmin(P->upper[i] - p->x[i], radius);
     }
     for (int64_t i = n; i < size; i++) H[i * size + i] = 1e-6;
     double *row = A, *lo = low + size, *hi = high + size;
@@ -124,6 +126,7 @@ static int quadratic_step(Program *P, const Point *p, const double *B, double ra
         int64_t k = s->ball_rows[ball];
         double rho = P->radius[ball] * s->descent.inside;
         double pull = box_axes(P, p, ball, first, prices, p->df + steepest * n, axes);
+        pulls[ball] = pull;
         const double *J = p->J + first * n;
         for (int64_t i = 0; i < n; i++)
             for (int64_t j = 0; j < n; j++)
@@ -157,6 +160,7 @@ static int quadratic_step(Program *P, const Point *p, const double *B, double ra
         for (int64_t b = 0; b < k; b++) {
             double sum = 0;
             for (int64_t a = 0; a < k; a++) sum += axes[a * k + b] * weight[a];
+            sum += pulls[ball] * dot(p->J + (first + b) * n, d, n);
             prices->balls[first + b] = sum / (P->radius[ball] * s->descent.inside);
         }
         weight += k, first += k, axes += k * k;
@@ -174,6 +178,12 @@ static void lagrangian_slope(const Setup *s, const Point *p, const Multipliers *
         for (int64_t k = 0; k < s->floors; k++) slope[i] -= prices->floors[k] * p->dg[k * n + i];
         for (int64_t k = 0; k < s->rows; k++) slope[i] += prices->balls[k] * p->J[k * n + i];
     }
+}
+
+/* Whether a step off a pressure limit that gained nothing met a slope back to it: there is a kink
+ * at the limit, as in the norm law where a segment is unpressurised. */
+static int is_pushed_back(const Program *P, const Point *p, int64_t i, double rise) {
+    return rise > 0 && (p->x[i] <= P->lower[i] || p->x[i] >= P->upper[i]);
 }
 
 /* Powell's damped update, which keeps B positive definite. */
@@ -232,21 +242,38 @@ static const Descent *arrives(const Setup *s, const Point *p, const Known *known
     return NULL;
 }
 
+/* First guess B (n, n) of the second derivative: of a stage that of Gauss and Newton. */
+static void first_curvature(const Program *P, const Point *p, double *B) {
+    const Setup *s = P->setup;
+    int64_t n = s->n;
+    double trace = 0;
+    memset(B, 0, (size_t)(n * n) * sizeof(double));
+    for (int64_t k = 0, row = 0; P->stage && k < s->balls; row += s->ball_rows[k++]) {
+        if (s->stage[k] != P->stage->number) continue;
+        for (int64_t r = row * n; r < (row + s->ball_rows[k]) * n; r += n)
+            for (int64_t i = 0; i < n; i++)
+                for (int64_t j = 0; j < n; j++)
+                    B[i * n + j] += p->J[r + i] * p->J[r + j] / (s->scale[k] * s->scale[k]);
+    }
+    for (int64_t i = 0; i < n; i++) trace += B[i * n + i];
+    for (int64_t i = 0; i < n; i++) B[i * n + i] += P->stage ? 1e-8 * trace : s->descent.curvature;
+}
+
 /* Minimise the objective from a point that reaches the pose and was evaluated in full. */
 static Descent descend(Program *P, Point *p, const Known *known) {
     const Setup *s = P->setup;
     const DescentSettings *set = &s->descent;
-    int64_t n = s->n;
+    int64_t n = s->n, held[n];
     double B[n * n], d[n], before[n], after[n], step[n];
     double ball_prices[s->rows], term_prices[s->terms], floor_prices[s->floors + 1];
     Multipliers prices = {ball_prices, term_prices, floor_prices, 0};
     double radius = set->first_radius, price = 10, promised = 0;
     Descent end = {0, 0, 0, 0};
-    memset(B, 0, sizeof B);
-    for (int64_t i = 0; i < n; i++) B[i * n + i] = set->curvature;
+    first_curvature(P, p, B);
+    memset(held, 0, sizeof held);
     NEW_POINT(trial, s);
-    while (end.iterations++ < set->iterations) {
-        if (!quadratic_step(P, p, B, radius, price, &prices, d, &promised)) break;
+    while (end.iterations++ < set->iterations && !stopped(P)) {
+        if (!quadratic_step(P, p, B, held, radius, price, &prices, d, &promised)) break;
         for (int64_t i = 0; i < s->floors; i++) price = fmax(price, 2 * prices.floors[i]);
         if (promised < s->precision) {
             end.converged = 1;
@@ -262,7 +289,11 @@ static Descent descend(Program *P, Point *p, const Known *known) {
                         price * violation(P, &trial);
         lagrangian_slope(s, p, &prices, before);
         lagrangian_slope(s, &trial, &prices, after);
-        for (int64_t i = 0; i < n; i++) step[i] = trial.x[i] - p->x[i], after[i] -= before[i];
+        for (int64_t i = 0; i < n; i++) {
+            step[i] = trial.x[i] - p->x[i];
+            held[i] = !(gained > 0) && (held[i] || is_pushed_back(P, p, i, step[i] * after[i]));
+            after[i] -= before[i];
+        }
         update_hessian(B, step, after, n);
         double share = gained / promised;
         if (share < 0.25)
@@ -284,6 +315,7 @@ static Descent descend(Program *P, Point *p, const Known *known) {
         }
     }
     snap(P, p);
+    if (P->slope && prices.known) lagrangian_slope(s, p, &prices, P->slope);
     end.value = objective(s, p);
     end.violation = violation(P, p);
     return end;

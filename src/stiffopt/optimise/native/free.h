@@ -13,6 +13,8 @@ static void per_share(const Setup *s, double *J, int64_t rows) {
 /* Residuals at p->x and, if full, terms and floors too; 0 where anything is not finite. */
 static int evaluate(Program *P, Point *p, int full) {
     const Setup *s = P->setup;
+    int staged = full && P->stage;
+    full = full && !staged;
     double pressures[s->n];
     for (int64_t i = 0; i < s->n; i++) pressures[i] = p->x[i] * s->unit[i];
     P->arg[0] = pressures, P->arg[1] = P->parameters;
@@ -32,6 +34,7 @@ static int evaluate(Program *P, Point *p, int full) {
     int64_t size = s->n + s->rows * (1 + s->n);
     if (bad || !all_finite(p->x, full ? value_count(s) : size)) return 0;
     measure_balls(P, p);
+    if (staged) stage_term(P, p);
     return 1;
 }
 

@@ -49,6 +49,8 @@ static int evaluate(Program *P, Point *p, int full) {
     const Rod *rod = s->rod;
     Linear *l = P->linear;
     Work work = work_of(P);
+    int staged = full && P->stage;
+    full = full && !staged;
     int64_t n = s->n, values = s->terms + s->floors;
     double pressures[n], R[9], C[36], by_twist[6 * s->rows];
     for (int64_t i = 0; i < n; i++) pressures[i] = p->x[i] * s->unit[i];
@@ -96,6 +98,7 @@ static int evaluate(Program *P, Point *p, int full) {
     int64_t size = n + s->rows * (1 + n);
     if (!all_finite(p->x, full ? value_count(s) : size)) return 0;
     measure_balls(P, p);
+    if (staged) stage_term(P, p);
     return 1;
 }
 

@@ -11,6 +11,7 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
+#include <time.h>
 
 /* Settings as in settings.py, which explains them. */
 typedef struct {
@@ -28,6 +29,11 @@ typedef struct {
     int64_t screened, agreeing, most_descents;
 } Effort;
 
+typedef struct {
+    int64_t general_descents, general_agreeing, most_descents, agreeing, samples;
+    double same, precision;
+} ClosestSettings;
+
 /* Sizes of a task structure and settings; mirrors `_Setup` in fast.py. */
 typedef struct {
     int64_t n;     /* pressures */
@@ -40,8 +46,10 @@ typedef struct {
     const int64_t *ball_rows, *one_sided; /* (balls) */
     const double *scale;                  /* (balls) of residuals while the target is far */
     const double *unit;                   /* (n) Pa per unit of x */
+    const int64_t *stage;                 /* (balls) of closest.h */
     ReachSettings reach;
     DescentSettings descent;
+    ClosestSettings closest;
     Effort least_effort, most_effort;
     double covered, same_optimum, unlike, price_of_floors, precision;
     const double *sample_x;     /* (samples, n) */
@@ -52,14 +60,30 @@ typedef struct {
     const void *rod;             /* Rod */
 } Setup;
 
+/* When to give up; mirrors `StopFlag` in stopping.py. */
+typedef struct {
+    double seconds;          /* from the start of the call; infinite: no limit */
+    volatile int64_t cancel; /* not 0: at once */
+} Stop;
+
+/* One stage of the search for the closest configuration: the error of its balls is minimised. */
+typedef struct {
+    int64_t number;
+    const double *radius; /* (balls) of the target */
+} Stage;
+
 typedef struct {
     const Setup *setup;
+    const Stop *stop; /* NULL: never */
+    double deadline;
     const double *parameters, *radius, *lower, *upper, *floor, *near;
     const int64_t *turns; /* (near): whether a term's nearness depends on the rotation */
     const double **arg;
     double **res;
     casadi_int *iw;
     double *w;
+    const Stage *stage; /* of the search for the closest configuration, else NULL */
+    double *slope;      /* (n) of the Lagrangian where a descent ended, if wanted, else NULL */
     int64_t poses, points, programs; /* evaluations and quadratic programs so far */
     void *linear; /* Linear: the last equilibrium with its derivatives */
 } Program;
@@ -113,6 +137,16 @@ static void inherit_state(const Setup *s, const Point *from, Point *to) {
 /* Start from the unpressurised arm. */
 static void forget_state(const Setup *s, Point *p) {
     if (s->state) p->state[0] = NAN;
+}
+
+static double now(void) {
+    struct timespec t;
+    clock_gettime(CLOCK_MONOTONIC, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+}
+
+static int stopped(const Program *P) {
+    return P->stop && (P->stop->cancel || now() > P->deadline);
 }
 
 static double dot(const double *a, const double *b, int64_t n) {
@@ -186,6 +220,22 @@ static const double *lacking(const Program *P, const Point *p, double *lacks, do
         if (p->r[i] <= inside) memset(J + i * s->n, 0, (size_t)s->n * sizeof(double));
     }
     return found;
+}
+
+/* Instead of the task's own terms, that of a stage: half the squared error, over its scale. */
+static void stage_term(const Program *P, Point *p) {
+    const Setup *s = P->setup;
+    int64_t n = s->n;
+    memset(p->f, 0, (size_t)(1 + n) * sizeof(double));
+    for (int64_t k = 0, row = 0; k < s->balls; row += s->ball_rows[k++]) {
+        if (s->stage[k] != P->stage->number) continue;
+        for (int64_t i = row; i < row + s->ball_rows[k]; i++) {
+            double e = p->r[i] / s->scale[k];
+            if (s->one_sided[k]) e = fmax(0, (p->r[i] - P->stage->radius[k]) / s->scale[k]);
+            p->f[0] += 0.5 * e * e;
+            for (int64_t j = 0; j < n; j++) p->df[j] += e * p->J[i * n + j] / s->scale[k];
+        }
+    }
 }
 
 /* Largest term, and the sum by which floors are missed. */

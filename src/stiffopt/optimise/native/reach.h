@@ -69,6 +69,7 @@ static int reach(Program *P, Point *p, int64_t most) {
     const double *J = lacking(P, p, lacks, memory);
     double before = misfit(s, lacks, weight);
     for (int64_t iteration = 0; iteration < most && !p->reached; iteration++) {
+        if (stopped(P)) return 0;
         double wanted[s->rows], low[s->n], high[s->n], d[s->n];
         for (int64_t i = 0; i < s->rows; i++) wanted[i] = -lacks[i];
         for (int64_t i = 0; i < s->n; i++) {

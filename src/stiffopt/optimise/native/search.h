@@ -92,6 +92,15 @@ static int64_t nearest_samples(Program *P, Ranked *nearest, Effort *effort) {
     return count;
 }
 
+/* Pressures, and the equilibrium, of a sample. */
+static void start_from_sample(const Program *P, int64_t index, Point *p) {
+    const Setup *s = P->setup;
+    const double *x = s->sample_x + index * s->n;
+    for (int64_t k = 0; k < s->n; k++) p->x[k] = clip(x[k], P->lower[k], P->upper[k]);
+    if (s->state)
+        memcpy(p->state, s->sample_states + index * s->state, (size_t)s->state * sizeof(double));
+}
+
 static int same(const Setup *s, const Descent *a, const Descent *b) {
     return fabs(a->value - b->value) < s->same_optimum && fabs(a->violation - b->violation) < s->same_optimum;
 }
@@ -99,6 +108,19 @@ static int same(const Setup *s, const Descent *a, const Descent *b) {
 static int better(const Setup *s, const Descent *a, const Descent *b) {
     if (fabs(a->violation - b->violation) > 0.5 * s->descent.floor_margin) return a->violation < b->violation;
     return a->value < b->value;
+}
+
+/* Whether one of the samples nearest to the target, at most so many, comes to it: to p. */
+static int can_come(Program *P, Point *p, int64_t most) {
+    const Setup *s = P->setup;
+    Effort effort;
+    Ranked nearest[2 * s->most_effort.screened];
+    int64_t count = nearest_samples(P, nearest, &effort);
+    for (int64_t i = 0; i < count && i < most; i++) {
+        start_from_sample(P, nearest[i].index, p);
+        if (reach(P, p, s->reach.iterations_of_many)) return 1;
+    }
+    return 0;
 }
 
 /* Best local optimum; 0 where no sample came to the pose or no descent converged. */
@@ -111,13 +133,9 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
     Ranked screened[effort.screened];
     double memory[effort.screened * size];
     memset(found, 0, sizeof *found);
-    for (int64_t i = 0; i < count && ranked < effort.screened; i++) {
+    for (int64_t i = 0; i < count && ranked < effort.screened && !stopped(P); i++) {
         Point p = point_in(s, memory + ranked * size);
-        memcpy(p.x, s->sample_x + nearest[i].index * s->n, (size_t)s->n * sizeof(double));
-        for (int64_t k = 0; k < s->n; k++) p.x[k] = clip(p.x[k], P->lower[k], P->upper[k]);
-        if (s->state)
-            memcpy(p.state, s->sample_states + nearest[i].index * s->state,
-                   (size_t)s->state * sizeof(double));
+        start_from_sample(P, nearest[i].index, &p);
         found->tried++;
         if (!reach(P, &p, s->reach.iterations_of_many) || !evaluate(P, &p, 1)) continue;
         screened[ranked] = (Ranked){objective(s, &p) + s->price_of_floors * violation(P, &p), ranked};
@@ -151,13 +169,14 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
     Known known = {0, optima, optimal_x};
     int64_t nothing_new = 0;
     NEW_POINT(p, s);
-    for (int64_t i = 0; i < given && i < effort.most_descents; i++) {
+    for (int64_t i = 0; i < given && i < effort.most_descents && !(i && stopped(P)); i++) {
         Point from = point_in(s, memory + screened[order[i]].index * size);
         copy_point(s, &from, &p);
         measure_balls(P, &p);
         Descent now = descend(P, &p, &known);
         found->iterations += now.iterations;
-        if (!now.converged || !isfinite(now.value)) continue;
+        /* a descent that is stopped is at the pose: better than nothing */
+        if (!(now.converged || stopped(P)) || !isfinite(now.value)) continue;
         int is_new = 1;
         for (int64_t k = 0; k < found->descents && is_new; k++) is_new = !same(s, &now, ends + k);
         if (is_new) {

@@ -1,17 +1,33 @@
 /* Tasks of one structure on one arm, solved row by row.
  *
  * A task is a row of numbers: parameters of its functions, radii of the balls, lower and upper
- * pressure limits (Pa), floors, the `Nearness` of each term, a flag and a guess (Pa).
+ * pressure limits (Pa), floors, the `Nearness` of each term, what is asked for and a guess (Pa).
  * An answer is a row of numbers too, see `solve_row`.
  */
 #include "functions.h"
 
-#include "search.h"
+#include "closest.h"
 
-enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL };
+/* What is asked for, and what came of it; as fast.py has them. */
+enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, COME, CLOSEST };
+enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL, JUDGED, CAME, NEAREST, NOT_FINITE };
+
+/* From a guess (n) in Pa; whether the descent from there ended at an optimum, or was stopped. */
+static int from_guess(Program *P, const double *guess, Point *p, Descent *end, Found *found) {
+    const Setup *s = P->setup;
+    for (int64_t i = 0; i < s->n; i++)
+        p->x[i] = clip(guess[i] / s->unit[i], P->lower[i], P->upper[i]);
+    forget_state(s, p);
+    if (!reach(P, p, s->reach.iterations) || !evaluate(P, p, 1)) return 0;
+    *end = descend(P, p, NULL);
+    *found = (Found){1, 1, 1, 1, 1, 0, end->iterations};
+    return (end->converged || stopped(P)) && end->violation < 0.5 * s->descent.floor_margin;
+}
 
 /* Row of an answer: outcome, value, violation, converged, the seven numbers of Found, three
- * counts of evaluations, pressures (n) in Pa, then what judge_at writes.
+ * counts of evaluations, pressures (n) in Pa, slope (n) per unit of x of the error of the closest
+ * configuration, then what judge_at writes: not of a guess alone, which is judged when it is
+ * looked at.
  */
 static void solve_row(Program *P, const double *task, double *answer) {
     const Setup *s = P->setup;
@@ -23,23 +39,26 @@ static void solve_row(Program *P, const double *task, double *answer) {
     P->lower = lower, P->upper = upper, task += 2 * s->n;
     P->floor = task, task += s->floors;
     P->near = task, task += 18 * s->near;
-    int guessed = *task++ != 0;
+    int64_t asked = (int64_t)*task++, outcome = NEEDS_GENERAL_METHOD;
     P->poses = P->points = P->programs = 0;
 
     NEW_POINT(p, s);
     Descent end = {0, 0, 0, 0};
     Found found = {0, 0, 0, 0, 0, 0, 0};
-    int64_t outcome = NEEDS_GENERAL_METHOD;
-    if (guessed) {
-        for (int64_t i = 0; i < s->n; i++) p.x[i] = clip(task[i] / s->unit[i], lower[i], upper[i]);
-        forget_state(s, &p);
-        if (reach(P, &p, s->reach.iterations) && evaluate(P, &p, 1)) {
-            end = descend(P, &p, NULL);
-            found = (Found){1, 1, 1, 1, 1, 0, end.iterations};
-            if (end.converged && end.violation < 0.5 * s->descent.floor_margin) outcome = LOCAL;
-        }
-    }
-    if (outcome != LOCAL && search(P, &p, &end, &found) && end.violation < 0.5 * s->descent.floor_margin)
+    double slope[s->n];
+    memset(slope, 0, sizeof slope);
+    if (!all_finite(P->parameters, s->parameters) || !all_finite(task, s->n))
+        outcome = NOT_FINITE;
+    else if (asked == JUDGE)
+        outcome = JUDGED;
+    else if (asked == COME)
+        outcome = can_come(P, &p, s->least_effort.screened) ? CAME : NEEDS_GENERAL_METHOD;
+    else if (asked == CLOSEST)
+        outcome = closest(P, p.x, slope, &found) ? NEAREST : NEEDS_GENERAL_METHOD;
+    else if (asked != SEARCH && from_guess(P, task, &p, &end, &found))
+        outcome = LOCAL;
+    else if (asked != GUESS_ALONE && search(P, &p, &end, &found) &&
+             end.violation < 0.5 * s->descent.floor_margin)
         outcome = GLOBAL;
     double *out = answer;
     *out++ = (double)outcome, *out++ = end.value, *out++ = end.violation, *out++ = end.converged;
@@ -49,9 +68,11 @@ static void solve_row(Program *P, const double *task, double *answer) {
     *out++ = (double)P->poses, *out++ = (double)P->points, *out++ = (double)P->programs;
     double *pressures = out;
     for (int64_t i = 0; i < s->n; i++)
-        *out++ = clip(p.x[i] * s->unit[i], least[i], most[i]);
-    if (outcome != NEEDS_GENERAL_METHOD && !judge_at(P, pressures, out))
-        answer[0] = NEEDS_GENERAL_METHOD;
+        *out++ = outcome == JUDGED ? task[i] : clip(p.x[i] * s->unit[i], least[i], most[i]);
+    memcpy(out, slope, sizeof slope), out += s->n;
+    int judged = outcome == GLOBAL || outcome == NEAREST || outcome == JUDGED ||
+                 (outcome == LOCAL && asked != GUESS_ALONE);
+    if (judged && !judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
 }
 
 /* For the caller to check that it has the same idea of a Setup. */
@@ -59,11 +80,12 @@ int64_t stiffopt_setup_size(void) { return sizeof(Setup); }
 
 /* Solve tasks begin to end - 1 of rows of the given widths; not 0 if memory is short. */
 int stiffopt_solve(const Setup *setup, const double *tasks, int64_t task_width, double *answers,
-                   int64_t answer_width, int64_t begin, int64_t end) {
+                   int64_t answer_width, int64_t begin, int64_t end, const Stop *stop) {
     const double *arg[WORK_ARG];
     double *res[WORK_RES], w[WORK_W + 1];
     casadi_int iw[WORK_IW + 1];
     Program program = {.setup = setup, .arg = arg, .res = res, .iw = iw, .w = w};
+    program.stop = stop, program.deadline = stop ? now() + stop->seconds : 0;
     if (!add_memory(&program)) return 1;
     for (int64_t i = begin; i < end; i++)
         solve_row(&program, tasks + i * task_width, answers + i * answer_width);

@@ -5,7 +5,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, PlainSerializer
 
-from stiffopt.optimise.term import Nearness, Term, Tolerance
+from stiffopt.optimise.term import Nearness, Term, Tolerance, numbers_shown
 from stiffopt.optimise.term import Vector as Numbers
 from stiffopt.schema import Vector
 from stiffopt.units import Length, format_quantity, within
@@ -70,6 +70,11 @@ class PositionTerm(Term):
             root=1.0,
             limit=self.radius / length,
         )
+
+    def asked(self) -> str:
+        """See `Term.asked`."""
+        value = [None if x is None else 1e3 * x for x in self.value]
+        return f"{numbers_shown(value)} mm within {self.words(self.radius)}"
 
     @classmethod
     def moved_back(cls, value: Any, offset: Numbers) -> Any:

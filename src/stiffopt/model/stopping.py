@@ -1,0 +1,146 @@
+"""Giving up on what takes long: after a time, or when somebody says so.
+
+`giving_up` sets it for all that is called in its context; `checkpoint` is where Python code gives
+up, and `stop_flag` tells machine code, which looks at it between two evaluations of the model.
+"""
+
+import ctypes
+import math
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from time import monotonic
+from typing import Protocol
+
+from stiffopt.errors import CancelledError, InputError, OutOfTimeError, shown
+
+_LOOK_AGAIN = 0.01  # s between two questions whether to go on
+
+
+class Settable(Protocol):
+    """What a `threading.Event` and that of a process have in common."""
+
+    def is_set(self) -> bool:
+        """Whether somebody has set it."""
+
+
+Cancel = Callable[[], object] | Settable
+"""An event, or what is called and says true: that the answer is no longer wanted."""
+
+
+class StopFlag(ctypes.Structure):
+    """`Stop` of optimise/native/program.h."""
+
+    _fields_ = (("seconds", ctypes.c_double), ("cancel", ctypes.c_int64))
+
+
+@dataclass(frozen=True)
+class _Limits:
+    timeout: float
+    deadline: float
+    questions: tuple[Callable[[], object], ...]
+
+    @property
+    def is_cancelled(self) -> bool:
+        return any(question() for question in self.questions)
+
+    def check(self) -> None:
+        if self.is_cancelled:
+            raise CancelledError("cancelled before there was an answer")
+        if monotonic() > self.deadline:
+            raise OutOfTimeError(f"no answer within the {self.timeout:g} s that it was given")
+
+
+_limits: ContextVar[_Limits | None] = ContextVar("limits", default=None)
+
+
+@contextmanager
+def giving_up(timeout: float | None = None, cancel: Cancel | None = None) -> Iterator[None]:
+    """Within this context, give up after a time (s) or as soon as `cancel` says so.
+
+    An outer context of this kind goes on to hold.
+
+    Raises
+    ------
+    InputError
+        If the timeout is no positive number, or `cancel` neither an event nor callable.
+    """
+    if timeout is None and cancel is None:
+        yield
+        return
+    outer = _limits.get()
+    seconds = deadline = math.inf
+    questions: tuple[Callable[[], object], ...] = ()
+    if outer is not None:
+        seconds, deadline, questions = outer.timeout, outer.deadline, outer.questions
+    if timeout is not None:
+        own = _checked_timeout(timeout)
+        if monotonic() + own < deadline:
+            seconds, deadline = own, monotonic() + own
+    if cancel is not None:
+        questions = (*questions, _question(cancel))
+    token = _limits.set(_Limits(seconds, deadline, questions))
+    try:
+        yield
+    finally:
+        _limits.reset(token)
+
+
+def checkpoint() -> None:
+    """Give up here if it is time to.
+
+    Raises
+    ------
+    OutOfTimeError, CancelledError
+    """
+    limits = _limits.get()
+    if limits is not None:
+        limits.check()
+
+
+@contextmanager
+def stop_flag() -> Iterator[int]:
+    """Address of the `StopFlag` for a call of machine code; 0 where nothing limits it.
+
+    While the context lasts, another thread asks whether to go on, if there is anybody to ask.
+    """
+    limits = _limits.get()
+    if limits is None:
+        yield 0
+        return
+    flag = StopFlag(limits.deadline - monotonic(), 0)
+    if not limits.questions:
+        yield ctypes.addressof(flag)
+        return
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not flag.cancel:
+            flag.cancel = int(limits.is_cancelled)
+            if ended.wait(_LOOK_AGAIN):
+                return
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield ctypes.addressof(flag)
+    finally:
+        ended.set()
+        watcher.join()
+
+
+def _checked_timeout(timeout: float) -> float:
+    if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not timeout > 0:
+        raise InputError(f"timeout must be a positive number of seconds; got {shown(timeout)}")
+    return float(timeout)
+
+
+def _question(cancel: Cancel) -> Callable[[], object]:
+    asked = getattr(cancel, "is_set", cancel)
+    if not callable(asked):
+        raise InputError(
+            f"cancel must be an event or a function without arguments; got {shown(cancel)}"
+        )
+    return asked

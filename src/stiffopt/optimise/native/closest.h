@@ -1,0 +1,109 @@
+/* As near to the target as the arm comes: the method of diagnosis.py.
+ *
+ * Terms of the target are approached one stage after the other, each within the tolerances of the
+ * stages before or, where these cannot be had, at their least errors.
+ */
+#ifndef STIFFOPT_CLOSEST_H
+#define STIFFOPT_CLOSEST_H
+
+#include "search.h"
+
+#define FREE 1e6 /* radius of a term whose stage has not come yet */
+
+/* A start of a stage, to p: the best of the stage before, then in turn the nearest samples and any;
+ * 0 where there are no more. */
+static int closest_start(Program *P, int64_t number, const double *last, const Ranked *nearest,
+                         int64_t count, Point *p) {
+    const Setup *s = P->setup;
+    if (last && number-- == 0) {
+        memcpy(p->x, last, (size_t)s->n * sizeof(double));
+        forget_state(s, p);
+        return 1;
+    }
+    if (number / 2 >= s->closest.samples || number / 2 >= count) return 0;
+    start_from_sample(P, number % 2 ? number / 2 : nearest[number / 2].index, p);
+    return 1;
+}
+
+/* Optima x (known->count, n) of a stage, from the start `last` and samples. */
+static void closest_optima(Program *P, const double *last, const Ranked *nearest, int64_t count,
+                           const ClosestSettings *set, Known *known, Found *found) {
+    const Setup *s = P->setup;
+    int64_t nothing_new = 0, descents = 0;
+    NEW_POINT(p, s);
+    for (int64_t i = 0; closest_start(P, i, last, nearest, count, &p); i++) {
+        if (stopped(P) || descents >= set->most_descents || nothing_new >= set->agreeing) break;
+        found->tried++;
+        if (!reach(P, &p, s->reach.iterations) || !evaluate(P, &p, 1)) continue;
+        Descent now = descend(P, &p, known);
+        found->iterations += now.iterations, found->descents++, descents++;
+        if (!isfinite(now.value)) continue;
+        int is_new = 1;
+        for (int64_t k = 0; k < known->count; k++) is_new = is_new && !same(s, &now, known->ends + k);
+        nothing_new = is_new ? 0 : nothing_new + 1;
+        if (!is_new) continue;
+        int64_t k = known->count++; /* kept in order, the best first */
+        for (; k > 0 && known->ends[k - 1].value > now.value; k--) {
+            known->ends[k] = known->ends[k - 1];
+            memcpy(known->x + k * s->n, known->x + (k - 1) * s->n, (size_t)s->n * sizeof(double));
+        }
+        known->ends[k] = now;
+        memcpy(known->x + k * s->n, p.x, (size_t)s->n * sizeof(double));
+    }
+}
+
+/* Whether pressures have the same errors from rest as next to where they were found: p. */
+static int stands(Program *P, const double *x, Point *p) {
+    memcpy(p->x, x, (size_t)P->setup->n * sizeof(double));
+    forget_state(P->setup, p);
+    return evaluate(P, p, 1);
+}
+
+/* Pressures x (n) that come nearest to the target, their slope of the Lagrangian; 0 if none do or
+ * they are not to be trusted, 1 otherwise. */
+static int closest(Program *P, double *x, double *slope, Found *found) {
+    const Setup *s = P->setup;
+    const ClosestSettings *set = &s->closest;
+    Setup own = *s;
+    const double *asked = P->radius;
+    own.terms = 1, own.floors = 0, own.precision = set->precision, own.same_optimum = set->same;
+    int64_t n = own.n, balls = own.balls, stages = 0, good = 0;
+    double radius[balls], optima[set->most_descents * n];
+    Descent ends[set->most_descents];
+    Effort effort;
+    Ranked nearest[2 * own.most_effort.screened];
+    int64_t count = nearest_samples(P, nearest, &effort);
+    memset(found, 0, sizeof *found);
+    for (int64_t k = 0; k < balls; k++) {
+        radius[k] = FREE;
+        stages = own.stage[k] + 1 > stages ? own.stage[k] + 1 : stages;
+    }
+    Stage stage = {0, asked};
+    P->setup = &own, P->radius = radius, P->stage = &stage;
+    NEW_POINT(p, &own);
+    for (; stage.number < stages; stage.number++) {
+        Known known = {0, ends, optima};
+        closest_optima(P, stage.number ? x : NULL, nearest, count, set, &known, found);
+        for (int64_t k = good = 0; !good && k < known.count; k++)
+            good = stands(P, optima + k * n, &p) && p.f[0] < ends[k].value + set->same;
+        if (!good) break;
+        memcpy(x, p.x, (size_t)n * sizeof(double));
+        double least = 0;
+        for (int64_t k = 0; k < balls; k++)
+            if (own.stage[k] == stage.number) least = fmax(least, p.error[k]);
+        for (int64_t k = 0; k < balls && stage.number + 1 < stages; k++)
+            if (own.stage[k] == stage.number) radius[k] = fmax(asked[k], least * (1 + 1e-6) + 1e-7);
+    }
+    if (good) { /* once more from where it ended, for its multipliers */
+        stage.number = stages - 1;
+        P->slope = slope;
+        descend(P, &p, NULL);
+        good = stands(P, p.x, &p);
+        memcpy(x, p.x, (size_t)n * sizeof(double));
+        P->slope = NULL;
+    }
+    P->setup = s, P->radius = asked, P->stage = NULL;
+    return good;
+}
+
+#endif
