@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
 from stiffopt.model.batch import in_parallel
-from stiffopt.model.body_functions import free_moving_functions, loaded_body_functions, strain_rows
+from stiffopt.model.body_functions import free_body_functions, loaded_body_functions, strain_rows
 from stiffopt.model.compiled import Library, checkpoint, library
 from stiffopt.model.compiler import NATIVE
 from stiffopt.model.layout import Layout
@@ -85,7 +85,9 @@ class BodyShape:
         first, second = place[1 : 1 + len(s)], place[1 + len(s) :]
         if isinstance(self._stations, FreeStations):
             self._arm._check_margin(p, "")
-            return self._stations.compliances(p, at, first, second)
+            native = self.machine_code(len(p))
+            function = native.code.function if native else self._stations.interpreted
+            return self._stations.compliances(function, p, at, first, second)
         found = self._evaluate(_RESPONSES, p, at)
         carried = found[:, :-27].reshape(len(p), len(at), 3, 3, 9)
         return response(carried, found[:, -27:].reshape(-1, 9, 3).swapaxes(1, 2), first, second)
@@ -140,7 +142,7 @@ class BodyShape:
 
 def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
     """Machine code of an arm's body; None where there is none."""
-    kind, make, source = "body", free_moving_functions, "clearance.c"
+    kind, make, source = "body", free_body_functions, "clearance.c"
     if arm.is_loaded:
         if rod_functions(arm.layout) is None:
             return None
