@@ -141,7 +141,7 @@ def _functions(segments: int) -> dict[str, ca.Function]:
 def _program(segments: int) -> dict[str, ca.Function]:
     """Functions of the optimiser's nonlinear program for a position and one stiffness."""
     robot, task = tasks.task_of("position", segments, SEED, 0)
-    program = Program.of(task.target, task.stiffness, robot.description)
+    program = Program.of(task, robot.description)
     return {
         f"program's {name}": robot.tip_function(name, getattr(program, name), program.n_parameters)
         for name in ("pose", "point", "judge")

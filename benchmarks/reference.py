@@ -225,7 +225,7 @@ class Reference:
                 balls.append(1 - z[used : used + size] @ z[used : used + size])
                 used += size
             above = values[first_floor:] - floor_values if len(floor_values) else np.zeros(0)
-            return np.concatenate([worst, balls, above])
+            return np.concatenate([worst, balls, above, self._spare_clearance(z[:n])[0]])
 
         def least_slope(z: Vector) -> Vector:
             rows = []
@@ -245,7 +245,9 @@ class Reference:
                 row = np.zeros((len(floor_values), total))
                 row[:, :n] = slopes[first_floor:]
                 rows.append(row)
-            return np.vstack(rows) if rows else np.zeros((0, total))
+            clear = self._spare_clearance(z[:n])[1]
+            rows.append(np.pad(clear, ((0, 0), (0, total - n))))
+            return np.vstack(rows)
 
         start = np.zeros(total)
         start[:n] = x
@@ -276,6 +278,13 @@ class Reference:
     def _stiffnesses(self, x: Vector) -> tuple[Vector, Vector]:
         values = self._values(x)
         return values[3][:, 0], values[4] * BAR
+
+    def _spare_clearance(self, x: Vector) -> tuple[Vector, Vector]:
+        """Distances (k,) from objects beyond the clearance, in mm, and slopes (k, n) per bar."""
+        if self.task.scene is None:
+            return np.zeros(0), np.zeros((0, self.n))
+        found = self.robot.clearances(x * BAR, self.task.scene)
+        return 1e3 * (found.distances - self.task.scene.clearance), 1e3 * BAR * found.gradients
 
     def _cost(
         self, x: Vector, objective: Callable[[Vector], tuple[float, Vector]] | None
@@ -308,6 +317,7 @@ class Reference:
         near = (position is None or position <= tolerance.position * (1 + SLACK)) and (
             angle is None or angle <= tolerance.angle * (1 + SLACK)
         )
+        near = near and bool((self._spare_clearance(x)[0] > -0.01).all())
         goal = self.task.stiffness
         if not near or goal is None or not floors:
             return near

@@ -54,6 +54,7 @@ def json_record(solved: SolvedTask) -> Record:
             f"{term.result_name}_{term.unit}": solution.errors.get(term.name)
             for term in solution.task.target.terms
         },
+        **_clearance(solution),
         "stiffness": solution.stiffness,
         "stiffness_unit": solution.stiffness_unit,
         "stiffnesses": solution.stiffnesses,
@@ -75,6 +76,12 @@ def json_record(solved: SolvedTask) -> Record:
     return record
 
 
+def _clearance(solution: PressureSolution) -> Record:
+    if solution.task.scene is None:
+        return {}
+    return {"clearance_m": solution.clearance, "nearest_object": solution.nearest_object}
+
+
 def _json_sensitivities(solution: PressureSolution) -> Record | None:
     given = solution.sensitivities
     if given is None:
@@ -92,6 +99,7 @@ def _json_sensitivities(solution: PressureSolution) -> Record | None:
                 f"per_{_relaxed(term)}_per_{term.unit}": given.per_tolerance.get(term.name)
                 for term in solution.task.target.terms
             },
+            **({"per_clearance_per_m": given.per_clearance} if given.per_clearance else {}),
             "objective_unit": given.objective_unit,
         }
     return record
@@ -126,6 +134,8 @@ def result_record(solved: SolvedTask) -> Record:
             )
             for term in solution.task.target.terms
         },
+        "clearance": _quantity(solution.clearance, "m", "mm"),
+        "nearest_object": solution.nearest_object,
         "stiffness": _stiffnesses(solved),
         "matrix_distance": solution.matrix_distance,
         "compliance": _compliance(solution),

@@ -16,6 +16,7 @@ from stiffopt.cli.tables import labelled, number_table
 from stiffopt.errors import printable
 from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
 from stiffopt.optimise.measure import Measure
+from stiffopt.optimise.settings import OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import (
@@ -62,6 +63,7 @@ def _lines(solved: SolvedTask) -> Iterable[Line]:
         return
     yield "pressures", _pressures(solved, solution.pressures)
     yield from _tip(solution, solution.tip_pose)
+    yield from _clearance(solution)
     yield from _uncertainty(solved)
     yield from _stiffnesses(solved)
     yield from _worth(solution)
@@ -106,6 +108,22 @@ def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
     yield "tip at", Text(f"({x}, {y}, {z}) mm, pointing {vector_text(pose[:3, 2])}")
     for number, term in enumerate(solution.task.target.terms):
         yield "" if number else "tip error", _error(term, solution.errors[term.name])
+
+
+def _clearance(solution: PressureSolution) -> Iterable[Line]:
+    """How near the body is to the scene."""
+    scene, distance = solution.task.scene, solution.clearance
+    if scene is None or distance is None:
+        return
+    short = distance < scene.clearance - OBSTACLES.allowed
+    yield (
+        "clearance",
+        Text.assemble(
+            (f"{distance * MM:.3f} mm", "bold yellow" if short else "bold"),
+            f" from '{printable(solution.nearest_object or '')}', required: at least "
+            f"{scene.clearance * MM:g} mm",
+        ),
+    )
 
 
 def _error(term: Term, value: float) -> Text:
@@ -225,6 +243,9 @@ def _worth(solution: PressureSolution) -> Iterable[Line]:
         moved = "raised" if name.endswith("max") else "lowered"
         if value:
             offers.append((value / BAR, f"bar by which {name} is {moved}"))
+    for name, price in given.per_clearance.items():
+        if price:
+            offers.append((price * 1e-3, f"mm less clearance of '{printable(name)}'"))
     for number, (value, per) in enumerate(offers):
         text = Text.assemble((f"{value:+.3g} {unit}", "bold"), f" per {per}")
         yield "" if number else "worth", text

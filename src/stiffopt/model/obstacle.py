@@ -115,7 +115,7 @@ class Obstacle(Schema, ABC):
     def distance_of(self, point: Any) -> float:
         """Signed distance of one point (3,), from the formula itself, in m."""
         formula = _function(type(self))
-        return float(np.max(formula(point, np.array(self.pieces).T)))
+        return float(formula(point, np.array(self.pieces).T).full().max())
 
 
 @cache

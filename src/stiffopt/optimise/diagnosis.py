@@ -6,10 +6,12 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.search import search
-from stiffopt.optimise.settings import CLOSEST, Effort
+from stiffopt.optimise.settings import CLOSEST, OBSTACLES, Effort
 from stiffopt.optimise.solution import Judgement, Sensitivities
 from stiffopt.optimise.task import Task
 
@@ -98,6 +100,11 @@ def unreachable_message(judgement: Judgement, task: Task, holding: list[str]) ->
         value = judgement.errors[term.name]
         if not term.holds(value):
             (beyond if term.is_inequality else away).append(term.words(value))
+    beyond += [
+        f"{missing * 1e3:.3g} mm too near '{name}'"
+        for name, missing in judgement.intruders.items()
+        if missing > OBSTACLES.allowed
+    ]
     misses = [*([f"{' and '.join(away)} away"] if away else []), *beyond]
     held = (
         f"held back by {', '.join(holding)}"
@@ -105,6 +112,17 @@ def unreachable_message(judgement: Judgement, task: Task, holding: list[str]) ->
         else "no pressure limit holds it back: the target is beyond the arm itself"
     )
     return f"unreachable: the closest configuration is {' and '.join(misses)}; {held}"
+
+
+def in_the_way(robot: Manipulator, scene: Scene, pressures: Vector) -> str:
+    """Say which objects are nearer than the clearance at pressures (n,), and by how much."""
+    near = robot.clearances(pressures, scene)
+    missing = [
+        f"{(scene.clearance - distance) * 1e3:.3g} mm too near '{name}'"
+        for name, distance in zip(near.names, near.distances.tolist(), strict=True)
+        if distance < scene.clearance - OBSTACLES.allowed
+    ]
+    return f"; without its scene the task is solved, with the body {' and '.join(missing)}"
 
 
 def demands_message(judgement: Judgement) -> str:

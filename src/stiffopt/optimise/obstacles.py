@@ -27,6 +27,9 @@ from stiffopt.optimise.settings import OBSTACLES
 
 Vector = NDArray[np.float64]
 
+CLEARANCE_OF = "clearance of "
+"""Begins the names of constraints of obstacles."""
+
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
 
@@ -142,7 +145,7 @@ class Obstacles:
     @property
     def row_names(self) -> tuple[str, ...]:
         """Names of the constraints, a row each."""
-        return tuple(f"clearance of {self.measured.names[index]}" for index in self.row_objects)
+        return tuple(f"{CLEARANCE_OF}{self.measured.names[index]}" for index in self.row_objects)
 
     def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
         """Rows (k,) and their derivatives (k, n) per Pa, at pressures (n,), without machine code."""
@@ -167,6 +170,15 @@ class Obstacles:
         distances = arm.clearances(p, self.scene).distances[list(self.row_objects)]
         found: list[float] = (OBSTACLES.margin - (distances - self.scene.clearance)).tolist()
         return found
+
+    def touched(self, rows: list[float]) -> list[str]:
+        """Names of objects that rows say the body is next to, but for the clearance."""
+        near = (
+            self.measured.names[index]
+            for index, row in zip(self.row_objects, rows, strict=True)
+            if row > OBSTACLES.margin - OBSTACLES.touching
+        )
+        return list(dict.fromkeys(near))
 
     def intruders(self, rows: list[float]) -> dict[str, float]:
         """Names of objects whose rows say that the body is too near, and by how much, in m."""

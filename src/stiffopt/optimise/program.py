@@ -208,6 +208,10 @@ class Program:
             return {}
         return self.obstacles.intruders(residuals[self.n_own_rows :])
 
+    def touched(self, residuals: list[float]) -> list[str]:
+        """Objects that the body is next to, but for the clearance, from (m,)."""
+        return self.obstacles.touched(residuals[self.n_own_rows :]) if self.obstacles else []
+
     def at(self, target: Target) -> "Program":
         """The same program for another target."""
         return replace(self, terms=target.terms)

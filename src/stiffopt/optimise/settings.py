@@ -139,6 +139,7 @@ class ObstacleSettings:
     spacing : of coarse stations, as a share of the arm's length.
     margin : width of a row's bound in m, the scale on which the method sees it.
     cutoff : distance beyond the clearance, in m, from which an object has no part in a step.
+    touching : how near to the clearance an object counts as one that holds the arm back, in m.
     turns, closer : without machine code, how often it is looked closer, and at how many stations.
     allowed : by how much an answer may be nearer than the clearance, in m: the precision of least
         distances.
@@ -147,6 +148,7 @@ class ObstacleSettings:
     spacing: float = 1 / 8
     margin: float = 1e-3
     cutoff: float = 0.005
+    touching: float = 2e-5
     turns: int = 5
     closer: int = 9
     allowed: float = 1e-5

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.errors import DerivativeError
 from stiffopt.model.arm import Evaluator
+from stiffopt.model.arm_clearance import Clearances
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.functions import functions
+from stiffopt.optimise.obstacles import CLEARANCE_OF
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.settings import ANSWER, OBSTACLES
 from stiffopt.optimise.task import Task
@@ -88,7 +90,7 @@ class Sensitivities:
         per Pa.
     per_tolerance : dict of str to float
         The same for each term of the target by its name, per m or rad of tolerance or, of an
-        inequality, of margin.
+        inequality, of margin; and per m less clearance of each object, see `per_clearance`.
     per_position_tolerance, per_angle_tolerance : float or None
         Those of position and angle; None where not asked for.
     objective_unit : str
@@ -115,6 +117,15 @@ class Sensitivities:
     def per_angle_tolerance(self) -> float | None:
         """Gain per rad of the angle's tolerance."""
         return self.per_tolerance.get("angle")
+
+    @property
+    def per_clearance(self) -> dict[str, float]:
+        """Gain per m less clearance, by the objects of the scene."""
+        return {
+            key.removeprefix(CLEARANCE_OF): price
+            for key, price in self.per_tolerance.items()
+            if key.startswith(CLEARANCE_OF)
+        }
 
 
 class Explanation(NamedTuple):
@@ -289,11 +300,37 @@ class PressureSolution:
 
         if self.robot is None or self.pressures is None or not self.found:
             raise DerivativeError("only a solution that was found has derivatives")
-        return AnswerDerivatives(self.robot, self.task, self.pressures)
+        task, distance = self.task, self.clearance
+        if task.scene is not None and distance is not None:
+            if distance < task.scene.clearance + OBSTACLES.touching:
+                raise DerivativeError(
+                    f"'{self.nearest_object}' holds the answer back; there are derivatives only "
+                    "where no object of the scene does"
+                )
+            task = task.model_copy(update={"scene": None})
+        return AnswerDerivatives(self.robot, task, self.pressures)
+
+    @property
+    def clearance(self) -> float | None:
+        """Least distance between the body and the objects of the task's scene, in m."""
+        near = self._clearances
+        return None if near is None else float(near.distances.min())
+
+    @property
+    def nearest_object(self) -> str | None:
+        """Name of the object of the scene that the body is nearest to."""
+        near = self._clearances
+        return None if near is None else near.nearest
+
+    @cached_property
+    def _clearances(self) -> Clearances | None:
+        if self.robot is None or self.pressures is None or self.task.scene is None:
+            return None
+        return self.robot.clearances(self.pressures, self.task.scene)
 
     @property
     def found(self) -> bool:
-        """Whether every tolerance, limit and demand of the task holds."""
+        """Whether every tolerance, limit, clearance and demand of the task holds."""
         return self.status == "solved"
 
     @property
@@ -322,6 +359,7 @@ class Judgement(NamedTuple):
     limits_hold: bool
     shortfalls: tuple[str, ...]
     intruders: dict[str, float]
+    touched: list[str]
 
     @property
     def holds(self) -> bool:
@@ -368,6 +406,7 @@ class Judgement(NamedTuple):
             limits_hold=within,
             shortfalls=tuple(m.shortfall(value) for m, value in pairs if not m.holds(value)),
             intruders=program.intruders(residuals),
+            touched=program.touched(residuals),
         )
 
 

@@ -366,7 +366,7 @@ class PressureSolver:
         if judgement.pose_holds or not within:
             return None
         active = active_bounds(self.robot, task, p)
-        holding = _pressed(active, -answer.slope)
+        holding = [*map(repr, judgement.touched), *_pressed(active, -answer.slope)]
 
         def explain() -> Explanation:
             problem = PressureProblem(self.robot, task)
@@ -377,7 +377,7 @@ class PressureSolver:
         return PressureSolution.explained_later(
             explain,
             status="unreachable",
-            message=diagnosis.unreachable_message(judgement, task, holding),
+            message=diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task),
             active_bounds=tuple(active),
             **self._quantities(task, judgement),
             pressures=p,
@@ -485,6 +485,10 @@ class PressureSolver:
                 judged.append(self._solution(problem, result, found.confidence))
             except EquilibriumError:
                 continue  # not reached from rest
+        if not judged and problem.task.scene is not None:
+            raise EquilibriumError(
+                "no pressures were found at which the body keeps the clearance of the scene"
+            )
         if not judged:
             raise EquilibriumError("no stable equilibrium was found near the target")
         return min(judged, key=_distance)
@@ -544,12 +548,23 @@ class PressureSolver:
         freedom = diagnosis.freedom(problem, pressures / problem.unit)
         message = ""
         if not judgement.pose_holds:
-            message = diagnosis.unreachable_message(judgement, task, self._holding(result, active))
+            holding = [*map(repr, judgement.touched), *self._holding(result, active)]
+            message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task)
         elif not judgement.holds:
             message = diagnosis.demands_message(judgement)
         elif freedom == 0 and task.stiffness is not None:
             message = diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
         return Explanation(message, tuple(active), freedom, sensitivities)
+
+    def _blocked(self, task: Task) -> str:
+        """What a scene keeps the arm from, if the task is solved without it."""
+        if task.scene is None:
+            return ""
+        plain = task.model_copy(update={"scene": None})
+        found = PressureSolver(self._given, plain, seed=self.seed).solve_at_once()
+        if found is None or not found.found or found.pressures is None:
+            return ""
+        return diagnosis.in_the_way(self.robot, task.scene, found.pressures)
 
     @staticmethod
     def _holding(result: LocalResult, active: dict[str, tuple[int, int]]) -> list[str]:

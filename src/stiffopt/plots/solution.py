@@ -68,7 +68,7 @@ def plot_solution(
     title : str, optional
         By default the name of the task's file.
     scene : Scene, optional
-        What is around the arm.
+        What is around the arm, by default that of the task.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def plot_solution(
         1 if front is None else 2, 3, width_ratios=(0.42, 1.15, 1), left=0.03, right=0.975,
         top=0.825, bottom=0.09, wspace=0.2, hspace=0.42,
     )  # fmt: skip
-    _draw_arm(figure, grid[:, 1], arm, solution, scene)
+    _draw_arm(figure, grid[:, 1], arm, solution, scene or solution.task.scene)
     _draw_pressures(figure.add_subplot(grid[0, 2]), arm, solution)
     if front is not None:
         _draw_pareto(figure.add_subplot(grid[1, 2]), front, plain)
