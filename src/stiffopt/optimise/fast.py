@@ -255,6 +255,23 @@ class FastSolver:
         """Pressures (n,) of the answer in a block, in Pa."""
         return block[self._pressures]
 
+    def point(self, parameters: Vector, radii: Vector, pressures: Vector) -> list[Vector] | None:
+        """Parts of a point of a loaded arm's program, from rest; None for no equilibrium.
+
+        Pressures are (n,) in Pa.  The parts are residuals (m,), their Jacobian (m, n) per share of
+        a range, terms (t,), their gradients (t, n), floors (f,) and theirs (f, n).
+        """
+        s = self._setup
+        values = np.empty(s.n + (s.rows + s.terms + s.floors) * (1 + s.n))
+        arrays = [np.ascontiguousarray(each) for each in (parameters, radii, pressures)]
+        point = self._library.cdll.stiffopt_point
+        point.argtypes = [_pointer] * 5
+        if not point(self._address, *(each.ctypes.data for each in (*arrays, values))):
+            return None
+        counts = [count for k in (s.rows, s.terms, s.floors) for count in (k, k * s.n)]
+        parts = np.split(values[s.n :], np.cumsum(counts)[:-1])
+        return [each.reshape(-1, s.n) if i % 2 else each for i, each in enumerate(parts)]
+
     def _run_one(self, row: Vector, asked: int | None = None) -> Vector:
         numbers = np.empty(self._answer_width)
         if asked is not None:
