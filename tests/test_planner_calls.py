@@ -202,7 +202,7 @@ def test_the_closest_configuration_is_that_of_the_general_method(kind, compiled,
     name = "stiff-flop-2" if kind == "free" else "stiff-flop-1"
     robot = hanging(name) if kind == "hanging" else so.load_robot(name)
     rng = np.random.default_rng(3)
-    for k in range(3):
+    for k in range(3 if kind == "free" else 1):
         way = rng.normal(size=3)
         place = tuple(1.3 * robot.length * way / np.linalg.norm(way))
         target = so.Target(position=place, pointing=(0, 0.3, 1) if k == 2 else None)
