@@ -446,7 +446,7 @@ BAD = {
     "sphere: {c": ("shpere: {c", 7, "objects[2].shpere", "did you mean 'sphere'?"),
     "sphere: {centre": ("sphere: {center", 7, "objects[2].sphere", "mean 'centre'?"),
     "capsule: {from": ("capsule: {form", 4, "objects[0].capsule", "did you mean 'from'?"),
-    "to: [40 mm, 30 mm": ("to: [40 mm, -30 mm", 4, "objects[0].capsule", "begins where it ends"),
+    "to: [40 mm, 30 mm": ("to: [40 mm, -30 mm", 4, "objects[0].capsule.to", "ends where it begins"),
     "[0 mm, 0 mm, 300 mm]]": ("[0 mm, 0 mm, -5 mm]]", 11, "objects[4].inside_tube.points",
                               "point 2 is where point 1 is"),
     ", [0 mm, 0 mm, 300 mm]]": ("]", 11, "objects[4].inside_tube.points", "at least 2 points"),

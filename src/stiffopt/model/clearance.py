@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 CLEARANCE_ERROR = 4e-6  # m, of a least distance at most
 _SHORTEST = 1e-6  # m of arc length, which is not divided again
-_FINE = 5e-4  # m of arc length, on which any object is as a convex one
+_FINE = 3e-4  # m of arc length, on which any object is as a convex one
 _IN_PLANE = 1e-9  # m above a ring's plane that are none
 _SHARPENED = 1e-4  # m of arc length, over which a slope's change is measured
 _STEEPEST = 1.5  # change of an interpolated distance with the way
@@ -195,9 +195,9 @@ class _Search:
         m = _MORE_CURVED * stretch.speed * stretch.turn
         if least >= self._to_beat:
             return least
-        if self.item.along == "concave":
-            return min(a.value, b.value) - m * h * h / 8 if a.piece == b.piece else least
-        if self.item.along == "any" and h > _FINE:
+        if self.item.along == "concave" and a.piece == b.piece:
+            return max(least, min(a.value, b.value) - m * h * h / 8)
+        if self.item.along != "convex" and h > _FINE:
             return least
         down, up = a.slope - m * h / 2, b.slope + m * h / 2
         if down >= 0:

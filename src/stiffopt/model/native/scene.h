@@ -33,7 +33,7 @@ enum { CONVEX, CONCAVE, ANY_COURSE };
 
 #define CLEARANCE_ERROR 4e-6 /* m, of a least distance at most */
 #define SHORTEST 1e-6        /* m of arc length, which is not divided again */
-#define FINE 5e-4            /* m of arc length, on which any object is as a convex one */
+#define FINE 3e-4            /* m of arc length, on which any object is as a convex one */
 #define IN_PLANE 1e-9        /* m above a ring's plane that are none */
 #define SHARPENED 1e-4       /* m of arc length, over which a slope's change is measured */
 #define STEEPEST 1.5         /* change of an interpolated distance with the way */
@@ -208,9 +208,9 @@ static double least_between(const NearestSearch *search, const Probe *a, const P
     double least = (a->value + b->value - steepness(search) * h) / 2;
     double m = MORE_CURVED * range->speed * range->turn;
     if (least >= to_beat(search)) return least;
-    if (course == CONCAVE)
-        return a->piece == b->piece ? fmin(a->value, b->value) - m * h * h / 8 : least;
-    if (course == ANY_COURSE && h > FINE) return least;
+    if (course == CONCAVE && a->piece == b->piece)
+        return fmax(least, fmin(a->value, b->value) - m * h * h / 8);
+    if (course != CONVEX && h > FINE) return least;
     double down = a->slope - m * h / 2, up = b->slope + m * h / 2;
     if (down >= 0) return fmax(least, a->value);
     if (up <= 0) return fmax(least, b->value);
