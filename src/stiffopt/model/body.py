@@ -85,7 +85,9 @@ class BodyShape:
         first, second = place[1 : 1 + len(s)], place[1 + len(s) :]
         if isinstance(self._stations, FreeStations):
             self._arm._check_margin(p, "")
-            return self._stations.compliances(p, at, first, second)
+            native = self.machine_code(len(p))
+            function = native.code.function if native else self._stations.interpreted
+            return self._stations.compliances(function, p, at, first, second)
         found = self._evaluate(_RESPONSES, p, at)
         carried = found[:, :-27].reshape(len(p), len(at), 3, 3, 9)
         return response(carried, found[:, -27:].reshape(-1, 9, 3).swapaxes(1, 2), first, second)
@@ -140,7 +142,7 @@ class BodyShape:
 
 def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
     """Machine code of an arm's body; None where there is none."""
-    kind, make, source = "body", _free_functions, "clearance.c"
+    kind, make, source = "body", free_body_functions, "clearance.c"
     if arm.is_loaded:
         if rod_functions(arm.layout) is None:
             return None
@@ -155,11 +157,6 @@ def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
         return NativeBody(code, arm)
     except EquilibriumError:  # the VM says more
         return None
-
-
-def _free_functions(layout: Layout) -> list[ca.Function]:
-    names = ("frames", "moving_frames", "along", "moving_along")
-    return [each for each in free_body_functions(layout) if each.name() in names]
 
 
 def _loaded_functions(layout: Layout) -> list[ca.Function]:
