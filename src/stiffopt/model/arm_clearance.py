@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -83,11 +83,14 @@ class MeasuredScene:
     def __init__(self, scene: Scene) -> None:
         self.names = tuple(item.name for item in scene.objects)
         self.items = tuple(MeasuredObject(item.shape) for item in scene.objects)
+        self._in_c: tuple[Library, ctypes.Array[SceneObjectInC]] | None = None
 
-    @lru_cache(maxsize=1)  # noqa: B019
     def in_c(self, code: Library) -> ctypes.Array[SceneObjectInC]:
         """What C takes; it refers to memory of these objects."""
-        return (SceneObjectInC * len(self.items))(*(item.in_c(code) for item in self.items))
+        if self._in_c is None or self._in_c[0] is not code:
+            objects = (SceneObjectInC * len(self.items))(*(item.in_c(code) for item in self.items))
+            self._in_c = code, objects
+        return self._in_c[1]
 
 
 @lru_cache(maxsize=64)
@@ -100,14 +103,26 @@ def measured_scene(scene: Scene) -> MeasuredScene:
     return _measured(SceneKey(scene))
 
 
+class Ranges(NamedTuple):
+    """The ranges of an arm's body: ends (k, 2) and numbers of coarse stations (k,)."""
+
+    ends: tuple[tuple[float, float, int], ...]
+    bounds: Array
+    counts: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, ends: tuple[tuple[float, float, int], ...]) -> Ranges:
+        """Beside them as tuples, arrays for C."""
+        bounds = np.array([[start, end] for start, end, _ in ends])
+        return cls(ends, bounds, np.array([count for *_, count in ends], dtype=np.int64))
+
+
 class ArmClearance:
     """Distances of an arm's body from a scene, at pressures (N, n) in Pa that are finite."""
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:
         self._arm, self._scene = arm, _measured(SceneKey(scene))
-        self._ends = arm.kept("ranges", lambda: range_ends(arm.description))
-        self._bounds = np.array([[start, end] for start, end, _ in self._ends])
-        self._counts = np.array([count for _, _, count in self._ends], dtype=np.int64)
+        self._ranges = arm.kept("ranges", lambda: Ranges.of(range_ends(arm.description)))
 
     def least(self, p: Array) -> Array:
         """The least of all distances, (N,)."""
@@ -134,8 +149,8 @@ class ArmClearance:
 
     def _of(self, p: Array) -> list[Nearest]:
         """Nearest points of all objects at pressures (n,)."""
-        line = _CentreLine(self._arm, p, self._bounds)
-        ranges = survey(line, self._ends)
+        line = _CentreLine(self._arm, p, self._ranges.bounds)
+        ranges = survey(line, self._ranges.ends)
         return [nearest_point(line, item, ranges) for item in self._scene.items]
 
     # -- in machine code --------------------------------------------------------------------
@@ -156,7 +171,8 @@ class ArmClearance:
             address = None if gradients is None else gradients.ctypes.data
             call = partial(
                 _clearances(body), body.address, ctypes.addressof(objects), len(objects),
-                self._bounds.ctypes.data, self._counts.ctypes.data, len(self._counts),
+                self._ranges.bounds.ctypes.data, self._ranges.counts.ctypes.data,
+                len(self._ranges.ends),
                 p.ctypes.data, found.ctypes.data, address, outcome.ctypes.data,
             )  # fmt: skip
             _in_chunks(call, len(p))

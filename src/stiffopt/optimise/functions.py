@@ -7,8 +7,8 @@ from pathlib import Path
 
 import casadi as ca
 
-from stiffopt.model.body_functions import free_moving_functions, loaded_body_functions
 from stiffopt.model.batch import BatchFunction, InterpretedFunction
+from stiffopt.model.body_functions import free_moving_functions, loaded_body_functions
 from stiffopt.model.compiled import Library, library
 from stiffopt.model.distances import scene_library
 from stiffopt.model.layout import Layout, free_tip_function

@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.arm_clearance import ArmBody, MeasuredScene, gradients, measured_scene
+from stiffopt.model.arm_clearance import (
+    ArmBody,
+    MeasuredScene,
+    Ranges,
+    gradients,
+    measured_scene,
+)
 from stiffopt.model.body import ModelInC
 from stiffopt.model.clearance import Nearest, nearest_point, range_ends, survey
 from stiffopt.model.description import RobotDescription
@@ -56,7 +62,9 @@ def _quickly_nearest(
         seen = item.distances(positions)
         values = seen.values - radii
         best = int(values.argmin())
-        near = Nearest(float(values[best]), float(s[best]), 1.0, positions[best], seen.normals[best])
+        near = Nearest(
+            float(values[best]), float(s[best]), 1.0, positions[best], seen.normals[best]
+        )
         s = np.linspace(s[max(best - 1, 0)], s[min(best + 1, len(s) - 1)], OBSTACLES.closer)
     return near
 
@@ -70,12 +78,11 @@ class ObstaclesInC:
         Of the `Obstacles`.
     """
 
-    def __init__(
-        self, obstacles: "Obstacles", arm: Manipulator, rod: LoadedArm | None
-    ) -> None:
+    def __init__(self, obstacles: "Obstacles", arm: Manipulator, rod: LoadedArm | None) -> None:
         code = scene_library()
         assert code is not None  # see `Functions.library`
         objects = obstacles.measured.in_c(code)
+
         def make() -> tuple[Any, ...]:
             return _body_in_c(arm, rod, obstacles.range_groups)
 
@@ -100,13 +107,8 @@ class ObstaclesInC:
 
 def _body_in_c(arm: Manipulator, rod: LoadedArm | None, groups: tuple[int, ...]) -> tuple[Any, ...]:
     """The arm's body, and what is known of its ranges: ends of segments, bounds and stations."""
-    ranges = range_ends(arm.description, OBSTACLES.spacing)
-    return (
-        ModelInC(arm, rod),
-        np.array(groups, dtype=np.int64),
-        np.array([[start, end] for start, end, _ in ranges]),
-        np.array([count for _, _, count in ranges], dtype=np.int64),
-    )
+    ranges = Ranges.of(range_ends(arm.description, OBSTACLES.spacing))
+    return ModelInC(arm, rod), np.array(groups, dtype=np.int64), ranges.bounds, ranges.counts
 
 
 @dataclass(frozen=True)

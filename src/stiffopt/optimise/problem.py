@@ -230,7 +230,9 @@ class PressureProblem:
         residual, jacobian = self._with_obstacles(x, residual[:, 0], jacobian.T * self.unit)
         return ProgramPoint(x, residual, jacobian, self.constraints, *_NOTHING)
 
-    def _with_obstacles(self, x: Vector, residual: Vector, jacobian: Vector) -> tuple[Vector, Vector]:
+    def _with_obstacles(
+        self, x: Vector, residual: Vector, jacobian: Vector
+    ) -> tuple[Vector, Vector]:
         """Rows of the terms (m,), (m, n) at pressures x, and those of obstacles after them."""
         if self.program.obstacles is None:
             return residual, jacobian

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.shape import Shape
-from stiffopt.optimise.goal import StiffnessGoal
 from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.obstacles import Obstacles
 from stiffopt.optimise.settings import OBSTACLES, PROGRAM
