@@ -57,7 +57,8 @@ class _Setup(ctypes.Structure):
 
     _fields_ = [
         *((name, _integer) for name in (
-            "n", "rows", "own_rows", "balls", "terms", "floors", "values", "parameters", "near", "samples"
+            "n", "rows", "own_rows", "balls", "terms", "floors", "values", "parameters", "near",
+            "samples",
         )),
         *((name, _pointer) for name in ("ball_rows", "one_sided", "scale", "unit", "stage")),
         ("reach", type(_REACH)),

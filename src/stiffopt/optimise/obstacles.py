@@ -150,7 +150,7 @@ class Obstacles:
         return tuple(f"{CLEARANCE_OF}{self.measured.names[index]}" for index in self.row_objects)
 
     def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
-        """Rows (k,) and their derivatives (k, n) per Pa, at pressures (n,), without machine code."""
+        """Rows (k,) and derivatives (k, n) per Pa at pressures (n,), without machine code."""
         body = ArmBody(arm, p)
         ranges = range_ends(self.description, OBSTACLES.spacing)
         groups = [ranges[begin:end] for begin, end in pairwise((0, *self.range_groups))]

@@ -28,7 +28,7 @@ from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.reach import comes, reach
 from stiffopt.optimise.search import Search, search, starts
-from stiffopt.optimise.settings import ANSWER, CLOSEST, PRICES, Effort
+from stiffopt.optimise.settings import ANSWER, CLOSEST, OBSTACLES, PRICES, Effort
 from stiffopt.optimise.solution import (
     Confidence,
     Explanation,
@@ -438,6 +438,11 @@ class PressureSolver:
             if again.results:
                 return self._first_that_holds(problem, again)
         results = results[:1]
+        scene = problem.task.scene
+        if not results and scene is not None:
+            clearest = table.pressures[: OBSTACLES.clearest]
+            clearest = clearest[np.argmax(self.robot.clearance(clearest, scene))]
+            results = [diagnosis.unimproved(problem, clearest / problem.unit)]
         if self.robot.is_loaded:  # what is found need not be what is reached from rest
             as_they_are = (diagnosis.unimproved(problem, x) for x in candidates[: ANSWER.tried])
             results = [*results[: ANSWER.tried], *as_they_are]
@@ -447,10 +452,6 @@ class PressureSolver:
                 judged.append(self._solution(problem, result, found.confidence))
             except EquilibriumError:
                 continue  # not reached from rest
-        if not judged and problem.task.scene is not None:
-            raise EquilibriumError(
-                "no pressures were found at which the body keeps the clearance of the scene"
-            )
         if not judged:
             raise EquilibriumError("no stable equilibrium was found near the target")
         return min(judged, key=_distance)

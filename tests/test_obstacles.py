@@ -1,0 +1,295 @@
+"""Tasks with a scene: no answer is nearer than it may be, and the stiffest of those is found.
+
+Distances are measured here once more, with formulas in NumPy on 2000 stations of the body.
+"""
+
+from __future__ import annotations
+
+import pickle
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stiffopt import (
+    Manipulator,
+    PressureSolver,
+    Scene,
+    StiffnessGoal,
+    Target,
+    Task,
+    load_robot,
+    load_task,
+    solve_batch,
+    solve_pressure,
+)
+from stiffopt.errors import DerivativeError, FileError, InputError
+from stiffopt.model import compiled as code
+from stiffopt.optimise.problem import PressureProblem
+
+Array = NDArray[np.float64]
+
+PROBLEMS = Path(__file__).parents[1] / "problems"
+CLEARANCE = 2e-3
+EXACT = 5e-5  # m, by which an answer may be nearer than it may be
+AT = (-0.03, 0.01, 0.19)
+
+POST = {"name": "post", "sphere": {"centre": (0.006, -0.012, 0.13), "radius": 0.008}}
+RIB = {
+    "name": "rib",
+    "capsule": {"from": (-0.024, -0.04, 0.11), "to": (-0.024, 0.04, 0.11), "radius": 0.006},
+}
+KINDS: dict[str, dict[str, Any]] = {
+    "sphere": POST["sphere"],
+    "capsule": RIB["capsule"],
+    "box": {"centre": (0.022, 0.0, 0.12), "size": (0.02, 0.03, 0.02)},
+    "cylinder": {"from": (0.018, -0.03, 0.13), "to": (0.018, 0.02, 0.13), "radius": 0.006},
+    "half_space": {"point": (0.0173, 0, 0), "normal": (-1, 0, -0.01)},
+    "inside_tube": {
+        "points": [(0, 0, 0), (0, 0, 0.09), (-0.006, -0.003, 0.14), (-0.03, 0.01, 0.2)],
+        "radius": 0.022,
+    },
+    "trocar": {"centre": (0.0015, 0.0035, 0.1), "axis": (0, 0, 1), "radius": 0.0176},
+}
+
+
+def from_line(x: Array, a: Any, b: Any) -> Array:
+    """Distances (k,) of points from a straight line between two."""
+    a, way = np.array(a), np.subtract(b, a)
+    share = np.clip((x - a) @ way / (way @ way), 0, 1)
+    return np.asarray(np.linalg.norm(x - a - share[:, None] * way, axis=1))
+
+
+def from_box(excess: Array) -> Array:
+    outside = np.linalg.norm(np.maximum(excess, 0), axis=1)
+    return np.asarray(outside + np.minimum(excess.max(axis=1), 0))
+
+
+def distances(kind: str, shape: dict[str, Any], x: Array) -> Array:
+    """Distances (k,) of points (k, 3) of a centre line."""
+    if kind == "sphere":
+        return np.asarray(np.linalg.norm(x - shape["centre"], axis=1) - shape["radius"])
+    if kind == "capsule":
+        return from_line(x, shape["from"], shape["to"]) - shape["radius"]
+    if kind == "box":
+        return from_box(np.abs(x - shape["centre"]) - np.array(shape["size"]) / 2)
+    if kind == "cylinder":
+        middle = np.add(shape["from"], shape["to"]) / 2
+        way = np.subtract(shape["to"], shape["from"])
+        height = (x - middle) @ way / np.linalg.norm(way)
+        beside = np.linalg.norm(np.cross(x - middle, way / np.linalg.norm(way)), axis=1)
+        half = np.linalg.norm(way) / 2
+        return from_box(np.stack([beside - shape["radius"], np.abs(height) - half], 1))
+    if kind == "half_space":
+        normal = np.array(shape["normal"]) / np.linalg.norm(shape["normal"])
+        return np.asarray((x - shape["point"]) @ normal)
+    if kind == "inside_tube":
+        points = shape["points"]
+        pieces = [from_line(x, a, b) for a, b in pairwise(points)]
+        return np.asarray(shape["radius"] - np.min(pieces, axis=0))
+    centre, axis = np.array(shape["centre"]), np.array(shape["axis"])
+    height = (x - centre) @ axis
+    beside = np.linalg.norm(x - centre - height[:, None] * axis, axis=1)
+    crossing = np.flatnonzero(height[:-1] * height[1:] <= 0)
+    assert (beside[crossing] < shape["radius"]).all()
+    assert len(crossing) % 2
+    return np.hypot(beside - shape["radius"], height)
+
+
+def clearance(robot: Manipulator, pressures: Any, scene: Scene) -> float:
+    """The least of all distances of the body, for arms of one outer radius."""
+    x = robot.backbone(pressures, 2000)[:, :3, 3]
+    least = []
+    for item in scene.model_dump(by_alias=True)["objects"]:
+        (kind,) = (key for key in KINDS if item.get(key) is not None)
+        least.append(distances(kind, item[kind], x).min())
+    return float(min(least) - robot.description.segments[0].outer_radius)
+
+
+def scene_of(*objects: dict[str, Any]) -> Scene:
+    return Scene(clearance=CLEARANCE, objects=list(objects))
+
+
+def task_with(scene: Scene | None, position: Any = AT, **options: Any) -> Task:
+    goal = StiffnessGoal(maximise=[{"direction": (1, 0, 0)}])
+    return Task(target=Target(position=position), stiffness=goal, scene=scene, **options)
+
+
+@pytest.fixture(scope="module")
+def two() -> Manipulator:
+    return load_robot("stiff-flop-2")
+
+
+@pytest.fixture(params=["general", "compiled"])
+def way(request: pytest.FixtureRequest) -> str:
+    if request.param == "compiled":
+        request.getfixturevalue("compiled")
+    return str(request.param)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_object_is_kept_clear_of(kind: str, compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    scene = scene_of({"name": "it", kind: KINDS[kind]})
+    free = solve_pressure(robot, task_with(None))
+    assert free.pressures is not None
+    assert robot.clearance(free.pressures, scene) < CLEARANCE - EXACT  # it is in the way
+    found = solve_pressure(robot, task_with(scene))
+    assert found.found, found.message
+    assert clearance(robot, found.pressures, scene) > CLEARANCE - EXACT
+    assert found.clearance == pytest.approx(CLEARANCE, abs=EXACT)
+    assert found.nearest_object == "it"
+    assert found.stiffness is not None
+    assert free.stiffness is not None
+    assert 0 < found.stiffness < free.stiffness
+
+
+def test_both_methods_find_the_same(way: str) -> None:
+    robot = load_robot("stiff-flop-2")
+    scene = scene_of(POST, RIB)
+    found = solve_pressure(robot, task_with(scene))
+    assert found.found
+    assert found.stiffness == pytest.approx(1.39652, rel=1e-4)  # as benchmarks/reference.py finds
+    assert clearance(robot, found.pressures, scene) > CLEARANCE - EXACT
+
+
+def test_no_local_solution_is_stiffer(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    rng = np.random.default_rng(4)
+    for _ in range(6):
+        p = rng.uniform(robot.pressure_min, robot.pressure_max)
+        other = rng.uniform(robot.pressure_min, robot.pressure_max)
+        position = tuple(robot.tip_pose(p)[:3, 3].tolist())
+        obstacle = robot.pose(other, 0.15)[:3, 3] + rng.normal(size=3) * 0.01
+        scene = scene_of({"name": "a", "sphere": {"centre": obstacle, "radius": 0.006}}, RIB)
+        if robot.clearance(p, scene) < CLEARANCE:
+            continue
+        solver = PressureSolver(robot, task_with(scene, position))
+        found = solver.solve()
+        assert found.found
+        assert clearance(robot, found.pressures, scene) > CLEARANCE - EXACT
+        for start in rng.uniform(robot.pressure_min, robot.pressure_max, (15, 6)):
+            local = solver.warm(position, start)
+            if local.found:
+                assert local.solution is not None
+                assert local.solution.stiffness <= found.stiffness * 1.005
+
+
+def test_rows_have_the_derivatives_of_differences(two: Manipulator) -> None:
+    ring = {"name": "ring", "trocar": KINDS["trocar"]}
+    tube = {"name": "tube", "inside_tube": KINDS["inside_tube"]}
+    problem = PressureProblem(two, task_with(scene_of(POST, RIB, tube, ring)))
+    x = np.array([0.35, 0.1, 0.2, 0.7, 0.3, 0.55])
+    own, step = problem.program.n_own_rows, 1e-4
+    slopes = problem.pose(x).jacobian[own:]
+    assert slopes.shape == (3 * 2 + 1, 6)
+    for k in range(6):
+        aside = step * np.eye(6)[k]
+        ahead, behind = (problem.pose(x + sign * aside).residual[own:] for sign in (1, -1))
+        np.testing.assert_allclose(slopes[:, k], (ahead - behind) / (2 * step), atol=2e-5)
+
+
+def test_an_arm_under_a_load(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-1").with_load((0.0, 0.02, 0.0))
+    target = Target(position=(0.012, None, None), tolerance={"position": 2e-3})
+    ball = {"name": "ball", "sphere": {"centre": (0.026, 0.01, 0.075), "radius": 0.006}}
+    scene = scene_of(ball)
+    task = task_with(scene).model_copy(update={"target": target})
+    found = solve_pressure(robot, task)
+    assert found.found, found.message
+    assert clearance(robot, found.pressures, scene) > CLEARANCE - EXACT
+    problem = PressureProblem(robot, task)  # the same in the VM
+    rows = problem.pose(found.pressures / problem.unit).residual[problem.program.n_own_rows :]
+    distance = robot.clearance(found.pressures, scene)
+    assert max(rows) - 1e-3 == pytest.approx(CLEARANCE - distance, abs=1e-5)
+
+
+def test_what_is_in_the_way_is_told(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    wall = {"name": "wall", "half_space": {"point": (-0.03, 0, 0), "normal": (1, 0, 0)}}
+    found = solve_pressure(robot, task_with(scene_of(POST, wall)))
+    assert found.status == "unreachable"
+    assert found.position_error == pytest.approx(0.017, abs=2e-4)
+    assert found.clearance == pytest.approx(CLEARANCE, abs=EXACT)
+    assert "17 mm away; held back by 'wall'" in found.message
+    assert "without its scene the task is solved" in found.message
+    assert "mm too near 'wall'" in found.message
+
+
+def test_a_scene_that_leaves_no_way(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    points = [(0, 0, 0), (0, 0, 0.09), (-0.08, 0, 0.1)]  # round a corner
+    lumen = {"name": "lumen", "inside_tube": {"points": points, "radius": 0.018}}
+    found = solve_pressure(robot, task_with(scene_of(lumen)))
+    assert found.status == "unreachable"
+    assert "too near 'lumen'" in found.message
+    assert found.clearance is not None
+    assert found.clearance < CLEARANCE
+
+
+def test_a_scene_is_data(compiled: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Adding or moving an object makes no code."""
+    robot = load_robot("stiff-flop-2")
+    first = solve_pressure(robot, task_with(scene_of(POST)))
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("something was compiled")
+
+    monkeypatch.setattr(code, "_make", refuse)
+    for x in (0.0, 0.01):
+        moved = {"name": "post", "sphere": {"centre": (x, -0.03, 0.13), "radius": 0.008}}
+        table = {"name": "table", "half_space": {"point": (0, 0, 0.26), "normal": (0, 0, -1)}}
+        found = solve_pressure(load_robot("stiff-flop-2"), task_with(scene_of(moved, RIB, table)))
+        assert found.found
+        assert not np.allclose(found.pressures, first.pressures)
+
+
+def test_calls_of_planners_and_processes(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    scene = scene_of(POST, RIB)
+    solver = PressureSolver(robot, task_with(scene))
+    found = solver.solve()
+    assert solver.reachable()
+    near = solver.warm((-0.0295, 0.01, 0.19), found.pressures)
+    assert near.found
+    assert clearance(robot, near.pressures, scene) > CLEARANCE - EXACT
+    again = pickle.loads(pickle.dumps(found))
+    assert again.clearance == pytest.approx(found.clearance)
+    tasks = [task_with(scene), task_with(None), task_with(scene_of(RIB), (-0.028, 0.01, 0.19))]
+    for task, each in zip(tasks, solve_batch(robot, tasks), strict=True):
+        alone = solve_pressure(robot, task)
+        np.testing.assert_allclose(each.pressures, alone.pressures, atol=1.0)
+
+
+def test_prices_and_derivatives(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    scene = scene_of(POST)
+    found = solve_pressure(robot, task_with(scene))
+    assert found.sensitivities is not None
+    price = found.sensitivities.per_clearance["post"]
+    less = scene.model_copy(update={"clearance": CLEARANCE - 1e-4})
+    other = solve_pressure(robot, task_with(less))
+    assert other.stiffness - found.stiffness == pytest.approx(price * 1e-4, rel=0.05)
+    with pytest.raises(DerivativeError, match="'post' holds the answer back"):
+        found.gradient("stiffness", by="target")
+    far = scene_of({"name": "post", "sphere": {"centre": (0.1, 0, 0.1), "radius": 0.01}})
+    free = solve_pressure(robot, task_with(far))
+    plain = solve_pressure(robot, task_with(None))
+    np.testing.assert_allclose(
+        free.gradient("stiffness", by="target"), plain.gradient("stiffness", by="target"), rtol=1e-3
+    )
+
+
+def test_scenes_that_make_no_sense_for_the_arm(two: Manipulator, tmp_path: Path) -> None:
+    inside = scene_of({"name": "rock", "sphere": {"centre": (0, 0, 0), "radius": 0.02}})
+    with pytest.raises(InputError, match="rock: the arm's base"):
+        PressureSolver(two, task_with(inside))
+    text = (PROBLEMS / "two_segment_past_a_rib.yaml").read_text()
+    path = tmp_path / "task.yaml"
+    path.write_text(text.replace("radius: 20 mm", "radius: 12 mm"))
+    with pytest.raises(FileError, match=r"task.yaml:12: scene.objects.0..*port: 12 mm") as caught:
+        PressureSolver(two, load_task(path))
+    assert caught.value.line is not None
