@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -84,10 +84,14 @@ class MeasuredScene:
         self.names = tuple(item.name for item in scene.objects)
         self.items = tuple(MeasuredObject(item.shape) for item in scene.objects)
 
-    @lru_cache(maxsize=1)  # noqa: B019
+        self._in_c: tuple[Library, ctypes.Array[SceneObjectInC]] | None = None
+
     def in_c(self, code: Library) -> ctypes.Array[SceneObjectInC]:
         """What C takes; it refers to memory of these objects."""
-        return (SceneObjectInC * len(self.items))(*(item.in_c(code) for item in self.items))
+        if self._in_c is None or self._in_c[0] is not code:
+            objects = (SceneObjectInC * len(self.items))(*(item.in_c(code) for item in self.items))
+            self._in_c = code, objects
+        return self._in_c[1]
 
 
 @lru_cache(maxsize=64)
@@ -95,14 +99,26 @@ def _measured(key: _Same) -> MeasuredScene:
     return MeasuredScene(key.scene)
 
 
+class _Ranges(NamedTuple):
+    """The ranges of an arm's body: ends (k, 2) and numbers of coarse stations (k,)."""
+
+    ends: tuple[tuple[float, float, int], ...]
+    bounds: Array
+    counts: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, ends: tuple[tuple[float, float, int], ...]) -> _Ranges:
+        """Beside them as tuples, arrays for C."""
+        bounds = np.array([[start, end] for start, end, _ in ends])
+        return cls(ends, bounds, np.array([count for *_, count in ends], dtype=np.int64))
+
+
 class ArmClearance:
     """Distances of an arm's body from a scene, at pressures (N, n) in Pa that are finite."""
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:
         self._arm, self._scene = arm, _measured(_Same(scene))
-        self._ends = arm.kept("ranges", lambda: range_ends(arm.description))
-        self._bounds = np.array([[start, end] for start, end, _ in self._ends])
-        self._counts = np.array([count for _, _, count in self._ends], dtype=np.int64)
+        self._ranges = arm.kept("ranges", lambda: _Ranges.of(range_ends(arm.description)))
 
     def least(self, p: Array) -> Array:
         """The least of all distances, (N,)."""
@@ -128,8 +144,8 @@ class ArmClearance:
 
     def _of(self, p: Array) -> list[Nearest]:
         """Nearest points of all objects at pressures (n,)."""
-        line = _CentreLine(self._arm, p, self._bounds)
-        ranges = survey(line, self._ends)
+        line = _CentreLine(self._arm, p, self._ranges.bounds)
+        ranges = survey(line, self._ranges.ends)
         return [nearest_point(line, item, ranges) for item in self._scene.items]
 
     def _gradient(self, p: Array, nearest: Nearest) -> Array:
@@ -160,7 +176,8 @@ class ArmClearance:
             address = None if gradients is None else gradients.ctypes.data
             call = partial(
                 _clearances(body), body.address, ctypes.addressof(objects), len(objects),
-                self._bounds.ctypes.data, self._counts.ctypes.data, len(self._counts),
+                self._ranges.bounds.ctypes.data, self._ranges.counts.ctypes.data,
+                len(self._ranges.ends),
                 p.ctypes.data, found.ctypes.data, address, outcome.ctypes.data,
             )  # fmt: skip
             _in_chunks(call, len(p))

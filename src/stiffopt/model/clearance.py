@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import asin, inf, isfinite
+from math import asin, inf, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 CLEARANCE_ERROR = 4e-6  # m, of a least distance at most
 _SHORTEST = 1e-6  # m of arc length, which is not divided again
-_FINE = 5e-4  # m of arc length, on which any object is as a convex one
+_FINE = 3e-4  # m of arc length, on which any object is as a convex one
 _IN_PLANE = 1e-9  # m above a ring's plane that are none
 _SHARPENED = 1e-4  # m of arc length, over which a slope's change is measured
 _STEEPEST = 1.5  # change of an interpolated distance with the way
@@ -195,9 +195,14 @@ class _Search:
         m = _MORE_CURVED * stretch.speed * stretch.turn
         if least >= self._to_beat:
             return least
-        if self.item.along == "concave":
-            return min(a.value, b.value) - m * h * h / 8 if a.piece == b.piece else least
-        if self.item.along == "any" and h > _FINE:
+        if self.item.along == "concave" and a.piece == b.piece:
+            return max(least, min(a.value, b.value) - m * h * h / 8)
+        first, second = a.value + a.point.radius, b.value + b.point.radius
+        if self.item.along == "any" and first > 0 and second > 0:
+            chord = float(np.linalg.norm(b.point.position - a.point.position))
+            found = _outside_spheres(chord, first, second) - m * h * h / 8
+            least = max(least, found - max(a.point.radius, b.point.radius))
+        if self.item.along != "convex" and h > _FINE:
             return least
         down, up = a.slope - m * h / 2, b.slope + m * h / 2
         if down >= 0:
@@ -233,6 +238,14 @@ class _Search:
             return
         if low < best.s + step * slope / change < high:
             self._probe(self.point_at(best.s + step * slope / change), stretch)
+
+
+def _outside_spheres(chord: float, first: float, second: float) -> float:
+    """How near to a chord something is at least that is outside of spheres about its ends."""
+    x = (chord**2 + first**2 - second**2) / (2 * chord)
+    if x <= 0:
+        return first
+    return second if x >= chord else sqrt(max(first**2 - x**2, 0.0))
 
 
 def _of_ring(search: _Search, ranges: Sequence[BodyRange]) -> Nearest:

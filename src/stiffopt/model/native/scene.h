@@ -33,7 +33,7 @@ enum { CONVEX, CONCAVE, ANY_COURSE };
 
 #define CLEARANCE_ERROR 4e-6 /* m, of a least distance at most */
 #define SHORTEST 1e-6        /* m of arc length, which is not divided again */
-#define FINE 5e-4            /* m of arc length, on which any object is as a convex one */
+#define FINE 3e-4            /* m of arc length, on which any object is as a convex one */
 #define IN_PLANE 1e-9        /* m above a ring's plane that are none */
 #define SHARPENED 1e-4       /* m of arc length, over which a slope's change is measured */
 #define STEEPEST 1.5         /* change of an interpolated distance with the way */
@@ -195,9 +195,18 @@ static double steepness(const NearestSearch *search) {
     return search->range->speed * (search->object->cell ? STEEPEST : 1);
 }
 
+/* How near to the chord between two points something is at least that is nowhere nearer to them than
+ * these distances: the circle in which the two spheres meet. */
+static double outside_spheres(double chord, double first, double second) {
+    double x = (chord * chord + first * first - second * second) / (2 * chord);
+    if (x <= 0) return first;
+    return x >= chord ? second : sqrt(fmax(first * first - x * x, 0));
+}
+
 /* What the distance between two probes is at least.
  *
- * It changes by no more than the way.  Along a centre line of speed v and curvature c, a distance
+ * It changes by no more than the way, and between two points outside of an object by less, as none
+ * of it is within either distance; a centre line is within m h^2 / 8 of its chord, see m here.  Along a centre line of speed v and curvature c, a distance
  * that is convex along straight lines has second derivatives of at least -m, m = v^2 c.  With
  * m u (h - u) / 2 taken away it is convex, the same at both ends, and above its tangents there; m
  * h^2 / 8 below its chord lies what is concave along straight lines. */
@@ -208,9 +217,15 @@ static double least_between(const NearestSearch *search, const Probe *a, const P
     double least = (a->value + b->value - steepness(search) * h) / 2;
     double m = MORE_CURVED * range->speed * range->turn;
     if (least >= to_beat(search)) return least;
-    if (course == CONCAVE)
-        return a->piece == b->piece ? fmin(a->value, b->value) - m * h * h / 8 : least;
-    if (course == ANY_COURSE && h > FINE) return least;
+    if (course == CONCAVE && a->piece == b->piece)
+        return fmax(least, fmin(a->value, b->value) - m * h * h / 8);
+    double first = a->value + a->point->radius, second = b->value + b->point->radius;
+    if (course == ANY_COURSE && first > 0 && second > 0) {
+        double chord = scene_far(a->point->position, b->point->position);
+        double found = outside_spheres(chord, first, second) - m * h * h / 8;
+        least = fmax(least, found - fmax(a->point->radius, b->point->radius));
+    }
+    if (course != CONVEX && h > FINE) return least;
     double down = a->slope - m * h / 2, up = b->slope + m * h / 2;
     if (down >= 0) return fmax(least, a->value);
     if (up <= 0) return fmax(least, b->value);
