@@ -85,6 +85,12 @@ def workspace(
     boundary: BoundaryOption = "free",
     frame: FrameOption = "base",
     seed: Annotated[int, typer.Option(metavar="N", min=0, help="Of the quasi-random samples.")] = 0,
+    scene: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE", help="Leave out samples that are nearer to its objects than it says."
+        ),
+    ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(metavar="ADDRESS", help="Have the workers of this Dask scheduler do it."),
@@ -103,6 +109,7 @@ def workspace(
     check_picture(plot)
     from stiffopt.cli import map_report, quantities  # here, so that --help waits for no numerics
     from stiffopt.model.manipulator import load_robot
+    from stiffopt.model.scene import load_scene
     from stiffopt.workspace import map_workspace
 
     begin = perf_counter()
@@ -112,6 +119,7 @@ def workspace(
     choices: dict[str, Any] = {"kind": kind, "boundary": boundary, "frame": frame}
     size = quantities.quantity("--cell", cell, "m", "length")
     mapped = load_robot(robot)
+    around = None if scene is None else load_scene(scene)
     interrupt = InterruptBetweenSteps([signal.SIGINT])
     so_far: tuple[int, int] | None = None
 
@@ -127,7 +135,7 @@ def workspace(
         with interrupt.handled(), ProgressBar(quiet=quiet) as bar, warnings_as_notes(quiet=quiet):
             found = map_workspace(
                 mapped, out, directions=directions, samples=samples, levels=levels, cell=size,
-                seed=seed, scheduler=scheduler, overwrite=overwrite, progress=progress, **choices,
+                seed=seed, scene=around, scheduler=scheduler, overwrite=overwrite, progress=progress, **choices,
             )  # fmt: skip
     except KeyboardInterrupt:
         if so_far is not None and not quiet:

@@ -15,6 +15,7 @@ from stiffopt.model.arguments import checked_integer
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.workspace.map import WorkspaceMap
 from stiffopt.workspace.plan import TUNING, MapPlan
 from stiffopt.workspace.store import MapStore, is_vacant
@@ -37,6 +38,7 @@ def map_workspace(
     levels: int | None = None,
     cell: float = 0.01,
     seed: int = 0,
+    scene: Scene | None = None,
     scheduler: str | None = None,
     threads: int | None = None,
     overwrite: bool = False,
@@ -66,6 +68,8 @@ def map_workspace(
         Size of a cell in m.
     seed : int
         Of the quasi-random samples.
+    scene : Scene, optional
+        Samples whose body is nearer to its objects than its clearance are left out.
     scheduler : str, optional
         Address of a Dask scheduler; its workers do the sampling.
     threads : int, optional
@@ -93,7 +97,7 @@ def map_workspace(
     """
     plan = MapPlan.of(
         robot, directions=directions, kind=kind, boundary=boundary, frame=frame, samples=samples,
-        levels=levels, cell=cell, seed=seed,
+        levels=levels, cell=cell, seed=seed, scene=scene,
     )  # fmt: skip
     if threads is not None:
         checked_integer("threads", threads, 1)
@@ -244,6 +248,7 @@ def _plan_of(store: MapStore) -> MapPlan:
             frame=said["frame"], samples=None if grid else said["samples"],
             levels=said["levels"] if grid else None, cell=said["cell_m"],
             seed=0 if grid else said["seed"],
+            scene=Scene.model_validate(said["scene"], strict=False) if "scene" in said else None,
         )  # fmt: skip
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(store.path, f"is damaged: {error}") from None

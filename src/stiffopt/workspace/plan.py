@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.directions import direction_name
-from stiffopt.errors import EquilibriumError, InputError
+from stiffopt.errors import EquilibriumError, InputError, shown
 from stiffopt.model.arguments import (
     DirectionalMeasure,
     checked_integer,
@@ -30,6 +30,7 @@ from stiffopt.model.batch import BatchFunction
 from stiffopt.model.compiled import compiling_at_once, interpreted, library
 from stiffopt.model.compliance import Boundary, Frame, Kind, directional_stiffness
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.model.shape import Shape
 from stiffopt.workspace.table import FARTHEST, CellTable, MapPart, cell_indices, cell_keys
 
@@ -52,6 +53,7 @@ class MapTuning:
     loaded_samples: int = 1_000
     block: int = 1 << 15  # number of samples that are evaluated at a time, likewise
     loaded_block: int = 16
+    clear_from: int = 4096  # number of samples from which machine code of distances pays
     # number of samples from which machine code pays for its compilation
     compiled_from: int = 50_000
     # cells that one map may fill; each takes about 0.5 kB while it is made
@@ -173,12 +175,14 @@ class MapPlan:
     measures : the stiffness measures (m,), with unit directions.
     sampling : the pressures that are sampled.
     cell : edge length of a cell, in m.
+    scene : what the body keeps clear of, or None.
     """
 
     robot: Manipulator
     measures: tuple[DirectionalMeasure, ...]
     sampling: Sampling
     cell: float
+    scene: Scene | None = None
 
     @classmethod
     def of(
@@ -193,6 +197,7 @@ class MapPlan:
         levels: int | None = None,
         cell: float = 0.01,
         seed: int = 0,
+        scene: Scene | None = None,
     ) -> "MapPlan":
         """Plan from arguments; see `map_workspace`. `InputError`: one of them is wrong."""
         if not isinstance(robot, Manipulator):
@@ -201,7 +206,11 @@ class MapPlan:
             )
         measures = _measures(AXES if directions is None else directions, kind, boundary, frame)
         sampling = _sampling(robot, samples, levels, checked_integer("seed", seed, 0))
-        return cls(robot, measures, sampling, _cell_size(robot, cell))
+        if scene is not None:
+            if not isinstance(scene, Scene):
+                raise InputError(f"expected a Scene, as load_scene returns it, not {shown(scene)}")
+            scene.check_against(robot.description)
+        return cls(robot, measures, sampling, _cell_size(robot, cell), scene)
 
     # -- blocks -----------------------------------------------------------------------------
 
@@ -228,6 +237,9 @@ class MapPlan:
         """Compile what blocks need; after that several threads may evaluate blocks at once."""
         if not self.robot.is_loaded:
             self._function  # noqa: B018
+        if self.scene is not None and self.total >= TUNING.clear_from:
+            with compiling_at_once():
+                self._is_clear(self.sampling.pressures(0, TUNING.clear_from))
 
     def evaluate(self, index: int) -> MapPart:
         """Result of one block, counted from 0."""
@@ -237,16 +249,27 @@ class MapPlan:
         position, stiffness = evaluate(pressures)
         sample = np.arange(start, stop)
         good = np.isfinite(position).all(axis=1) & np.isfinite(stiffness).all(axis=0)
+        lost = int((~good).sum())
+        if self.scene is not None:
+            good[good] = self._is_clear(pressures[good])
         if not good.all():
             position, stiffness, sample = position[good], stiffness[:, good], sample[good]
         keys = cell_keys(cell_indices(position, self.cell))
         return MapPart(
             blocks=1,
-            lost=int((~good).sum()),
+            lost=lost,
             low=position.min(axis=0, initial=np.inf),
             high=position.max(axis=0, initial=-np.inf),
             table=CellTable.of_samples(keys, stiffness, sample),
         )
+
+    def _is_clear(self, pressures: Vector) -> NDArray[np.bool_]:
+        """Whether the body keeps the clearance of the scene, at each of some pressures (k, n)."""
+        assert self.scene is not None
+        clear: NDArray[np.bool_] = (
+            self.robot.clearance(pressures, self.scene) >= self.scene.clearance
+        )
+        return clear
 
     def _in_closed_form(self, pressures: Vector) -> tuple[Vector, Vector]:
         """Positions (k, 3) and stiffnesses (m, k) of the arm without loads."""
@@ -321,9 +344,15 @@ class MapPlan:
             "stiffness_unit": self.unit,
             **self.sampling.record(),
             "cell_m": self.cell,
+            **({} if self.scene is None else {"scene": self._scene_record}),
             "block_size": self.block_size,
             "stiffopt_version": __version__,
         }
+
+    @property
+    def _scene_record(self) -> dict[str, Any]:
+        assert self.scene is not None
+        return self.scene.model_dump(mode="json", by_alias=True, exclude_none=True)
 
     @cached_property
     def token(self) -> str:
