@@ -135,7 +135,8 @@ def workspace(
         with interrupt.handled(), ProgressBar(quiet=quiet) as bar, warnings_as_notes(quiet=quiet):
             found = map_workspace(
                 mapped, out, directions=directions, samples=samples, levels=levels, cell=size,
-                seed=seed, scene=around, scheduler=scheduler, overwrite=overwrite, progress=progress, **choices,
+                seed=seed, scene=around, scheduler=scheduler, overwrite=overwrite,
+                progress=progress, **choices,
             )  # fmt: skip
     except KeyboardInterrupt:
         if so_far is not None and not quiet:

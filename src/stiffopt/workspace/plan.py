@@ -251,7 +251,8 @@ class MapPlan:
         good = np.isfinite(position).all(axis=1) & np.isfinite(stiffness).all(axis=0)
         lost = int((~good).sum())
         if self.scene is not None:
-            good[good] = self._is_clear(pressures[good])
+            clear = np.flatnonzero(good)[self._is_clear(pressures[good])]
+            good = np.isin(np.arange(len(good)), clear)
         if not good.all():
             position, stiffness, sample = position[good], stiffness[:, good], sample[good]
         keys = cell_keys(cell_indices(position, self.cell))
