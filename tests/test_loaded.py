@@ -1,6 +1,5 @@
 """The compiled solver of arms under gravity and loads against the model and the general method."""
 
-
 import numpy as np
 import pytest
 

@@ -100,6 +100,17 @@ def test_parts_of_the_target_take_the_place_of_the_tasks(code):
             assert pose[:3, 2] @ target.pointing > np.cos(np.radians(1.0001))
 
 
+def test_what_a_caller_does_to_his_arrays_later_does_not_matter(compiled):
+    solver = solver_of(so.load_robot("stiff-flop-2"))
+    place, guess = np.array(PLACE), solver.solve().pressures.copy()
+    answer, again = (solver.warm(place, guess) for _ in range(2))
+    place[:], guess[:] = 0, 0
+    assert answer.found
+    assert answer.solution.task.target == solver.task.target
+    assert solver.warm(None, again.pressures).found  # the task's own target, not the last one
+    np.testing.assert_array_equal(again.pressures, answer.pressures)
+
+
 def test_limits_of_a_warm_call_only_narrow_the_tasks(code):
     solver = solver_of(so.load_robot("stiff-flop-2"))
     p = solver.solve().pressures
