@@ -22,7 +22,7 @@ import environment
 import plots
 import report
 from report import Section
-from sections import calls, full_task, kinds, kinematics, pose, processes, rates
+from sections import body, calls, full_task, kinds, kinematics, pose, processes, rates
 from settings import Settings, quick
 
 HERE = Path(__file__).resolve().parent
@@ -39,6 +39,7 @@ SECTIONS: dict[str, Callable[[Settings], Section]] = {
     "command": processes.command,
     "throughput": rates.batch,
     "evaluations": kinematics.section,
+    "body": body.section,
     "pose": pose.section,
     "simulator": rates.simulated_arm,
 }

@@ -204,7 +204,7 @@ def test_an_arm_of_more_kinds_of_sections_than_fit_has_no_machine_code(compiled)
 def test_the_header_serves_other_libraries(case, compiled):
     """Position, tangent and radius, and their derivatives by pressures."""
     model = robot(case)
-    make = body._loaded_functions if model.is_loaded else body._free_functions
+    make = body._loaded_functions if model.is_loaded else body.free_body_functions
     source = str(Path(__file__).with_name("native_body.c"))
     content = ("tested", model.is_loaded, model.layout.skeleton)
     code = body.library(content, partial(make, model.layout), (source,))

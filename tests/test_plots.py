@@ -13,6 +13,7 @@ from matplotlib.image import imread
 
 import stiffopt
 from stiffopt import plots
+from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
 
 MAXIMISE = {"maximise": {"direction": (1, 0, 0)}}
@@ -190,3 +191,27 @@ def test_a_picture_that_cannot_be_written(tmp_path: Path) -> None:
         with pytest.raises(stiffopt.FileError, match="cannot be"):
             plots.save_figure(figure, tmp_path / name)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_scene_is_drawn_with_the_names_of_its_objects(tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.creation.box((0.02, 0.03, 0.04)).export(tmp_path / "box.stl")
+    shapes: dict[str, dict[str, Any]] = {
+        "sphere": {"centre": (0, 0.05, 0.1), "radius": 0.01},
+        "capsule": {"from": (0.04, -0.03, 0.09), "to": (0.04, 0.03, 0.09), "radius": 0.006},
+        "cylinder": {"from": (-0.06, 0.04, 0), "to": (-0.06, 0.04, 0.1), "radius": 0.008},
+        "box": {"centre": (0.05, 0.05, 0.15), "size": (0.03, 0.02, 0.04)},
+        "half_space": {"point": (0, 0, 0.23), "normal": (0, 0, -1)},
+        "mesh": {"file": tmp_path / "box.stl", "scale": 1.0, "centre": (-0.05, -0.05, 0.1)},
+        "inside_tube": {"points": [(0, 0, -0.01), (0, 0, 0.08), (-0.02, 0, 0.15)], "radius": 0.03},
+        "trocar": {"centre": (0, 0, 0.03), "axis": (0, 0, 1), "radius": 0.02},
+    }
+    objects = [{"name": f"the {key}", key: shape} for key, shape in shapes.items()]
+    figure = plots.plot_solution(*solved(), scene=stiffopt.Scene(objects=objects))
+    text = texts(figure)
+    assert set(shapes) == set(OBSTACLES)
+    for part in ("scene", *(f"the {key}" for key in shapes)):
+        assert part in text
+    far = {"name": "far", "sphere": {"centre": (9, 0, 0), "radius": 0.01}}
+    figure = plots.plot_solution(*solved(), scene=stiffopt.Scene(objects=[far]))
+    assert figure.axes[0].get_xlim()[1] < 400  # mm

@@ -303,12 +303,16 @@ def test_the_minimum_along_a_body_is_that_of_very_many_stations(key, organ):
     rng = np.random.default_rng(7)
     negative = 0
     for snake, positions, radii in snakes():
-        item = MeasuredObject(random_shape(key, rng, organ))
+        shape = random_shape(key, rng, organ)
+        item = MeasuredObject(shape)
         found = nearest_point(snake, item, survey(snake, snake.ends))
         brute = by_brute_force(item, positions, radii)
         assert brute - 5e-5 < found.distance  # as stations are 0.1 mm apart
         beside = item.is_ring and brute < 0
-        assert found.distance < brute + (5e-5 if beside else 4e-6)
+        assert found.distance < brute + (5e-5 if beside else 1e-5 if key == "mesh" else 4e-6)
+        if isinstance(shape, Mesh):  # the triangles themselves; what is interpolated has kinks
+            seen = (positions - np.array(shape.centre)) @ rotation(shape.orientation)
+            assert found.distance < (shape.surface.distances(seen) - radii).min() + 4e-6
         negative += found.distance < 0
         position, _, radius = snake.at(found.s)
         assert position == pytest.approx(found.position, abs=1e-9)
@@ -446,7 +450,7 @@ BAD = {
     "sphere: {c": ("shpere: {c", 7, "objects[2].shpere", "did you mean 'sphere'?"),
     "sphere: {centre": ("sphere: {center", 7, "objects[2].sphere", "mean 'centre'?"),
     "capsule: {from": ("capsule: {form", 4, "objects[0].capsule", "did you mean 'from'?"),
-    "to: [40 mm, 30 mm": ("to: [40 mm, -30 mm", 4, "objects[0].capsule", "begins where it ends"),
+    "to: [40 mm, 30 mm": ("to: [40 mm, -30 mm", 4, "objects[0].capsule.to", "ends where it begins"),
     "[0 mm, 0 mm, 300 mm]]": ("[0 mm, 0 mm, -5 mm]]", 11, "objects[4].inside_tube.points",
                               "point 2 is where point 1 is"),
     ", [0 mm, 0 mm, 300 mm]]": ("]", 11, "objects[4].inside_tube.points", "at least 2 points"),

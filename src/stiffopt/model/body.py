@@ -85,7 +85,9 @@ class BodyShape:
         first, second = place[1 : 1 + len(s)], place[1 + len(s) :]
         if isinstance(self._stations, FreeStations):
             self._arm._check_margin(p, "")
-            return self._stations.compliances(p, at, first, second)
+            native = self.machine_code(len(p))
+            function = native.code.function if native else self._stations.interpreted
+            return self._stations.compliances(function, p, at, first, second)
         found = self._evaluate(_RESPONSES, p, at)
         carried = found[:, :-27].reshape(len(p), len(at), 3, 3, 9)
         return response(carried, found[:, -27:].reshape(-1, 9, 3).swapaxes(1, 2), first, second)
@@ -103,7 +105,7 @@ class BodyShape:
     def _evaluate(self, what: int, p: Vector, at: Vector) -> Vector:
         """Numbers (N, ...) of stations, by machine code if there is any."""
         checkpoint()
-        native = self._machine_code(len(p))
+        native = self.machine_code(len(p))
         if native is None:
             return self._interpreted(what, p, at)
         found, outcome = native.stations(what, p, at)
@@ -124,7 +126,8 @@ class BodyShape:
         assert isinstance(self._stations, LoadedStations)
         return self._stations.responses(p, at)
 
-    def _machine_code(self, rows: int) -> NativeBody | None:
+    def machine_code(self, rows: int) -> NativeBody | None:
+        """Machine code for a number of rows more; None where there is none, or not yet."""
         if self._native is not None:
             return self._native
         with self._lock:
@@ -139,11 +142,11 @@ class BodyShape:
 
 def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
     """Machine code of an arm's body; None where there is none."""
-    kind, make, source = "body", _free_functions, "body.c"
+    kind, make, source = "body", free_body_functions, "clearance.c"
     if arm.is_loaded:
         if rod_functions(arm.layout) is None:
             return None
-        kind, make, source = "loaded body", _loaded_functions, "loaded_body.c"
+        kind, make, source = "loaded body", _loaded_functions, "loaded_clearance.c"
     code = library(
         (kind, arm.layout.skeleton), partial(make, arm.layout), (str(NATIVE / source),),
         build_missing=build_missing,
@@ -154,11 +157,6 @@ def native_body(arm: Arm, build_missing: bool = True) -> NativeBody | None:
         return NativeBody(code, arm)
     except EquilibriumError:  # the VM says more
         return None
-
-
-def _free_functions(layout: Layout) -> list[ca.Function]:
-    names = ("frames", "moving_frames", "along", "moving_along")
-    return [each for each in free_body_functions(layout) if each.name() in names]
 
 
 def _loaded_functions(layout: Layout) -> list[ca.Function]:
@@ -182,12 +180,14 @@ class NativeBody:
 
     Parameters
     ----------
-    code : library of the functions of `stiffopt.model.body_functions` with body.c.
+    code : library of the functions of `stiffopt.model.body_functions` with clearance.c.
 
     Attributes
     ----------
     address : int
         Of the `BodyModel`.
+    code : Library
+        What it was made of, with what clearance.c adds.
 
     Raises
     ------
@@ -199,7 +199,8 @@ class NativeBody:
         self._n = arm.n_pressures
         pieces, numbers = Pieces(arm), arm.numbers
         rod = LoadedArm(code, arm) if arm.is_loaded else None
-        self._keep = (code, pieces, numbers, rod)  # what pointers below lead to
+        self.code = code
+        self._keep = (pieces, numbers, rod)  # what pointers below lead to
         size = code.cdll.stiffopt_body_model_size
         size.restype = _integer
         if size() != ctypes.sizeof(BodyModel):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import asin, inf, isfinite
+from math import asin, inf, isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -22,10 +22,12 @@ Array = NDArray[np.float64]
 
 CLEARANCE_ERROR = 4e-6  # m, of a least distance at most
 _SHORTEST = 1e-6  # m of arc length, which is not divided again
-_FINE = 5e-4  # m of arc length, on which any object is as a convex one
+_FINE = 3e-4  # m of arc length, on which any object is as a convex one
+_IN_PLANE = 1e-9  # m above a ring's plane that are none
+_SHARPENED = 1e-4  # m of arc length, over which a slope's change is measured
 _STEEPEST = 1.5  # change of an interpolated distance with the way
 _MORE_CURVED = 1.25  # than the curvature that coarse stations show
-_SPACING = 1 / 20  # of coarse stations, as a share of the arm's length
+_SPACING = 1 / 14  # of coarse stations, as a share of the arm's length
 _INSET = 1e-9  # m, by which a range ends before the next begins
 
 StationOf = Callable[[Array], tuple[Array, Array, Array]]
@@ -95,7 +97,10 @@ def range_ends(robot: RobotDescription) -> tuple[tuple[float, float, int], ...]:
                 count = 1 + max(1, int(np.ceil(length / (_SPACING * robot.length) - 1e-9)))
                 ends.append((start + _INSET, start + length - _INSET, count))
             start += length
-    return tuple(ends)
+    (_, first, count), (last, _, other) = ends[0], ends[-1]
+    if len(ends) == 1:
+        return ((0.0, start, count),)
+    return ((0.0, first, count), *ends[1:-1], (last, start, other))
 
 
 def survey(station: StationOf, ends: Sequence[tuple[float, float, int]]) -> list[BodyRange]:
@@ -136,6 +141,7 @@ def nearest_point(
     search = _Search(station, item, inf if item.is_ring else cutoff)
     for each in ranges:
         search.look_at(each)
+    search.sharpen()
     assert search.best is not None  # every range has stations
     return _of_ring(search, ranges) if item.is_ring else search.best
 
@@ -146,6 +152,8 @@ class _Search:
     def __init__(self, station: StationOf, item: MeasuredObject, cutoff: float) -> None:
         self.station, self.item, self.cutoff = station, item, cutoff
         self.best: Nearest | None = None
+        self._slope = 0.0
+        self._within: BodyRange | None = None
         self._steepness = _STEEPEST if item.is_interpolated else 1.0
 
     def point_at(self, s: float) -> BodyPoint:
@@ -174,9 +182,10 @@ class _Search:
         value, normal = float(values[0]) - point.radius, normals[0]
         if not isfinite(value):
             raise ArithmeticError("a distance is not finite")
+        slope = stretch.speed * float(normal @ point.tangent)
         if self.best is None or value < self.best.distance:
             self.best = Nearest(value, point.s, 1.0, point.position, normal)
-        slope = stretch.speed * float(normal @ point.tangent)
+            self._slope, self._within = slope, stretch
         return Probe(point, value, slope, normal, int(pieces[0]))
 
     def _least_between(self, a: Probe, b: Probe, stretch: BodyRange) -> float:
@@ -186,9 +195,14 @@ class _Search:
         m = _MORE_CURVED * stretch.speed * stretch.turn
         if least >= self._to_beat:
             return least
-        if self.item.along == "concave":
-            return min(a.value, b.value) - m * h * h / 8 if a.piece == b.piece else least
-        if self.item.along == "any" and h > _FINE:
+        if self.item.along == "concave" and a.piece == b.piece:
+            return max(least, min(a.value, b.value) - m * h * h / 8)
+        first, second = a.value + a.point.radius, b.value + b.point.radius
+        if self.item.along == "any" and first > 0 and second > 0:
+            chord = float(np.linalg.norm(b.point.position - a.point.position))
+            found = _outside_spheres(chord, first, second) - m * h * h / 8
+            least = max(least, found - max(a.point.radius, b.point.radius))
+        if self.item.along != "convex" and h > _FINE:
             return least
         down, up = a.slope - m * h / 2, b.slope + m * h / 2
         if down >= 0:
@@ -209,15 +223,40 @@ class _Search:
         self._refine(a, middle, stretch)
         self._refine(middle, b, stretch)
 
+    def sharpen(self) -> None:
+        """Bring the best to where the slope is zero, so that its normal is right too."""
+        stretch, best = self._within, self.best
+        if stretch is None or best is None or best.distance >= self.cutoff:
+            return
+        low, high = stretch.points[0].s, stretch.points[-1].s
+        step = -_SHARPENED if self._slope > 0 else _SHARPENED
+        slope = self._slope
+        if not low < best.s + step < high:
+            return
+        change = slope - self._probe(self.point_at(best.s + step), stretch).slope
+        if change == 0 or abs(step * slope / change) >= _FINE:
+            return
+        if low < best.s + step * slope / change < high:
+            self._probe(self.point_at(best.s + step * slope / change), stretch)
+
+
+def _outside_spheres(chord: float, first: float, second: float) -> float:
+    """How near to a chord something is at least that is outside of spheres about its ends."""
+    x = (chord**2 + first**2 - second**2) / (2 * chord)
+    if x <= 0:
+        return first
+    return second if x >= chord else sqrt(max(first**2 - x**2, 0.0))
+
 
 def _of_ring(search: _Search, ranges: Sequence[BodyRange]) -> Nearest:
     """A ring's distance is that of its circle; negative where the centre line is beside it."""
     assert search.best is not None
     points = [point for stretch in ranges for point in stretch.points]
     seen = search.item.passages(np.stack([point.position for point in points]))
+    heights = np.where(np.abs(seen.heights) < _IN_PLANE, 0.0, seen.heights)
     crossed = passed = False
     for index in range(1, len(points)):
-        low, high = seen.heights[index - 1], seen.heights[index]
+        low, high = heights[index - 1], heights[index]
         if high == 0 or low * high > 0:
             continue
         if low == 0:

@@ -36,9 +36,15 @@ _MEMORY, _MOST_PARAMETERS = 64, 32  # as scene.h has them
 _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
 
+_kept: list[Library] = []
+
+
 def scene_library() -> Library | None:
-    """Machine code of all distances; None where it is not there (yet)."""
-    return library("distances of scenes", distance_functions, _SOURCES)
+    """Machine code of all distances; None where it is not there (yet). Once found it is kept."""
+    if not _kept:
+        found = library("distances of scenes", distance_functions, _SOURCES)
+        _kept.extend([] if found is None else [found])
+    return _kept[0] if _kept else None
 
 
 def distance_functions() -> list[ca.Function]:

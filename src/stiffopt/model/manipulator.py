@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt import lie
-from stiffopt.errors import InputError
+from stiffopt.errors import InputError, shown
 from stiffopt.model.arguments import (
     DirectionalMeasure,
     check_choice,
@@ -18,12 +18,14 @@ from stiffopt.model.arguments import (
     checked_measure,
 )
 from stiffopt.model.arm import Arm, Values
+from stiffopt.model.arm_clearance import ArmClearance, Clearances
 from stiffopt.model.body_symbols import Along, body_function
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import Compensation, RobotDescription
 from stiffopt.model.equilibrium import dead_and_follower
 from stiffopt.model.history import NO_HISTORY
 from stiffopt.model.robot_files import load_description
+from stiffopt.model.scene import Scene
 from stiffopt.model.screws import Twist, Wrench, checked_wrench
 from stiffopt.model.shape import Shape, stiffness_along
 from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
@@ -122,6 +124,28 @@ class Manipulator(Arm):
         """
         found = self._at_stations(self._body.radii, p, self._arc_lengths(at, base_too=True))
         return float(found) if found.ndim == 0 else found
+
+    # -- clearance --------------------------------------------------------------------------
+
+    def clearance(self, p: ArrayLike, scene: Scene) -> Any:
+        """Least distance in m between the arm's body and the objects of a scene; negative within.
+
+        The body is the union of spheres of the outer radius about the centre line, from base to
+        tip; the least distance along it is exact to 0.004 mm.
+
+        Returns
+        -------
+        float or ndarray (N,)
+        """
+        values = self._checked(p)
+        found = ArmClearance(self, _checked_scene(scene)).least(np.atleast_2d(values))
+        return float(found[0]) if values.ndim == 1 else found
+
+    def clearances(self, p: ArrayLike, scene: Scene) -> Clearances:
+        """Distances from each object of a scene, where they are, and how pressures change them."""
+        values = self._checked(p)
+        found = ArmClearance(self, _checked_scene(scene)).each(np.atleast_2d(values))
+        return found.only() if values.ndim == 1 else found
 
     # -- compliance -------------------------------------------------------------------------
 
@@ -410,6 +434,12 @@ def load_robot(
     if isinstance(name_or_path, RobotDescription):
         return Manipulator(name_or_path, resolution=resolution)
     return Manipulator(load_description(name_or_path), resolution=resolution)
+
+
+def _checked_scene(scene: Scene) -> Scene:
+    if not isinstance(scene, Scene):
+        raise InputError(f"expected a Scene, as load_scene returns it, not {shown(scene)}")
+    return scene
 
 
 def _is_table(direction: ArrayLike) -> TypeGuard[Sequence[ArrayLike]]:

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
-from stiffopt.errors import InputError
 from stiffopt.schema import BadKeyError, Schema, Vector
 from stiffopt.units import Length, within
 
@@ -116,6 +115,33 @@ class Obstacle(Schema, ABC):
         return max(float(self.formula(ca.DM(point), ca.DM(q))) for q in self.pieces)
 
 
+class BetweenEnds(Obstacle):
+    """What has a radius about the straight line between two points.
+
+    Attributes
+    ----------
+    start, end : centres of its ends, in m; ``from`` and ``to`` in files.
+    radius : in m.
+    """
+
+    n_parameters = 7
+
+    start: Annotated[Point, Field(alias="from")]
+    end: Annotated[Point, Field(alias="to")]
+    radius: Radius
+
+    @model_validator(mode="after")
+    def _check(self) -> BetweenEnds:
+        if np.linalg.norm(np.subtract(self.end, self.start)) < 1e-9:
+            raise BadKeyError("to", "it ends where it begins; expected another point")
+        return self
+
+    @property
+    def pieces(self) -> list[list[float]]:
+        """Both ends, radius."""
+        return [[*self.start, *self.end, self.radius]]
+
+
 def norm(vector: ca.SX) -> ca.SX:
     """Length of a vector whose gradient exists at zero too; exact to 1e-12."""
     return ca.sqrt(ca.sumsqr(vector) + _TINY)
@@ -132,12 +158,6 @@ def from_box(excess: ca.SX) -> ca.SX:
     """Signed distance of a box from how far a point is beyond its faces, (k,)."""
     outside = norm(ca.fmax(excess, 0))
     return outside + ca.fmin(ca.mmax(excess), 0)
-
-
-def check_apart(start: tuple[float, ...], end: tuple[float, ...], instead: str) -> None:
-    """Raise where two points are one."""
-    if np.linalg.norm(np.subtract(end, start)) < 1e-9:
-        raise InputError(f"begins where it ends; {instead}")
 
 
 # -- surfaces for plots ---------------------------------------------------------------------------

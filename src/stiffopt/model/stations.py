@@ -5,6 +5,7 @@ The same functions as in machine code, called in blocks, with NumPy in place of 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.model.batch import InterpretedFunction
+from stiffopt.model.batch import BatchFunction, InterpretedFunction
 from stiffopt.model.body_functions import DENSE, free_body_functions, loaded_body_functions
 from stiffopt.model.codegen import dense
 from stiffopt.model.layout import Layout
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 Places = NDArray[np.intp]
+Functions = Callable[[str], BatchFunction]
 
 
 class Pieces:
@@ -60,26 +62,26 @@ class FreeStations:
 
     def __init__(self, arm: Arm, pieces: Pieces) -> None:
         self._numbers, self._pieces = arm.numbers, pieces
-        self._functions = _free_functions(arm.layout)
+        self.interpreted: Functions = _free_functions(arm.layout).__getitem__
 
     def poses(self, p: Vector, at: Vector) -> Vector:
         """See `stiffopt.model.body.BodyShape`, as for the other methods."""
-        _, strains, starts, _ = self._functions["frames"].many(p, self._numbers)
-        pose = self._along("along", strains, starts, at)[0]
+        _, strains, starts, _ = self.interpreted("frames").many(p, self._numbers)
+        pose = self._along(self.interpreted("along"), strains, starts, at)[0]
         return _transforms(pose[..., 3:12], pose[..., :3])
 
     def line(self, p: Vector, at: Vector) -> Vector:
         """Positions and tangents (N, k, 6)."""
-        _, strains, starts, _ = self._functions["frames"].many(p, self._numbers)
-        pose = self._along("along", strains, starts, at)[0]
+        _, strains, starts, _ = self.interpreted("frames").many(p, self._numbers)
+        pose = self._along(self.interpreted("along"), strains, starts, at)[0]
         return np.concatenate([pose[..., :3], pose[..., 12:]], -1)
 
     def jacobians(self, p: Vector, at: Vector) -> Vector:
         """Twists beyond a pressure's piece are those of its end; on it they grow along it."""
-        _, strains, starts, _, slopes, twists, _ = self._functions["moving_frames"].many(
+        _, strains, starts, _, slopes, twists, _ = self.interpreted("moving_frames").many(
             p, self._numbers
         )
-        pose, moves = self._along("moving_along", strains, starts, at)
+        pose, moves = self._along(self.interpreted("moving_along"), strains, starts, at)
         own = moves @ slopes[:, None]  # (N, k, 6, n)
         v, w = np.broadcast_arrays(twists[:, None, :3], twists[:, None, 3:])
         beyond = np.concatenate(
@@ -89,13 +91,15 @@ class FreeStations:
         of = self._pieces.piece_of
         return in_axes(pose[..., 3:12], np.where(of < piece, beyond, np.where(of == piece, own, 0)))
 
-    def compliances(self, p: Vector, at: Vector, s: Places, t: Places) -> Vector:
+    def compliances(
+        self, function: Functions, p: Vector, at: Vector, s: Places, t: Places
+    ) -> Vector:
         """``X_s A(min(s, t)) X_t'``, with s and t places (k,) in `at`, which ascends."""
         count = len(p)
-        _, strains, starts, _ = self._functions["frames"].many(p, self._numbers)
-        sections, before = self._functions["gathering"].many(p, self._numbers)
+        _, strains, starts, _ = function("frames").many(p, self._numbers)
+        sections, before = function("gathering").many(p, self._numbers)
         piece, local = self._pieces.find(at)
-        own = self._functions["gathered"].many(
+        own = function("gathered").many(
             _at_pieces(starts, piece),
             _at_pieces(strains, piece),
             _at_pieces(sections, piece).reshape(-1, 6, 6),
@@ -103,22 +107,22 @@ class FreeStations:
         )[0]
         A = (own + _at_pieces(before, piece).reshape(-1, 6, 6)).reshape(count, len(at), 6, 6)
         X = np.tile(np.eye(6), (count, len(at), 1, 1))
-        X[..., :3, 3:] = -_hat(self._along("along", strains, starts, at)[0][..., :3])
+        X[..., :3, 3:] = -_hat(self._along(function("along"), strains, starts, at)[0][..., :3])
         found: Vector = X[:, s] @ A[:, np.minimum(s, t)] @ np.swapaxes(X[:, t], -1, -2)
         return found
 
     def radii(self, p: Vector) -> Vector:
         """Of each piece, (N, pieces)."""
-        return self._functions["frames"].many(p, self._numbers)[3][..., 0]
+        return self.interpreted("frames").many(p, self._numbers)[3][..., 0]
 
-    def _along(self, name: str, strains: Vector, starts: Vector, at: Vector) -> list[Vector]:
-        """Poses (N, k, 15), and with ``moving_along`` twists per strain (N, k, 6, m)."""
+    def _along(
+        self, function: BatchFunction, strains: Vector, starts: Vector, at: Vector
+    ) -> list[Vector]:
+        """Poses (N, k, 15), and of ``moving_along`` twists per strain (N, k, 6, m)."""
         count = len(strains)
         piece, local = self._pieces.find(at)
         lengths = np.tile(local, count)[:, np.newaxis]
-        found = self._functions[name].many(
-            _at_pieces(starts, piece), _at_pieces(strains, piece), lengths
-        )
+        found = function.many(_at_pieces(starts, piece), _at_pieces(strains, piece), lengths)
         pose, *moves = (each.reshape(count, len(at), *each.shape[1:]) for each in found)
         return [pose[..., 0], *moves]
 

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.errors import InputError, printable
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
+from stiffopt.plots.scene import draw_objects
 from stiffopt.plots.style import literal, new_figure, tidy
 from stiffopt.plots.wording import (
     BAR,
@@ -50,6 +52,7 @@ def plot_solution(
     front: Sequence[PressureSolution] | None = None,
     plain: float | None = None,
     title: str | None = None,
+    scene: Scene | None = None,
 ) -> Figure:
     """Draw an answer: the arm in space, and its pressures against their limits.
 
@@ -64,6 +67,8 @@ def plot_solution(
         First stiffness of a stiffness-blind solution, to compare with.
     title : str, optional
         By default the name of the task's file.
+    scene : Scene, optional
+        What is around the arm.
 
     Raises
     ------
@@ -82,7 +87,7 @@ def plot_solution(
         1 if front is None else 2, 3, width_ratios=(0.42, 1.15, 1), left=0.03, right=0.975,
         top=0.825, bottom=0.09, wspace=0.2, hspace=0.42,
     )  # fmt: skip
-    _draw_arm(figure, grid[:, 1], arm, solution)
+    _draw_arm(figure, grid[:, 1], arm, solution, scene)
     _draw_pressures(figure.add_subplot(grid[0, 2]), arm, solution)
     if front is not None:
         _draw_pareto(figure.add_subplot(grid[1, 2]), front, plain)
@@ -255,21 +260,25 @@ def _pressure_legend(axes: Any, any_active: bool) -> None:
 # -- the arm in 3-D -------------------------------------------------------------------------------
 
 
-def _draw_arm(figure: Any, place: Any, robot: Manipulator, solution: PressureSolution) -> None:
+def _draw_arm(
+    figure: Any, place: Any, robot: Manipulator, solution: PressureSolution, scene: Scene | None
+) -> None:
     """Draw the arm at a solution's pressures, in mm, all axes to one scale."""
     axes = figure.add_subplot(place, projection="3d", computed_zorder=False)
-    scene = _Scene(axes, robot, solution)
-    scene.draw_base()
-    scene.draw_tube()
-    scene.draw_ellipsoid()
-    scene.draw_directions()
-    scene.draw_target()
-    scene.draw_loads()
-    scene.finish()
+    drawing = _Drawing(axes, robot, solution)
+    drawing.draw_base()
+    drawing.draw_tube()
+    drawing.draw_ellipsoid()
+    drawing.draw_directions()
+    drawing.draw_target()
+    drawing.draw_loads()
+    if scene is not None:
+        drawing.draw_objects(scene)
+    drawing.finish()
 
 
 @dataclass
-class _Scene:
+class _Drawing:
     """Axes in 3-D and what has been drawn in them, in mm."""
 
     axes: Any
@@ -434,12 +443,17 @@ class _Scene:
             self._arrow(start, 0.18 * self.size * way, "#666666", 9)
             self.axes.text(*start, "gravity ", color="#666666", fontsize=9, ha="right")
 
+    def draw_objects(self, scene: Scene) -> None:
+        """What is around the arm."""
+        self.corners.append(draw_objects(self.axes, scene, self.size, np.vstack(self.corners)))
+        self._patch(style.OBSTACLE, "scene")
+
     # -- parts ------------------------------------------------------------------------------
 
     def _arrow(
         self, start: Vector, vector: Vector, colour: str, zorder: int, linestyle: str = "-"
     ) -> None:
-        """A shaft with a cone as its head, to the scale of the scene."""
+        """A shaft with a cone as its head, to the scale of the figure."""
         end = start + vector
         self.axes.plot(
             *np.stack([start, start + 0.82 * vector]).T, color=colour, linewidth=2.0,

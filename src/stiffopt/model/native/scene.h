@@ -33,7 +33,9 @@ enum { CONVEX, CONCAVE, ANY_COURSE };
 
 #define CLEARANCE_ERROR 4e-6 /* m, of a least distance at most */
 #define SHORTEST 1e-6        /* m of arc length, which is not divided again */
-#define FINE 5e-4            /* m of arc length, on which any object is as a convex one */
+#define FINE 3e-4            /* m of arc length, on which any object is as a convex one */
+#define IN_PLANE 1e-9        /* m above a ring's plane that are none */
+#define SHARPENED 1e-4       /* m of arc length, over which a slope's change is measured */
 #define STEEPEST 1.5         /* change of an interpolated distance with the way */
 #define MORE_CURVED 1.25     /* than the curvature that coarse stations show */
 
@@ -86,6 +88,8 @@ typedef struct {
     const Range *range;
     double cutoff;
     Nearest *best;
+    double slope;        /* at the best */
+    const Range *within; /* that has the best */
 } NearestSearch;
 
 static double scene_dot(const double *a, const double *b) {
@@ -176,6 +180,7 @@ static int probe_at(NearestSearch *search, const BodyPoint *point, Probe *probe)
     probe->slope = search->range->speed * scene_dot(probe->normal, point->tangent);
     if (probe->value >= best->distance) return 1;
     best->distance = probe->value, best->s = point->s, best->radius_share = 1;
+    search->slope = probe->slope, search->within = search->range;
     for (int k = 0; k < 3; k++)
         best->position[k] = point->position[k], best->normal[k] = probe->normal[k];
     return 1;
@@ -190,9 +195,18 @@ static double steepness(const NearestSearch *search) {
     return search->range->speed * (search->object->cell ? STEEPEST : 1);
 }
 
+/* How near to the chord between two points something is at least that is nowhere nearer to them than
+ * these distances: the circle in which the two spheres meet. */
+static double outside_spheres(double chord, double first, double second) {
+    double x = (chord * chord + first * first - second * second) / (2 * chord);
+    if (x <= 0) return first;
+    return x >= chord ? second : sqrt(fmax(first * first - x * x, 0));
+}
+
 /* What the distance between two probes is at least.
  *
- * It changes by no more than the way.  Along a centre line of speed v and curvature c, a distance
+ * It changes by no more than the way, and between two points outside of an object by less, as none
+ * of it is within either distance; a centre line is within m h^2 / 8 of its chord, see m here.  Along a centre line of speed v and curvature c, a distance
  * that is convex along straight lines has second derivatives of at least -m, m = v^2 c.  With
  * m u (h - u) / 2 taken away it is convex, the same at both ends, and above its tangents there; m
  * h^2 / 8 below its chord lies what is concave along straight lines. */
@@ -203,9 +217,15 @@ static double least_between(const NearestSearch *search, const Probe *a, const P
     double least = (a->value + b->value - steepness(search) * h) / 2;
     double m = MORE_CURVED * range->speed * range->turn;
     if (least >= to_beat(search)) return least;
-    if (course == CONCAVE)
-        return a->piece == b->piece ? fmin(a->value, b->value) - m * h * h / 8 : least;
-    if (course == ANY_COURSE && h > FINE) return least;
+    if (course == CONCAVE && a->piece == b->piece)
+        return fmax(least, fmin(a->value, b->value) - m * h * h / 8);
+    double first = a->value + a->point->radius, second = b->value + b->point->radius;
+    if (course == ANY_COURSE && first > 0 && second > 0) {
+        double chord = scene_far(a->point->position, b->point->position);
+        double found = outside_spheres(chord, first, second) - m * h * h / 8;
+        least = fmax(least, found - fmax(a->point->radius, b->point->radius));
+    }
+    if (course != CONVEX && h > FINE) return least;
     double down = a->slope - m * h / 2, up = b->slope + m * h / 2;
     if (down >= 0) return fmax(least, a->value);
     if (up <= 0) return fmax(least, b->value);
@@ -243,6 +263,20 @@ static int search_range(NearestSearch *search, const Range *range) {
     return 1;
 }
 
+/* Bring the best to where the slope is zero, so that its normal is right to first order too. */
+static int sharpen(NearestSearch *search) {
+    const Range *range = search->range = search->within;
+    double low = range->points[0].s, high = range->points[range->count - 1].s;
+    double s = search->best->s, slope = search->slope, step = slope > 0 ? -SHARPENED : SHARPENED;
+    BodyPoint point;
+    Probe probe;
+    if (search->best->distance >= search->cutoff || s + step <= low || s + step >= high) return 1;
+    if (!body_point(search->line, s + step, &point) || !probe_at(search, &point, &probe)) return 0;
+    step *= slope / (slope - probe.slope);
+    if (!(fabs(step) < FINE) || s + step <= low || s + step >= high) return 1;
+    return body_point(search->line, s + step, &point) && probe_at(search, &point, &probe);
+}
+
 /* -- rings --------------------------------------------------------------------------------- */
 
 typedef struct {
@@ -253,7 +287,9 @@ static int passage_of(const SceneObject *o, const double *point, Passage *passag
     double w[SCENE_MEMORY];
     const double *arg[2] = {point, o->parameters};
     double *res[4] = {&passage->height, &passage->beyond, &passage->from_disc, passage->normal};
-    return !o->passage(arg, res, 0, w, 0);
+    if (o->passage(arg, res, 0, w, 0)) return 0;
+    if (fabs(passage->height) < IN_PLANE) passage->height = 0;
+    return 1;
 }
 
 /* Whether the centre line passes the disc where it crosses its plane between two points. */
@@ -297,6 +333,7 @@ static int ring_nearest(NearestSearch *search, const Range *ranges, int64_t coun
             before = now;
         }
     }
+    if (!sharpen(search)) return 0;
     if (passed) return 1;
     if (crossed) {
         BodyPoint nearest;
@@ -314,12 +351,12 @@ static int ring_nearest(NearestSearch *search, const Range *ranges, int64_t coun
 /* The nearest point of an object along ranges that have been surveyed. */
 static int object_nearest(const CentreLine *line, const SceneObject *object, const Range *ranges,
                           int64_t count, double cutoff, Nearest *nearest) {
-    NearestSearch search = {line, object, ranges, cutoff, nearest};
+    NearestSearch search = {line, object, ranges, cutoff, nearest, 0, ranges};
     nearest->distance = INFINITY;
     if (object->passage) return ring_nearest(&search, ranges, count);
     for (int64_t r = 0; r < count; r++)
         if (!search_range(&search, ranges + r)) return 0;
-    return 1;
+    return sharpen(&search);
 }
 
 #endif

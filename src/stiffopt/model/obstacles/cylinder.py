@@ -1,43 +1,15 @@
 """A cylinder with flat ends."""
 
-from typing import Annotated
-
 import casadi as ca
 import numpy as np
-from pydantic import Field, model_validator
 
-from stiffopt.model.obstacle import (
-    Array,
-    Obstacle,
-    Point,
-    Radius,
-    check_apart,
-    from_box,
-    norm,
-    revolved,
-)
+from stiffopt.model.obstacle import Array, BetweenEnds, from_box, norm, revolved
 
 
-class Cylinder(Obstacle):
-    """A cylinder with flat ends.
-
-    Attributes
-    ----------
-    start, end : centres of its ends, in m; ``from`` and ``to`` in files.
-    radius : in m.
-    """
+class Cylinder(BetweenEnds):
+    """A cylinder with flat ends; see `BetweenEnds` for its keys."""
 
     key = "cylinder"
-    n_parameters = 7
-
-    start: Annotated[Point, Field(alias="from")]
-    end: Annotated[Point, Field(alias="to")]
-    radius: Radius
-
-    @model_validator(mode="after")
-    def _check(self) -> "Cylinder":
-        check_apart(self.start, self.end, "expected another 'to'")
-        return self
 
     @staticmethod
     def formula(point: ca.SX, parameters: ca.SX) -> ca.SX:
@@ -49,11 +21,6 @@ class Cylinder(Obstacle):
         beside = norm(seen - height * way / length)
         beyond = ca.fabs(height - length / 2) - length / 2
         return from_box(ca.vertcat(beside - parameters[6], beyond))
-
-    @property
-    def pieces(self) -> list[list[float]]:
-        """Both ends, radius."""
-        return [[*self.start, *self.end, self.radius]]
 
     def outline(self, size: float) -> list[Array]:
         """See `Obstacle.outline`."""

@@ -149,10 +149,10 @@ class Mesh(Obstacle):
         super().check_against(robot, clearance)
 
     def outline(self, size: float) -> list[Array]:
-        """Its triangles (3, m, 4), closed; see `Obstacle.outline`."""
+        """Its triangles, (3, m, 3); see `Obstacle.outline`."""
         axes = np.asarray(lie.rotation_from_quaternion(np.array(self.orientation)))
         corners = self.surface.vertices @ axes.T + np.array(self.centre)
-        triangles: Array = corners[self.surface.faces[:, [0, 1, 2]]]  # (m, 3, 3)
+        triangles: Array = corners[self.surface.faces]  # (m, 3, 3)
         return [np.moveaxis(triangles, 2, 0)]
 
 

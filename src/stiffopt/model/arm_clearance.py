@@ -1,0 +1,230 @@
+"""The clearance of one arm to a scene, in machine code where it is there."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import NDArray
+
+from stiffopt.model.batch import in_parallel
+from stiffopt.model.body import NativeBody
+from stiffopt.model.clearance import Nearest, nearest_point, range_ends, survey
+from stiffopt.model.compiled import Library
+from stiffopt.model.distances import MeasuredObject, SceneObjectInC, scene_library
+from stiffopt.model.scene import Scene
+
+if TYPE_CHECKING:
+    from stiffopt.model.manipulator import Manipulator
+
+Array = NDArray[np.float64]
+
+_CHUNK = 16  # poses that a thread takes at a time
+_DEGREE = 22  # of polynomials along a range, which are exact to a nanometre
+_STEP = 10.0  # Pa, of differences of radii
+
+_integer, _pointer = ctypes.c_int64, ctypes.c_void_p
+
+
+@dataclass(frozen=True)
+class Clearances:
+    """How far the body of an arm is from each of k objects, for one pose or N.
+
+    Attributes
+    ----------
+    names : of the objects, (k,).
+    distances : of the body's surface, negative where it is within an object, (k,) or (N, k), in m.
+    at : arc lengths at rest of the nearest points of the body, alike, in m.
+    positions : these points of the centre line, (k, 3) or (N, k, 3), in m.
+    normals : unit vectors in which the body gets away, alike.
+    gradients : of the distances by the pressures, (k, n) or (N, k, n), in m/Pa; where a distance
+        has a kink, one of its sides.
+    """
+
+    names: tuple[str, ...]
+    distances: Array
+    at: Array
+    positions: Array
+    normals: Array
+    gradients: Array
+
+    @property
+    def nearest(self) -> str:
+        """Name of the object with the least distance, in all poses."""
+        return self.names[int(np.argmin(self.distances)) % len(self.names)]
+
+    def only(self) -> Clearances:
+        """Those of a single pose, without the leading axis."""
+        arrays = (self.distances, self.at, self.positions, self.normals, self.gradients)
+        return Clearances(self.names, *(array[0] for array in arrays))
+
+
+class _Same:
+    """A scene as a key: that very one, whatever it is equal to."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+
+    def __hash__(self) -> int:
+        return id(self.scene)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and other.scene is self.scene
+
+
+class MeasuredScene:
+    """The objects of a scene with their numbers."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.names = tuple(item.name for item in scene.objects)
+        self.items = tuple(MeasuredObject(item.shape) for item in scene.objects)
+
+        self._in_c: tuple[Library, ctypes.Array[SceneObjectInC]] | None = None
+
+    def in_c(self, code: Library) -> ctypes.Array[SceneObjectInC]:
+        """What C takes; it refers to memory of these objects."""
+        if self._in_c is None or self._in_c[0] is not code:
+            objects = (SceneObjectInC * len(self.items))(*(item.in_c(code) for item in self.items))
+            self._in_c = code, objects
+        return self._in_c[1]
+
+
+@lru_cache(maxsize=64)
+def _measured(key: _Same) -> MeasuredScene:
+    return MeasuredScene(key.scene)
+
+
+class _Ranges(NamedTuple):
+    """The ranges of an arm's body: ends (k, 2) and numbers of coarse stations (k,)."""
+
+    ends: tuple[tuple[float, float, int], ...]
+    bounds: Array
+    counts: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, ends: tuple[tuple[float, float, int], ...]) -> _Ranges:
+        """Beside them as tuples, arrays for C."""
+        bounds = np.array([[start, end] for start, end, _ in ends])
+        return cls(ends, bounds, np.array([count for *_, count in ends], dtype=np.int64))
+
+
+class ArmClearance:
+    """Distances of an arm's body from a scene, at pressures (N, n) in Pa that are finite."""
+
+    def __init__(self, arm: Manipulator, scene: Scene) -> None:
+        self._arm, self._scene = arm, _measured(_Same(scene))
+        self._ranges = arm.kept("ranges", lambda: _Ranges.of(range_ends(arm.description)))
+
+    def least(self, p: Array) -> Array:
+        """The least of all distances, (N,)."""
+        found, missing = self._in_c(p, None)
+        for row in missing:
+            found[row, 0, 0] = min(each.distance for each in self._of(p[row]))
+        return found[:, 0, 0]
+
+    def each(self, p: Array) -> Clearances:
+        """The distances of all objects."""
+        gradients = np.empty((len(p), len(self._scene.names), self._arm.n_pressures))
+        found, missing = self._in_c(p, gradients)
+        for row in missing:
+            for index, each in enumerate(self._of(p[row])):
+                found[row, index] = [*each[:3], *each.position, *each.normal]
+                gradients[row, index] = self._gradient(p[row], each)
+        return Clearances(
+            self._scene.names, found[..., 0], found[..., 1], found[..., 3:6], found[..., 6:],
+            gradients,
+        )  # fmt: skip
+
+    # -- without machine code ---------------------------------------------------------------
+
+    def _of(self, p: Array) -> list[Nearest]:
+        """Nearest points of all objects at pressures (n,)."""
+        line = _CentreLine(self._arm, p, self._ranges.bounds)
+        ranges = survey(line, self._ranges.ends)
+        return [nearest_point(line, item, ranges) for item in self._scene.items]
+
+    def _gradient(self, p: Array, nearest: Nearest) -> Array:
+        """Derivative (n,) of a distance by the pressures."""
+        at = np.array([nearest.s])
+        rotation = self._arm._body.poses(p[None], at)[0, 0, :3, :3]
+        moves = rotation @ self._arm._body.jacobians(p[None], at)[0, 0, :3]  # (3, n)
+        aside = _STEP * np.eye(len(p))
+        widening = self._arm._body.radii(p + aside, at) - self._arm._body.radii(p - aside, at)
+        found: Array = nearest.normal @ moves - nearest.radius_share * widening[:, 0] / (2 * _STEP)
+        return found
+
+    # -- in machine code --------------------------------------------------------------------
+
+    def _in_c(self, p: Array, gradients: Array | None) -> tuple[Array, NDArray[np.intp]]:
+        """Least distances (N, 1, 9), or with gradients those of all objects (N, k, 9).
+
+        And which rows are missing: all without machine code, and those at whose pressures the arm
+        has no shape, of which the other way says why.
+        """
+        width = 1 if gradients is None else len(self._scene.names)
+        found = np.full((len(p), width, 9), np.nan)
+        outcome = np.ones(len(p), dtype=np.int64)
+        body = self._arm._body.machine_code(len(p))
+        code = scene_library() if body is not None else None
+        if body is not None and code is not None:
+            objects, p = self._scene.in_c(code), np.ascontiguousarray(p)
+            address = None if gradients is None else gradients.ctypes.data
+            call = partial(
+                _clearances(body), body.address, ctypes.addressof(objects), len(objects),
+                self._ranges.bounds.ctypes.data, self._ranges.counts.ctypes.data,
+                len(self._ranges.ends),
+                p.ctypes.data, found.ctypes.data, address, outcome.ctypes.data,
+            )  # fmt: skip
+            _in_chunks(call, len(p))
+        return found, np.flatnonzero(outcome)
+
+
+def _clearances(body: NativeBody) -> Callable[..., int]:
+    function = body.code.cdll.stiffopt_clearances
+    function.argtypes = [
+        _pointer, _pointer, _integer, _pointer, _pointer, _integer, _pointer, _pointer, _pointer,
+        _pointer, _integer, _integer,
+    ]  # fmt: skip
+    found: Callable[..., int] = function
+    return found
+
+
+def _in_chunks(call: Callable[[int, int], int], count: int) -> None:
+    """Have threads work on rows of a batch."""
+    failed: list[int] = []
+
+    def work(starts: Iterator[int]) -> None:
+        failed.extend(start for start in starts if call(start, min(start + _CHUNK, count)))
+
+    in_parallel(work, range(0, count, _CHUNK))
+    if failed:
+        raise MemoryError("no memory is left for the stations of the arm")
+
+
+class _CentreLine:
+    """The body of an arm at pressures (n,), by polynomials along each range."""
+
+    def __init__(self, arm: Manipulator, p: Array, bounds: Array) -> None:
+        self._bounds = bounds
+        nodes = chebyshev.chebpts1(_DEGREE + 1)
+        at = bounds.mean(axis=1)[:, None] + np.ptp(bounds, axis=1)[:, None] / 2 * nodes
+        positions = arm._body.poses(p[None], at.ravel())[0, :, :3, 3].reshape(*at.shape, 3)
+        inverse = np.linalg.inv(chebyshev.chebvander(nodes, _DEGREE))
+        self._positions = inverse @ positions  # (ranges, degree + 1, 3)
+        self._slopes = chebyshev.chebder(self._positions, axis=1)
+        self._radii = arm._body.radii(p[None], bounds.mean(axis=1))[0]
+
+    def __call__(self, at: Array) -> tuple[Array, Array, Array]:
+        """See `stiffopt.model.clearance.StationOf`."""
+        index = np.searchsorted(self._bounds[:-1, 1], at)
+        low, high = self._bounds[index].T
+        x = (2 * at - low - high) / (high - low)
+        values = chebyshev.chebvander(x, _DEGREE)[:, None]  # (k, 1, degree + 1)
+        slopes = (values[..., :-1] @ self._slopes[index])[:, 0]
+        tangents = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
+        return (values @ self._positions[index])[:, 0], tangents, self._radii[index]

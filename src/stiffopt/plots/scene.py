@@ -1,0 +1,62 @@
+"""The objects of a scene in axes in 3-D."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.model.scene import Scene
+from stiffopt.plots import style
+from stiffopt.plots.wording import MM
+
+Vector = NDArray[np.float64]
+
+_SHADES = {"inside_tube": 0.12, "half_space": 0.2}
+_SHADE = 0.45
+
+
+def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> Vector:
+    """Draw a scene's objects, in mm.
+
+    Parameters
+    ----------
+    axes :
+        In 3-D.
+    scene :
+        What is around the arm.
+    size :
+        Length of the arm, in mm: what has no end is cut off at about it.
+    seen : (k, 3)
+        What the figure shows anyway, in mm.
+
+    Returns
+    -------
+    (j, 3) array
+        Points that the figure should show too: those of objects that are not far from the rest.
+    """
+    near = [seen]
+    low, high = seen.min(axis=0) - 0.6 * size, seen.max(axis=0) + 0.6 * size
+    for item in scene.objects:
+        shade = _SHADES.get(item.shape.key, _SHADE)
+        for surface in item.shape.outline(size / MM):
+            _draw_surface(axes, surface * MM, shade, item.shape.key == "mesh")
+            points = surface.reshape(3, -1).T * MM
+            near.append(points[((points > low) & (points < high)).all(axis=1)])
+            middle = np.clip(points.mean(axis=0), low, high)
+        axes.text(*middle, f" {style.literal(item.name)}", color=style.DARK, fontsize=8, zorder=12)
+    return np.vstack(near)
+
+
+def _draw_surface(axes: Any, surface: Vector, shade: float, is_mesh: bool) -> None:
+    if is_mesh:
+        from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+        triangles = np.moveaxis(surface, 0, 2)  # (m, 3, 3)
+        body = Poly3DCollection(triangles, facecolors=style.OBSTACLE, alpha=shade, shade=True)
+        axes.add_collection3d(body)
+        return
+    axes.plot_surface(
+        *surface, color=style.OBSTACLE, alpha=shade, linewidth=0, rstride=1, cstride=1, zorder=2
+    )
