@@ -221,6 +221,7 @@ def test_the_closest_configuration_is_that_of_the_general_method(kind, compiled,
         fast = solver.solve()
         assert fast.status == "unreachable"
         assert fast.counts["descents"] > 0
+        assert str(fast.confidence).startswith("none of ")
         with monkeypatch.context() as patch:
             patch.setattr(PressureSolver, "_nearest", lambda *_: None)
             slow = solver.solve()

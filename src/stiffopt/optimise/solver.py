@@ -1,6 +1,7 @@
 """From a task to the stiffest pressures: global search, judgement and diagnosis."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from time import perf_counter
@@ -346,7 +347,7 @@ class PressureSolver:
             active_bounds=tuple(active),
             **self._quantities(task, judgement),
             pressures=p,
-            confidence=answer.confidence,
+            confidence=replace(answer.confidence, reached=0),  # none came to the pose
             counts=answer.counts,
             timings={},
         )
