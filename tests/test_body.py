@@ -317,7 +317,7 @@ def test_failures_are_those_of_the_tip(fast, request, monkeypatch):
         monkeypatch.setattr(body, "LOOKED_UP_FROM", 0)
         monkeypatch.setattr(body, "COMPILED_FREE_FROM", 0)
         monkeypatch.setattr(body, "COMPILED_LOADED_FROM", 0)
-    model = robot("2 segments")
+    model = made("2 segments")
     p = np.array([pressures(model), np.full(6, 4.99e5)])
     with pytest.raises(PressureError, match="drives the compensated modulus"):
         model.backbone(p)

@@ -96,7 +96,10 @@ def test_it_is_the_robot_that_is_built_anew(name: str, law: str) -> None:
         for at in (None, MIDDLE):
             poses = arm.poses(p, coordinates, at)
             expected = robot.tip_pose(p) if at is None else [robot.pose(q, at) for q in p]
-            assert poses.transforms == pytest.approx(np.array(expected), abs=1e-9)
+            # under loads a robot interpolates between steps of its own
+            interpolated = at is not None and robot.is_loaded
+            within = 1e-6 if interpolated else 1e-9
+            assert poses.transforms == pytest.approx(np.array(expected), abs=within)
         poses = arm.poses(p, coordinates)
         size = np.abs(poses.per_pressure).max()
         assert poses.per_pressure == pytest.approx(robot.tip_jacobian(p), abs=1e-7 * size)

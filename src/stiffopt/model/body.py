@@ -43,6 +43,8 @@ LOOKED_UP_FROM = 8
 COMPILED_FREE_FROM, COMPILED_LOADED_FROM = 2000, 64
 """Poses from which it is made if there is none: they have taken about a second in the VM."""
 
+_LOOKED_FOR_AGAIN = 32  # poses, while it is being made
+
 _CHUNK = 16  # poses that a thread takes at a time
 _KEPT = 16  # numbers of stations for which memory is kept
 _POSES, _JACOBIANS, _RESPONSES, _LINE = range(4)  # as body.c has them
@@ -63,8 +65,7 @@ class BodyShape:
         self._pieces = Pieces(arm)
         self._stations = LoadedStations(arm) if arm.is_loaded else FreeStations(arm, self._pieces)
         self._native: NativeBody | None = None
-        self._count = 0
-        self._looked_up = False
+        self._count, self._next_look = 0, LOOKED_UP_FROM
         self._lock = threading.Lock()
 
     def poses(self, p: Vector, at: Vector) -> Vector:
@@ -132,10 +133,10 @@ class BodyShape:
             return self._native
         with self._lock:
             self._count += rows
-            from_now = COMPILED_LOADED_FROM if self._arm.is_loaded else COMPILED_FREE_FROM
-            missing = self._count >= from_now
-            if missing or (self._count >= LOOKED_UP_FROM and not self._looked_up):
-                self._looked_up = True
+            if self._count >= self._next_look:
+                wanted_from = COMPILED_LOADED_FROM if self._arm.is_loaded else COMPILED_FREE_FROM
+                self._next_look = max(wanted_from, self._count + _LOOKED_FOR_AGAIN)
+                missing = self._count >= wanted_from
                 self._native = native_body(self._arm, build_missing=missing)
         return self._native
 

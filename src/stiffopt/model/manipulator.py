@@ -97,7 +97,7 @@ class Manipulator(Arm):
         return self._at_stations(self._body.poses, p, stations)
 
     def pose(self, p: ArrayLike, at: ArrayLike) -> Vector:
-        """Pose (4, 4) or (N, 4, 4) at arc length `at` (m, at rest, from the base).
+        """Pose (4, 4) or (N, 4, 4) at arc length `at` (m, at rest, from the base), above 0.
 
         Several arc lengths (k,) give poses (k, 4, 4) or (N, k, 4, 4).
         """
