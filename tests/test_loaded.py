@@ -1,7 +1,5 @@
 """The compiled solver of arms under gravity and loads against the model and the general method."""
 
-import ctypes
-
 import numpy as np
 import pytest
 
@@ -74,22 +72,10 @@ CASES = {
 
 def compiled_point(solver, program, pressures):
     """What the compiled solver evaluates: residuals, Jacobian, terms, floors and gradients."""
-    setup, n = solver._setup, len(pressures)
-    point = solver._library.cdll.stiffopt_point
-    point.argtypes = [ctypes.c_void_p] * 5
-    rows, terms, floors = setup.rows, setup.terms, setup.floors
-    values = np.zeros(n + (rows + terms + floors) * (1 + n))
     radii = np.array([constraint.radius for constraint in program.constraints(1.0)])
     parameters = np.concatenate([solver._numbers, program.parameters])
-    assert point(
-        ctypes.addressof(setup), parameters.ctypes.data, radii.ctypes.data,
-        pressures.ctypes.data, values.ctypes.data,
-    )  # fmt: skip
-    found, start = [], n
-    for count in (rows, terms, floors):
-        found.append(values[start : start + count])
-        found.append(values[start + count : start + count * (1 + n)].reshape(count, n))
-        start += count * (1 + n)
+    found = solver.point(parameters, radii, pressures)
+    assert found is not None
     return found
 
 

@@ -73,13 +73,11 @@ def _calls(
     """What is timed, by name."""
     calls = solver._warm_calls
     assert calls is not None
-    row = calls._row.copy()
-    calls.fast.write(row, calls._row, calls.fast.guess_alone, p)
-    row[calls.fast.targets] = place
-    _, search = calls.fast.call(row)
+    block = calls.like.copy()
+    block[calls.fast.targets], block[calls.fast.guess] = place, p
     return {
         "nothing": calls.fast._library.cdll.stiffopt_setup_size,
-        "machine code": search,
+        "machine code": calls.fast.call(block),
         "warm": lambda: solver.warm(place, p).pressures,
         "warm, found": lambda: solver.warm(place, p).found,
         "solve": lambda: solver.solve(target, guess=p),

@@ -28,6 +28,7 @@ from stiffopt.errors import DerivativeError, InputError, shown
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.measures.directional import StiffnessMeasure
+from stiffopt.optimise.prepared import prepared
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.settings import DERIVATIVES, DESCENT
@@ -397,8 +398,16 @@ def _turned(program: Program, which: int, way: Vector, by: float) -> Program:
 
 def _evaluation(problem: PressureProblem) -> Callable[[Vector, Vector], ProgramPoint]:
     """Everything at pressures (n,), as shares, and parameters; from rest under loads."""
+    bare = problem.task.model_copy(update={"load": None})  # which the arm carries already
+    fast = None
+    if problem.robot.is_loaded:
+        fast = prepared(problem.robot, bare, 0).fast(problem.program)
+    radii = np.array([c.radius for c in problem.constraints])
 
     def evaluate(x: Vector, parameters: Vector) -> ProgramPoint:
+        parts = None if fast is None else fast[0].point(parameters, radii, x * problem.unit)
+        if parts is not None:
+            return ProgramPoint(x, parts[0], parts[1], problem.constraints, *parts[2:])
         other = copy(problem)
         other.parameters = parameters
         other.restart()

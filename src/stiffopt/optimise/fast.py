@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import InputError
 from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
@@ -32,7 +31,7 @@ Vector = NDArray[np.float64]
 _NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
 _SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _COME, _CLOSEST = range(6)  # as solver.c has them
-_UNSOLVED, _LOCAL, _GLOBAL, _JUDGED, _CAME, _NEAREST, _NOT_FINITE = range(7)
+_UNSOLVED, ANSWERED, _GLOBAL, _JUDGED, _CAME, _NEAREST, _NOT_FINITE = range(7)
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
@@ -114,14 +113,9 @@ class FastSolver:
 
     Attributes
     ----------
-    targets : slice
-        Where the target's parameters are in a row.
-    guess_alone, judge :
-        What can be asked of pressures in a row: the answer next to them, which is not judged, or
-        whether they are one.
+    targets, guess : slice
+        Where the target's parameters and a guess are in a row.
     """
-
-    guess_alone, judge = _GUESS_ALONE, _JUDGE
 
     def __init__(
         self, library: Library, robot: Manipulator, program: Program, table: SampleTable
@@ -136,7 +130,8 @@ class FastSolver:
         self._solve.argtypes = [
             _pointer, _pointer, _integer, _pointer, _integer, _integer, _integer, _pointer
         ]  # fmt: skip
-        n, constraints = robot.n_pressures, program.constraints(robot.length)
+        n = robot.n_pressures
+        constraints = program.constraints(robot.length)
         self._length = robot.length
         stages = [term.name for term in program.in_order_of_approach]
         self._arrays = (
@@ -194,6 +189,8 @@ class FastSolver:
         ends = np.cumsum([_COUNTS + n, n, program.n_rows, 16, 36, len(program.measures)]).tolist()
         self._parts = [slice(start, end) for start, end in pairwise(ends)]
         self._answer_width = ends[-1]
+        self.guess = slice(self._asked + 1, self._width)
+        self._pressures = slice(self._width + _COUNTS, self._width + _COUNTS + n)
 
     def row(self, program: Program, lower: Vector, upper: Vector, floors: Vector) -> Vector:
         """Numbers of a task, its target and guess left out."""
@@ -213,7 +210,7 @@ class FastSolver:
         row[self._near] = list(chain.from_iterable(near))
         if guess is not None:
             row[self._asked] = _GUESS_FIRST
-            row[self._asked + 1 :] = guess
+            row[self.guess] = guess
         return row
 
     def limit(self, row: Vector, lower: Vector, upper: Vector) -> None:
@@ -228,30 +225,52 @@ class FastSolver:
         """Configuration closest to a target out of reach; None if the general method is needed."""
         return self.answer(self._run_one(row, _CLOSEST))
 
-    def judged(self, row: Vector, numbers: Vector) -> CompiledAnswer | None:
-        """Answer from numbers that were not judged, for a row with its pressures as a guess."""
-        judged = self._run_one(row, _JUDGE)
-        judged[1:_COUNTS] = numbers[1:_COUNTS]
-        return self.answer(judged)
-
     def comes(self, row: Vector) -> bool:
         """Whether one of the configurations nearest to the target is brought to it."""
         return bool(self._run_one(row, _COME)[0] == _CAME)
 
-    def call(self, row: Vector) -> tuple[Vector, Callable[[], int]]:
-        """Numbers of an answer, and a call that finds them for a row; both stay where they are."""
-        numbers = np.empty(self._answer_width)
-        call = partial(
-            self._solve, self._address, row.ctypes.data, self._width,
-            numbers.ctypes.data, self._answer_width, 0, 1, 0,
-        )  # fmt: skip
-        return numbers, call
+    def block(self, row: Vector) -> Vector:
+        """A row that asks for the answer next to its guess, and behind it room for the numbers."""
+        block = np.concatenate([row, np.zeros(self._answer_width)])
+        block[self._asked] = _GUESS_ALONE
+        return block
 
-    def write(self, row: Vector, like: Vector, asked: float, pressures: Vector) -> None:
-        """Make a row like another one but for what is asked of which pressures (n,), in Pa."""
-        row[: self._asked] = like[: self._asked]
-        row[self._asked] = asked
-        row[self._asked + 1 :] = pressures
+    def call(self, block: Vector) -> Callable[[], int]:
+        """What fills in the numbers of a block, which stays where it is; they are not judged."""
+        row = block.ctypes.data
+        return partial(
+            self._solve, self._address, row, self._width, row + block.itemsize * self._width,
+            self._answer_width, 0, 1, 0,
+        )  # fmt: skip
+
+    def judged(self, block: Vector) -> CompiledAnswer | None:
+        """The answer in a block, judged by the model."""
+        row, numbers = block[: self._width].copy(), block[self._width :]
+        row[self.guess] = self.pressures(block)
+        judged = self._run_one(row, _JUDGE)
+        judged[1:_COUNTS] = numbers[1:_COUNTS]
+        return self.answer(judged)
+
+    def pressures(self, block: Vector) -> Vector:
+        """Pressures (n,) of the answer in a block, in Pa."""
+        return block[self._pressures]
+
+    def point(self, parameters: Vector, radii: Vector, pressures: Vector) -> list[Vector] | None:
+        """Parts of a point of a loaded arm's program, from rest; None for no equilibrium.
+
+        Pressures are (n,) in Pa.  The parts are residuals (m,), their Jacobian (m, n) per share of
+        a range, terms (t,), their gradients (t, n), floors (f,) and theirs (f, n).
+        """
+        s = self._setup
+        values = np.empty(s.n + (s.rows + s.terms + s.floors) * (1 + s.n))
+        arrays = [np.ascontiguousarray(each) for each in (parameters, radii, pressures)]
+        point = self._library.cdll.stiffopt_point
+        point.argtypes = [_pointer] * 5
+        if not point(self._address, *(each.ctypes.data for each in (*arrays, values))):
+            return None
+        counts = [count for k in (s.rows, s.terms, s.floors) for count in (k, k * s.n)]
+        parts = np.split(values[s.n :], np.cumsum(counts)[:-1])
+        return [each.reshape(-1, s.n) if i % 2 else each for i, each in enumerate(parts)]
 
     def _run_one(self, row: Vector, asked: int | None = None) -> Vector:
         numbers = np.empty(self._answer_width)
@@ -283,48 +302,18 @@ class FastSolver:
         if failed:
             raise MemoryError("no memory is left for the compiled solver")
 
-    def pressures(self, numbers: Vector) -> Vector:
-        """Pressures (n,) of an answer, in Pa."""
-        return numbers[_COUNTS : self._parts[0].start]
-
-    @staticmethod
-    def is_local(numbers: Vector) -> bool:
-        """Whether an answer was found next to a guess.
-
-        Raises
-        ------
-        InputError
-            If a number of the row was not finite.
-        """
-        outcome = numbers.item(0)
-        if outcome == _NOT_FINITE:
-            raise InputError("the target and the guess must be finite numbers")
-        return outcome == _LOCAL
-
-    def judgement(self, numbers: Vector) -> tuple[list[float], Vector, Vector, list[float]] | None:
-        """What `Judgement.of` takes, of the numbers of an answer; None if there is none."""
-        if numbers.item(0) not in (_LOCAL, _GLOBAL, _JUDGED, _NEAREST):
-            return None
-        _, residuals, pose, compliance, values = self._parts
-        return (
-            numbers[residuals].tolist(),
-            numbers[pose].reshape(4, 4),
-            numbers[compliance].reshape(6, 6),
-            numbers[values].tolist(),
-        )
-
     def answer(self, numbers: Vector) -> CompiledAnswer | None:
         """Answer from the numbers of a call, which become its own; None if there is none."""
-        judgement = self.judgement(numbers)
-        if judgement is None:
+        if numbers[0] not in (ANSWERED, _GLOBAL, _JUDGED, _NEAREST):
             return None
+        slope, residuals, pose, compliance, values = self._parts
         _, _, _, _, tried, reached, descents, agreeing, optima, complete, *work = map(
             int, numbers[:_COUNTS].tolist()
         )
         numbers.flags.writeable = False
         iterations, poses, points, programs = work
         return CompiledAnswer(
-            self.pressures(numbers),
+            numbers[_COUNTS : slope.start],
             Confidence(tried, descents, agreeing, optima, complete == 1),
             {
                 "starts": tried,
@@ -335,6 +324,11 @@ class FastSolver:
                 "points": points,
                 "programs": programs,
             },
-            judgement,
-            numbers[self._parts[0]],
+            (
+                numbers[residuals].tolist(),
+                numbers[pose].reshape(4, 4),
+                numbers[compliance].reshape(6, 6),
+                numbers[values].tolist(),
+            ),
+            numbers[slope],
         )

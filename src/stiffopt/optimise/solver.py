@@ -1,6 +1,7 @@
 """From a task to the stiffest pressures: global search, judgement and diagnosis."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from time import perf_counter
@@ -9,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.directions import unit_quaternion, unit_vector
 from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
 from stiffopt.model.arguments import checked_integer, checked_vector
 from stiffopt.model.compiled import (
@@ -41,7 +41,7 @@ from stiffopt.optimise.solution import (
 )
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
-from stiffopt.optimise.warm import WarmAnswer, WarmCalls, judged_answer
+from stiffopt.optimise.warm import WarmAnswer, WarmCalls, asked_task
 
 Vector = NDArray[np.float64]
 
@@ -141,16 +141,13 @@ class PressureSolver:
             If an argument is wrong, or not a part of the task's target.
         """
         calls = self._warm_calls or self._prepare_warm_calls()
-        check = calls is None  # compiled code sees for itself whether numbers are finite
-        parts = self._parts(position, pointing, orientation, check)
-        p = _array("guess", guess, self.robot.n_pressures, check)
-        narrow = None if limits is None else self._narrowed(*limits)
-        numbers = None if calls is None else calls(parts, p, narrow)
-        if calls is None or numbers is None:
-            return self._searched(self._task_of(parts), p, narrow)
-        found = calls.fast.pressures(numbers)
-        holds = partial(self._holds, parts, found)
-        return WarmAnswer(found, holds, partial(self._solution_of, parts, numbers))
+        if calls is not None and limits is None:
+            block = calls.next_to(guess, position, pointing, orientation)
+            if block is not None:
+                return WarmAnswer(calls.fast.pressures(block), self, block)
+        task = asked_task(self.task, position, pointing, orientation)
+        p = checked_vector("guess", guess, self.robot.n_pressures)
+        return self._warm_otherwise(task, p, limits)
 
     def reachable(self, target: Target | None = None) -> bool:
         """Whether the arm comes to a target (the task's, or another one); stiffness left aside.
@@ -222,76 +219,44 @@ class PressureSolver:
             self._warm_calls = WarmCalls(*fast, program)
         return self._warm_calls
 
-    def _parts(
-        self,
-        position: ArrayLike | None,
-        pointing: ArrayLike | None,
-        orientation: ArrayLike | None,
-        check: bool,
-    ) -> dict[str, Any]:
-        """Parts of a target that take the place of the task's."""
-        parts: dict[str, Any] = {}
-        target = self.task.target
-        if position is not None:
-            p = _array("position", position, 3, check)
-            own = target.position
-            if own is not None and None in own:
-                wanted = zip(p.tolist(), own, strict=True)
-                parts["position"] = tuple(None if x is None else new for new, x in wanted)
-            else:
-                parts["position"] = p
-        if pointing is not None:
-            parts["pointing"] = unit_vector(tuple(checked_vector("pointing", pointing).tolist()))
-        if orientation is not None:
-            q = checked_vector("orientation", orientation, 4)
-            parts["orientation"] = unit_quaternion(tuple(q.tolist()))
-        for key in parts:
-            if getattr(target, key) is None:
-                raise InputError(f"the task's target has no {key}, so that none can be given")
-        return parts
-
-    def _narrowed(self, lower: ArrayLike, upper: ArrayLike) -> tuple[Vector, Vector]:
-        """Limits (n,) in Pa where they are within the task's."""
-        n, own = self.robot.n_pressures, self._prepared
-        low = np.maximum(checked_vector("the lower limits", lower, n), own.lower)
-        high = np.minimum(checked_vector("the upper limits", upper, n), own.upper)
-        if (low > high).any():
-            raise InputError("limits leave a channel no pressure that the task permits")
-        return low, high
-
-    def _task_of(self, parts: dict[str, Any]) -> Task:
-        """The task with other parts of its target."""
-        plain = {k: tuple(v.tolist()) if isinstance(v, np.ndarray) else v for k, v in parts.items()}
-        target = self.task.target.model_copy(update=plain)
-        return self.task.model_copy(update={"target": target})
-
-    def _holds(self, parts: dict[str, Any], pressures: Vector) -> bool:
-        """Whether the model confirms an answer of a warm call."""
-        within = are_within(pressures, self._prepared.lower, self._prepared.upper)
-        return self._warm_calls is not None and self._warm_calls.holds(parts, pressures, within)
-
-    def _solution_of(self, parts: dict[str, Any], numbers: Vector) -> PressureSolution | None:
-        """Solution from the numbers of a warm call; None if it does not hold."""
-        task, calls = self._task_of(parts), self._warm_calls
-        fast = None if calls is None else self._fast(task, calls.fast.pressures(numbers))
-        if fast is None:
-            return None
-        return self._accepted(task, fast[2], fast[0].judged(fast[1], numbers))
-
-    def _searched(
-        self, task: Task, guess: Vector, limits: tuple[Vector, Vector] | None
+    def _warm_otherwise(
+        self, task: Task, guess: Vector, limits: tuple[ArrayLike, ArrayLike] | None
     ) -> WarmAnswer:
-        """Answer of a global search, where there is none next to a guess, or no compiled code."""
+        """Answer where the leanest call has none; all but the limits is checked."""
+        narrow = None
+        if limits is not None:
+            n, own = self.robot.n_pressures, self._prepared
+            low = np.maximum(checked_vector("the lower limits", limits[0], n), own.lower)
+            high = np.minimum(checked_vector("the upper limits", limits[1], n), own.upper)
+            if (low > high).any():
+                raise InputError("limits leave a channel no pressure that the task permits")
+            narrow = low, high
+            pressure = PressureRange(min=tuple(low.tolist()), max=tuple(high.tolist()))
+            task = task.model_copy(update={"pressure": pressure})
         if self._warm_calls is not None:
-            solution = self._compiled(task, None, limits)
+            solution = self._compiled(task, guess, narrow)
         else:
-            if limits is not None:
-                low, high = (tuple(each.tolist()) for each in limits)
-                task = task.model_copy(update={"pressure": PressureRange(min=low, max=high)})
-                guess = np.clip(guess, *limits)
-            solution = PressureSolver(self._given, task, seed=self.seed).solve(guess=guess)
+            start = guess if narrow is None else np.clip(guess, *narrow)
+            solution = PressureSolver(self._given, task, seed=self.seed).solve(guess=start)
         solution = solution if solution is not None and solution.found else None
-        return judged_answer(None if solution is None else solution.pressures, solution)
+        return WarmAnswer.judged(None if solution is None else solution.pressures, solution)
+
+    def _confirms(self, block: Vector) -> bool:
+        """Whether the model confirms an answer of a warm call."""
+        calls = self._warm_calls
+        assert calls is not None  # or there would be no block
+        answer = calls.fast.judged(block)
+        if answer is None:
+            return False
+        within = are_within(answer.pressures, self._prepared.lower, self._prepared.upper)
+        return Judgement.of(calls.program, answer.judged, within).holds
+
+    def _solution_of(self, block: Vector) -> PressureSolution | None:
+        """Solution from an answer of a warm call; None if it does not hold."""
+        calls = self._warm_calls
+        assert calls is not None
+        task = calls.task_of(block, self.task)
+        return self._accepted(task, self._prepared.program(task.target), calls.fast.judged(block))
 
     # -- solutions --------------------------------------------------------------------------
 
@@ -358,6 +323,7 @@ class PressureSolver:
         """Closest configuration by compiled code; None if the pose can be had, or for no code."""
         fast = self._fast(task, None)
         answer = None if fast is None else fast[0].closest(fast[1])
+        checkpoint()  # a search that was cut short proves nothing
         if fast is None or answer is None or answer.slope is None:
             return None
         p = answer.pressures
@@ -381,7 +347,7 @@ class PressureSolver:
             active_bounds=tuple(active),
             **self._quantities(task, judgement),
             pressures=p,
-            confidence=answer.confidence,
+            confidence=replace(answer.confidence, reached=0),  # none came to the pose
             counts=answer.counts,
             timings={},
         )
@@ -729,18 +695,6 @@ def _pressed(active: dict[str, tuple[int, int]], prices: Vector) -> list[str]:
     """Those of the active limits that have a price, of prices (n,) that count upwards."""
     least = 1e-6 * float(np.abs(prices).max())
     return [name for name, (index, side) in active.items() if side * prices[index] > least]
-
-
-def _array(name: str, value: ArrayLike, size: int, checked: bool) -> Vector:
-    """Numbers (size,) of the caller's, as an array of one's own; finite if it is checked here."""
-    if not checked:
-        try:
-            array = np.array(value, dtype=float)
-            if array.shape == (size,):
-                return array
-        except (TypeError, ValueError):
-            pass
-    return checked_vector(name, value, size)
 
 
 def _clean(price: float) -> float:

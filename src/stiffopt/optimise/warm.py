@@ -1,22 +1,52 @@
 """The lean call of planners: from one answer to the next, arrays in and arrays out.
 
 A row of numbers and the memory of an answer are made once; a call writes the target and the guess
-into them, calls machine code and copies what it found.  All else waits until it is asked for.
+into them, calls machine code and copies what it found.  All else waits until it is asked for: a
+call whose memory is no longer in the processor's caches pays for each line of Python it runs.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.optimise.fast import FastSolver
+from stiffopt.directions import unit_quaternion, unit_vector
+from stiffopt.errors import InputError
+from stiffopt.model.arguments import checked_vector
+from stiffopt.optimise.fast import ANSWERED, FastSolver
 from stiffopt.optimise.program import Program
-from stiffopt.optimise.solution import Judgement, PressureSolution
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.task import Task
 from stiffopt.optimise.term import Term
 
+if TYPE_CHECKING:
+    from stiffopt.optimise.solver import PressureSolver
+
 Vector = NDArray[np.float64]
-Limits = tuple[Vector, Vector]
+
+
+def asked_task(
+    task: Task,
+    position: ArrayLike | None,
+    pointing: ArrayLike | None,
+    orientation: ArrayLike | None,
+) -> Task:
+    """The task with other parts of its target, which are checked."""
+    parts: dict[str, Any] = {}
+    if position is not None:
+        given, own = checked_vector("position", position), task.target.position or (0, 0, 0)
+        pairs = zip(given.tolist(), own, strict=True)
+        parts["position"] = tuple(None if axis is None else new for new, axis in pairs)
+    if pointing is not None:
+        parts["pointing"] = unit_vector(tuple(checked_vector("pointing", pointing).tolist()))
+    if orientation is not None:
+        q = checked_vector("orientation", orientation, 4)
+        parts["orientation"] = unit_quaternion(tuple(q.tolist()))
+    for key in parts:
+        if getattr(task.target, key) is None:
+            raise InputError(f"the task's target has no {key}, so that none can be given")
+    return task.model_copy(update={"target": task.target.model_copy(update=parts)})
 
 
 class WarmAnswer:
@@ -34,27 +64,31 @@ class WarmAnswer:
         Whether the model confirms that all tolerances, limits and demands of the task hold.
     """
 
-    __slots__ = ("_holds", "_solve", "_solved", "pressures")
+    __slots__ = ("_block", "_solved", "_solver", "pressures")
 
-    def __init__(
-        self,
-        pressures: Vector | None,
-        holds: Callable[[], bool],
-        solve: Callable[[], PressureSolution | None],
-    ) -> None:
-        self.pressures, self._holds, self._solve = pressures, holds, solve
+    def __init__(self, pressures: Vector | None, solver: "PressureSolver", block: Vector) -> None:
+        self.pressures, self._solver, self._block = pressures, solver, block
+
+    @classmethod
+    def judged(cls, pressures: Vector | None, solution: PressureSolution | None) -> "WarmAnswer":
+        """Answer of which the solution is known."""
+        answer = cls.__new__(cls)
+        answer.pressures, answer._solved = pressures, solution
+        return answer
 
     @property
     def solution(self) -> PressureSolution | None:
         """See the class."""
         if not hasattr(self, "_solved"):
-            self._solved = self._solve()
+            self._solved = self._solver._solution_of(self._block)
         return self._solved
 
     @property
     def found(self) -> bool:
         """See the class."""
-        return self._holds()
+        if hasattr(self, "_solved"):
+            return self._solved is not None
+        return self._solver._confirms(self._block)
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
@@ -65,71 +99,93 @@ class WarmAnswer:
 
     def __reduce__(self) -> tuple[object, ...]:
         """Support pickling: it is judged now."""
-        return judged_answer, (self.pressures, self.solution)
+        return WarmAnswer.judged, (self.pressures, self.solution)
 
     def __repr__(self) -> str:
         return f"WarmAnswer({self.solution!r})" if self.found else "WarmAnswer(nothing was found)"
 
 
-def judged_answer(pressures: Vector | None, solution: PressureSolution | None) -> WarmAnswer:
-    """Answer that was judged already."""
-    return WarmAnswer(pressures, lambda: solution is not None, lambda: solution)
-
-
 class WarmCalls:
-    """Warm calls for one task, whose rows and memory for answers are used again and again."""
+    """Warm calls for one task, whose memory is used again and again.
+
+    Attributes
+    ----------
+    fast : FastSolver
+    program : Program
+        Of the task.
+    like : ndarray
+        Block of numbers of the task (see `FastSolver.block`).
+    """
 
     def __init__(self, fast: FastSolver, row: Vector, program: Program) -> None:
-        self.fast, self._program = fast, program
-        self._row = fast.with_target(row, program, None)
+        self.fast, self.program = fast, program
+        self.like = fast.block(fast.with_target(row, program, None))
         self._spare = [self._memory()]
+        self._guess, self._outcome = fast.guess, len(row)
+        self._n = fast.guess.stop - fast.guess.start
         self._parts: dict[str, tuple[slice, Term]] = {}
         start = fast.targets.start
         for term in program.terms:
             self._parts[term.key] = slice(start, start + len(term.parameters)), term
             start += len(term.parameters)
+        place = self._parts.get("position")
+        self._place = None if place is None else place[0]
+        axes: tuple[int, ...] = () if place is None else getattr(place[1], "axes", ())
+        self._axes = None if len(axes) == 3 else list(axes)
 
-    def _memory(self) -> tuple[Vector, Vector, Callable[[], int]]:
-        """A row, the numbers of its answer, and the call that finds them."""
-        row = self._row.copy()
-        numbers, call = self.fast.call(row)
-        return row, numbers, call
+    def _memory(self) -> tuple[Vector, Callable[[], int]]:
+        """A block of numbers and the call that answers it."""
+        block = self.like.copy()
+        return block, self.fast.call(block)
 
-    def __call__(
-        self, parts: dict[str, Any], guess: Vector, limits: Limits | None
-    ) -> Vector | None:
-        """Numbers of the answer next to a guess (n,) in Pa, not judged; None where there is none.
-
-        Parameters
-        ----------
-        parts :
-            Of the target, instead of the task's: a position (3,), or what is in a `Target` under
-            the same key.
-        """
-        found = self._run(parts, guess, limits, self.fast.guess_alone)
-        return found if self.fast.is_local(found) else None
-
-    def holds(self, parts: dict[str, Any], pressures: Vector, within: bool) -> bool:
-        """Whether the model confirms pressures (n,); `within`: whether they are within limits."""
-        judged = self.fast.judgement(self._run(parts, pressures, None, self.fast.judge))
-        return judged is not None and Judgement.of(self._program, judged, within).holds
-
-    def _run(
-        self, parts: dict[str, Any], pressures: Vector, limits: Limits | None, asked: float
-    ) -> Vector:
-        """Numbers of an answer, a copy."""
+    def next_to(self, guess: Any, position: Any, pointing: Any, orientation: Any) -> Vector | None:
+        """Block with the answer next to a guess; None if there is none, or an argument is wrong."""
+        if not self._spare:  # other threads have them all
+            self._spare.append(self._memory())
+        memory = self._spare.pop()
+        block, call = memory
+        others = pointing is not None or orientation is not None
+        found = None
         try:
-            memory = self._spare.pop()
-        except IndexError:  # other threads have them all
-            memory = self._memory()
-        row, numbers, call = memory
-        self.fast.write(row, self._row, asked, pressures)
-        for key, value in parts.items():
-            where, term = self._parts[key]
-            row[where] = value if isinstance(value, np.ndarray) else term.like(value).parameters
-        if limits is not None:
-            self.fast.limit(row, *limits)
-        call()
-        found = numbers.copy()
+            if position is None:
+                block[self.fast.targets] = self.like[self.fast.targets]
+            elif len(position) == 3 and self._place is not None:
+                own = position if self._axes is None else np.asarray(position)[self._axes]
+                block[self._place] = own
+            else:
+                raise ValueError
+            if others:
+                self._turn(block, pointing, orientation)
+            if len(guess) == self._n:
+                block[self._guess] = guess
+                call()
+                if block.item(self._outcome) == ANSWERED:
+                    found = block.copy()
+        except (KeyError, TypeError, ValueError):
+            pass
+        if others:
+            block[self.fast.targets] = self.like[self.fast.targets]
         self._spare.append(memory)
         return found
+
+    def _turn(self, block: Vector, pointing: Any, orientation: Any) -> None:
+        """Write the angular parts of a target."""
+        if pointing is not None:
+            where, term = self._parts["pointing"]
+            block[where] = term.like(unit_vector(tuple(map(float, pointing)))).parameters
+        if orientation is not None:
+            where, _ = self._parts["orientation"]
+            block[where] = unit_quaternion(tuple(map(float, orientation)))
+
+    def task_of(self, block: Vector, task: Task) -> Task:
+        """The task that a block asks for."""
+        parts: dict[str, Any] = {}
+        for key, (where, _) in self._parts.items():
+            values = tuple(block[where].tolist())
+            if key == "position":
+                left = iter(values)
+                own = task.target.position or ()
+                parts[key] = tuple(None if axis is None else next(left) for axis in own)
+            elif key in ("pointing", "orientation"):
+                parts[key] = values[: 3 if key == "pointing" else 4]
+        return task.model_copy(update={"target": task.target.model_copy(update=parts)})
