@@ -62,6 +62,7 @@ COMMAND_SECONDS = 0.8
 TIMES_REAL_TIME = 10.0  # of the simulated arm, two segments, full dynamics
 BATCH_SOLVES = 1500.0  # per second, two segments
 BODY_SINGLE_US, BODY_BATCH_US = {"free": 40.0, "hanging": 150.0}, {"free": 10.0, "hanging": 100.0}
+CLEARANCE_BATCH_US = 5.0
 WARM_ABOVE_HOT_US, WARM_ABOVE_COLD_US = 20.0, 250.0  # CPU of a lean call above that of C
 UNREACHABLE_MS = 60.0  # CPU, under gravity or a load
 BATCH_POSES, BATCH_STIFFNESSES = 1.5e6, 0.5e6  # per second, two segments

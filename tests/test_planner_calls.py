@@ -100,6 +100,17 @@ def test_parts_of_the_target_take_the_place_of_the_tasks(code):
             assert pose[:3, 2] @ target.pointing > np.cos(np.radians(1.0001))
 
 
+def test_what_a_caller_does_to_his_arrays_later_does_not_matter(compiled):
+    solver = solver_of(so.load_robot("stiff-flop-2"))
+    place, guess = np.array(PLACE), solver.solve().pressures.copy()
+    answer, again = (solver.warm(place, guess) for _ in range(2))
+    place[:], guess[:] = 0, 0
+    assert answer.found
+    assert answer.solution.task.target == solver.task.target
+    assert solver.warm(None, again.pressures).found  # the task's own target, not the last one
+    np.testing.assert_array_equal(again.pressures, answer.pressures)
+
+
 def test_limits_of_a_warm_call_only_narrow_the_tasks(code):
     solver = solver_of(so.load_robot("stiff-flop-2"))
     p = solver.solve().pressures
@@ -210,6 +221,7 @@ def test_the_closest_configuration_is_that_of_the_general_method(kind, compiled,
         fast = solver.solve()
         assert fast.status == "unreachable"
         assert fast.counts["descents"] > 0
+        assert str(fast.confidence).startswith("none of ")
         with monkeypatch.context() as patch:
             patch.setattr(PressureSolver, "_nearest", lambda *_: None)
             slow = solver.solve()

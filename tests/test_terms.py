@@ -155,7 +155,9 @@ def test_is_what_the_arms_poses_say(kind):
         (term,) = problem.program.terms
         found = problem.pose(P2 / problem.unit).residual
         values = term.radius - found if term.is_inequality else found
-        assert values == pytest.approx(residual(term, robot(name), P2), abs=1e-8)
+        # under loads an arm's poses on the way are interpolated between steps
+        within = 1e-6 if kind.has_stations and robot(name).is_loaded else 1e-8
+        assert values == pytest.approx(residual(term, robot(name), P2), abs=within)
 
 
 @each_kind

@@ -73,11 +73,11 @@ def _calls(
     """What is timed, by name."""
     calls = solver._warm_calls
     assert calls is not None
-    block = calls.like.copy()
+    block, search = calls._spare[0]
     block[calls.fast.targets], block[calls.fast.guess] = place, p
     return {
         "nothing": calls.fast._library.cdll.stiffopt_setup_size,
-        "machine code": calls.fast.call(block),
+        "machine code": search,
         "warm": lambda: solver.warm(place, p).pressures,
         "warm, found": lambda: solver.warm(place, p).found,
         "solve": lambda: solver.solve(target, guess=p),

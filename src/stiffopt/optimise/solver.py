@@ -1,7 +1,7 @@
 """From a task to the stiffest pressures: global search, judgement and diagnosis."""
 
 from collections.abc import Iterable
-from copy import deepcopy
+from dataclasses import replace
 from functools import partial
 from itertools import islice
 from time import perf_counter
@@ -40,8 +40,8 @@ from stiffopt.optimise.solution import (
     judge,
 )
 from stiffopt.optimise.target import Target
-from stiffopt.optimise.task import Task
-from stiffopt.optimise.warm import Asked, WarmAnswer, WarmCalls
+from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.optimise.warm import WarmAnswer, WarmCalls, asked_task
 
 Vector = NDArray[np.float64]
 
@@ -141,13 +141,13 @@ class PressureSolver:
             If an argument is wrong, or not a part of the task's target.
         """
         calls = self._warm_calls or self._prepare_warm_calls()
-        plain = pointing is None and orientation is None and limits is None
-        if calls is not None and plain and position is not None:
-            block = calls.place(position, guess)
+        if calls is not None and limits is None:
+            block = calls.next_to(guess, position, pointing, orientation)
             if block is not None:
                 return WarmAnswer(calls.fast.pressures(block), self, block)
-        asked = Asked(*deepcopy((position, pointing, orientation, limits)))
-        return self._warm_otherwise(asked, guess)
+        task = asked_task(self.task, position, pointing, orientation)
+        p = checked_vector("guess", guess, self.robot.n_pressures)
+        return self._warm_otherwise(task, p, limits)
 
     def reachable(self, target: Target | None = None) -> bool:
         """Whether the arm comes to a target (the task's, or another one); stiffness left aside.
@@ -219,20 +219,25 @@ class PressureSolver:
             self._warm_calls = WarmCalls(*fast, program)
         return self._warm_calls
 
-    def _warm_otherwise(self, asked: Asked, guess: ArrayLike) -> WarmAnswer:
-        """Answer where the leanest call has none, checked as every call from outside."""
-        p = checked_vector("guess", guess, self.robot.n_pressures)
-        own, calls = self._prepared, self._warm_calls
-        narrow = None if asked.limits is None else asked.narrowed(own.lower, own.upper)
-        parts, task = asked.parts(self.task), asked.task(self.task, own.lower, own.upper)
-        if calls is not None:
-            block = calls.general(parts, p, narrow)
-            if block is not None:
-                return WarmAnswer(calls.fast.pressures(block), self, block, asked)
-            solution = self._compiled(task, None, narrow)
+    def _warm_otherwise(
+        self, task: Task, guess: Vector, limits: tuple[ArrayLike, ArrayLike] | None
+    ) -> WarmAnswer:
+        """Answer where the leanest call has none; all but the limits is checked."""
+        narrow = None
+        if limits is not None:
+            n, own = self.robot.n_pressures, self._prepared
+            low = np.maximum(checked_vector("the lower limits", limits[0], n), own.lower)
+            high = np.minimum(checked_vector("the upper limits", limits[1], n), own.upper)
+            if (low > high).any():
+                raise InputError("limits leave a channel no pressure that the task permits")
+            narrow = low, high
+            pressure = PressureRange(min=tuple(low.tolist()), max=tuple(high.tolist()))
+            task = task.model_copy(update={"pressure": pressure})
+        if self._warm_calls is not None:
+            solution = self._compiled(task, guess, narrow)
         else:
-            p = p if narrow is None else np.clip(p, *narrow)
-            solution = PressureSolver(self._given, task, seed=self.seed).solve(guess=p)
+            start = guess if narrow is None else np.clip(guess, *narrow)
+            solution = PressureSolver(self._given, task, seed=self.seed).solve(guess=start)
         solution = solution if solution is not None and solution.found else None
         return WarmAnswer.judged(None if solution is None else solution.pressures, solution)
 
@@ -246,13 +251,12 @@ class PressureSolver:
         within = are_within(answer.pressures, self._prepared.lower, self._prepared.upper)
         return Judgement.of(calls.program, answer.judged, within).holds
 
-    def _solution_of(self, block: Vector, asked: Asked | None) -> PressureSolution | None:
+    def _solution_of(self, block: Vector) -> PressureSolution | None:
         """Solution from an answer of a warm call; None if it does not hold."""
-        calls, own = self._warm_calls, self._prepared
+        calls = self._warm_calls
         assert calls is not None
-        asked = asked or Asked(block[calls.position])
-        task = asked.task(self.task, own.lower, own.upper)
-        return self._accepted(task, own.program(task.target), calls.fast.judged(block))
+        task = calls.task_of(block, self.task)
+        return self._accepted(task, self._prepared.program(task.target), calls.fast.judged(block))
 
     # -- solutions --------------------------------------------------------------------------
 
@@ -343,7 +347,7 @@ class PressureSolver:
             active_bounds=tuple(active),
             **self._quantities(task, judgement),
             pressures=p,
-            confidence=answer.confidence,
+            confidence=replace(answer.confidence, reached=0),  # none came to the pose
             counts=answer.counts,
             timings={},
         )

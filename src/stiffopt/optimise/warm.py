@@ -6,7 +6,7 @@ call whose memory is no longer in the processor's caches pays for each line of P
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,59 +17,36 @@ from stiffopt.model.arguments import checked_vector
 from stiffopt.optimise.fast import ANSWERED, FastSolver
 from stiffopt.optimise.program import Program
 from stiffopt.optimise.solution import PressureSolution
-from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.optimise.task import Task
 from stiffopt.optimise.term import Term
 
 if TYPE_CHECKING:
     from stiffopt.optimise.solver import PressureSolver
 
 Vector = NDArray[np.float64]
-Limits = tuple[Vector, Vector]
 
 
-class Asked(NamedTuple):
-    """What a warm call asks beside a guess; None: as the task has it."""
-
-    position: ArrayLike | None = None
-    pointing: ArrayLike | None = None
-    orientation: ArrayLike | None = None
-    limits: tuple[ArrayLike, ArrayLike] | None = None
-
-    def parts(self, task: Task) -> dict[str, Any]:
-        """The parts of the target that take the place of the task's, checked, by key."""
-        parts: dict[str, Any] = {}
-        if self.position is not None:
-            wanted = zip(checked_vector("position", self.position).tolist(),
-                         task.target.position or (0, 0, 0), strict=True)  # fmt: skip
-            parts["position"] = tuple(None if own is None else new for new, own in wanted)
-        if self.pointing is not None:
-            p = checked_vector("pointing", self.pointing)
-            parts["pointing"] = unit_vector(tuple(p.tolist()))
-        if self.orientation is not None:
-            q = checked_vector("orientation", self.orientation, 4)
-            parts["orientation"] = unit_quaternion(tuple(q.tolist()))
-        for key in parts:
-            if getattr(task.target, key) is None:
-                raise InputError(f"the task's target has no {key}, so that none can be given")
-        return parts
-
-    def narrowed(self, lower: Vector, upper: Vector) -> Limits:
-        """The limits (n,) in Pa, where they are within the task's."""
-        low, high = self.limits or (lower, upper)
-        low = np.maximum(checked_vector("the lower limits", low, len(lower)), lower)
-        high = np.minimum(checked_vector("the upper limits", high, len(lower)), upper)
-        if (low > high).any():
-            raise InputError("limits leave a channel no pressure that the task permits")
-        return low, high
-
-    def task(self, task: Task, lower: Vector, upper: Vector) -> Task:
-        """The task as it was asked; `lower`, `upper` (n,): its limits in Pa."""
-        target = task.target.model_copy(update=self.parts(task))
-        if self.limits is None:
-            return task.model_copy(update={"target": target})
-        low, high = (tuple(each.tolist()) for each in self.narrowed(lower, upper))
-        limits = PressureRange(min=low, max=high)
-        return task.model_copy(update={"target": target, "pressure": limits})
+def asked_task(
+    task: Task,
+    position: ArrayLike | None,
+    pointing: ArrayLike | None,
+    orientation: ArrayLike | None,
+) -> Task:
+    """The task with other parts of its target, which are checked."""
+    parts: dict[str, Any] = {}
+    if position is not None:
+        given, own = checked_vector("position", position), task.target.position or (0, 0, 0)
+        pairs = zip(given.tolist(), own, strict=True)
+        parts["position"] = tuple(None if axis is None else new for new, axis in pairs)
+    if pointing is not None:
+        parts["pointing"] = unit_vector(tuple(checked_vector("pointing", pointing).tolist()))
+    if orientation is not None:
+        q = checked_vector("orientation", orientation, 4)
+        parts["orientation"] = unit_quaternion(tuple(q.tolist()))
+    for key in parts:
+        if getattr(task.target, key) is None:
+            raise InputError(f"the task's target has no {key}, so that none can be given")
+    return task.model_copy(update={"target": task.target.model_copy(update=parts)})
 
 
 class WarmAnswer:
@@ -87,17 +64,10 @@ class WarmAnswer:
         Whether the model confirms that all tolerances, limits and demands of the task hold.
     """
 
-    __slots__ = ("_asked", "_block", "_solved", "_solver", "pressures")
+    __slots__ = ("_block", "_solved", "_solver", "pressures")
 
-    def __init__(
-        self,
-        pressures: Vector | None,
-        solver: "PressureSolver",
-        block: Vector,
-        asked: Asked | None = None,
-    ) -> None:
-        self.pressures = pressures
-        self._solver, self._block, self._asked = solver, block, asked
+    def __init__(self, pressures: Vector | None, solver: "PressureSolver", block: Vector) -> None:
+        self.pressures, self._solver, self._block = pressures, solver, block
 
     @classmethod
     def judged(cls, pressures: Vector | None, solution: PressureSolution | None) -> "WarmAnswer":
@@ -110,7 +80,7 @@ class WarmAnswer:
     def solution(self) -> PressureSolution | None:
         """See the class."""
         if not hasattr(self, "_solved"):
-            self._solved = self._solver._solution_of(self._block, self._asked)
+            self._solved = self._solver._solution_of(self._block)
         return self._solved
 
     @property
@@ -145,8 +115,6 @@ class WarmCalls:
         Of the task.
     like : ndarray
         Block of numbers of the task (see `FastSolver.block`).
-    position : slice or None
-        Where the target's position is in a block, if none of its axes is free.
     """
 
     def __init__(self, fast: FastSolver, row: Vector, program: Program) -> None:
@@ -155,49 +123,69 @@ class WarmCalls:
         self._spare = [self._memory()]
         self._guess, self._outcome = fast.guess, len(row)
         self._n = fast.guess.stop - fast.guess.start
-        self._terms: dict[str, tuple[slice, Term]] = {}
+        self._parts: dict[str, tuple[slice, Term]] = {}
         start = fast.targets.start
         for term in program.terms:
-            self._terms[term.key] = slice(start, start + len(term.parameters)), term
+            self._parts[term.key] = slice(start, start + len(term.parameters)), term
             start += len(term.parameters)
-        place = self._terms.get("position")
-        self.position = place[0] if place is not None and place[1].size == 3 else None
+        place = self._parts.get("position")
+        self._place = None if place is None else place[0]
+        axes: tuple[int, ...] = () if place is None else getattr(place[1], "axes", ())
+        self._axes = None if len(axes) == 3 else list(axes)
 
     def _memory(self) -> tuple[Vector, Callable[[], int]]:
         """A block of numbers and the call that answers it."""
         block = self.like.copy()
         return block, self.fast.call(block)
 
-    def place(self, position: Any, guess: Any) -> Vector | None:
-        """Block with the answer next to a guess (n,) for a position (3,); None for all else.
-
-        That is where there is no answer, an argument is wrong, or axes of the position are free.
-        """
-        if self.position is None or not self._spare:
-            return None
+    def next_to(self, guess: Any, position: Any, pointing: Any, orientation: Any) -> Vector | None:
+        """Block with the answer next to a guess; None if there is none, or an argument is wrong."""
+        if not self._spare:  # other threads have them all
+            self._spare.append(self._memory())
         memory = self._spare.pop()
         block, call = memory
+        others = pointing is not None or orientation is not None
         found = None
         try:
-            if len(position) == 3 and len(guess) == self._n:
-                block[self.position] = position
+            if position is None:
+                block[self.fast.targets] = self.like[self.fast.targets]
+            elif len(position) == 3 and self._place is not None:
+                own = position if self._axes is None else np.asarray(position)[self._axes]
+                block[self._place] = own
+            else:
+                raise ValueError
+            if others:
+                self._turn(block, pointing, orientation)
+            if len(guess) == self._n:
                 block[self._guess] = guess
                 call()
                 if block.item(self._outcome) == ANSWERED:
                     found = block.copy()
-        except (TypeError, ValueError):
+        except (KeyError, TypeError, ValueError):
             pass
+        if others:
+            block[self.fast.targets] = self.like[self.fast.targets]
         self._spare.append(memory)
         return found
 
-    def general(self, parts: dict[str, Any], guess: Vector, limits: Limits | None) -> Vector | None:
-        """The same for other parts of the target, and within limits."""
-        block = self.like.copy()
-        for key, value in parts.items():
-            where, term = self._terms[key]
-            block[where] = term.like(value).parameters
-        block[self._guess] = guess
-        if limits is not None:
-            self.fast.limit(block, *limits)
-        self.fast.call(block)()
-        return block if block[self._outcome] == ANSWERED else None
+    def _turn(self, block: Vector, pointing: Any, orientation: Any) -> None:
+        """Write the angular parts of a target."""
+        if pointing is not None:
+            where, term = self._parts["pointing"]
+            block[where] = term.like(unit_vector(tuple(map(float, pointing)))).parameters
+        if orientation is not None:
+            where, _ = self._parts["orientation"]
+            block[where] = unit_quaternion(tuple(map(float, orientation)))
+
+    def task_of(self, block: Vector, task: Task) -> Task:
+        """The task that a block asks for."""
+        parts: dict[str, Any] = {}
+        for key, (where, _) in self._parts.items():
+            values = tuple(block[where].tolist())
+            if key == "position":
+                left = iter(values)
+                own = task.target.position or ()
+                parts[key] = tuple(None if axis is None else next(left) for axis in own)
+            elif key in ("pointing", "orientation"):
+                parts[key] = values[: 3 if key == "pointing" else 4]
+        return task.model_copy(update={"target": task.target.model_copy(update=parts)})

@@ -37,7 +37,7 @@ enum { CONVEX, CONCAVE, ANY_COURSE };
 #define IN_PLANE 1e-9        /* m above a ring's plane that are none */
 #define SHARPENED 1e-4       /* m of arc length, over which a slope's change is measured */
 #define STEEPEST 1.5         /* change of an interpolated distance with the way */
-#define MORE_CURVED 1.25     /* than the curvature that coarse stations show */
+#define MORE_CURVED 1.35     /* than the curvature that coarse stations show */
 
 typedef int (*Formula)(const double **arg, double **res, long long int *iw, double *w, int mem);
 typedef int (*StationOf)(const void *body, double s, double *position, double *tangent,
