@@ -28,6 +28,9 @@ from stiffopt.daemon.messages import (
     trajectory_of,
 )
 from stiffopt.errors import InputError
+from stiffopt.model.obstacles import OBSTACLES
+from stiffopt.model.obstacles.mesh import Mesh
+from stiffopt.model.scene import AllowedContact, Scene, SceneObject
 from stiffopt.optimise.goal import (
     AtLeast,
     MatchMatrix,
@@ -48,7 +51,14 @@ X = (1.0, 0.0, 0.0)
 MESSAGES: tuple[type[Schema], ...] = (
     *(Task, Target, Tolerance, StiffnessGoal, StiffnessMeasure, AtLeast, MatchValue, MatchMatrix),
     *(Load, PressureRange, Plane, Waypoint, Trajectory),
+    *(Scene, SceneObject, AllowedContact, *(kind for kind in OBSTACLES.values() if kind != Mesh)),
 )
+UNSAID: dict[type[Schema], set[str]] = {
+    Task: {"source"},
+    Scene: {"source"},
+    MatchMatrix: {"unit"},
+    SceneObject: {"mesh"},
+}
 
 
 class GentleTarget(Target):
@@ -219,7 +229,24 @@ def test_a_trajectory_survives_its_message() -> None:
     assert trajectory_of(sent) == given
 
 
+SHAPES: list[dict[str, Any]] = [
+    {"sphere": {"centre": X, "radius": 0.1}},
+    {"capsule": {"from": X, "to": (0, 0, 1), "radius": 0.1}},
+    {"cylinder": {"from": X, "to": (0, 0, 1), "radius": 0.1}},
+    {"box": {"centre": X, "size": (0.1, 0.1, 0.2), "orientation": (0, 1, 0, 0)}},
+    {"half_space": {"point": X, "normal": (0, 0, -1)}},
+    {"inside_tube": {"points": [X, (0, 0, 1)], "radius": 0.1}},
+    {"trocar": {"centre": X, "axis": (0, 0, 1), "radius": 0.1}},
+]
+SCENE = Scene(
+    clearance=0.001,
+    objects=[
+        {"name": f"{k}", "contact": {"allowed": True, "max_force": 0.3, "friction": 0.2}, **shape}
+        for k, shape in enumerate(SHAPES)
+    ],
+)
 EVERYTHING: list[Schema] = [
+    Task(robot="stiff-flop-1", target=TASK.target, scene=SCENE),
     Task(
         robot="stiff-flop-1",
         target=Target(
@@ -283,7 +310,7 @@ def test_every_field_of_every_schema_survives_its_message() -> None:
     }
     assert {model for model, _ in seen} == set(MESSAGES)
     for model in MESSAGES:
-        unsaid = {"source"} if model is Task else {"unit"} if model is MatchMatrix else set()
+        unsaid = UNSAID.get(model, set())
         wanted = {(model, name) for name in model.model_fields if name not in unsaid}
         assert wanted <= seen, f"EVERYTHING lacks {wanted - seen}"
         assert set(message_of(model).names) == {name for _, name in wanted}

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import stiffopt
+from stiffopt.daemon.messages import task_of
 from stiffopt.errors import FileError, InputError, MissingExtraError
 from stiffopt.files import save_file
 from stiffopt.model import distances as distances_module
@@ -592,3 +593,41 @@ def test_a_rig_file_may_have_a_scene_which_is_checked_against_its_arm(folder):
         load_rig_description(folder / "rig.yaml")
     assert caught.value.key == "scene.objects[0].sphere"
     assert caught.value.line == len(text.splitlines())
+
+
+def test_a_task_may_have_a_scene_which_is_checked_against_its_arm(folder):
+    text = (
+        "format: stiffopt-task/1\nrobot: stiff-flop-2\n"
+        "target: {position: [0 mm, 0 mm, 180 mm]}\nscene: scene.yaml\n"
+    )
+    (folder / "task.yaml").write_text(text)
+    task = stiffopt.load_task(folder / "task.yaml")
+    assert task.scene == load_scene(folder / "scene.yaml")
+    task.check_scene(task.resolve_robot())
+    own = "scene: {objects: [{name: a, sphere: {centre: [0 mm, 0 mm, 0 mm], radius: 1 mm}}]}"
+    (folder / "task.yaml").write_text(text.replace("scene: scene.yaml", own))
+    task = stiffopt.load_task(folder / "task.yaml")
+    with pytest.raises(FileError, match="within it") as caught:
+        stiffopt.solve_pressure(stiffopt.load_robot("stiff-flop-2"), task)
+    assert (caught.value.line, caught.value.key) == (4, "scene.objects[0].sphere")
+
+
+MESH = {"objects": [{"name": "a", "mesh": {"file": "a.stl", "scale_m": 1}}]}
+
+
+@pytest.mark.parametrize("scene", ["scene.yaml", MESH])
+def test_no_message_has_a_file_read(scene):
+    given = {"target": {"position_m": [0, 0, 0.18]}, "scene": scene}
+    with pytest.raises(InputError, match=r"valid dictionary|mesh: Extra inputs"):
+        task_of(given, "stiff-flop-2")
+    text = f"format: stiffopt-task/1\ntarget: {{}}\nscene: {scene}\n"
+    with pytest.raises(InputError, match="scene: no file is read here"):
+        task_of({"text": text}, "stiff-flop-2")
+
+
+def test_a_message_may_have_a_scene():
+    sphere = {"centre_m": [0, 0.05, 0.1], "radius_m": 0.01}
+    scene = {"clearance_m": 0.002, "objects": [{"name": "post", "sphere": sphere}]}
+    task = task_of({"target": {"position_m": [0, 0, 0.18]}, "scene": scene}, "stiff-flop-2")
+    assert task.scene is not None
+    assert task.scene.objects[0].shape == Sphere(centre=(0, 0.05, 0.1), radius=0.01)

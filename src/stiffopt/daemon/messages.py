@@ -41,6 +41,7 @@ from stiffopt.control.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
 from stiffopt.documents import document_of
 from stiffopt.errors import InputError, Loc, dotted, shown
 from stiffopt.files import from_document
+from stiffopt.model.obstacles.mesh import Mesh
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.schema import Schema
@@ -205,9 +206,10 @@ def _with_fields_of(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
 
 
 def _is_left_out(info: FieldInfo) -> bool:
-    """Whether a field is not in messages: the file that it was read from, or a constant."""
-    is_constant = get_origin(info.annotation) is Literal and len(get_args(info.annotation)) == 1
-    return bool(info.exclude) or is_constant
+    """Whether a field is not in messages: a file, what is read from one, or a constant."""
+    args = get_args(info.annotation)
+    is_constant = get_origin(info.annotation) is Literal and len(args) == 1
+    return bool(info.exclude) or is_constant or Mesh in args
 
 
 def _unit(hint: Any) -> str:
@@ -351,8 +353,18 @@ def _task_of_text(text: str, robot: str) -> Task:
         raise InputError("the text of the task is not UTF-8") from None
     document = document_of(text, "task")
     _check_robot(document.data.get("robot"), robot)
+    _check_scene(document.data.get("scene"))
     document.data["robot"] = robot
     return from_document(document, "task", Task)
+
+
+def _check_scene(given: Any) -> None:
+    """Refuse a scene that would have a file read here: a scene file, or a mesh."""
+    objects = given.get("objects") if isinstance(given, dict) else None
+    meshes = [each for each in objects or () if isinstance(each, dict) and "mesh" in each]
+    if isinstance(given, str) or meshes:
+        what = "a mesh" if meshes else "a scene file"
+        raise InputError(f"scene: no file is read here, so {what} cannot be sent; send the objects")
 
 
 def _check_robot(given: Any, robot: str) -> None:

@@ -41,6 +41,7 @@ class Prepared:
     def __init__(self, robot: Manipulator, task: Task, seed: int) -> None:
         load = task.load
         self.robot = robot.with_load(load.force, load.moment, load.frame) if load else robot
+        task.check_scene(robot.description)
         self.lower, self.upper = task.pressure_bounds(robot.description)
         self._program = Program.of(task, robot.description)
         self._floors = floor_bounds(task.stiffness)
@@ -48,10 +49,7 @@ class Prepared:
         self._seed = seed
         limits = (self.lower.tobytes(), self.upper.tobytes())
         self._key = (self.robot.tip_load, *limits, seed)
-        self._scene = None
-        if task.scene is not None:
-            task.scene.check_against(robot.description, task.source)
-            self._scene = SceneKey(task.scene)
+        self._scene = None if task.scene is None else SceneKey(task.scene)
         self._rows: dict[ProgramStructure, tuple[FastSolver, Vector] | None] = {}
 
     def program(self, target: Target) -> Program:

@@ -114,6 +114,8 @@ class Task(Schema):
             parts.append("with a load")
         if self.pressure != PressureRange():
             parts.append("with pressure limits")
+        if self.scene is not None:
+            parts.append("in a scene")
         return f"Task({', '.join(parts)})"
 
     __str__ = __repr__
@@ -146,6 +148,17 @@ class Task(Schema):
             raise self._error("robot", f"there is no file '{error.path}'") from None
         except InputError as error:
             raise self._error("robot", str(error)) from None
+
+    def check_scene(self, description: RobotDescription) -> None:
+        """Refuse a scene that makes no sense for a robot.
+
+        Raises
+        ------
+        InputError
+            See `Scene.check_against`.
+        """
+        if self.scene is not None:
+            self.scene.check_against(description, self.source)
 
     def pressure_bounds(
         self, description: RobotDescription
