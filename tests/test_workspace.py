@@ -25,7 +25,8 @@ from hypothesis import strategies as st
 import stiffopt
 from stiffopt.cli.main import main
 from stiffopt.errors import FileError, InputError, MissingExtraError
-from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.scene import Scene
 from stiffopt.workspace import (
     MapPlan,
     WorkspaceMap,
@@ -437,6 +438,24 @@ CLUSTER = """
     if __name__ == "__main__":
         main()
 """
+
+
+def test_what_a_scene_forbids_is_left_out(tmp_path: Path) -> None:
+    robot = load_robot("stiff-flop-1")
+    wall = {"name": "wall", "half_space": {"point": (0.02, 0, 0), "normal": (-1, 0, 0)}}
+    scene = Scene(clearance=2e-3, objects=[wall])
+    found = map_workspace(robot, tmp_path / "a.zarr", samples=300, cell=0.02, scene=scene)
+    whole = map_workspace(robot, samples=300, cell=0.02)
+    pressures = found.plan.sampling.pressures(0, 300)
+    clear = robot.clearance(pressures, scene) >= scene.clearance
+    assert 30 < clear.sum() < 270
+    assert found.count.sum() == clear.sum() < whole.count.sum()
+    assert found.lost == 0
+    assert found.high[0] == pytest.approx(robot.tip_pose(pressures[clear])[:, 0, 3].max())
+    assert open_workspace_map(tmp_path / "a.zarr").plan.scene == scene
+    with pytest.raises(InputError, match="wall"):
+        near = {"name": "wall", "half_space": {"point": (0.01, 0, 0), "normal": (-1, 0, 0)}}
+        map_workspace(robot, samples=10, scene=Scene(objects=[near]))
 
 
 @pytest.mark.skipif(find_spec("distributed") is None, reason="distributed is not installed")

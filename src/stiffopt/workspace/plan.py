@@ -248,11 +248,11 @@ class MapPlan:
         evaluate = self._at_equilibria if self.robot.is_loaded else self._in_closed_form
         position, stiffness = evaluate(pressures)
         sample = np.arange(start, stop)
-        good = np.isfinite(position).all(axis=1) & np.isfinite(stiffness).all(axis=0)
+        finite = np.isfinite(position).all(axis=1) & np.isfinite(stiffness).all(axis=0)
+        good = np.asarray(finite)
         lost = int((~good).sum())
         if self.scene is not None:
-            clear = np.flatnonzero(good)[self._is_clear(pressures[good])]
-            good = np.isin(np.arange(len(good)), clear)
+            good[good] = self._is_clear(pressures[good])
         if not good.all():
             position, stiffness, sample = position[good], stiffness[:, good], sample[good]
         keys = cell_keys(cell_indices(position, self.cell))
