@@ -453,8 +453,8 @@ def test_what_a_scene_forbids_is_left_out(tmp_path: Path) -> None:
     assert found.lost == 0
     assert found.high[0] == pytest.approx(robot.tip_pose(pressures[clear])[:, 0, 3].max())
     assert open_workspace_map(tmp_path / "a.zarr").plan.scene == scene
+    near = {"name": "wall", "half_space": {"point": (0.01, 0, 0), "normal": (-1, 0, 0)}}
     with pytest.raises(InputError, match="wall"):
-        near = {"name": "wall", "half_space": {"point": (0.01, 0, 0), "normal": (-1, 0, 0)}}
         map_workspace(robot, samples=10, scene=Scene(objects=[near]))
 
 
