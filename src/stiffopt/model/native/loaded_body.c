@@ -1,3 +1,0 @@
-/* Stations along an arm under gravity or loads. */
-#define STIFFOPT_LOADED
-#include "body.c"
