@@ -1159,9 +1159,9 @@ def test_a_simulated_rig_is_hosted_whole() -> None:
     rest = supply.hosted
     assert rest is not None
     assert supply.timeout == TIMEOUT
-    assert not rest.poses()
+    first = rest.poses()  # none yet, but on a machine that is busy
     time.sleep(0.2)
-    samples = rest.poses()
+    samples = (*first, *rest.poses())
     assert [sample.frame for sample in samples][:3] == [1, 2, 3]
     assert -0.1 < time.monotonic() - supply.epoch - samples[-1].received < 1.0
     assert np.shape(rest.ask("truth", {})) == (4, 4)

@@ -353,7 +353,7 @@ def test_a_server_that_accepts_and_says_nothing() -> None:
 
 
 def test_a_device_that_goes_silent_does_not_hang_its_user(started: Any, bench: FakeBench) -> None:
-    supply = started(timeout=0.5)
+    supply = started(timeout=1.0)
     supply.open()
     supply.arm()
     supply.command([1e5, 1e5])
@@ -361,9 +361,9 @@ def test_a_device_that_goes_silent_does_not_hang_its_user(started: Any, bench: F
     uses = (lambda: supply.command([1e5, 0]), supply.read, supply.vent, supply.close)
     for use in uses:
         began = time.monotonic()
-        with pytest.raises(DeviceError, match=r"has not answered for 0.5 s"):
+        with pytest.raises(DeviceError, match=r"has not answered for 1 s"):
             use()
-        assert time.monotonic() - began < 4.0
+        assert time.monotonic() - began < 6.0
     assert not supply.is_open
     assert bench.pressures[0] == pytest.approx(1e5)  # it did not get through, and close said so
     assert bench.pressures[1] == pytest.approx(1e5)

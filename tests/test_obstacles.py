@@ -225,9 +225,29 @@ def test_a_scene_that_leaves_no_way(compiled: Path) -> None:
     lumen = {"name": "lumen", "inside_tube": {"points": points, "radius": 0.018}}
     found = solve_pressure(robot, task_with(scene_of(lumen)))
     assert found.status == "unreachable"
-    assert "too near 'lumen'" in found.message
+    assert "no configuration was found whose body keeps the clearance" in found.message
+    assert "mm too far out of 'lumen'" in found.message
     assert found.clearance is not None
     assert found.clearance < CLEARANCE
+
+
+def test_a_cloud_of_points(compiled: Path) -> None:
+    """As many objects as there may be: more rows than fit on a stack as square matrices."""
+    robot = load_robot("stiff-flop-2")
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0, 2 * np.pi, 900), rng.uniform(0.03, 0.2, 900)
+    centres = np.stack([0.0205 * np.cos(angle), 0.0205 * np.sin(angle), height], 1)
+    cloud = [
+        {"name": f"point {k}", "sphere": {"centre": centre, "radius": 0.0005}}
+        for k, centre in enumerate(centres)
+    ]
+    target = Target(position=(0.0, 0.0, 0.184), tolerance={"position": 1e-3})
+    task = task_with(Scene(clearance=1e-3, objects=cloud)).model_copy(update={"target": target})
+    found = solve_pressure(robot, task)
+    assert found.found
+    x = robot.backbone(found.pressures, 500)[:, :3, 3]
+    nearest = np.linalg.norm(x[:, None] - centres, axis=2).min()
+    assert nearest - 0.0005 - 0.015 > 1e-3 - EXACT
 
 
 def test_a_scene_is_data(compiled: Path, monkeypatch: pytest.MonkeyPatch) -> None:

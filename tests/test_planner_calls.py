@@ -273,6 +273,23 @@ def test_cancelling_by_an_event_or_a_function(code):
         assert solver.solve(far, cancel=cancel).message == "cancelled before there was an answer"
 
 
+def test_what_a_cancel_function_raises_is_raised(compiled):
+    solver = solver_of(so.load_robot("stiff-flop-2"))
+    solver.solve()
+
+    def broken():
+        raise LookupError("lost")
+
+    with pytest.raises(LookupError, match="lost"):
+        solver.solve(cancel=broken)
+
+
+def test_a_timeout_may_be_any_number(code):
+    solver = solver_of(so.load_robot("stiff-flop-2"))
+    assert solver.solve(timeout=np.float32(5)).found
+    assert solver.solve(timeout=np.int64(5)).found
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -68,7 +68,10 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[VirtualLab, 
     with VirtualLab(description, load_description("stiff-flop-1"), "modbus") as lab:
         supply: Any = lab.description.supply
         supply = supply.model_copy(
-            update={"tcp": supply.tcp.model_copy(update={"port": 0}), "watchdog": None}
+            update={
+                "tcp": supply.tcp.model_copy(update={"port": 0, "timeout": 1.0}),
+                "watchdog": None,
+            }
         )
         lab.description = lab.description.model_copy(update={"supply": supply, "tracker": None})
         save_file(path, "rig", lab.start())

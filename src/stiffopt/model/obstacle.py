@@ -43,6 +43,7 @@ class Obstacle(Schema, ABC):
     along : what the distance is along a straight line: convex (that to any convex shape),
         concave in each piece (that inside a tube), or any. Exact minima along an arm rest on it.
     wrong_side : of it, for the arm.
+    amiss : where a body is that lacks the clearance, in words before the object's name.
     n_parameters : how many numbers the formula takes for a piece.
     is_interpolated : whether distances come from grids; the last eight parameters are then the
         values at the corners of a point's cube.
@@ -54,6 +55,7 @@ class Obstacle(Schema, ABC):
     key: ClassVar[str]
     along: ClassVar[Along] = "convex"
     wrong_side: ClassVar[str] = "within"
+    amiss: ClassVar[str] = "too near"
     n_parameters: ClassVar[int]
     is_interpolated: ClassVar[bool] = False
     is_ring: ClassVar[bool] = False

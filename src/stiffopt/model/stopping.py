@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from numbers import Real
 from time import monotonic
 from typing import Protocol
 
@@ -116,9 +117,15 @@ def stop_flag() -> Iterator[int]:
         return
     ended = threading.Event()
 
+    failures: list[BaseException] = []
+
     def watch() -> None:
         while not flag.cancel:
-            flag.cancel = int(limits.is_cancelled)
+            try:
+                flag.cancel = int(limits.is_cancelled)
+            except BaseException as error:  # the caller's own: it is raised where they wait
+                failures.append(error)
+                flag.cancel = 1
             if ended.wait(_LOOK_AGAIN):
                 return
 
@@ -129,10 +136,12 @@ def stop_flag() -> Iterator[int]:
     finally:
         ended.set()
         watcher.join()
+        if failures:
+            raise failures[0]
 
 
 def _checked_timeout(timeout: float) -> float:
-    if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not timeout > 0:
+    if isinstance(timeout, bool) or not isinstance(timeout, Real) or not timeout > 0:
         raise InputError(f"timeout must be a positive number of seconds; got {shown(timeout)}")
     return float(timeout)
 

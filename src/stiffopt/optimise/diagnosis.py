@@ -100,29 +100,41 @@ def unreachable_message(judgement: Judgement, task: Task, holding: list[str]) ->
         value = judgement.errors[term.name]
         if not term.holds(value):
             (beyond if term.is_inequality else away).append(term.words(value))
-    beyond += [
-        f"{missing * 1e3:.3g} mm too near '{name}'"
-        for name, missing in judgement.intruders.items()
-        if missing > OBSTACLES.allowed
-    ]
+    if task.scene is not None:
+        beyond += _intrusions(task.scene, judgement.intruders)
     misses = [*([f"{' and '.join(away)} away"] if away else []), *beyond]
-    held = (
-        f"held back by {', '.join(holding)}"
-        if holding
-        else "no pressure limit holds it back: the target is beyond the arm itself"
-    )
+    held = "no pressure limit holds it back: the target is beyond the arm itself"
+    if holding or task.scene is not None:
+        held = f"held back by {', '.join(holding) or 'its scene'}"
     return f"unreachable: the closest configuration is {' and '.join(misses)}; {held}"
+
+
+def no_way_message(judgement: Judgement, task: Task, samples: int) -> str:
+    """Say that nothing keeps the clearance, and what the clearest configuration lacks of it."""
+    assert task.scene is not None
+    words = " and ".join(_intrusions(task.scene, judgement.intruders))
+    return (
+        f"unreachable: no configuration was found whose body keeps the clearance of the scene; the "
+        f"clearest of {samples} is {words}"
+    )
 
 
 def in_the_way(robot: Manipulator, scene: Scene, pressures: Vector) -> str:
     """Say which objects are nearer than the clearance at pressures (n,), and by how much."""
     near = robot.clearances(pressures, scene)
-    missing = [
-        f"{(scene.clearance - distance) * 1e3:.3g} mm too near '{name}'"
-        for name, distance in zip(near.names, near.distances.tolist(), strict=True)
-        if distance < scene.clearance - OBSTACLES.allowed
+    missing = (scene.clearance - near.distances).tolist()
+    words = _intrusions(scene, dict(zip(near.names, missing, strict=True)))
+    return f"; without its scene the task is solved, with the body {' and '.join(words)}"
+
+
+def _intrusions(scene: Scene, missing: dict[str, float]) -> list[str]:
+    """Say by how much (m) the body lacks the clearance of each object that it is too near."""
+    shapes = {item.name: item.shape for item in scene.objects}
+    return [
+        f"{lack * 1e3:.3g} mm {shapes[name].amiss} '{name}'"
+        for name, lack in missing.items()
+        if lack > OBSTACLES.allowed
     ]
-    return f"; without its scene the task is solved, with the body {' and '.join(missing)}"
 
 
 def demands_message(judgement: Judgement) -> str:

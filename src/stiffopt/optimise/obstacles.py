@@ -29,6 +29,7 @@ from stiffopt.model.distances import MeasuredObject, scene_library
 from stiffopt.model.loaded_arm import LoadedArm
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
+from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.settings import OBSTACLES
 
 Vector = NDArray[np.float64]
@@ -151,6 +152,7 @@ class Obstacles:
 
     def rows(self, arm: Manipulator, p: Vector) -> tuple[Vector, Vector]:
         """Rows (k,) and derivatives (k, n) per Pa at pressures (n,), without machine code."""
+        checkpoint()
         body = ArmBody(arm, p)
         ranges = range_ends(self.description, OBSTACLES.spacing)
         groups = [ranges[begin:end] for begin, end in pairwise((0, *self.range_groups))]

@@ -213,6 +213,8 @@ class PressureProblem:
             for c in self.program.constraints(self.robot.length)
         )
         self.bounding = Bounding(self.constraints)
+        own = self.program.n_own_rows
+        self.terms_bounding = Bounding(tuple(c for c in self.constraints if c.first < own))
 
     # -- evaluation -------------------------------------------------------------------------
 
@@ -242,17 +244,13 @@ class PressureProblem:
     def poses(self, x: Vector) -> tuple[Vector, Vector]:
         """Residuals (N, m) and Jacobians (N, m, n) at pressures (N, n) of an arm without loads.
 
-        Obstacles are not looked at: their rows hold.
+        These are the terms' own: obstacles are not looked at.
         """
         checkpoint()
         residuals, jacobians = self._functions["pose"].many(
             x * self.unit, self.parameters, threads=1
         )
-        missing = ((0, 0), (0, self.program.n_rows - self.program.n_own_rows))
-        return (
-            np.pad(residuals[:, :, 0], missing),
-            np.pad(jacobians.swapaxes(1, 2) * self.unit, (*missing, (0, 0))),
-        )
+        return residuals[:, :, 0], jacobians.swapaxes(1, 2) * self.unit
 
     def point(self, x: Vector) -> ProgramPoint:
         """Everything at pressures x."""

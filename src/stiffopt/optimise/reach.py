@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError
+from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.problem import PressureProblem, ProgramPoint
 from stiffopt.optimise.settings import REACH
 
@@ -76,9 +77,9 @@ def reach_all(
     """Bring pressures (N, n) of an arm without loads to the pose, all at once.
 
     Returns where they came to, and by how much (N,) the worst residual there exceeds its radius,
-    as a ratio: at most one where the pose was reached.
+    as a ratio: at most one where the pose was reached.  Obstacles are not looked at.
     """
-    bounding = problem.bounding
+    bounding = problem.terms_bounding
     x = within(problem.lower, x, problem.upper)
     if not bounding.constraints:
         return x, np.zeros(len(x))
@@ -90,6 +91,7 @@ def reach_all(
     damping = np.full(len(x), REACH.damping)
     going = np.flatnonzero((ratio > 1) & np.isfinite(before))
     for _ in range(most_iterations):
+        checkpoint()
         if not len(going):
             break
         here, r, J, misfit = x[going], residual[going], jacobian[going], before[going]
@@ -141,7 +143,13 @@ def bounded_steps(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vecto
 
 
 def bounded_step(J: Vector, wanted: Vector, D: Vector, low: Vector, high: Vector) -> Vector:
-    """The same for one row, which is most of the cost of small steps."""
+    """The same for one row, which is most of the cost of small steps.
+
+    Rows without a slope, as those of obstacles far away, have no part in it.
+    """
+    used = J.any(axis=1)
+    if not used.all():
+        J, wanted, D = J[used], wanted[used], D[np.ix_(used, used)]
     d = _solved(J.dot(J.T) + D, wanted).dot(J)
     leaving = (d < low) | (d > high)
     return bounded_steps(J, wanted, D, low, high) if leaving.any() else d

@@ -152,7 +152,7 @@ class ObstacleSettings:
     touching: float = 2e-5
     turns: int = 5
     closer: int = 9
-    clearest: int = 64
+    clearest: int = 512
     allowed: float = 1e-5
 
 

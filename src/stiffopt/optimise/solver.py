@@ -315,7 +315,10 @@ class PressureSolver:
         """Answer where the compiled search has none."""
         try:
             checkpoint()
-            return self._nearest(task) or self._general(task, guess)
+            nearest = self._nearest(task)
+            if nearest is None and task.scene is not None and not self.reachable(task.target):
+                nearest = self._clearest(task)
+            return nearest or self._general(task, guess)
         except StoppedError as error:
             return PressureSolution("failed", str(error), task)
 
@@ -350,6 +353,28 @@ class PressureSolver:
             confidence=replace(answer.confidence, reached=0),  # none came to the pose
             counts=answer.counts,
             timings={},
+        )
+
+    def _clearest(self, task: Task) -> PressureSolution | None:
+        """Of sampled configurations the one with most clearance, if none keeps enough of it.
+
+        None where one does, or without compiled code to look at many.
+        """
+        if task.scene is None or self._fast(task, None) is None:
+            return None
+        samples = self._prepared.samples.pressures[: OBSTACLES.clearest]
+        distances = self.robot.clearance(samples, task.scene)
+        if distances.max() >= task.scene.clearance:
+            return None
+        p = samples[int(distances.argmax())]
+        judgement = judge(self.robot, task, p)
+        return PressureSolution(
+            status="unreachable",
+            message=diagnosis.no_way_message(judgement, task, len(samples)),
+            active_bounds=tuple(active_bounds(self.robot, task, p)),
+            **self._quantities(task, judgement),
+            pressures=p,
+            confidence=Confidence(len(samples), 0, 0, 0, complete=False),
         )
 
     def _general(self, task: Task, guess: Vector | None) -> PressureSolution:
@@ -444,7 +469,7 @@ class PressureSolver:
         results = results[:1]
         scene = problem.task.scene
         if not results and scene is not None:
-            clearest = table.pressures[: OBSTACLES.clearest]
+            clearest = table.pressures[: CLOSEST.samples]
             clearest = clearest[np.argmax(self.robot.clearance(clearest, scene))]
             results = [diagnosis.unimproved(problem, clearest / problem.unit)]
         if self.robot.is_loaded:  # what is found need not be what is reached from rest

@@ -31,6 +31,7 @@ class InsideTube(Obstacle):
     """
 
     key = "inside_tube"
+    amiss = "too far out of"
     along = "concave"
     wrong_side = "outside of"
     n_parameters = 7

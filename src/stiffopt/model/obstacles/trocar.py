@@ -23,6 +23,7 @@ class Trocar(Obstacle):
     """
 
     key = "trocar"
+    amiss = "short of passing"
     along = "any"
     n_parameters = 7
     is_ring = True

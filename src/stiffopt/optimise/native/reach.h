@@ -8,6 +8,53 @@
 #include "free.h"
 #endif
 
+/* Components of d that are not held, by a system of as many equations as there are rows. */
+static int steps_of_few_rows(const Setup *s, const double *J, const int64_t *row, int64_t m,
+                             const double *rest, const double *weight, double damping,
+                             const int64_t *held, double *d) {
+    int64_t n = s->n;
+    double A[m * m], y[m];
+    for (int64_t i = 0; i < m; i++) {
+        for (int64_t j = 0; j <= i; j++) {
+            double sum = 0;
+            for (int64_t k = 0; k < n; k++)
+                if (!held[k]) sum += J[row[i] * n + k] * J[row[j] * n + k];
+            A[i * m + j] = A[j * m + i] = sum;
+        }
+        A[i * m + i] += damping / (weight[row[i]] * weight[row[i]]);
+        y[i] = rest[i];
+    }
+    if (!cholesky_solve(A, y, m)) return 0;
+    for (int64_t k = 0; k < n; k++) {
+        if (held[k]) continue;
+        d[k] = 0;
+        for (int64_t i = 0; i < m; i++) d[k] += J[row[i] * n + k] * y[i];
+    }
+    return 1;
+}
+
+/* The same by as many equations as there are pressures; the two agree by Woodbury's identity. */
+static int steps_of_many_rows(const Setup *s, const double *J, const int64_t *row, int64_t m,
+                              const double *rest, const double *weight, double damping,
+                              const int64_t *held, double *d) {
+    int64_t n = s->n, f = 0, free[n];
+    for (int64_t k = 0; k < n; k++)
+        if (!held[k]) free[f++] = k;
+    double A[f * f], y[f];
+    memset(A, 0, sizeof A), memset(y, 0, sizeof y);
+    for (int64_t i = 0; i < m; i++) {
+        const double *own = J + row[i] * n, square = weight[row[i]] * weight[row[i]];
+        for (int64_t a = 0; a < f; a++) {
+            for (int64_t b = 0; b < f; b++) A[a * f + b] += square * own[free[a]] * own[free[b]];
+            y[a] += square * own[free[a]] * rest[i];
+        }
+    }
+    for (int64_t a = 0; a < f; a++) A[a * f + a] += damping;
+    if (!cholesky_solve(A, y, f)) return 0;
+    for (int64_t a = 0; a < f; a++) d[free[a]] = y[a];
+    return 1;
+}
+
 /* Step d within [low, high] with |W (J d - wanted)|^2 + damping |d|^2 small.
  *
  * Components that would leave their range are put on its end and the rest is solved again.  Rows
@@ -26,26 +73,10 @@ static int bounded_step(const Setup *s, const double *J, const double *wanted,
         return 1;
     }
     while (left > 0) {
-        double A[m * m], y[m];
-        for (int64_t i = 0; i < m; i++) {
-            for (int64_t j = 0; j <= i; j++) {
-                double sum = 0;
-                for (int64_t k = 0; k < n; k++)
-                    if (!held[k]) sum += J[row[i] * n + k] * J[row[j] * n + k];
-                A[i * m + j] = A[j * m + i] = sum;
-            }
-            A[i * m + i] += damping / (weight[row[i]] * weight[row[i]]);
-            y[i] = rest[i];
-        }
-        if (!cholesky_solve(A, y, m)) return 0;
         int64_t leaving = 0;
-        for (int64_t k = 0; k < n; k++) {
-            if (held[k]) continue;
-            double sum = 0;
-            for (int64_t i = 0; i < m; i++) sum += J[row[i] * n + k] * y[i];
-            d[k] = sum;
-            leaving += sum < low[k] || sum > high[k];
-        }
+        if (!(m > n ? steps_of_many_rows : steps_of_few_rows)(s, J, row, m, rest, weight, damping, held, d))
+            return 0;
+        for (int64_t k = 0; k < n; k++) leaving += !held[k] && (d[k] < low[k] || d[k] > high[k]);
         if (!leaving) return 1;
         for (int64_t k = 0; k < n; k++) {
             if (held[k] || (d[k] >= low[k] && d[k] <= high[k])) continue;

@@ -131,7 +131,8 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
     Ranked nearest[2 * s->most_effort.screened];
     int64_t count = nearest_samples(P, nearest, &effort);
     Ranked screened[effort.screened];
-    double memory[effort.screened * size];
+    double *memory = malloc((size_t)(effort.screened * size) * sizeof(double));
+    if (!memory) return 0;
     memset(found, 0, sizeof *found);
     for (int64_t i = 0; i < count && ranked < effort.screened && !stopped(P); i++) {
         Point p = point_in(s, memory + ranked * size);
@@ -198,6 +199,7 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
     }
     found->optima = known.count;
     for (int64_t k = 0; k < found->descents; k++) found->agreeing += same(s, ends + k, end);
+    free(memory);
     return found->descents > 0;
 }
 
