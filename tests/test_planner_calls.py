@@ -284,6 +284,15 @@ def test_what_a_cancel_function_raises_is_raised(compiled):
         solver.solve(cancel=broken)
 
 
+def test_a_question_may_be_cancelled(code):
+    solver = solver_of(so.load_robot("stiff-flop-2"))
+    assert solver.reachable(timeout=10.0)
+    event = threading.Event()
+    event.set()
+    with pytest.raises(so.CancelledError):
+        solver.reachable(so.Target(position=(0, 0, 1)), cancel=event)
+
+
 def test_a_timeout_may_be_any_number(code):
     solver = solver_of(so.load_robot("stiff-flop-2"))
     assert solver.solve(timeout=np.float32(5)).found

@@ -612,6 +612,16 @@ def test_a_task_may_have_a_scene_which_is_checked_against_its_arm(folder):
     assert (caught.value.line, caught.value.key) == (4, "scene.objects[0].sphere")
 
 
+def test_a_mesh_with_too_fine_a_grid_is_refused_with_its_line(organ, tmp_path):
+    path = tmp_path / "scene.yaml"
+    mesh = f"{{file: {organ}, scale: 1 mm, centre: [60 mm, 0 mm, 90 mm], resolution: 0.01 mm}}"
+    path.write_text(f"format: stiffopt-scene/1\nobjects:\n  - {{name: organ, mesh: {mesh}}}\n")
+    scene = load_scene(path)
+    with pytest.raises(FileError, match="expected a coarser 'resolution'") as caught:
+        scene.check_against(stiffopt.load_robot("stiff-flop-2").description)
+    assert (caught.value.line, caught.value.key) == (3, "objects[0].mesh.resolution")
+
+
 MESH = {"objects": [{"name": "a", "mesh": {"file": "a.stl", "scale_m": 1}}]}
 
 

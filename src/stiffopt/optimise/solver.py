@@ -149,23 +149,39 @@ class PressureSolver:
         p = checked_vector("guess", guess, self.robot.n_pressures)
         return self._warm_otherwise(task, p, limits)
 
-    def reachable(self, target: Target | None = None) -> bool:
+    def reachable(
+        self,
+        target: Target | None = None,
+        *,
+        timeout: float | None = None,
+        cancel: Cancel | None = None,
+    ) -> bool:
         """Whether the arm comes to a target (the task's, or another one); stiffness left aside.
 
         The configurations nearest to the target, of those that were sampled over the range of
         pressures, are brought to it one by one.  True: one of them came, so pressures within the
         limits are known that meet all tolerances.  False: none did, which is no proof, but rare
         for a target that can be had; `solve` says how far the arm is from it.
+
+        Raises
+        ------
+        OutOfTimeError, CancelledError
+            Where `timeout` or `cancel`, as those of `solve`, ended it before it was known.
         """
         if target is not None and not isinstance(target, Target):
             raise InputError(f"target must be a Target; got {shown(target)}")
         task = self.task if target is None else self.task.model_copy(update={"target": target})
-        fast = self._fast(task, None)
-        if fast is not None:
-            return fast[0].comes(fast[1])
-        problem = PressureProblem(self.robot, task)
-        candidates, effort = starts(problem, self._prepared.samples)
-        return comes(problem, list(islice(candidates, effort.screened)))
+        with giving_up(timeout, cancel):
+            fast = self._fast(task, None)
+            if fast is not None:
+                found = fast[0].comes(fast[1])
+            else:
+                problem = PressureProblem(self.robot, task)
+                candidates, effort = starts(problem, self._prepared.samples)
+                found = comes(problem, list(islice(candidates, effort.screened)))
+            if not found:
+                checkpoint()
+            return found
 
     def solve_at_once(
         self,

@@ -92,7 +92,7 @@ class Mesh(Obstacle):
         """By how much the interpolated distance may differ from the true one, in m."""
         return _share_of_cube * self.spacing
 
-    @property
+    @cached_property
     def grids(self) -> tuple[DistanceGrid, ...]:
         """The distances, a grid for each piece; made and kept in the cache folder."""
         return grids_about(self.surface, self.spacing)
@@ -146,6 +146,10 @@ class Mesh(Obstacle):
                 f"{robot.length * 1e3:.4g} mm long; expected the length of one unit of the file: "
                 "1 mm for files in millimetres, 1 m for files in metres",
             )
+        try:
+            self.grids  # noqa: B018 (made now, as it will be needed)
+        except InputError as error:
+            raise BadKeyError(f"{self.key}.resolution", str(error)) from None
         super().check_against(robot, clearance)
 
     def outline(self, size: float) -> list[Array]:
