@@ -79,7 +79,7 @@ class DerivativeError(StiffoptError):
 
 
 class StoppedError(StiffoptError):
-    """What was asked for was given up before it was done.
+    """A computation was ended before it had a result.
 
     Attributes
     ----------

@@ -12,20 +12,31 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, ValidationInfo
+from pydantic_core import PydanticKnownError
 
 from stiffopt.documents import Document, read_document, to_yaml, write_file
 from stiffopt.errors import FileError, Loc, dotted, shown
 from stiffopt.schema import Schema, explain
-from stiffopt.units import FROM_FILE
+from stiffopt.units import FROM_FILE, read_from_file
 
 MAX_MISTAKES = 10  # told at once
 VERSIONS = {"robot": 1, "task": 1, "rig": 1}
 """The version of each kind of file that is read; a kind not listed is at version 1."""
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+def _not_in_a_file(value: Any, info: ValidationInfo) -> Any:
+    if read_from_file(info):
+        raise PydanticKnownError("extra_forbidden")
+    return value
+
+
+SourceFile = Annotated[Path | None, Field(exclude=True), BeforeValidator(_not_in_a_file)]
+"""The file that a description was read from; no key of a file."""
 
 
 def read_file(path: str | os.PathLike[str], kind: str, model: type[ModelT]) -> ModelT:

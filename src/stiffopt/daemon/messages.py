@@ -206,7 +206,7 @@ def _with_fields_of(schema: type[Schema]) -> Callable[[ClassT], ClassT]:
 
 
 def _is_left_out(info: FieldInfo) -> bool:
-    """Whether a field is not in messages: a file, what is read from one, or a constant."""
+    """Whether messages lack a field: it is a constant, a file or read from a file."""
     args = get_args(info.annotation)
     is_constant = get_origin(info.annotation) is Literal and len(args) == 1
     return bool(info.exclude) or is_constant or Mesh in args

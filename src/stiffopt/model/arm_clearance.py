@@ -86,21 +86,21 @@ class MeasuredScene:
         self._in_c: tuple[Library, ctypes.Array[SceneObjectInC]] | None = None
 
     def in_c(self, code: Library) -> ctypes.Array[SceneObjectInC]:
-        """What C takes; it refers to memory of these objects."""
+        """The objects as structures for C, which point into these objects' memory."""
         if self._in_c is None or self._in_c[0] is not code:
             objects = (SceneObjectInC * len(self.items))(*(item.in_c(code) for item in self.items))
             self._in_c = code, objects
         return self._in_c[1]
 
 
-@lru_cache(maxsize=64)
-def _measured(key: SceneKey) -> MeasuredScene:
-    return MeasuredScene(key.scene)
-
-
 def measured_scene(scene: Scene) -> MeasuredScene:
     """The objects of a scene with their numbers, made once."""
     return _measured(SceneKey(scene))
+
+
+@lru_cache(maxsize=64)
+def _measured(key: SceneKey) -> MeasuredScene:
+    return MeasuredScene(key.scene)
 
 
 class Ranges(NamedTuple):
@@ -121,7 +121,7 @@ class ArmClearance:
     """Distances of an arm's body from a scene, at pressures (N, n) in Pa that are finite."""
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:
-        self._arm, self._scene = arm, _measured(SceneKey(scene))
+        self._arm, self._scene = arm, measured_scene(scene)
         self._ranges = arm.kept("ranges", lambda: Ranges.of(range_ends(arm.description)))
 
     def least(self, p: Array) -> Array:

@@ -53,7 +53,7 @@ _integer, _pointer = ctypes.c_int64, ctypes.c_void_p
 
 
 class BodyShape:
-    """What is known of stations along one arm under its own loads.
+    """Poses, Jacobians, compliances and radii of stations along one arm under its own loads.
 
     Pressures are of shape (N, n), in Pa and finite; arc lengths (k,) from 0 to the arm's length.
     Methods raise `PressureError` beyond a strain law and `EquilibriumError` where the loaded arm

@@ -172,7 +172,7 @@ class MeasuredObject:
         return _interpreted()[f"{what}_{self.key}"].many(points, parameters)
 
     def in_c(self, code: Library) -> SceneObjectInC:
-        """What C takes; it refers to memory of this object."""
+        """The object as a structure for C, which points into this object's memory."""
 
         def address(what: str) -> int | None:
             function = getattr(code.cdll, f"{what}_{self.key}")

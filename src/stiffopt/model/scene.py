@@ -18,19 +18,17 @@ from pydantic import (
     Field,
     ValidationInfo,
     create_model,
-    field_validator,
     model_validator,
 )
-from pydantic_core import PydanticKnownError
 
 from stiffopt.documents import read_document
 from stiffopt.errors import FileError, InputError, dotted
-from stiffopt.files import from_document, line_of
+from stiffopt.files import SourceFile, from_document, line_of
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.obstacle import Obstacle
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.schema import BadKeyError, Items, Schema
-from stiffopt.units import Force, Length, Number, read_from_file
+from stiffopt.units import Force, Length, Number
 
 
 class AllowedContact(Schema):
@@ -122,14 +120,7 @@ class Scene(Schema):
 
     clearance: Annotated[Length, Field(ge=0)] = 0.0
     objects: Annotated[Items[SceneObject], Field(min_length=1)]
-    source: Annotated[Path | None, Field(exclude=True)] = None
-
-    @field_validator("source", mode="before")
-    @classmethod
-    def _not_in_a_file(cls, value: Any, info: ValidationInfo) -> Any:
-        if read_from_file(info):
-            raise PydanticKnownError("extra_forbidden")
-        return value
+    source: SourceFile = None
 
     @model_validator(mode="after")
     def _check(self) -> Scene:

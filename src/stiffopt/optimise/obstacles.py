@@ -1,8 +1,9 @@
 """The objects of a task's scene as rows of its program: how far the body is from each.
 
 After the rows of the terms there is one for each object and segment (with its connector), of a
-ring one for the whole arm: ``margin - (distance - clearance) <= margin``.  Distances are exact
-minima along the body (`stiffopt.model.clearance`); a row has the derivatives of the nearest point.
+ring one for the whole arm: ``margin - (distance - clearance) <= margin``, with the derivatives of
+the nearest point.  Steps of a search find that point by a few stations; an answer is judged by the
+exact minimum along the body (`stiffopt.model.clearance`).
 Scenes are data of these rows, so that no object compiles anything.
 """
 
@@ -170,7 +171,7 @@ class Obstacles:
         return rows, -gradients(arm, p, found)
 
     def exact_rows(self, arm: Manipulator, p: Vector) -> list[float]:
-        """Rows (k,) for a judgement: of each segment the least distance of the whole arm."""
+        """Rows (k,) to judge by; each has the exact least distance of the whole arm."""
         distances = arm.clearances(p, self.scene).distances[list(self.row_objects)]
         found: list[float] = (OBSTACLES.margin - (distances - self.scene.clearance)).tolist()
         return found

@@ -16,12 +16,12 @@ from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationInfo, field_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, ValidationInfo
 from pydantic_core import PydanticKnownError
 
 from stiffopt.directions import Frame
 from stiffopt.errors import FileError, InputError
-from stiffopt.files import line_of, read_file
+from stiffopt.files import SourceFile, line_of, read_file
 from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import SceneOrFile
@@ -96,14 +96,7 @@ class Task(Schema):
     load: Load | None = None
     pressure: PressureRange = PressureRange()
     scene: SceneOrFile | None = None
-    source: Annotated[Path | None, Field(exclude=True)] = None
-
-    @field_validator("source", mode="before")
-    @classmethod
-    def _not_in_a_file(cls, value: Any, info: ValidationInfo) -> Any:
-        if read_from_file(info):
-            raise PydanticKnownError("extra_forbidden")
-        return value
+    source: SourceFile = None
 
     def __repr__(self) -> str:
         parts = [] if self.robot is None else [self.robot]
