@@ -207,7 +207,7 @@ class PressureSolution:
         _protect(self, "pressures", "tip_pose", "compliance")
 
     @classmethod
-    def explained_later(cls, explain: Callable[[], "Explanation"], **fields: Any) -> Self:
+    def explained_later(cls, explain: Callable[[], "Explanation"], fields: dict[str, Any]) -> Self:
         """A solution whose `Explanation` is computed when one of its fields is first read."""
         solution = cls.__new__(cls)
         solution.__dict__.update(fields, _explain=explain)
@@ -390,21 +390,25 @@ class Judgement(NamedTuple):
         """
         residuals, tip_pose, compliance, values = numbers
         errors = program.errors(residuals)
-        holds = all(term.holds(errors[term.name]) for term in program.terms)
-        judged = [
-            math.exp(value) if measure.is_stiffness else math.sqrt(value)
-            for measure, value in zip(program.measures, values, strict=True)
-        ]
-        pairs = list(zip(program.measures, judged, strict=True))
+        stiffnesses, shortfalls, distance = [], [], None
+        for measure, number in zip(program.measures, values, strict=True):
+            if measure.is_stiffness:
+                value = math.exp(number)
+                stiffnesses.append(value)
+            else:
+                value = math.sqrt(number)
+                distance = value if distance is None else distance
+            if not measure.holds(value):
+                shortfalls.append(measure.shortfall(value))
         return cls(
             tip_pose=tip_pose,
             errors=errors,
             compliance=compliance,
-            stiffnesses=tuple(value for measure, value in pairs if measure.is_stiffness),
-            matrix_distance=next((v for measure, v in pairs if not measure.is_stiffness), None),
-            pose_holds=holds,
+            stiffnesses=tuple(stiffnesses),
+            matrix_distance=distance,
+            pose_holds=all(term.holds(errors[term.name]) for term in program.terms),
             limits_hold=within,
-            shortfalls=tuple(m.shortfall(value) for m, value in pairs if not m.holds(value)),
+            shortfalls=tuple(shortfalls),
             intruders=program.intruders(residuals),
             touched=program.touched(residuals),
         )
@@ -412,7 +416,8 @@ class Judgement(NamedTuple):
 
 def are_within(pressures: Vector, lower: Vector, upper: Vector) -> bool:
     """Whether all pressures (n,) are within their limits."""
-    return bool(((pressures >= lower) & (pressures <= upper)).all())
+    limits = zip(lower.tolist(), pressures.tolist(), upper.tolist(), strict=True)
+    return all(low <= p <= high for low, p, high in limits)
 
 
 def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:
