@@ -36,12 +36,12 @@ class LeastDistance(NamedTuple):
 
     Attributes
     ----------
-    index : of the object.
+    which : number of the object.
     s : arc length at rest, in m.
     low, high : ends of the range of the body that it is in.
     """
 
-    index: int
+    which: int
     s: float
     low: float
     high: float
@@ -66,7 +66,7 @@ class FollowedObstacles(Obstacles):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "least", tuple(self._found()))
-        object.__setattr__(self, "row_objects", tuple(each.index for each in self.least))
+        object.__setattr__(self, "row_objects", tuple(each.which for each in self.least))
 
     def _found(self) -> Iterator[LeastDistance]:
         ranges = range_ends(self.description, _SPACING)
@@ -85,7 +85,7 @@ class FollowedObstacles(Obstacles):
         """See `Obstacles.rows`."""
         checkpoint()
         body = ArmBody(arm, p)
-        found = [_followed(body, self.measured.items[each.index], each) for each in self.least]
+        found = [_followed(body, self.measured.items[each.which], each) for each in self.least]
         if not found:
             return np.zeros(0), np.zeros((0, len(p)))
         distances = np.array([nearest.distance for nearest in found])
