@@ -272,8 +272,9 @@ class FastSolver:
     def point(self, parameters: Vector, radii: Vector, pressures: Vector) -> list[Vector] | None:
         """Parts of a point of a loaded arm's program, from rest; None for no equilibrium.
 
-        Pressures are (n,) in Pa.  The parts are residuals (m,), their Jacobian (m, n) per share of
-        a range, terms (t,), their gradients (t, n), floors (f,) and theirs (f, n).
+        Pressures are (n,) in Pa.  The parts are residuals (m,), those of obstacles zero, their
+        Jacobian (m, n) per share of a range, terms (t,), their gradients (t, n), floors (f,) and
+        theirs (f, n).
         """
         s = self._setup
         values = np.empty(s.n + (s.rows + s.terms + s.floors) * (1 + s.n))
