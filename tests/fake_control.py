@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.state import ControllerStatus
-from stiffopt.control.trajectory import Trajectory
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureReading
 
 Array = NDArray[np.float64]

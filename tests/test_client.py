@@ -21,7 +21,6 @@ from websockets.sync.client import ClientConnection, connect
 
 from fake_loop import FakeLoop
 from stiffopt.control.state import Alarm, Severity, Snapshot, State, Timing
-from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.daemon import server as server_module
 from stiffopt.daemon.client import Client, ClientStream
 from stiffopt.daemon.messages import MAX_MESSAGE
@@ -39,6 +38,7 @@ from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 
 TOKEN = "a-secret-of-the-tests"
 HEARTBEAT = 1.0

@@ -13,12 +13,12 @@ import pytest
 
 import stiffopt as so
 from stiffopt.control.controller import TipController
-from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant.plant import Plant
 from stiffopt.plant.settings import PlantLoad
 from stiffopt.rig.assembly import make_rig

@@ -15,7 +15,6 @@ from pydantic import BaseModel
 
 import stiffopt
 from examples import run_examples
-from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.logs import read_log
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.description import (
@@ -36,6 +35,7 @@ from stiffopt.model.scene import AllowedContact, Scene, SceneObject
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant import settings as simulated
 from stiffopt.registration import Placement, Registration
 from stiffopt.rig.config import (

@@ -16,8 +16,8 @@ from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.loop import ControlLoop, TickTiming
 from stiffopt.control.request_queue import Requester, requested_by
 from stiffopt.control.state import Severity, State
-from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import CommandError, DeviceError, InputError
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.settings import Safety
 
 WAY = Trajectory(waypoints=(Waypoint(time=0.0, target=TASK.target),))

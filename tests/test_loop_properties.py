@@ -19,11 +19,11 @@ from fake_control import FakeController
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import ControllerStatus, State
-from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import CommandError, DeviceError, InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import (
     Clock,
     PoseSample,

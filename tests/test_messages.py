@@ -18,7 +18,6 @@ from stiffopt.control.checks import (
     differences,
 )
 from stiffopt.control.state import State
-from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.daemon.messages import (
     TargetMessage,
     TaskMessage,
@@ -41,6 +40,7 @@ from stiffopt.optimise.goal import (
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task, load_task
 from stiffopt.optimise.terms.above import Plane
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.schema import Items, Schema, Vector
 from stiffopt.units import Length, Number, Speed, TranslationalStiffness

@@ -17,9 +17,9 @@ from simulated_loop import TASK, Lab
 from stiffopt.control import checks
 from stiffopt.control.checks import limited_range
 from stiffopt.control.controller import TipController
+from stiffopt.control.course import Course
 from stiffopt.control.interface import ControlOutput
 from stiffopt.control.state import State
-from stiffopt.control.trajectory import MAX_WAYPOINTS, Course, Trajectory, Waypoint
 from stiffopt.daemon.messages import task_of, trajectory_of
 from stiffopt.errors import CommandError, DeviceError, GuardTripped, InputError
 from stiffopt.model.manipulator import Manipulator
@@ -27,6 +27,7 @@ from stiffopt.model.robot_files import load_description
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Load, PressureRange, Task
+from stiffopt.paths.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits
 from test_loop_properties import PERIOD, N, World
 

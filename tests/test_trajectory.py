@@ -7,9 +7,10 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
-from stiffopt.control.trajectory import Course, Trajectory, Waypoint
+from stiffopt.control.course import Course
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 
 HOME = np.array([0.0, 0.01, 0.17])
 UPRIGHT = np.eye(3)

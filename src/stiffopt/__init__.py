@@ -11,8 +11,6 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from stiffopt.control.trajectory import Trajectory as Trajectory
-    from stiffopt.control.trajectory import Waypoint as Waypoint
     from stiffopt.daemon.client import Client as Client
     from stiffopt.errors import CancelledError as CancelledError
     from stiffopt.errors import CommandError as CommandError
@@ -68,6 +66,8 @@ if TYPE_CHECKING:
     from stiffopt.optimise.task import Task as Task
     from stiffopt.optimise.task import load_task as load_task
     from stiffopt.optimise.warm import WarmAnswer as WarmAnswer
+    from stiffopt.paths.trajectory import Trajectory as Trajectory
+    from stiffopt.paths.trajectory import Waypoint as Waypoint
     from stiffopt.rig.interface import Observation as Observation
     from stiffopt.rig.interface import PoseSample as PoseSample
     from stiffopt.rig.interface import PressureCommand as PressureCommand
@@ -82,7 +82,7 @@ __version__ = "0.1.0"
 # Names are imported at their first use: NumPy, CasADi and pydantic take a quarter of a second, for
 # which neither `--help` nor a wrong option should wait.
 _NAMES = {
-    "stiffopt.control.trajectory": ("Trajectory", "Waypoint"),
+    "stiffopt.paths.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.daemon.client": ("Client",),
     "stiffopt.errors": (
         *("CancelledError", "CommandError", "DerivativeError", "DeviceError", "EquilibriumError"),

@@ -16,10 +16,10 @@ from pydantic import BaseModel
 
 from stiffopt.control.interface import Controller
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
-from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.rig.interface import PressureLimits, PressureReading, Rig
 from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor

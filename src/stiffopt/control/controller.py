@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
 from stiffopt.control.checks import limited_range, refusing
+from stiffopt.control.course import Course
 from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.feedback import GainSchedule, tracking_rows
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
@@ -28,7 +29,6 @@ from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import Pursuit, Replanner
 from stiffopt.control.state import ControllerStatus, Severity
 from stiffopt.control.tip_errors import TipErrors, target_arrays, wrench_at
-from stiffopt.control.trajectory import Course, Trajectory
 from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode
 from stiffopt.errors import InputError
@@ -36,6 +36,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipAt
+from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.state import ControllerStatus, Severity
-from stiffopt.control.trajectory import Trajectory
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureReading
 
 Array = NDArray[np.float64]

@@ -16,11 +16,11 @@ from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.request_queue import RequestQueue, current_requester
 from stiffopt.control.state import ControllerStatus, Snapshot, State, Timing
 from stiffopt.control.supervisor import Supervisor
-from stiffopt.control.trajectory import Trajectory
 from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.errors import CommandError, InputError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import Safety
 from stiffopt.safety.gate import Outlet

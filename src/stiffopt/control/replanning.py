@@ -9,12 +9,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.course import Course
 from stiffopt.control.feedback import prescribed_components
 from stiffopt.control.interface import Notice
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Plan, PlanRequest
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
-from stiffopt.control.trajectory import Course
 from stiffopt.control.tuning import ReplanningTuning
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task

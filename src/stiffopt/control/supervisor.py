@@ -16,11 +16,11 @@ from stiffopt.control.interface import Controller
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.state import Severity, State
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
-from stiffopt.control.trajectory import Trajectory
 from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.errors import CommandError, DeviceError, GuardTripped, InputError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureCommand, PressureReading, Rig, SystemClock
 from stiffopt.rig.settings import ControlSettings, Safety
 from stiffopt.safety.expected_pressure import Regulation

@@ -17,7 +17,6 @@ from urllib.parse import urlsplit
 from numpy.typing import ArrayLike
 
 from stiffopt.control.state import Event, Snapshot, State
-from stiffopt.control.trajectory import Trajectory, Waypoint
 from stiffopt.daemon.messages import TargetMessage, TaskMessage, TrajectoryMessage
 from stiffopt.daemon.reports import LEASE_HEADER, RobotReport, error_of
 from stiffopt.daemon.state_json import record_of
@@ -31,6 +30,7 @@ from stiffopt.errors import (
 )
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task, load_task
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection

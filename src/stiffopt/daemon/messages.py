@@ -37,13 +37,13 @@ from pydantic import (
 from pydantic.fields import FieldInfo
 
 from stiffopt.control.checks import listed
-from stiffopt.control.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
 from stiffopt.documents import document_of
 from stiffopt.errors import InputError, Loc, dotted, shown
 from stiffopt.files import from_document
 from stiffopt.model.obstacles.mesh import Mesh
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
+from stiffopt.paths.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint
 from stiffopt.schema import Schema
 from stiffopt.units import QuantityKind, unit_suffix
 

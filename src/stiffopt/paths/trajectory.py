@@ -1,0 +1,87 @@
+"""`Trajectory`: targets of the tip over time, as they are given to a controller."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from stiffopt.errors import InputError
+from stiffopt.optimise.target import Target
+from stiffopt.schema import Items, Schema
+from stiffopt.units import Duration
+
+MAX_WAYPOINTS = 2_000
+"""Of a trajectory; its splines are made between two ticks of the control loop."""
+_LONGEST = 86_400.0  # s, of a trajectory
+_CLOSEST = 1e-3  # s, between waypoints
+_ROUNDING = 1e-6  # of that
+
+
+class Waypoint(Schema):
+    """A target and when to be there.
+
+    Attributes
+    ----------
+    time : since the beginning of the trajectory, in s; at most a day.
+    target : the pose.
+    """
+
+    time: Annotated[Duration, Field(ge=0, le=_LONGEST)]
+    target: Target
+
+
+class Trajectory(Schema):
+    """Waypoints through which the tip passes smoothly.
+
+    Attributes
+    ----------
+    waypoints : in order of time, at least 1 ms apart, the first at 0 or 1 ms later; all
+        prescribe the same components of the pose.
+    """
+
+    waypoints: Items[Waypoint]
+
+    @model_validator(mode="after")
+    def _check(self) -> Trajectory:
+        if len(self.waypoints) > MAX_WAYPOINTS:
+            raise ValueError(
+                f"{len(self.waypoints)} waypoints are too many; at most {MAX_WAYPOINTS}"
+            )
+        check_times([w.time for w in self.waypoints])
+        kinds = {_kind(w.target) for w in self.waypoints}
+        if len(kinds) > 1:
+            raise ValueError("all waypoints must ask for the same axes of the pose")
+        return self
+
+    @property
+    def duration(self) -> float:
+        """Time of the last waypoint, in s."""
+        return self.waypoints[-1].time
+
+
+def check_times(times: list[float]) -> None:
+    """Refuse times that are out of range, not ascending or too close."""
+    if not times:
+        raise InputError("has no waypoints")
+    for time in (times[0], times[-1]):
+        if not 0 <= time <= _LONGEST:
+            raise InputError(f"waypoints must be between 0 s and {_LONGEST:g} s, not at {time:g} s")
+    for before, after in itertools.pairwise(times):
+        if not after > before:
+            raise InputError(
+                f"waypoints must be in order of time; {after:g} s follows {before:g} s"
+            )
+    begun = times if times[0] == 0 else [0.0, *times]  # the trajectory begins where the tip is
+    for before, after in itertools.pairwise(begun):
+        if after - before < _CLOSEST * (1 - _ROUNDING):
+            raise InputError(
+                f"waypoints must be at least {_CLOSEST:g} s apart, and the first at 0 s or as "
+                f"much later; {after:g} s follows {before:g} s"
+            )
+
+
+def _kind(target: Target) -> tuple[object, ...]:
+    axes = None if target.position is None else tuple(v is None for v in target.position)
+    return axes, target.pointing is None, target.orientation is None
