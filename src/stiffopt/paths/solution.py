@@ -71,7 +71,7 @@ class PathSolution:
 
     @property
     def found(self) -> bool:
-        """Whether every point holds its tolerances, limits and clearance, and every step its rates."""
+        """Whether every point holds what was asked of it, and every step its rates."""
         return self.status == "solved"
 
     @property
@@ -88,7 +88,7 @@ class PathSolution:
         return None if self.stiffness is None or index is None else float(self.stiffness[index])
 
     def trajectory(self) -> Trajectory:
-        """What `ControlLoop` and `Client` follow: the pressures, and the tip's pose that they give."""
+        """What a `ControlLoop` follows: the pressures, and the tip positions that they give."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
