@@ -101,7 +101,7 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.model.obstacles": "Scene file",
     "stiffopt.model": "Robot file",
     "stiffopt.optimise": "Task file",
-    "stiffopt.control": "Trajectory",
+    "stiffopt.paths.trajectory": "Trajectory",
 }
 
 
