@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     from stiffopt.optimise.task import Task as Task
     from stiffopt.optimise.task import load_task as load_task
     from stiffopt.optimise.warm import WarmAnswer as WarmAnswer
+    from stiffopt.paths.motion import plan_motion as plan_motion
+    from stiffopt.paths.solution import PathSolution as PathSolution
     from stiffopt.paths.trajectory import Trajectory as Trajectory
     from stiffopt.paths.trajectory import Waypoint as Waypoint
     from stiffopt.rig.interface import Observation as Observation
@@ -82,6 +84,8 @@ __version__ = "0.1.0"
 # Names are imported at their first use: NumPy, CasADi and pydantic take a quarter of a second, for
 # which neither `--help` nor a wrong option should wait.
 _NAMES = {
+    "stiffopt.paths.motion": ("plan_motion",),
+    "stiffopt.paths.solution": ("PathSolution",),
     "stiffopt.paths.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.daemon.client": ("Client",),
     "stiffopt.errors": (
