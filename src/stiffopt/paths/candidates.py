@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.stopping import checkpoint
+from stiffopt.optimise.problem import PressureProblem
+from stiffopt.optimise.reach import reach_all
 from stiffopt.paths.points import Candidate, Local, PathTasks
-from stiffopt.paths.settings import CANDIDATES
+from stiffopt.paths.settings import CANDIDATES, LANES
 
 Vector = NDArray[np.float64]
 
@@ -52,6 +54,56 @@ def distinct(tasks: PathTasks, some: Iterable[Candidate]) -> list[Candidate]:
             kept.append(each)
     most = CANDIDATES.kept if tasks.is_compiled else CANDIDATES.general_kept
     return sorted(kept, key=lambda each: -each.value)[:most]
+
+
+def lanes(tasks: PathTasks) -> list[list[Candidate]]:
+    """Further candidates at each point of a free arm: any pressures that solve the task there.
+
+    Some are spread over all that reach the target at a few points, and follow the path from there
+    with as little change as possible.  A way from branch to branch leads over them where the
+    direct one does not stay on the path.
+    """
+    count, n = len(tasks), len(tasks.unit)
+    if tasks.robot.is_loaded:
+        return [[] for _ in range(count)]
+    problems = [tasks.problem(index) for index in range(count)]
+    knots = np.unique(np.linspace(0, count - 1, LANES.knots).round().astype(int)).tolist()
+    spread = {
+        knot: _spread(tasks, _come(problems[knot], tasks.near(knot, LANES.starts)))
+        for knot in knots
+    }
+    followed: list[list[Vector]] = [[] for _ in range(count)]
+    for order in (range(count), range(count - 1, -1, -1)):
+        live = np.zeros((0, n))
+        for index in order:
+            checkpoint()
+            live = _come(problems[index], np.vstack([live, spread.get(index, live[:0])]))
+            followed[index].append(live)
+    return [
+        tasks.assessed(index, _spread(tasks, np.vstack(some), len(tasks.unit) * LANES.kept))
+        for index, some in enumerate(followed)
+    ]
+
+
+def _come(problem: PressureProblem, pressures: Vector) -> Vector:
+    """Those of some pressures (k, n) that come to the target, there."""
+    if not len(pressures):
+        return pressures
+    x, excess = reach_all(problem, pressures / problem.unit)
+    return np.clip(x[excess <= 1], problem.lower, problem.upper) * problem.unit
+
+
+def _spread(tasks: PathTasks, pressures: Vector, most: int = LANES.kept) -> Vector:
+    """Some of these pressures (k, n), far from each other: each the furthest from those before."""
+    if not len(pressures):
+        return pressures
+    x = pressures / tasks.unit
+    chosen = [0]
+    distance = np.abs(x - x[0]).max(axis=1)
+    while len(chosen) < most and distance.max() > LANES.apart:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.abs(x - x[chosen[-1]]).max(axis=1))
+    return pressures[chosen]
 
 
 def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[Candidate]], int]:

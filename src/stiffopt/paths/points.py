@@ -175,6 +175,23 @@ class PathTasks:
 
     # -- evaluation -------------------------------------------------------------------------
 
+    def problem(self, index: int) -> PressureProblem:
+        """The general optimiser's view of a point."""
+        return PressureProblem(self.robot, self._without_load[index])
+
+    def assessed(self, index: int, pressures: Vector) -> list[Candidate]:
+        """Candidates that pressures (k, n) at the target of a point are, if the body is clear."""
+        scene = self.tasks[index].scene
+        if scene is not None and len(pressures):
+            pressures = pressures[self.robot.clearance(pressures, scene) >= scene.clearance]
+        if not len(pressures):
+            return []
+        slopes = self.slopes([index] * len(pressures), pressures)
+        if slopes is None:
+            return []
+        pairs = zip(pressures, slopes.costs.max(axis=1).tolist(), strict=True)
+        return [Candidate(p, -cost) for p, cost in pairs]
+
     def judged(self, pressures: Vector) -> list[Judgement | None]:
         """Judgement by the model of pressures (N, n), one of each point; None: no equilibrium."""
         if self._fast is None:

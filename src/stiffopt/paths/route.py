@@ -49,6 +49,11 @@ class Route:
     candidates: list[Candidate]
     crossings: int
 
+    def value(self, over: str) -> float:
+        """Its worst value, or its mean."""
+        values = [each.value for each in self.candidates]
+        return float(min(values) if over == "worst" else np.mean(values))
+
 
 class _Sequence(NamedTuple):
     """Candidates (point, number) and crossings in order, with their worst value and mean."""
@@ -56,10 +61,6 @@ class _Sequence(NamedTuple):
     steps: list[tuple[int, int] | _Crossing]
     worst: float
     mean: float
-
-    def is_about(self, other: "_Sequence") -> bool:
-        """Whether another one is hardly better."""
-        return self.worst > other.worst - ROUTE.hardly and self.mean > other.mean - ROUTE.hardly
 
 
 @dataclass
@@ -111,6 +112,10 @@ class RouteSearch:
 
     def best(self) -> Route | None:
         """The best sequence; None if there is none."""
+        hope = self._hope()
+        direct = self._sequence()
+        if direct is not None and self._is_about(direct, hope):
+            return self._route(direct)
         for crossing in self._all_crossings():
             self._crossings.setdefault(crossing.begin + crossing.length, []).append(crossing)
         for _ in range(ROUTE.evaluated):
@@ -121,7 +126,7 @@ class RouteSearch:
             if not unknown:
                 return self._route(hoped)
             known = self._sequence(computed=True)
-            if known is not None and known.is_about(hoped):
+            if known is not None and self._is_about(known, hoped):
                 return self._route(known)
             for crossing in unknown:
                 checkpoint()
@@ -129,10 +134,30 @@ class RouteSearch:
         known = self._sequence(computed=True)
         return None if known is None else self._route(known)
 
+    def _is_about(self, known: _Sequence, hoped: _Sequence) -> bool:
+        """Whether a sequence is hardly worse than what is hoped for."""
+        if self._over == "worst":
+            return (
+                known.worst > hoped.worst - ROUTE.hardly
+                and known.mean > hoped.mean - ROUTE.hardly_on_average
+            )
+        return known.mean > hoped.mean - ROUTE.hardly
+
+    def _hope(self) -> _Sequence:
+        """What no sequence can be better than."""
+        best = [values.max(initial=-np.inf) for values in self._values]
+        return _Sequence([], float(min(best)), float(np.mean(best)))
+
+    def comes_up_to(self, route: Route | None, share: float) -> bool:
+        """Whether a sequence has this share of what the points alone could have."""
+        hope = self._hope()
+        best = hope.worst if self._over == "worst" else hope.mean
+        return route is not None and route.value(self._over) > best + np.log(share)
+
     @property
     def furthest(self) -> int:
         """The last point that a sequence comes to."""
-        values = self._best(-np.inf, bottleneck=True).values
+        values = self._best(-np.inf, bottleneck=True, computed=True).values
         return max(
             (i for i, each in enumerate(values) if np.isfinite(each).any()), default=0
         )
@@ -224,7 +249,8 @@ class RouteSearch:
                 needed = share * length  # steps, if all of them are as large
                 for more in ROUTE.lengths:
                     fits = (np.ceil(more * np.maximum(needed, 1.0)) == length) & (needed > 1)
-                    for k in later[fits]:
+                    nearest = np.flatnonzero(fits)[np.argsort(needed[fits], kind="stable")]
+                    for k in later[nearest[: ROUTE.nearest]]:
                         yield self._guessed(begin, a, int(point[k]) - begin, int(number[k]))
 
     def _guessed(self, begin: int, a: int, length: int, b: int) -> _Crossing:

@@ -27,6 +27,26 @@ class CandidateSettings:
 
 
 @dataclass(frozen=True)
+class LaneSettings:
+    """Further configurations along a path (`stiffopt.paths.candidates.lanes`).
+
+    Attributes
+    ----------
+    knots : points at which they are spread over all that reach the target.
+    starts : samples that are brought to the target at each of them.
+    kept : most of them that are followed from each.
+    apart : least distance between two, as a share of a channel's range.
+    enough : share of what the points alone could have from which on none are looked for.
+    """
+
+    knots: int = 4
+    starts: int = 256
+    kept: int = 16
+    apart: float = 0.1
+    enough: float = 0.99
+
+
+@dataclass(frozen=True)
 class RouteSettings:
     """Search over sequences of candidates (`stiffopt.paths.route`).
 
@@ -34,18 +54,22 @@ class RouteSettings:
     ----------
     crossings : points of a path at which a crossing to another branch may begin.
     lengths : of a crossing, times the least number of steps that the rates allow.
-    evaluated : most crossings that are computed.
+    nearest : candidates to which crossings lead from another, for each length.
+    evaluated : rounds in which crossings are computed.
     price : by which a crossing counts as worse than it is: small, so that none is idle.
     within : share of a rate that crossings use.
-    hardly : gain of the logarithm of stiffness, worst or mean, for which none is computed.
+    hardly : gain of the logarithm of stiffness for which no crossing is computed; and of its mean
+    hardly_on_average : where the worst is maximised.
     """
 
     crossings: int = 40
     lengths: tuple[float, ...] = (1.0, 1.5, 2.5)
+    nearest: int = 6
     evaluated: int = 40
     price: float = 1e-3
     within: float = 0.98
     hardly: float = 2e-3
+    hardly_on_average: float = 2e-2
 
 
 @dataclass(frozen=True)
@@ -100,6 +124,7 @@ class RateSettings:
 
 
 CANDIDATES = CandidateSettings()
+LANES = LaneSettings()
 ROUTE = RouteSettings()
 REFINEMENT = RefinementSettings()
 RATES = RateSettings()

@@ -13,13 +13,13 @@ from stiffopt.model.stopping import Cancel, giving_up
 from stiffopt.optimise.solution import Judgement, PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.task import Task
-from stiffopt.paths.candidates import candidates
+from stiffopt.paths.candidates import candidates, lanes
 from stiffopt.paths.path import Path
 from stiffopt.paths.points import Candidate, PathTasks
 from stiffopt.paths.rates import least_times, slew_limits, step_limits
 from stiffopt.paths.refinement import refined
 from stiffopt.paths.route import Route, RouteSearch
-from stiffopt.paths.settings import RATES
+from stiffopt.paths.settings import CANDIDATES, LANES, RATES
 from stiffopt.paths.solution import PathSolution
 
 Vector = NDArray[np.float64]
@@ -102,6 +102,7 @@ class _PathSolver:
         self._ends = path.end_pressures(robot.description)
         self._over = "mean" if path.stiffness is None else path.stiffness.over
         self._unreachable: tuple[int, str] | None = None  # the first point, and why
+        self._lanes: list[list[Candidate]] | None = None
 
     def solve(self) -> PathSolution:
         """Answer; see `solve_path`."""
@@ -197,7 +198,12 @@ class _PathSolver:
         if route is None:
             return self._without_route(tasks, layers, steps)
         pressures = np.array([each.pressures for each in route.candidates])
-        pressures = refined(tasks, pressures, steps, self._over, closed=self._path.closed)
+        fixed = [
+            index % len(pressures)
+            for index, end in zip((0, -1), self._ends, strict=True)
+            if end is not None or self._path.closed
+        ]
+        pressures = refined(tasks, pressures, steps, self._over, fixed)
         if times is None:
             times = self._fastest(pressures)
         alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
@@ -221,20 +227,37 @@ class _PathSolver:
     def _best_route(
         self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector
     ) -> Route | None:
-        """The best sequence; that of a closed path ends where it begins."""
+        """The best sequence, over further configurations where the local optima are not enough."""
         if not all(layers):
             return None
+        hope = RouteSearch(tasks, layers, steps, self._over)
+        route = self._best_of(tasks, layers, steps)
+        if hope.comes_up_to(route, LANES.enough) or tasks.robot.is_loaded:
+            return route
+        if self._lanes is None:
+            self._lanes = lanes(tasks)
+        ends = {0, len(layers) - 1}
+        more = [
+            layer if index in ends and len(layer) == 1 else [*layer, *lane]
+            for index, (layer, lane) in enumerate(zip(layers, self._lanes, strict=True))
+        ]
+        other = self._best_of(tasks, more, steps)
+        found = [each for each in (route, other) if each is not None]
+        return max(found, key=lambda each: each.value(self._over), default=None)
+
+    def _best_of(
+        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector
+    ) -> Route | None:
+        """The best sequence of candidates; that of a closed path ends where it begins."""
         if not self._path.closed:
             return RouteSearch(tasks, layers, steps, self._over).best()
-        found: list[tuple[float, float, int, Route]] = []
-        for number, first in enumerate(layers[0]):
+        found: list[Route] = []
+        for first in layers[0][: CANDIDATES.kept]:
             closed = [[first], *layers[1:-1], [first]]
             route = RouteSearch(tasks, closed, steps, self._over).best()
             if route is not None:
-                values = [each.value for each in route.candidates]
-                worst = min(values) if self._over == "worst" else 0.0
-                found.append((worst, sum(values), -number, route))
-        return max(found)[3] if found else None
+                found.append(route)
+        return max(found, key=lambda each: each.value(self._over), default=None)
 
     def _slower(
         self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector
