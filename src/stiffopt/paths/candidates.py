@@ -122,7 +122,7 @@ def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[Ca
     found: dict[int, list[Candidate]] = {}
     for index, candidate in (
         *zip(knots, best, strict=True),
-        *((q.index, a) for q, a in zip(questions, answers, strict=True)),
+        *((q.point, a) for q, a in zip(questions, answers, strict=True)),
     ):
         if candidate is not None:
             found.setdefault(index, []).append(candidate)

@@ -39,9 +39,9 @@ class Candidate(NamedTuple):
 
 
 class Local(NamedTuple):
-    """A question for the local optimum at a point next to a guess (n,), within limits (n,), in Pa."""
+    """A question for the local optimum at a point, next to a guess and within limits, in Pa."""
 
-    index: int
+    point: int
     guess: Vector
     lower: Vector
     upper: Vector
@@ -115,7 +115,7 @@ class PathTasks:
         if self._fast is None:
             return [self._general(question) for question in questions]
         solver = self._fast[0]
-        rows = [solver.next_to(self._row(q.index), q.guess, q.lower, q.upper) for q in questions]
+        rows = [solver.next_to(self._row(q.point), q.guess, q.lower, q.upper) for q in questions]
         if not rows:
             return []
         threads = None if len(rows) > 64 else 1  # a thread costs as much as some answers
@@ -157,7 +157,7 @@ class PathTasks:
 
     def _general(self, question: Local) -> Candidate | None:
         """The same without machine code."""
-        index = question.index
+        index = question.point
         problem = PressureProblem(self.robot, self._without_load[index])
         problem.lower, problem.upper = question.lower / self.unit, question.upper / self.unit
         x = np.clip(question.guess / self.unit, problem.lower, problem.upper)

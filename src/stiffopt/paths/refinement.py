@@ -15,6 +15,7 @@ each tolerance.  A trust region and an exact penalty decide whether a step is ta
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import clarabel
 import numpy as np
@@ -27,6 +28,8 @@ from stiffopt.paths.points import PathTasks, Slopes
 from stiffopt.paths.settings import REFINEMENT
 
 Vector = NDArray[np.float64]
+Entries = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Rows, columns and values of entries of a matrix."""
 
 
 def refined(
@@ -186,9 +189,7 @@ class _Window:
             robot = self._tasks.robot
             clear = robot.clearances(pressures, self._scene)
             values += list((self._scene.clearance - clear.distances.T) / robot.length)
-            derivatives += list(
-                -clear.gradients.swapaxes(0, 1) * self._tasks.unit / robot.length
-            )
+            derivatives += list(-clear.gradients.swapaxes(0, 1) * self._tasks.unit / robot.length)
         if not values:
             return np.zeros((k, 0)), np.zeros((k, 0, n))
         return np.stack(values, axis=1), np.stack(derivatives, axis=1)
@@ -202,9 +203,9 @@ class _Window:
             slopes = self._tasks.slopes(self._free, x * self._tasks.unit)
             if slopes is None:
                 return None
-            return np.einsum("kt,ktn->kn", weights, slopes.gradients) + np.einsum(
-                "km,kmn->kn", pulls, slopes.jacobians
-            )
+            found: Vector = np.einsum("kt,ktn->kn", weights, slopes.gradients)
+            found += np.einsum("km,kmn->kn", pulls, slopes.jacobians)
+            return found
 
         here = gradients(state.x)
         columns = []
@@ -218,7 +219,8 @@ class _Window:
         H = np.stack(columns, axis=2)
         values, vectors = np.linalg.eigh((H + H.swapaxes(1, 2)) / 2)
         values = np.maximum(values, 1e-6)
-        return (vectors * values[:, np.newaxis, :]) @ vectors.swapaxes(1, 2)
+        convex: Vector = (vectors * values[:, np.newaxis, :]) @ vectors.swapaxes(1, 2)
+        return convex
 
     # -- the convex program ---------------------------------------------------------------------
 
@@ -243,11 +245,12 @@ class _Window:
         if worst:
             index = np.arange(k)
             rows.add(
-                np.zeros(k), (index, e + index, np.ones(k)), (index, np.full(k, size - 1), -np.ones(k))
+                np.zeros(k),
+                (index, e + index, np.ones(k)),
+                (index, np.full(k, size - 1), -np.ones(k)),
             )
             if np.isfinite(self._floor):
                 rows.add(np.array([-self._floor]), (np.zeros(1), np.array([size - 1]), -np.ones(1)))
-        near_from = rows.count
         b = state.near.shape[1]
         if b:
             point = np.repeat(np.arange(k), b)
@@ -296,7 +299,6 @@ class _Window:
             own = z[at : at + k * width].reshape(k, width)
             pulls[:, ball.first : ball.end] = -own[:, 1:] / ball.scale
             at += k * width
-        del near_from
         weights = z[costs_from : costs_from + k * t].reshape(k, t)
         hoped = float(q @ x)
         return d, weights, pulls, state.merit - hoped
@@ -356,9 +358,9 @@ class _Rows:
     def __init__(self, size: int) -> None:
         self._size, self.count = size, 0
         self._bounds: list[Vector] = []
-        self._entries: list[tuple[Vector, Vector, Vector]] = []
+        self._entries: list[Entries] = []
 
-    def add(self, bounds: Vector, *entries: tuple[Vector, Vector, Vector]) -> None:
+    def add(self, bounds: Vector, *entries: Entries) -> None:
         """Add rows with these b, and entries (row from the first of them, column, value)."""
         self._bounds.append(bounds)
         self._entries += [(row + self.count, column, value) for row, column, value in entries]

@@ -100,25 +100,27 @@ class RouteSearch:
             for layer in layers
         ]
         self._may_follow = [
-            (
-                np.abs(after - before[:, np.newaxis])
-                <= step * (1 + RATES.rounding) + 1e-9
-            ).all(axis=2)
+            (np.abs(after - before[:, np.newaxis]) <= step * (1 + RATES.rounding) + 1e-9).all(
+                axis=2
+            )
             for before, after, step in zip(
                 self._pressures[:-1], self._pressures[1:], steps, strict=True
             )
         ]
         self._crossings: dict[int, list[_Crossing]] = {}  # by the point where they end
 
-    def best(self) -> Route | None:
-        """The best sequence; None if there is none."""
-        hope = self._hope()
+    def best(self, rounds: int = ROUTE.rounds) -> Route | None:
+        """The best sequence; None if there is none.
+
+        Crossings are computed in so many rounds; without any, only steps from candidate to
+        candidate count.
+        """
         direct = self._sequence()
-        if direct is not None and self._is_about(direct, hope):
-            return self._route(direct)
+        if not rounds or (direct is not None and self._is_about(direct, self._hope())):
+            return None if direct is None else self._route(direct)
         for crossing in self._all_crossings():
             self._crossings.setdefault(crossing.begin + crossing.length, []).append(crossing)
-        for _ in range(ROUTE.evaluated):
+        for _ in range(rounds):
             hoped = self._sequence()
             if hoped is None:
                 return None
@@ -158,9 +160,7 @@ class RouteSearch:
     def furthest(self) -> int:
         """The last point that a sequence comes to."""
         values = self._best(-np.inf, bottleneck=True, computed=True).values
-        return max(
-            (i for i, each in enumerate(values) if np.isfinite(each).any()), default=0
-        )
+        return max((i for i, each in enumerate(values) if np.isfinite(each).any()), default=0)
 
     # -- dynamic programming ------------------------------------------------------------------
 

@@ -55,7 +55,7 @@ class RouteSettings:
     crossings : points of a path at which a crossing to another branch may begin.
     lengths : of a crossing, times the least number of steps that the rates allow.
     nearest : candidates to which crossings lead from another, for each length.
-    evaluated : rounds in which crossings are computed.
+    rounds, first_rounds : in which crossings are computed; and before anything else is tried.
     price : by which a crossing counts as worse than it is: small, so that none is idle.
     within : share of a rate that crossings use.
     hardly : gain of the logarithm of stiffness for which no crossing is computed; and of its mean
@@ -65,7 +65,8 @@ class RouteSettings:
     crossings: int = 40
     lengths: tuple[float, ...] = (1.0, 1.5, 2.5)
     nearest: int = 6
-    evaluated: int = 40
+    rounds: int = 40
+    first_rounds: int = 8
     price: float = 1e-3
     within: float = 0.98
     hardly: float = 2e-3

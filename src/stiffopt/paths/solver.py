@@ -19,10 +19,13 @@ from stiffopt.paths.points import Candidate, PathTasks
 from stiffopt.paths.rates import least_times, slew_limits, step_limits
 from stiffopt.paths.refinement import refined
 from stiffopt.paths.route import Route, RouteSearch
-from stiffopt.paths.settings import CANDIDATES, LANES, RATES
+from stiffopt.paths.settings import CANDIDATES, LANES, RATES, ROUTE
 from stiffopt.paths.solution import PathSolution
 
 Vector = NDArray[np.float64]
+
+# what is tried until it is good enough: whether with lanes, and rounds of crossings
+_STAGES = ((False, ROUTE.first_rounds), (True, 0), (True, ROUTE.rounds))
 
 
 def solve_path(
@@ -182,9 +185,7 @@ class _PathSolver:
 
     # -- the answer ----------------------------------------------------------------------------
 
-    def _answer(
-        self, tasks: PathTasks, layers: list[list[Candidate]], starts: int
-    ) -> PathSolution:
+    def _answer(self, tasks: PathTasks, layers: list[list[Candidate]], starts: int) -> PathSolution:
         times = self._points.times
         slowed = 1.0
         steps = self._steps(tasks, times)
@@ -231,30 +232,38 @@ class _PathSolver:
         if not all(layers):
             return None
         hope = RouteSearch(tasks, layers, steps, self._over)
-        route = self._best_of(tasks, layers, steps)
-        if hope.comes_up_to(route, LANES.enough) or tasks.robot.is_loaded:
-            return route
+        best: Route | None = None
+        for with_lanes, rounds in _STAGES:
+            if with_lanes and tasks.robot.is_loaded:
+                break
+            some = self._with_lanes(tasks, layers) if with_lanes else layers
+            route = self._best_of(tasks, some, steps, rounds)
+            found = [each for each in (best, route) if each is not None]
+            best = max(found, key=lambda each: each.value(self._over), default=None)
+            if hope.comes_up_to(best, LANES.enough):
+                break
+        return best
+
+    def _with_lanes(self, tasks: PathTasks, layers: list[list[Candidate]]) -> list[list[Candidate]]:
+        """Candidates with further ones, but where the pressures are given."""
         if self._lanes is None:
             self._lanes = lanes(tasks)
-        ends = {0, len(layers) - 1}
-        more = [
-            layer if index in ends and len(layer) == 1 else [*layer, *lane]
+        given = {0: self._ends[0], len(layers) - 1: self._ends[1]}
+        return [
+            layer if given.get(index) is not None else [*layer, *lane]
             for index, (layer, lane) in enumerate(zip(layers, self._lanes, strict=True))
         ]
-        other = self._best_of(tasks, more, steps)
-        found = [each for each in (route, other) if each is not None]
-        return max(found, key=lambda each: each.value(self._over), default=None)
 
     def _best_of(
-        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector
+        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector, rounds: int
     ) -> Route | None:
         """The best sequence of candidates; that of a closed path ends where it begins."""
         if not self._path.closed:
-            return RouteSearch(tasks, layers, steps, self._over).best()
+            return RouteSearch(tasks, layers, steps, self._over).best(rounds)
         found: list[Route] = []
         for first in layers[0][: CANDIDATES.kept]:
             closed = [[first], *layers[1:-1], [first]]
-            route = RouteSearch(tasks, closed, steps, self._over).best()
+            route = RouteSearch(tasks, closed, steps, self._over).best(rounds)
             if route is not None:
                 found.append(route)
         return max(found, key=lambda each: each.value(self._over), default=None)
@@ -291,7 +300,7 @@ class _PathSolver:
     def _judged(
         self, tasks: PathTasks, pressures: Vector, times: Vector, alone: Vector
     ) -> PathSolution:
-        """The solution at some pressures (N, n), judged by the model of the path as it was given."""
+        """The solution at pressures (N, n), judged by the model against the path as given."""
         own = PathTasks(self._robot, self._tasks, self._seed)
         judgements = own.judged(pressures)
         known = [j for j in judgements if j is not None]
@@ -322,15 +331,13 @@ class _PathSolver:
         if self._unreachable is not None:
             index, why = self._unreachable
             message = (
-                f"{self._name(index)} cannot be reached: {why} The nearest path that can be "
-                "followed is given."
+                f"{self._name(index)} cannot be reached: {why.removeprefix('unreachable: ')}.  "
+                "The nearest path that can be followed is given."
             )
             return replace(solution, status="unreachable", message=message, first_failure=index)
         if wrong:
             message = f"{self._name(wrong[0])} does not hold: {_what_is_wrong(known[wrong[0]])}"
-            return replace(
-                solution, status="unreachable", message=message, first_failure=wrong[0]
-            )
+            return replace(solution, status="unreachable", message=message, first_failure=wrong[0])
         if self._slew is not None and self._points.times is not None:
             limits = step_limits(times, self._slew)
             assert (np.abs(np.diff(pressures, axis=0)) <= limits * (1 + 1e-6) + 1e-6).all()
@@ -409,8 +416,10 @@ class _PathSolver:
 
 def _at_tip(task: Task, solution: PressureSolution) -> Task:
     """The task with the tip's pose of a solution as its target."""
-    assert solution.tip_position is not None and solution.tip_pose is not None
-    target, parts = task.target, {}
+    assert solution.tip_position is not None
+    assert solution.tip_pose is not None
+    target = task.target
+    parts: dict[str, object] = {}
     if target.position is not None:
         pairs = zip(target.position, solution.tip_position.tolist(), strict=True)
         parts["position"] = tuple(None if axis is None else own for axis, own in pairs)
