@@ -67,6 +67,8 @@ if TYPE_CHECKING:
     from stiffopt.optimise.task import load_task as load_task
     from stiffopt.optimise.warm import WarmAnswer as WarmAnswer
     from stiffopt.paths.motion import plan_motion as plan_motion
+    from stiffopt.paths.path import Path as Path
+    from stiffopt.paths.path import load_path as load_path
     from stiffopt.paths.solution import PathSolution as PathSolution
     from stiffopt.paths.trajectory import Trajectory as Trajectory
     from stiffopt.paths.trajectory import Waypoint as Waypoint
@@ -84,9 +86,6 @@ __version__ = "0.1.0"
 # Names are imported at their first use: NumPy, CasADi and pydantic take a quarter of a second, for
 # which neither `--help` nor a wrong option should wait.
 _NAMES = {
-    "stiffopt.paths.motion": ("plan_motion",),
-    "stiffopt.paths.solution": ("PathSolution",),
-    "stiffopt.paths.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.daemon.client": ("Client",),
     "stiffopt.errors": (
         *("CancelledError", "CommandError", "DerivativeError", "DeviceError", "EquilibriumError"),
@@ -123,6 +122,10 @@ _NAMES = {
     "stiffopt.optimise.target": ("Target", "Tolerance"),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
     "stiffopt.optimise.warm": ("WarmAnswer",),
+    "stiffopt.paths.motion": ("plan_motion",),
+    "stiffopt.paths.path": ("Path", "load_path"),
+    "stiffopt.paths.solution": ("PathSolution",),
+    "stiffopt.paths.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.safety.rigs": ("open_rig",),
     "stiffopt.rig.interface": ("Observation", "PoseSample", "PressureCommand", "Rig"),
     "stiffopt.workspace": ("WorkspaceMap", "map_workspace", "open_workspace_map"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -48,12 +49,14 @@ def several(goal: End | Sequence[End]) -> list[End]:
         return [goal]
     if isinstance(goal, np.ndarray):
         return list(goal) if goal.ndim == 2 and len(goal) else [goal]
+    if isinstance(goal, Sequence) and not len(goal):
+        return []
     if isinstance(goal, Sequence) and any(
         isinstance(each, Task | Sequence | np.ndarray) and not isinstance(each, str)
         for each in goal
     ):
         return list(goal)
-    return [goal]
+    return [cast(End, goal)]
 
 
 def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Vector:

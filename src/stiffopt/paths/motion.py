@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
+from stiffopt.errors import EquilibriumError, StoppedError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.model.scene import Scene
@@ -22,11 +21,10 @@ from stiffopt.paths.configurations import (
     End,
     TaskConfigurations,
     Unsolved,
-    checked_pressures,
     maximised,
-    several,
 )
-from stiffopt.paths.rates import least_times, slew_limits
+from stiffopt.paths.motion_request import MotionRequest
+from stiffopt.paths.rates import least_times
 from stiffopt.paths.shortening import rounded, shortened
 from stiffopt.paths.solution import PathSolution
 from stiffopt.paths.stiffness import least_stiffness
@@ -36,11 +34,9 @@ Vector = NDArray[np.float64]
 
 _NEARLY_AS_STIFF = 0.95  # of the best, which is not worth looking for stiffer ones
 _MORE = 50  # motions tried for a stiffer goal, beyond as many as for the first
-_USUAL_RATE = 1e5  # Pa/s, where no rate is known
 _LEAST_STEP = 1.1e-3  # s, between points: what a trajectory takes
 _STEPS = 50  # into which the motion is divided at least, unless they are shorter than:
 _SHORT = 5e-3  # s
-_MARGIN_SAMPLES = 12  # pressures at which a calibration is asked for the error
 
 
 def plan_motion(
@@ -79,7 +75,7 @@ def plan_motion(
         To be kept by the body, in m; that of the scene if absent.  A calibrated robot's body keeps
         as much more as the calibration leaves unknown of the tip (`Manipulator.tip_uncertainty`).
     slew : float or (n,), optional
-        Greatest rates of change in Pa/s; the robot's own hold too.
+        Greatest rates of change in Pa/s; the robot's own hold too, and one of both must be known.
     load : Load, optional
         At the tip all the way, instead of that of the tasks.
     seed : int
@@ -99,10 +95,8 @@ def plan_motion(
     MissingExtraError
         The straight way is not clear, and OMPL is not installed.
     """
-    if not isinstance(robot, Manipulator):
-        raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
     begin = perf_counter()
-    request = _Request.of(robot, start, several(goal), scene, clearance, slew, load, seed)
+    request = MotionRequest.of(robot, start, goal, scene, clearance, slew, load, seed)
     timings: dict[str, float] = {}
     with giving_up(timeout):
         try:
@@ -116,97 +110,11 @@ def plan_motion(
     return found
 
 
-@dataclass(frozen=True)
-class _Request:
-    """What was asked for, checked.
-
-    Attributes
-    ----------
-    bare, robot : without and with the load of the motion.
-    margin : of the asked clearance, for what a calibration leaves unknown; None: nothing is known.
-    """
-
-    bare: Manipulator
-    robot: Manipulator
-    load: Load | None
-    start: Vector | Task
-    goals: list[Vector | Task]
-    scene: Scene | None
-    clearance: float
-    margin: float | None
-    slew: Vector | None
-    seed: int
-
-    @classmethod
-    def of(
-        cls,
-        robot: Manipulator,
-        start: End,
-        goals: list[End],
-        scene: Scene | None,
-        clearance: float | None,
-        slew: float | ArrayLike | None,
-        load: Load | None,
-        seed: int,
-    ) -> _Request:
-        """Check arguments."""
-        if not goals:
-            raise InputError("a motion needs a goal; got an empty list")
-        tasks = [each for each in (*goals, start) if isinstance(each, Task)]
-        load = _load_of(tasks, load)
-        bearer = robot.with_load(load.force, load.moment, load.frame) if load else robot
-        scene = scene or next((task.scene for task in tasks if task.scene is not None), None)
-        if scene is not None:
-            if not isinstance(scene, Scene):
-                raise InputError(f"scene must be a Scene, see load_scene; got {shown(scene)}")
-            if clearance is not None:
-                scene = scene.model_copy(update={"clearance": _checked_clearance(clearance)})
-            scene.check_against(robot.description)
-        elif clearance is not None:
-            raise InputError("a clearance needs a scene, to whose objects it is kept")
-        ends = [
-            each if isinstance(each, Task) else checked_pressures(name, robot, each)
-            for name, each in (("start", start), *(("goal", goal) for goal in goals))
-        ]
-        return cls(
-            bare=robot,
-            robot=bearer,
-            load=load,
-            start=ends[0],
-            goals=ends[1:],
-            scene=scene,
-            clearance=0.0 if scene is None else scene.clearance,
-            margin=None if scene is None else _margin(bearer),
-            slew=slew_limits(robot.description, _checked_slew(robot, slew)),
-            seed=seed,
-        )
-
-    @property
-    def asked(self) -> float:
-        """Clearance that is kept by the model's body, in m."""
-        return self.clearance + (self.margin or 0.0)
-
-    def posed(self, task: Task) -> Task:
-        """A task with the load, the scene and the clearance of the motion."""
-        scene = self.scene
-        if scene is not None:
-            scene = scene.model_copy(update={"clearance": self.asked})
-        return task.model_copy(update={"load": self.load, "scene": scene})
-
-    def without_answer(self, message: str, status: Any) -> PathSolution:
-        """Solution with nothing but its message."""
-        n = self.robot.n_pressures
-        return PathSolution(
-            status, message, self.robot, np.empty(0), np.empty((0, n)), np.empty((0, 4, 4)),
-            slew=self.slew,
-        )  # fmt: skip
-
-
 @dataclass
 class _Planner:
     """Finds and describes the motion of a request."""
 
-    request: _Request
+    request: MotionRequest
     timings: dict[str, float]
     poses: int = 0
     known: int = 0
@@ -239,13 +147,12 @@ class _Planner:
             self.timings["goals"] += perf_counter() - begin
             way, end = self._search(start, goals, tasks)
         begin = perf_counter()
-        scale = np.full(len(start), _USUAL_RATE) if self.request.slew is None else self.request.slew
         if len(way) > 2:
-            way = shortened(way, self.is_clear, scale, self.request.seed)
-            way = rounded(way, self.is_clear, scale)
+            way = shortened(way, self.is_clear, self.request.slew, self.request.seed)
+            way = rounded(way, self.is_clear, self.request.slew)
         self.timings["shorten"] = perf_counter() - begin
         begin = perf_counter()
-        found = self._described(way, scale)
+        found = self._described(way)
         self.timings["describe"] = perf_counter() - begin
         return found
 
@@ -294,12 +201,12 @@ class _Planner:
         index = int(np.argmin(near.distances))
         distance, name = float(near.distances[index]), near.names[index]
         shape = next(item.shape for item in request.scene.objects if item.name == name)
-        if distance < 0:
-            return f"the body is {-distance * 1e3:.3g} mm {shape.amiss} '{name}'"
-        asked = f"{request.asked * 1e3:.3g} mm"
+        text = f"the body is {(request.asked - distance) * 1e3:.3g} mm {shape.amiss} '{name}'"
+        if request.asked:
+            text += f", where {request.asked * 1e3:.3g} mm of clearance are asked"
         if request.margin:
-            asked += f" ({request.margin * 1e3:.3g} mm of it for what the calibration leaves open)"
-        return f"the body is {distance * 1e3:.3g} mm from '{name}', where {asked} are asked"
+            text += f", {request.margin * 1e3:.3g} mm of them for what the calibration leaves open"
+        return text
 
     # -- ways -------------------------------------------------------------------------------
 
@@ -318,20 +225,18 @@ class _Planner:
     ) -> tuple[Vector, Configuration]:
         """A way around; see `plan_motion` for which goal."""
         begin = perf_counter()
-        self.searched = True
-        low, high = self._limits(start, goals, tasks)
-        assert self.motions is not None
-        bounds = self.motions.bounds
-        weights = bounds.speeds[self.motions.piece_of]
-        search = TreeSearch(self.is_clear, low, high, weights, self.request.seed)
+        assert self.motions is not None  # or the straight way was clear
+        weights = self.motions.bounds.speeds[self.motions.piece_of]
+        limits = self._limits(start, goals, tasks)
+        search = TreeSearch(self.is_clear, *limits, weights, self.request.seed)
         way, end = self._straight(start, goals)
-        reached: Vector | None = None
-        if way is None:
-            way, reached = search.way(start, np.stack([g.pressures for g in goals]), np.inf)
-        if way is None:
-            raise Unsolved(self._no_way(reached))
-        end = min(goals, key=lambda goal: float(np.abs(goal.pressures - way[-1]).max()))
-        way = np.concatenate([[start], way[1:-1], [end.pressures]])
+        if way is None or end is None:
+            self.searched = True
+            way, reached = search.way(start, _all(goals), np.inf)
+            if way is None:
+                raise Unsolved(self._no_way(reached))
+            end = _nearest(goals, way[-1])
+            way = np.concatenate([[start], way[1:-1], [end.pressures]])
         best = max(goal.worth for goal in goals)
         stiff = [goal for goal in goals if goal.worth >= _NEARLY_AS_STIFF * best]
         if end not in stiff:
@@ -346,12 +251,10 @@ class _Planner:
         further, goal = self._straight(end.pressures, stiff)
         if further is not None and goal is not None:
             return np.concatenate([way, further[1:]]), goal
-        found, _ = search.way(
-            end.pressures, np.stack([g.pressures for g in stiff]), search.tried + _MORE
-        )
+        found, _ = search.way(end.pressures, _all(stiff), search.tried + _MORE)
         if found is None:
             return way, end
-        goal = min(stiff, key=lambda each: float(np.abs(each.pressures - found[-1]).max()))
+        goal = _nearest(stiff, found[-1])
         return np.concatenate([way, found[1:-1], [goal.pressures]]), goal
 
     def _limits(
@@ -376,11 +279,11 @@ class _Planner:
 
     # -- the answer -------------------------------------------------------------------------
 
-    def _described(self, way: Vector, rates: Vector) -> PathSolution:
+    def _described(self, way: Vector) -> PathSolution:
         """The motion with its times and all that the model says of it."""
         request = self.request
         robot = request.robot
-        p, times = timed(way, rates)
+        p, times = timed(way, request.slew)
         measures = _measures(request.goals)
         clearance = None if request.scene is None else robot.clearance(p, request.scene)
         return PathSolution(
@@ -398,29 +301,23 @@ class _Planner:
         )
 
     def _message(self, clearance: Vector | None) -> str:
-        request = self.request
-        parts = []
-        if clearance is not None:
-            parts.append(f"the body is at least {clearance.min() * 1e3:.3g} mm clear of the scene")
-            if request.margin is None:
-                parts[0] += "; this counts no error of the model, as the robot is not calibrated"
-            else:
-                parts[0] += (
-                    f", of which {request.margin * 1e3:.3g} mm are kept for what the calibration "
-                    "leaves unknown (95 %)"
-                )
-        if request.slew is None:
-            parts.append(
-                f"no rate of the pressures is known: timed at {_USUAL_RATE * 1e-5:g} bar/s"
-            )
-        return "; ".join(parts)
+        if clearance is None:
+            return ""
+        margin = self.request.margin
+        counted = (
+            "this counts no error of the model, as the robot is not calibrated"
+            if margin is None
+            else f"{margin * 1e3:.3g} mm of it are kept for what the calibration leaves open (95 %)"
+        )
+        return f"the body is at least {clearance.min() * 1e3:.3g} mm clear of the scene; {counted}"
 
     def _confidence(self) -> str:
         if self.motions is None:
             return "a straight way in pressures; there is no scene"
-        goals = "" if self.known == 1 else f", one of {self.known} goal configurations"
+        goals = "" if self.known == 1 else f" to one of {self.known} goal configurations"
         how = "RRTConnect" if self.searched else "a straight way in pressures"
-        return f"{how}{goals}, {self.poses} poses looked at, clear between them to {MOTION_ERROR * 1e3:g} mm"
+        kept = f"the way between them is clear to {MOTION_ERROR * 1e3:g} mm"
+        return f"{how}{goals}, {self.poses} poses looked at; {kept}"
 
 
 def timed(way: Vector, rates: Vector) -> tuple[Vector, Vector]:
@@ -439,58 +336,16 @@ def timed(way: Vector, rates: Vector) -> tuple[Vector, Vector]:
     return np.concatenate(points), np.concatenate(times)
 
 
+def _all(goals: Sequence[Configuration]) -> Vector:
+    return np.stack([goal.pressures for goal in goals])
+
+
+def _nearest(goals: Sequence[Configuration], p: Vector) -> Configuration:
+    """The goal at pressures (n,), but for rounding."""
+    return min(goals, key=lambda goal: float(np.abs(goal.pressures - p).max()))
+
+
 def _measures(goals: Sequence[Vector | Task]) -> tuple[StiffnessMeasure, ...]:
     """What the first task among the goals maximises."""
     tasks = (goal for goal in goals if isinstance(goal, Task))
     return next((found for found in map(maximised, tasks) if found), ())
-
-
-def _load_of(tasks: list[Task], load: Load | None) -> Load | None:
-    """The load of the whole motion."""
-    if load is not None:
-        if not isinstance(load, Load):
-            raise InputError(f"load must be a Load; got {shown(load)}")
-        return load
-    loads = [task.load for task in tasks]
-    if any(each != loads[0] for each in loads):
-        raise InputError("the tasks of a motion must have the same load; give one for all of them")
-    return loads[0] if loads else None
-
-
-def _checked_clearance(clearance: float) -> float:
-    if not isinstance(clearance, int | float) or not 0 <= clearance < np.inf:
-        raise InputError(f"clearance must be a length in m, not negative; got {shown(clearance)}")
-    return float(clearance)
-
-
-def _checked_slew(robot: Manipulator, slew: float | ArrayLike | None) -> Any:
-    """Rates (n,) that are positive, or None."""
-    if slew is None:
-        return None
-    try:
-        rates = np.broadcast_to(np.asarray(slew, dtype=float), robot.n_pressures)
-        good = bool((rates > 0).all() and np.isfinite(rates).all())
-    except (TypeError, ValueError):
-        good = False
-    if not good:
-        raise InputError(
-            f"slew must be one rate above 0 in Pa/s or {robot.n_pressures} of them; "
-            f"got {shown(slew)}"
-        )
-    return tuple(rates.tolist())
-
-
-def _margin(robot: Manipulator) -> float | None:
-    """What a calibration leaves unknown of the tip, in m; the largest over the pressures."""
-    if robot.description.calibration is None:
-        return None
-
-    def find() -> float:
-        rng = np.random.default_rng(0)
-        shares = rng.random((_MARGIN_SAMPLES, robot.n_pressures))
-        shares[:2] = [[0.0], [1.0]]
-        low, high = robot.pressure_min, robot.pressure_max
-        pressures = low + shares * (high - low)
-        return max(float(robot.tip_uncertainty(p).semi_axes[0]) for p in pressures)
-
-    return robot.kept(("margin of motions", robot.tip_load), find)

@@ -55,7 +55,8 @@ def _without_corners(way: Vector, is_clear: IsClear) -> Vector:
             ahead -= 1
         here = ahead
         kept.append(here)
-    return way[kept]
+    found: Vector = way[kept]
+    return found
 
 
 def _marks(way: Vector, scale: Vector) -> Vector:
@@ -79,7 +80,7 @@ def rounded(way: Vector, is_clear: IsClear, scale: Vector) -> Vector:
         parts.append(_corner(way[k - 1 : k + 2], lengths[k - 1 : k + 1], is_clear, scale))
     found = np.concatenate([*parts, way[-1:]])
     moves = np.abs(np.diff(found, axis=0)).max(axis=1) > 0
-    return found[np.concatenate([[True], moves])]
+    return np.asarray(found[np.concatenate([[True], moves])])
 
 
 def _corner(corner: Vector, lengths: Vector, is_clear: IsClear, scale: Vector) -> Vector:

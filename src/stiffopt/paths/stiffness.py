@@ -17,7 +17,8 @@ def least_stiffness(robot: Manipulator, p: Vector, measures: Sequence[StiffnessM
     """The smallest of several stiffnesses of the tip (N,) at pressures (N, n)."""
     C = robot.compliance_between(p, robot.length, robot.length)
     R = robot.pose(p, robot.length)[:, :3, :3]
-    return np.min([_stiffness(C, R, each) for each in measures], axis=0)
+    found: Vector = np.min([_stiffness(C, R, each) for each in measures], axis=0)
+    return found
 
 
 def _stiffness(C: Vector, R: Vector, measure: StiffnessMeasure) -> Vector:
