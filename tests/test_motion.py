@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from test_obstacles import KINDS, distances, scene_of
 
 from stiffopt import (
     InputError,
@@ -32,6 +31,7 @@ from stiffopt import (
 from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.paths.motion import timed
 from stiffopt.paths.shortening import rounded, shortened
+from test_obstacles import KINDS, distances, scene_of
 
 Array = NDArray[np.float64]
 
