@@ -165,9 +165,9 @@ def test_answers_are_written_as_yaml_and_csv(tmp_path: Path, write: Write) -> No
     assert list(pressures)[4] == "segment 2 channel 2"
     for k, name in enumerate(pressures):
         read = [parse_quantity(text, "Pa") for text in pressures[name]]
-        assert [float(row[f"p{k + 1}_pa"]) for row in rows] == pytest.approx(read, abs=1e-4)
+        assert [float(row[f"p{k + 1}_pa"]) for row in rows] == pytest.approx(read, abs=0.06)
     assert [float(row["stiffness_n_per_m"]) for row in rows] == pytest.approx(
-        [parse_quantity(text, "N/m") for text in result["stiffness"]]
+        [parse_quantity(text, "N/m") for text in result["stiffness"]], rel=1e-6
     )
     assert parse_quantity(result["times"][-1], "s") == 2
     assert parse_quantity(result["tip"]["x"][0], "m") == pytest.approx(-0.03, abs=1e-4)

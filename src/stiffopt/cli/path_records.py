@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import degrees
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -12,7 +13,8 @@ from stiffopt.logs.table import read_bytes
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution, Vector
-from stiffopt.units import format_quantity, unit_suffix
+from stiffopt.plots.wording import BAR, MM
+from stiffopt.units import unit_suffix
 
 _ERROR = "position_error_m"
 """A column that no log has, by which a solution is known."""
@@ -82,7 +84,7 @@ def csv_text(solution: PathSolution) -> str:
     }
     columns = {name: values for name, values in columns.items() if values is not None}
     rows = np.column_stack(list(columns.values())).tolist()
-    lines = [",".join("" if value != value else f"{value:.10g}" for value in row) for row in rows]
+    lines = [",".join("" if value != value else f"{value:.9g}" for value in row) for row in rows]
     return "\n".join([",".join(columns), *lines, ""])
 
 
@@ -92,7 +94,7 @@ def is_result_csv(file: FilePath) -> bool:
 
 
 def result_record(solved: SolvedPath) -> dict[str, Any]:
-    """Return a solution as the entry of a result file: quantities as text with their units."""
+    """Return a solution as the entry of a result file: numbers of seven digits with their units."""
     solution = solved.solution
     description = solution.robot.description
     unit = solution.stiffness_unit or ""
@@ -105,32 +107,30 @@ def result_record(solved: SolvedPath) -> dict[str, Any]:
         "confidence": solution.confidence or None,
         "worst_index": solution.worst_index,
         "first_failure": solution.first_failure,
-        "slew": _quantities(solution.slew, "Pa/s", "bar/s"),
+        "slew": _quantities(solution.slew, "bar/s", BAR),
         "times": _quantities(solution.times, "s"),
         "pressures": {
-            description.channel_name(k): _quantities(solution.pressures[:, k], "Pa", "bar")
+            description.channel_name(k): _quantities(solution.pressures[:, k], "bar", BAR)
             for k in channels
         },
         "tip": {
-            axis: _quantities(solution.tip_poses[:, k, 3], "m", "mm")
-            for k, axis in enumerate("xyz")
+            axis: _quantities(solution.tip_poses[:, k, 3], "mm", MM) for k, axis in enumerate("xyz")
         },
-        "position_error": _quantities(solution.position_errors, "m", "mm"),
-        "angle_error": _quantities(solution.angle_errors, "rad", "deg"),
+        "position_error": _quantities(solution.position_errors, "mm", MM),
+        "angle_error": _quantities(solution.angle_errors, "deg", degrees(1)),
         "stiffness": _quantities(solution.stiffness, unit),
         "stiffness_alone": _quantities(solution.alone, unit),
-        "clearance": _quantities(solution.clearance, "m", "mm"),
+        "clearance": _quantities(solution.clearance, "mm", MM),
+        "solve_time": f"{solution.timings.get('total', 0.0):.4g} s",
     }
-    if solution.timings.get("total") is not None:
-        record["solve_time"] = format_quantity(solution.timings["total"], "s")
     return {key: value for key, value in record.items() if value not in (None, [], {})}
 
 
-def _quantities(values: Vector | None, unit: str, written: str | None = None) -> Any:
-    """Return quantities as text, None where there is no number."""
+def _quantities(values: Vector | None, unit: str, per_si: float = 1.0) -> list[str | None] | None:
+    """Return quantities as text in a unit, of which one in SI is `per_si`; None: no number."""
     if values is None:
         return None
     return [
-        None if value is None else format_quantity(value, unit, written)
+        None if value is None else f"{value * per_si + 0.0:.7g} {unit}"
         for value in plain_data(values)
     ]

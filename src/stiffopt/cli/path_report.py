@@ -123,15 +123,19 @@ def _rates(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
 def _table(solution: PathSolution) -> RenderableType:
     """Every so many points, and those that matter."""
     count = len(solution.times)
-    marks = {solution.worst_index: "worst", solution.first_failure: "first that cannot be had"}
+    marks: dict[int, str] = {}
+    if solution.worst_index is not None:
+        marks[solution.worst_index] = "worst"
+    if solution.first_failure is not None:
+        marks[solution.first_failure] = "first that cannot be had"
     shown = {*range(0, count, max(1, round(count / _ROWS))), count - 1, *marks}
     columns = _columns(solution)
     table = number_table("  point", *columns, "")
     table.columns[0].justify = "right"
     table.columns[-1].justify = "left"
-    for index in sorted(shown - {None}):  # type: ignore[type-var]
-        cells = [values[index] for values in columns.values()]  # type: ignore[index]
-        table.add_row(str(index + 1), *cells, Text(marks.get(index, ""), "yellow"))  # type: ignore
+    for index in sorted(shown):
+        cells = [values[index] for values in columns.values()]
+        table.add_row(str(index + 1), *cells, Text(marks.get(index, ""), "yellow"))
     return _explained(table, solution)
 
 

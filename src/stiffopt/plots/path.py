@@ -132,7 +132,7 @@ def _draw_stiffness(axes: Any, solution: PathSolution) -> None:
         return
     if solution.alone is not None:
         axes.plot(
-            solution.times, solution.alone, color=style.GREY, linestyle="--", linewidth=1.4,
+            solution.times, solution.alone, color=style.GREY, linewidth=5, alpha=0.35,
             label="each point alone",
         )  # fmt: skip
     axes.plot(
@@ -211,6 +211,7 @@ def _legend(axes: Any) -> None:
     handles, labels = axes.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda k: labels[k] == "at its rate")
     axes.legend(
-        [handles[k] for k in order], [labels[k] for k in order], loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=len(labels),
+        [handles[k] for k in order], [labels[k] for k in order], loc="lower right",
+        bbox_to_anchor=(1.0, 0.97), ncols=len(labels),
         fontsize=8, frameon=False, columnspacing=1.2, handlelength=1.4, borderaxespad=0.0,
     )  # fmt: skip
