@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import degrees
-from textwrap import shorten
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.errors import InputError, printable
+from stiffopt.errors import InputError
 from stiffopt.model.scene import Scene
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
@@ -26,8 +25,6 @@ Vector = NDArray[np.float64]
 
 _POSES = 5  # of the arm
 _FULL = 0.99  # share of a rate from which a pressure counts as changing at it
-_STATUS = {"solved": "#2a7f3f", "unreachable": "#b35c00", "failed": "#b00020"}
-_LONGEST_NOTE = 120  # characters of the message that fit
 
 
 def plot_path(path: Path, solution: PathSolution, *, title: str | None = None) -> Figure:
@@ -117,12 +114,7 @@ def _figure(drawn: _Drawn, title: str, key_numbers: Callable[[], str]) -> Figure
     if solution.clearance is not None:
         _draw_clearance(next(left), drawn)
     _draw_pressures(list(left), drawn)
-    message = shorten(printable(solution.message), _LONGEST_NOTE, placeholder=" ...")
-    style.draw_head(figure, title, key_numbers(), message)
-    figure.text(
-        0.975, 1 - 0.34 / height, solution.status, fontsize=13, weight="bold", va="center",
-        ha="right", color=_STATUS[solution.status],
-    )  # fmt: skip
+    style.draw_outcome(figure, title, key_numbers(), solution.status, solution.message)
     return figure
 
 
