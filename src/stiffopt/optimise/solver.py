@@ -317,15 +317,15 @@ class PressureSolver:
             result = LocalResult.at(problem, point)
             return self._explanation(problem, result, judgement, p)
 
-        return PressureSolution.explained_later(
-            explain,
+        fields = self._quantities(task, judgement)
+        fields.update(
             status="solved",
-            **self._quantities(task, judgement),
             pressures=p,
             confidence=answer.confidence,
             counts=answer.counts,
             timings={},
         )
+        return PressureSolution.explained_later(explain, fields)
 
     def _otherwise(self, task: Task, guess: Vector | None) -> PressureSolution:
         """Answer where the compiled search has none."""
@@ -359,17 +359,17 @@ class PressureSolver:
             result = LocalResult.at(last, last.pose(p / problem.unit))
             return self._explanation(problem, result, judgement, p)
 
-        return PressureSolution.explained_later(
-            explain,
+        fields = self._quantities(task, judgement)
+        fields.update(
             status="unreachable",
             message=diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task),
             active_bounds=tuple(active),
-            **self._quantities(task, judgement),
             pressures=p,
             confidence=replace(answer.confidence, reached=0),  # none came to the pose
             counts=answer.counts,
             timings={},
         )
+        return PressureSolution.explained_later(explain, fields)
 
     def _clearest(self, task: Task) -> PressureSolution | None:
         """Of sampled configurations the one with most clearance, if none keeps enough of it.
