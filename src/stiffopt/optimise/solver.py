@@ -331,38 +331,44 @@ class PressureSolver:
         """Answer where the compiled search has none."""
         try:
             checkpoint()
-            nearest = self._nearest(task)
-            if nearest is None and task.scene is not None and not self.reachable(task.target):
-                nearest = self._clearest(task)
-            return nearest or self._general(task, guess)
+            found = self._nearest(task)
+            if found is None and task.scene is not None:
+                found = self._among_obstacles(task)
+            return found or self._general(task, guess)
         except StoppedError as error:
             return PressureSolution("failed", str(error), task)
 
-    def _nearest(self, task: Task) -> PressureSolution | None:
-        """Closest configuration by compiled code; None if the pose can be had, or for no code."""
+    def _nearest(self, task: Task, start: Vector | None = None) -> PressureSolution | None:
+        """Closest configuration by compiled code; None if the pose can be had, or for no code.
+
+        Among obstacles the answer from there, if the pose can be had.  A start (n,) is in Pa.
+        """
         fast = self._fast(task, None)
-        answer = None if fast is None else fast[0].closest(fast[1])
+        answer = None if fast is None else fast[0].closest(fast[1], start)
         checkpoint()  # a search that was cut short proves nothing
         if fast is None or answer is None or answer.slope is None:
             return None
         p = answer.pressures
         within = are_within(p, self._prepared.lower, self._prepared.upper)
         judgement = Judgement.of(fast[2], answer.judged, within)
+        if judgement.pose_holds and task.scene is not None:
+            return self._compiled(task, p)
         if judgement.pose_holds or not within:
             return None
         active = active_bounds(self.robot, task, p)
         holding = [*map(repr, judgement.touched), *_pressed(active, -answer.slope)]
+        message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task)
 
         def explain() -> Explanation:
             problem = PressureProblem(self.robot, task)
             last = diagnosis.last_stage(problem, judgement.errors)
             result = LocalResult.at(last, last.pose(p / problem.unit))
-            return self._explanation(problem, result, judgement, p)
+            return self._explanation(problem, result, judgement, p, message)
 
         return PressureSolution.explained_later(
             explain,
             status="unreachable",
-            message=diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task),
+            message=message,
             active_bounds=tuple(active),
             **self._quantities(task, judgement),
             pressures=p,
@@ -371,17 +377,49 @@ class PressureSolver:
             timings={},
         )
 
-    def _clearest(self, task: Task) -> PressureSolution | None:
-        """Of sampled configurations the one with most clearance, if none keeps enough of it.
+    def _among_obstacles(self, task: Task) -> PressureSolution | None:
+        """Answer of compiled code where neither search nor descents to the target had one.
 
-        None where one does, or without compiled code to look at many.
+        The pose can be had, but no stiffness that is demanded; or descents start from the clear
+        sample nearest to the target, or from the clearest; or nothing is clear.
         """
-        if task.scene is None or self._fast(task, None) is None:
+        fast = self._fast(task, None)
+        if fast is None or task.scene is None:
             return None
-        samples = self._prepared.samples.pressures[: OBSTACLES.clearest]
+        solver, row, program = fast
+        answer = solver.solve(row)
+        checkpoint()
+        if answer is not None:
+            within = are_within(answer.pressures, self._prepared.lower, self._prepared.upper)
+            judgement = Judgement.of(program, answer.judged, within)
+            if judgement.pose_holds and judgement.is_clear and within and judgement.shortfalls:
+                return self._too_soft(task, judgement, answer)
+        samples = solver.table.pressures[: OBSTACLES.clearest]
         distances = self.robot.clearance(samples, task.scene)
-        if distances.max() >= task.scene.clearance:
-            return None
+        clear = distances >= task.scene.clearance
+        far = solver.table.distances(program.terms, self.robot.length)[: len(samples)]
+        start = np.where(clear, far, np.inf).argmin() if clear.any() else distances.argmax()
+        found = self._nearest(task, samples[int(start)])
+        if found is None and not clear.any():
+            return self._clearest(task, samples, distances)
+        return found
+
+    def _too_soft(
+        self, task: Task, judgement: Judgement, answer: CompiledAnswer
+    ) -> PressureSolution:
+        """The stiffest that was found, where more is demanded."""
+        return PressureSolution(
+            status="unreachable",
+            message=diagnosis.demands_message(judgement),
+            active_bounds=tuple(active_bounds(self.robot, task, answer.pressures)),
+            **self._quantities(task, judgement),
+            pressures=answer.pressures,
+            confidence=answer.confidence,
+            counts=answer.counts,
+        )
+
+    def _clearest(self, task: Task, samples: Vector, distances: Vector) -> PressureSolution:
+        """Of configurations none of which keeps enough clearance the one with most of it."""
         p = samples[int(distances.argmax())]
         judgement = judge(self.robot, task, p)
         return PressureSolution(
@@ -547,20 +585,24 @@ class PressureSolver:
         }
 
     def _explanation(
-        self, problem: PressureProblem, result: LocalResult, judgement: Judgement, pressures: Vector
+        self,
+        problem: PressureProblem,
+        result: LocalResult,
+        judgement: Judgement,
+        pressures: Vector,
+        message: str = "",
     ) -> Explanation:
-        """Put a judged result into words."""
+        """Put a judged result into words, unless there are some already."""
         task = problem.task
         active = active_bounds(self.robot, task, pressures)
         sensitivities = self._sensitivities(problem, result, judgement, pressures, active)
         freedom = diagnosis.freedom(problem, pressures / problem.unit)
-        message = ""
-        if not judgement.pose_holds:
+        if not message and not judgement.pose_holds:
             holding = [*map(repr, judgement.touched), *self._holding(result, active)]
             message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task)
-        elif not judgement.holds:
+        elif not message and not judgement.holds:
             message = diagnosis.demands_message(judgement)
-        elif freedom == 0 and task.stiffness is not None:
+        elif not message and freedom == 0 and task.stiffness is not None:
             message = diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
         return Explanation(message, tuple(active), freedom, sensitivities)
 
