@@ -28,6 +28,7 @@ from stiffopt import (
 )
 from stiffopt.errors import DerivativeError, FileError, InputError
 from stiffopt.model import compiled as code
+from stiffopt.optimise.derivatives import AnswerDerivatives
 from stiffopt.optimise.problem import PressureProblem
 
 Array = NDArray[np.float64]
@@ -118,6 +119,36 @@ def task_with(scene: Scene | None, position: Any = AT, **options: Any) -> Task:
     return Task(target=Target(position=position), stiffness=goal, scene=scene, **options)
 
 
+def optimum_next_to(robot: Manipulator, task: Task, guess: Array) -> tuple[Array, float]:
+    """Pressures and stiffness, as exactly as can be had."""
+    near = solve_pressure(robot, task, guess=guess)
+    assert near.robot is not None
+    found = AnswerDerivatives(near.robot, task, near.pressures)
+    p = found._point.x * found._problem.unit
+    return p, float(robot.stiffness(p, (1, 0, 0)))
+
+
+def check_derivatives(robot: Manipulator, task: Task, h: float = 1e-6) -> None:
+    """By the target, along a direction, and by the clearance, against tasks solved again."""
+    found = solve_pressure(robot, task)
+    assert found.weakly_active == ()
+    assert task.scene is not None
+    way = np.array([0.5, -0.7, 0.4]) * [axis is not None for axis in task.target.position]
+    tasks: dict[str, list[Task]] = {"target": [], "clearance": []}
+    for step in (-h, h):
+        target = task.target.moved_back(-step * np.append(way, np.zeros(3)))
+        tasks["target"].append(task.model_copy(update={"target": target}))
+        scene = task.scene.model_copy(update={"clearance": CLEARANCE + step})
+        tasks["clearance"].append(task.model_copy(update={"scene": scene}))
+    for by, rate in (("target", way), ("clearance", np.ones(1))):
+        (p0, k0), (p1, k1) = (optimum_next_to(robot, each, found.pressures) for each in tasks[by])
+        of_p = found.gradient("pressures", by=by).reshape(len(p0), -1) @ rate
+        of_k = found.gradient("stiffness", by=by).ravel() @ rate
+        assert np.abs(of_p).max() > 1e5
+        np.testing.assert_allclose(of_p, (p1 - p0) / (2 * h), atol=1e-4 * np.abs(of_p).max())
+        assert of_k == pytest.approx((k1 - k0) / (2 * h), rel=1e-4)
+
+
 @pytest.fixture(scope="module")
 def two() -> Manipulator:
     return load_robot("stiff-flop-2")
@@ -154,6 +185,8 @@ def test_both_methods_find_the_same(way: str) -> None:
     assert found.found
     assert found.stiffness == pytest.approx(1.39652, rel=1e-4)  # as benchmarks/reference.py finds
     assert clearance(robot, found.pressures, scene) > CLEARANCE - EXACT
+    expected = [2.065236, 0.514544, -27.084176]
+    np.testing.assert_allclose(found.gradient("stiffness", by="target"), expected, rtol=1e-4)
 
 
 def test_no_local_solution_is_stiffer(compiled: Path) -> None:
@@ -205,6 +238,7 @@ def test_an_arm_under_a_load(compiled: Path) -> None:
     rows = problem.pose(found.pressures / problem.unit).residual[problem.program.n_own_rows :]
     distance = robot.clearance(found.pressures, scene)
     assert max(rows) - 1e-3 == pytest.approx(CLEARANCE - distance, abs=1e-5)
+    check_derivatives(robot, task)
 
 
 def test_what_is_in_the_way_is_told(compiled: Path) -> None:
@@ -333,14 +367,47 @@ def test_prices_and_derivatives(compiled: Path) -> None:
     less = scene.model_copy(update={"clearance": CLEARANCE - 1e-4})
     other = solve_pressure(robot, task_with(less))
     assert other.stiffness - found.stiffness == pytest.approx(price * 1e-4, rel=0.05)
-    with pytest.raises(DerivativeError, match="'post' holds the answer back"):
-        found.gradient("stiffness", by="target")
+    assert found.gradient("stiffness", by="clearance") == pytest.approx(-price, rel=0.01)
     far = scene_of({"name": "post", "sphere": {"centre": (0.1, 0, 0.1), "radius": 0.01}})
     free = solve_pressure(robot, task_with(far))
     plain = solve_pressure(robot, task_with(None))
     np.testing.assert_allclose(
         free.gradient("stiffness", by="target"), plain.gradient("stiffness", by="target"), rtol=1e-3
     )
+
+
+def mesh_of_a_ball(folder: Path, centre: tuple[float, float, float]) -> dict[str, Any]:
+    trimesh = pytest.importorskip("trimesh")
+    trimesh.creation.icosphere(2, 0.008).export(folder / "ball.stl")
+    return {"file": folder / "ball.stl", "scale": 1.0, "centre": centre, "resolution": 0.002}
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box", "half_space", "inside_tube", "mesh"])
+def test_derivatives_of_an_answer_that_an_object_holds_back(
+    kind: str, compiled: Path, tmp_path: Path
+) -> None:
+    at = (0.0063, -0.0125, 0.1291)
+    shape = mesh_of_a_ball(tmp_path, at) if kind == "mesh" else KINDS[kind]
+    check_derivatives(load_robot("stiff-flop-2"), task_with(scene_of({"name": "it", kind: shape})))
+
+
+def test_derivatives_of_an_answer_that_two_objects_hold_back(compiled: Path) -> None:
+    check_derivatives(load_robot("stiff-flop-2"), task_with(scene_of(POST, RIB)))
+
+
+def test_no_derivatives_where_a_distance_has_an_edge(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    found = solve_pressure(robot, task_with(scene_of(RIB)))
+    p, _ = optimum_next_to(robot, found.task, found.pressures)
+    nearest = robot.clearances(p, found.task.scene).positions[0]
+    end = (-0.024, nearest[1], 0.11)  # from there on the rib is round: the same, but for curvature
+    short = {"name": "rib", "capsule": {**RIB["capsule"], "to": end}}
+    found = solve_pressure(robot, task_with(scene_of(short)), guess=p)
+    with pytest.raises(DerivativeError, match="the clearance of rib has an edge at the answer"):
+        found.gradient("pressures", by="target")
+    free = solve_pressure(robot, task_with(None))
+    with pytest.raises(InputError, match="only a task with a scene has a clearance"):
+        free.gradient("stiffness", by="clearance")
 
 
 def test_scenes_that_make_no_sense_for_the_arm(two: Manipulator, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import ctypes
 import math
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass
 from numbers import Real
@@ -54,11 +54,13 @@ class _Limits:
             raise OutOfTimeError(f"no answer within the {self.timeout:g} s that it was given")
 
 
+_NO_LIMITS, _NO_FLAG = nullcontext(), nullcontext(0)  # most calls: as cheap as can be
 _limits: ContextVar[_Limits | None] = ContextVar("limits", default=None)
 
 
-@contextmanager
-def giving_up(timeout: float | None = None, cancel: Cancel | None = None) -> Iterator[None]:
+def giving_up(
+    timeout: float | None = None, cancel: Cancel | None = None
+) -> AbstractContextManager[None]:
     """Within this context, give up after a time (s) or as soon as `cancel` says so.
 
     An outer context of this kind goes on to hold.
@@ -68,9 +70,11 @@ def giving_up(timeout: float | None = None, cancel: Cancel | None = None) -> Ite
     InputError
         If the timeout is no positive number, or `cancel` neither an event nor callable.
     """
-    if timeout is None and cancel is None:
-        yield
-        return
+    return _NO_LIMITS if timeout is None and cancel is None else _giving_up(timeout, cancel)
+
+
+@contextmanager
+def _giving_up(timeout: float | None, cancel: Cancel | None) -> Iterator[None]:
     outer = _limits.get()
     seconds = deadline = math.inf
     questions: tuple[Callable[[], object], ...] = ()
@@ -101,22 +105,22 @@ def checkpoint() -> None:
         limits.check()
 
 
-@contextmanager
-def stop_flag() -> Iterator[int]:
+def stop_flag() -> AbstractContextManager[int]:
     """Address of the `StopFlag` for a call of machine code; 0 where nothing limits it.
 
     While the context lasts, another thread asks whether to go on, if there is anybody to ask.
     """
     limits = _limits.get()
-    if limits is None:
-        yield 0
-        return
+    return _NO_FLAG if limits is None else _stop_flag(limits)
+
+
+@contextmanager
+def _stop_flag(limits: _Limits) -> Iterator[int]:
     flag = StopFlag(limits.deadline - monotonic(), 0)
     if not limits.questions:
         yield ctypes.addressof(flag)
         return
     ended = threading.Event()
-
     failures: list[BaseException] = []
 
     def watch() -> None:

@@ -6,12 +6,13 @@ pressures x (shares of their ranges), the multipliers and the value t of the obj
     sum lambda_i grad f_i + sum mu_b grad c_b - sum nu_j grad g_j = 0   (pressures off their limits)
     f_i = t,  sum lambda_i = 1,  c_b = (|r_b|^2 / rho_b^2 - 1) / 2 = 0,  g_j = bound_j
 
-(of a ball that is bounded on one side c_b = r_b / rho_b - 1).  All this is F(y, theta) = 0, so that
-``dy = -(dF/dy)^-1 dF/dtheta``; the value follows from ``dt = dL/dtheta`` alone.  The model's first
-derivatives are exact; second ones are central differences of them, as there is no formula for those
-of an arm under gravity or loads (relative error about 1e-7).  The curvature of a ball, of which the
-radius is small, is taken from its formula.  An answer is exact to the optimiser's precision only,
-so a few steps of Newton's method come first.
+(of a ball that is bounded on one side c_b = r_b / rho_b - 1; so is the distance of each place of
+the body that is nearest to an object, see `stiffopt.optimise.least_distances`).  All this is
+F(y, theta) = 0, so that ``dy = -(dF/dy)^-1 dF/dtheta``; the value follows from ``dt = dL/dtheta``
+alone.  The model's first derivatives are exact; second ones are central differences of them, as
+there is no formula for those of an arm under gravity or loads (relative error about 1e-7).  The
+curvature of a ball, of which the radius is small, is taken from its formula.  An answer is exact to
+the optimiser's precision only, so a few steps of Newton's method come first.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from stiffopt.directions import unit_vector
 from stiffopt.errors import DerivativeError, InputError, shown
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.least_distances import FollowedObstacles
 from stiffopt.optimise.local import LocalResult
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.prepared import prepared
@@ -35,7 +37,7 @@ from stiffopt.optimise.settings import DERIVATIVES, DESCENT
 from stiffopt.optimise.task import Task
 
 Vector = NDArray[np.float64]
-By = Literal["target", "direction", "limits"]
+By = Literal["target", "direction", "limits", "clearance"]
 
 
 class _Change(NamedTuple):
@@ -93,21 +95,17 @@ class AnswerDerivatives:
     """
 
     def __init__(self, robot: Manipulator, task: Task, pressures: Vector) -> None:
-        self._problem = problem = PressureProblem(robot, task)
+        self._problem = problem = _problem(robot, task, pressures)
         self._evaluate = _evaluation(problem)
         x = pressures / problem.unit
         self._point = self._evaluate(x, problem.parameters)
         prices = LocalResult.at(problem, self._point).multipliers
         if prices is None:
             raise DerivativeError("the answer is no optimum, so that it has no derivatives")
-        touching, constraints = DERIVATIVES.touching, problem.constraints
+        touching = DERIVATIVES.touching
         self._active = _Active(
             np.flatnonzero(prices.terms > DERIVATIVES.least).tolist(),
-            [
-                i
-                for i, (error, c) in enumerate(zip(self._point.errors, constraints, strict=True))
-                if error > c.radius * (1 - DERIVATIVES.near)
-            ],
+            [i for i, pull in enumerate(prices.balls) if self._seems_to_bind(i, pull)],
             np.flatnonzero(prices.floors > DERIVATIVES.least).tolist(),
             (x <= problem.lower + touching) | (x >= problem.upper - touching),
         )
@@ -120,7 +118,35 @@ class AnswerDerivatives:
                 break
         else:
             raise DerivativeError("which constraints bind at the answer is not clear")
+        self._check_distances()
         self.weak = tuple(self._weak_names())
+
+    def _seems_to_bind(self, i: int, pull: Vector) -> bool:
+        """Whether a constraint is taken to bind at first, by its error and its price."""
+        c = self._problem.constraints[i]
+        if c.first >= self._problem.program.n_own_rows:
+            return bool(pull.any())  # many places may be as near
+        return bool(self._point.errors[i] > c.radius * (1 - DERIVATIVES.near))
+
+    def _check_distances(self) -> None:
+        """Refuse places where the slope of a distance changes otherwise to one side."""
+        problem, point = self._problem, self._point
+        bind = [problem.constraints[i] for i in self._active.balls]
+        names = {c.first: c.name for c in bind if c.first >= problem.program.n_own_rows}
+        if not names:
+            return
+        ways, rows = DERIVATIVES.step * np.eye(len(point.x)), list(names)
+        after, before = (
+            np.array([self._evaluate(x, problem.parameters).jacobian[rows] for x in point.x + side])
+            - point.jacobian[rows]
+            for side in (ways, -ways)
+        )  # (n, k, n)
+        uneven, even = (np.abs(each).max(axis=(0, 2)) for each in (after + before, after - before))
+        for name, much in zip(names.values(), uneven > DERIVATIVES.edge * even, strict=True):
+            if much:
+                raise DerivativeError(
+                    f"the {name} has an edge at the answer, which has no derivatives there"
+                )
 
     def _snap(self) -> None:
         """Put what is held onto its limits."""
@@ -141,11 +167,15 @@ class AnswerDerivatives:
             return self._by_limits(of)
         if by == "target":
             return np.stack([self._by(of, change) for change in self._target_changes()], -1)
+        if by == "clearance":
+            return self._by(of, self._clearance_change())
         if by == "direction":
             rows = [[self._by(of, c) for c in each] for each in self._direction_changes()]
             found = np.moveaxis(np.array(rows), (0, 1), (-2, -1))
             return found[..., 0, :] if len(rows) == 1 else found
-        raise InputError(f"derivatives are by 'target', 'direction' or 'limits'; got {shown(by)}")
+        raise InputError(
+            f"derivatives are by 'target', 'direction', 'limits' or 'clearance'; got {shown(by)}"
+        )
 
     def _by(self, of: str, change: _Change, moved: int | None = None) -> Vector:
         """Derivative of the answer by what changes the program in this way."""
@@ -168,6 +198,14 @@ class AnswerDerivatives:
             upper = int(self._point.x[i] >= problem.upper[i] - DESCENT.touching)
             found[upper, i] = self._by(of, self._inward_change(i), i) / problem.unit[i]
         return np.moveaxis(found, -1, 0) if of == "pressures" else found
+
+    def _clearance_change(self) -> _Change:
+        """Change by the clearance that is asked for, in m."""
+        if self._problem.task.scene is None:
+            raise InputError("only a task with a scene has a clearance")
+        none = _Change.of([self._point], np.zeros(1))
+        own = np.arange(len(none.residual)) < self._problem.program.n_own_rows
+        return none._replace(residual=np.where(own, 0.0, 1.0))
 
     def _target_changes(self) -> list[_Change]:
         """Changes by a motion of the target in base axes: in m, and in rad if it turns."""
@@ -396,18 +434,28 @@ def _turned(program: Program, which: int, way: Vector, by: float) -> Program:
     return replace(program, measures=tuple(measures))
 
 
+def _problem(robot: Manipulator, task: Task, pressures: Vector) -> PressureProblem:
+    """The program of a task, with a row for each place of the body that is near an object."""
+    problem = PressureProblem(robot, task)
+    if task.scene is None:
+        return problem
+    return problem.among(FollowedObstacles(task.scene, robot.description, robot, pressures))
+
+
 def _evaluation(problem: PressureProblem) -> Callable[[Vector, Vector], ProgramPoint]:
     """Everything at pressures (n,), as shares, and parameters; from rest under loads."""
-    bare = problem.task.model_copy(update={"load": None})  # which the arm carries already
-    fast = None
-    if problem.robot.is_loaded:
-        fast = prepared(problem.robot, bare, 0).fast(problem.program)
-    radii = np.array([c.radius for c in problem.constraints])
+    robot, task = problem.robot, problem.task
+    program = Program.of(task, robot.description)
+    bare = task.model_copy(update={"load": None})  # which the arm carries already
+    fast = prepared(robot, bare, 0).fast(program) if robot.is_loaded else None
+    radii = np.array([c.radius for c in program.constraints(robot.length)])
+    own = slice(program.n_own_rows)
 
     def evaluate(x: Vector, parameters: Vector) -> ProgramPoint:
         parts = None if fast is None else fast[0].point(parameters, radii, x * problem.unit)
         if parts is not None:
-            return ProgramPoint(x, parts[0], parts[1], problem.constraints, *parts[2:])
+            residual, jacobian = problem.with_obstacles(x, parts[0][own], parts[1][own])
+            return ProgramPoint(x, residual, jacobian, problem.constraints, *parts[2:])
         other = copy(problem)
         other.parameters = parameters
         other.restart()

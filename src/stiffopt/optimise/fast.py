@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import asdict
 from functools import partial
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -228,9 +228,11 @@ class FastSolver:
         """The same task with a target and, if there is one, a guess (Pa) to begin with."""
         row = row.copy()
         row[self.targets] = program.target_parameters
-        row[self._radii] = [c.radius for c in program.constraints(self._length)]
-        near = [term.nearness(self._length).numbers for term in program.terms]
-        row[self._near] = list(chain.from_iterable(near))
+        row[self._radii] = program.radii
+        near: tuple[float, ...] = ()
+        for term in program.terms:
+            near += term.nearness(self._length).numbers
+        row[self._near] = near
         if guess is not None:
             row[self._asked] = _GUESS_FIRST
             row[self.guess] = guess
@@ -290,8 +292,9 @@ class FastSolver:
     def point(self, parameters: Vector, radii: Vector, pressures: Vector) -> list[Vector] | None:
         """Parts of a point of a loaded arm's program, from rest; None for no equilibrium.
 
-        Pressures are (n,) in Pa.  The parts are residuals (m,), their Jacobian (m, n) per share of
-        a range, terms (t,), their gradients (t, n), floors (f,) and theirs (f, n).
+        Pressures are (n,) in Pa.  The parts are residuals (m,), those of obstacles zero, their
+        Jacobian (m, n) per share of a range, terms (t,), their gradients (t, n), floors (f,) and
+        theirs (f, n).
         """
         s = self._setup
         values = np.empty(s.n + (s.rows + s.terms + s.floors) * (1 + s.n))

@@ -15,7 +15,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.fast import FastSolver
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.problem import floor_bounds
-from stiffopt.optimise.program import Program, ProgramStructure
+from stiffopt.optimise.program import Program
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.settings import KEPT
 from stiffopt.optimise.target import Target
@@ -50,7 +50,7 @@ class Prepared:
         limits = (self.lower.tobytes(), self.upper.tobytes())
         self._key = (self.robot.tip_load, *limits, seed)
         self._scene = None if task.scene is None else SceneKey(task.scene)
-        self._rows: dict[ProgramStructure, tuple[FastSolver, Vector] | None] = {}
+        self._rows: dict[tuple[Hashable, ...], tuple[FastSolver, Vector] | None] = {}
 
     def program(self, target: Target) -> Program:
         """Program of a task with this target."""
@@ -58,8 +58,8 @@ class Prepared:
 
     def fast(self, program: Program) -> tuple[FastSolver, Vector] | None:
         """Compiled solver and the row of a task without its target; None if there is none."""
-        structure = program.structure
-        if structure not in self._rows:
+        terms = tuple(term.structure for term in program.terms)  # all that differs
+        if terms not in self._rows:
             library = functions(self.robot, program).library
             if library is None:
                 return None  # not remembered: another thread may be compiling
@@ -67,8 +67,8 @@ class Prepared:
             found = None
             if solver is not None:
                 found = solver, solver.row(program, self.lower, self.upper, self._floors)
-            self._rows[structure] = found
-        return self._rows[structure]
+            self._rows[terms] = found
+        return self._rows[terms]
 
     def _solver(self, library: Library, program: Program) -> FastSolver | None:
         """Compiled solver; None for a loaded arm that does not stand at rest."""

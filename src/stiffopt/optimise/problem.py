@@ -10,7 +10,7 @@ structure of the task (`stiffopt.optimise.program`) and stay with the robot.
 import math
 from collections.abc import Callable, Mapping
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -21,6 +21,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.goal import StiffnessGoal
+from stiffopt.optimise.obstacles import Obstacles
 from stiffopt.optimise.program import BAR, Constraint, Program, pressure_ranges
 from stiffopt.optimise.settings import CLOSEST, DESCENT
 from stiffopt.optimise.task import Task
@@ -229,10 +230,10 @@ class PressureProblem:
             residual, jacobian = self._pose(x * self.unit, self.parameters)
         else:
             residual, jacobian = self._functions["pose"](x * self.unit, self.parameters)
-        residual, jacobian = self._with_obstacles(x, residual[:, 0], jacobian.T * self.unit)
+        residual, jacobian = self.with_obstacles(x, residual[:, 0], jacobian.T * self.unit)
         return ProgramPoint(x, residual, jacobian, self.constraints, *_NOTHING)
 
-    def _with_obstacles(
+    def with_obstacles(
         self, x: Vector, residual: Vector, jacobian: Vector
     ) -> tuple[Vector, Vector]:
         """Rows of the terms (m,), (m, n) at pressures x, and those of obstacles after them."""
@@ -262,7 +263,7 @@ class PressureProblem:
         else:
             outputs = self._functions["point"](x * self.unit, self.parameters)
         residual, jacobian, terms, term_gradients, floors, floor_gradients = outputs
-        residual, jacobian = self._with_obstacles(x, residual[:, 0], jacobian.T * self.unit)
+        residual, jacobian = self.with_obstacles(x, residual[:, 0], jacobian.T * self.unit)
         return ProgramPoint(
             x,
             residual,
@@ -357,6 +358,13 @@ class PressureProblem:
         )
 
     # -- similar programs -------------------------------------------------------------------
+
+    def among(self, obstacles: Obstacles) -> "PressureProblem":
+        """The same program with these rows for the objects of a scene."""
+        other = copy(self)
+        other.program = replace(self.program, obstacles=obstacles)
+        other._set_constraints()
+        return other
 
     def changed(
         self, objective: Objective, radii: Mapping[str, float] | None = None, floors: bool = True

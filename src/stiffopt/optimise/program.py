@@ -8,7 +8,7 @@ per metre weighs the same wherever it is a tenth.
 
 import math
 from collections.abc import Hashable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -128,7 +128,10 @@ class Program:
     @cached_property
     def target_parameters(self) -> tuple[float, ...]:
         """Parameters of the terms, which come first."""
-        return tuple(value for term in self.terms for value in term.parameters)
+        found: tuple[float, ...] = ()
+        for term in self.terms:
+            found += term.parameters
+        return found
 
     @cached_property
     def measure_parameters(self) -> tuple[float, ...]:
@@ -147,6 +150,16 @@ class Program:
     def precision(self) -> float:
         """Decrease of the objective that no longer matters."""
         return float(getattr(PROGRAM, self.aim.replace(" ", "_")))
+
+    @property
+    def radii(self) -> list[float]:
+        """Radii of all `constraints`, in their order."""
+        found: list[float] = []
+        for term in self.terms:
+            found += [term.radius] * (term.size if term.is_inequality else 1)
+        if self.obstacles is not None:
+            found += [OBSTACLES.margin] * len(self.obstacles.row_objects)
+        return found
 
     def constraints(self, length: float) -> tuple[Constraint, ...]:
         """How the residual is bounded, for an arm of this length."""
@@ -213,7 +226,9 @@ class Program:
 
     def at(self, target: Target) -> "Program":
         """The same program for another target."""
-        return replace(self, terms=target.terms)
+        return Program(
+            target.terms, self.measures, self.aim, self.n_floors, self.reference, self.obstacles
+        )
 
     @property
     def n_terms(self) -> int:

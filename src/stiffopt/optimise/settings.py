@@ -210,6 +210,7 @@ class DerivativeSettings:
     tiny : relative violation, or wrong push, that is rounding.
     weak : multiplier, or relative distance, below which a constraint is about to let go, or bind.
     largest_condition : of the system, above which an answer is not alone.
+    edge : share by which the change of a distance's slope may differ between two sides.
     """
 
     step: float = 1e-4
@@ -224,6 +225,7 @@ class DerivativeSettings:
     tiny: float = 1e-7
     weak: float = 1e-6
     largest_condition: float = 1e11
+    edge: float = 0.05
 
 
 @dataclass(frozen=True)

@@ -207,7 +207,7 @@ class PressureSolution:
         _protect(self, "pressures", "tip_pose", "compliance")
 
     @classmethod
-    def explained_later(cls, explain: Callable[[], "Explanation"], **fields: Any) -> Self:
+    def explained_later(cls, explain: Callable[[], "Explanation"], fields: dict[str, Any]) -> Self:
         """A solution whose `Explanation` is computed when one of its fields is first read."""
         solution = cls.__new__(cls)
         solution.__dict__.update(fields, _explain=explain)
@@ -248,7 +248,7 @@ class PressureSolution:
     def gradient(
         self,
         of: Literal["stiffness", "pressures"],
-        by: Literal["target", "direction", "limits"],
+        by: Literal["target", "direction", "limits", "clearance"],
     ) -> Vector:
         """Derivative of the optimum at this answer by what was asked for.
 
@@ -257,14 +257,15 @@ class PressureSolution:
         of : {"stiffness", "pressures"}
             The stiffness that is maximised (of several the smallest), in N/m or N m/rad, or the
             pressures (n,) in Pa.
-        by : {"target", "direction", "limits"}
+        by : {"target", "direction", "limits", "clearance"}
             What is moved, the rest held:
 
             - the target, in base axes: (3,), per m; with a pointing or an orientation (6,), the
               last three per rad of turning it about the axes;
             - the direction that is maximised (3,), along which its length does not change; of m
               directions (m, 3);
-            - the limits of pressure (2, n), lower and upper, per Pa: zero by those that are off.
+            - the limits of pressure (2, n), lower and upper, per Pa: zero by those that are off;
+            - the clearance that the scene asks for (), per m.
 
         Returns
         -------
@@ -274,9 +275,10 @@ class PressureSolution:
         Raises
         ------
         DerivativeError
-            If other pressures next to the answer are as good, or it is no optimum.
+            If other pressures next to the answer are as good, it is no optimum, or the distance of
+            an object that holds it back has an edge there.
         InputError
-            If the task maximises nothing along a direction, where that is needed.
+            If the task maximises nothing along a direction, or has no scene, where that is needed.
 
         Notes
         -----
@@ -300,15 +302,7 @@ class PressureSolution:
 
         if self.robot is None or self.pressures is None or not self.found:
             raise DerivativeError("only a solution that was found has derivatives")
-        task, distance = self.task, self.clearance
-        if task.scene is not None and distance is not None:
-            if distance < task.scene.clearance + OBSTACLES.touching:
-                raise DerivativeError(
-                    f"'{self.nearest_object}' holds the answer back; there are derivatives only "
-                    "where no object of the scene does"
-                )
-            task = task.model_copy(update={"scene": None})
-        return AnswerDerivatives(self.robot, task, self.pressures)
+        return AnswerDerivatives(self.robot, self.task, self.pressures)
 
     @property
     def clearance(self) -> float | None:
@@ -390,21 +384,25 @@ class Judgement(NamedTuple):
         """
         residuals, tip_pose, compliance, values = numbers
         errors = program.errors(residuals)
-        holds = all(term.holds(errors[term.name]) for term in program.terms)
-        judged = [
-            math.exp(value) if measure.is_stiffness else math.sqrt(value)
-            for measure, value in zip(program.measures, values, strict=True)
-        ]
-        pairs = list(zip(program.measures, judged, strict=True))
+        stiffnesses, shortfalls, distance = [], [], None
+        for measure, number in zip(program.measures, values, strict=True):
+            if measure.is_stiffness:
+                value = math.exp(number)
+                stiffnesses.append(value)
+            else:
+                value = math.sqrt(number)
+                distance = value if distance is None else distance
+            if not measure.holds(value):
+                shortfalls.append(measure.shortfall(value))
         return cls(
             tip_pose=tip_pose,
             errors=errors,
             compliance=compliance,
-            stiffnesses=tuple(value for measure, value in pairs if measure.is_stiffness),
-            matrix_distance=next((v for measure, v in pairs if not measure.is_stiffness), None),
-            pose_holds=holds,
+            stiffnesses=tuple(stiffnesses),
+            matrix_distance=distance,
+            pose_holds=all(term.holds(errors[term.name]) for term in program.terms),
             limits_hold=within,
-            shortfalls=tuple(m.shortfall(value) for m, value in pairs if not m.holds(value)),
+            shortfalls=tuple(shortfalls),
             intruders=program.intruders(residuals),
             touched=program.touched(residuals),
         )
@@ -412,7 +410,8 @@ class Judgement(NamedTuple):
 
 def are_within(pressures: Vector, lower: Vector, upper: Vector) -> bool:
     """Whether all pressures (n,) are within their limits."""
-    return bool(((pressures >= lower) & (pressures <= upper)).all())
+    limits = zip(lower.tolist(), pressures.tolist(), upper.tolist(), strict=True)
+    return all(low <= p <= high for low, p, high in limits)
 
 
 def judge(robot: Manipulator, task: Task, pressures: Vector) -> Judgement:

@@ -317,15 +317,15 @@ class PressureSolver:
             result = LocalResult.at(problem, point)
             return self._explanation(problem, result, judgement, p)
 
-        return PressureSolution.explained_later(
-            explain,
+        fields = self._quantities(task, judgement)
+        fields.update(
             status="solved",
-            **self._quantities(task, judgement),
             pressures=p,
             confidence=answer.confidence,
             counts=answer.counts,
             timings={},
         )
+        return PressureSolution.explained_later(explain, fields)
 
     def _otherwise(self, task: Task, guess: Vector | None) -> PressureSolution:
         """Answer where the compiled search has none."""
@@ -365,17 +365,17 @@ class PressureSolver:
             result = LocalResult.at(last, last.pose(p / problem.unit))
             return self._explanation(problem, result, judgement, p, message)
 
-        return PressureSolution.explained_later(
-            explain,
+        fields = self._quantities(task, judgement)
+        fields.update(
             status="unreachable",
             message=message,
             active_bounds=tuple(active),
-            **self._quantities(task, judgement),
             pressures=p,
             confidence=replace(answer.confidence, reached=0),  # none came to the pose
             counts=answer.counts,
             timings={},
         )
+        return PressureSolution.explained_later(explain, fields)
 
     def _among_obstacles(self, task: Task) -> PressureSolution | None:
         """Answer of compiled code where neither search nor descents to the target had one.

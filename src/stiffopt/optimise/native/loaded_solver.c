@@ -2,15 +2,15 @@
 #define STIFFOPT_LOADED
 #include "solver.c"
 
-/* A point of a task's program at pressures (n), from rest: all that evaluate gives, in order;
- * 0 where there is no equilibrium. */
+/* A point of a task's program at pressures (n), from rest: all that evaluate gives, in order, but
+ * for obstacles, whose rows are zero; 0 where there is no equilibrium. */
 int stiffopt_point(const Setup *setup, const double *parameters, const double *radii,
                    const double *pressures, double *values) {
     const double *arg[WORK_ARG];
     double *res[WORK_RES], w[WORK_W + 1];
     casadi_int iw[WORK_IW + 1];
     Program program = {.setup = setup, .arg = arg, .res = res, .iw = iw, .w = w};
-    program.parameters = parameters, program.radius = radii;
+    program.parameters = parameters, program.radius = radii, program.sight = BLIND;
     if (!add_memory(&program)) return 0;
     NEW_POINT(p, setup);
     for (int64_t i = 0; i < setup->n; i++) p.x[i] = pressures[i] / setup->unit[i];

@@ -84,7 +84,6 @@ typedef struct {
     const Stop *stop; /* NULL: never */
     double deadline;
     const double *parameters, *radius, *lower, *upper, *floor, *near;
-    const int64_t *turns; /* (near): whether a term's nearness depends on the rotation */
     const double **arg;
     double **res;
     casadi_int *iw;

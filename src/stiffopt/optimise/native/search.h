@@ -51,19 +51,21 @@ static void sort_ranked(Ranked *items, int64_t count) {
     }
 }
 
-/* How far a sample's tip is from meeting all terms, roughly; see `Nearness` in term.py. */
-static double distance(const Program *P, const double *pose) {
-    const double *near = P->near;
-    double total = 0;
-    for (int64_t k = 0; k < P->setup->near; k++, near += 18) {
-        double value = near[0];
-        for (int i = 0; i < 3; i++) value += pose[i] * (near[1 + i] + near[4 + i] * pose[i]);
-        if (P->turns[k]) value += dot(near + 7, pose + 3, 9);
+/* How far the tips of all samples are from meeting a term, roughly, in addition to what `total` has;
+ * see `Nearness` in term.py. */
+static void add_nearness(const Setup *s, const double *near, double *total) {
+    const double a = near[0], bx = near[1], by = near[2], bz = near[3];
+    const double cx = near[4], cy = near[5], cz = near[6], limit = near[17];
+    const int turns = largest(near + 7, 9) > 0, is_root = near[16] != 0;
+    const double *pose = s->sample_poses;
+    for (int64_t i = 0; i < s->samples; i++, pose += 12) {
+        const double x = pose[0], y = pose[1], z = pose[2];
+        double value = a + x * (bx + cx * x) + y * (by + cy * y) + z * (bz + cz * z);
+        if (turns) value += dot(near + 7, pose + 3, 9);
         if (value < 0) value = 0; /* fmax is a call, once for each sample */
-        value = (near[16] != 0 ? sqrt(value) : value) - near[17];
-        if (value > 0) total += value;
+        value = (is_root ? sqrt(value) : value) - limit;
+        if (value > 0) total[i] += value;
     }
-    return total;
 }
 
 /* Samples nearest to the target, the nearest first, and how hard to search: the more, the more of
@@ -71,15 +73,11 @@ static double distance(const Program *P, const double *pose) {
 static int64_t nearest_samples(Program *P, Ranked *nearest, Effort *effort) {
     const Setup *s = P->setup;
     const Effort *least = &s->least_effort, *most = &s->most_effort;
-    int64_t count = 0, covered = 0, kept = 2 * most->screened, turns[s->near];
+    int64_t count = 0, covered = 0, kept;
     double distances[s->samples];
-    for (int64_t k = 0; k < s->near; k++)
-        turns[k] = largest(P->near + 18 * k + 7, 9) > 0;
-    P->turns = turns;
-    for (int64_t i = 0; i < s->samples; i++) {
-        distances[i] = distance(P, s->sample_poses + 12 * i);
-        covered += distances[i] == 0;
-    }
+    memset(distances, 0, sizeof distances);
+    for (int64_t k = 0; k < s->near; k++) add_nearness(s, P->near + 18 * k, distances);
+    for (int64_t i = 0; i < s->samples; i++) covered += distances[i] == 0;
     double share = fmin(1, (double)covered / (double)s->samples / s->covered);
     effort->screened = least->screened + (int64_t)(share * (double)(most->screened - least->screened));
     effort->agreeing = least->agreeing + (int64_t)(share * (double)(most->agreeing - least->agreeing));
@@ -87,7 +85,8 @@ static int64_t nearest_samples(Program *P, Ranked *nearest, Effort *effort) {
         (int64_t)(share * (double)(most->most_descents - least->most_descents));
     kept = 2 * effort->screened < s->samples ? 2 * effort->screened : s->samples;
     for (int64_t i = 0; i < s->samples; i++)
-        keep_smallest(nearest, &count, kept, (Ranked){distances[i], i});
+        if (count < kept || distances[i] < nearest[0].value)
+            keep_smallest(nearest, &count, kept, (Ranked){distances[i], i});
     sort_ranked(nearest, count);
     return count;
 }

@@ -60,13 +60,13 @@ class PositionTerm(Term):
 
     def nearness(self, length: float) -> Nearness:
         """Distance over the arm's length."""
-        wanted = [(value or 0.0) / length for value in self.value]
-        square = [(value is not None) / length**2 for value in self.value]
-        linear = [-2 * value / length for value in wanted]
+        x, y, z = self.value
+        u, v, w = (x or 0.0) / length, (y or 0.0) / length, (z or 0.0) / length
+        one = 1 / length**2
         return Nearness(
-            offset=sum(value**2 for value in wanted),
-            linear=(linear[0], linear[1], linear[2]),
-            square=(square[0], square[1], square[2]),
+            offset=u * u + v * v + w * w,
+            linear=(-2 * u / length, -2 * v / length, -2 * w / length),
+            square=(one * (x is not None), one * (y is not None), one * (z is not None)),
             root=1.0,
             limit=self.radius / length,
         )
