@@ -105,7 +105,7 @@ class WarmAnswer:
         return f"WarmAnswer({self.solution!r})" if self.found else "WarmAnswer(nothing was found)"
 
 
-class _Memory(NamedTuple):
+class _WarmMemory(NamedTuple):
     """A block of numbers, its parts for a position and a guess, and the call that answers it."""
 
     block: Vector
@@ -142,11 +142,11 @@ class WarmCalls:
         self._axes = None if len(axes) == 3 else list(axes)
         self._spare = [self._memory()]
 
-    def _memory(self) -> _Memory:
+    def _memory(self) -> _WarmMemory:
         """A block of numbers and the call that answers it."""
         block = self.like.copy()
         place = None if self._place is None else block[self._place]
-        return _Memory(block, place, block[self.fast.guess], *self.fast.call(block))
+        return _WarmMemory(block, place, block[self.fast.guess], *self.fast.call(block))
 
     def next_to(
         self, guess: Any, position: Any, pointing: Any, orientation: Any, stop: int = 0
