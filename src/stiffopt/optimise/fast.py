@@ -80,6 +80,12 @@ class _Setup(ctypes.Structure):
     ]  # fmt: skip
 
 
+class _OneTask(ctypes.Structure):
+    """`OneTask` of native/solver.c."""
+
+    _fields_ = [(name, _pointer) for name in ("setup", "task", "answer", "stop")]
+
+
 class CompiledAnswer(NamedTuple):
     """What the compiled solver found.
 
@@ -269,13 +275,17 @@ class FastSolver:
         block[self._asked] = _GUESS_ALONE
         return block
 
-    def call(self, block: Vector) -> Callable[[], int]:
-        """What fills in the numbers of a block, which stays where it is; they are not judged."""
+    def call(self, block: Vector) -> tuple[Callable[[], int], ctypes.Structure]:
+        """What fills in the numbers of a block, which stays where it is, and says what came of it.
+
+        They are not judged.  A single argument, as each takes longer to convert than to use; its
+        field `stop` may be set to the address of a `StopFlag`.
+        """
         row = block.ctypes.data
-        return partial(
-            self._solve, self._address, row, self._width, row + block.itemsize * self._width,
-            self._answer_width, 0, 1, 0,
-        )  # fmt: skip
+        task = _OneTask(self._address, row, row + block.itemsize * self._width, None)
+        solve_one = self._library.cdll.stiffopt_solve_one
+        solve_one.argtypes = [_pointer]
+        return partial(solve_one, ctypes.addressof(task)), task
 
     def judged(self, block: Vector) -> CompiledAnswer | None:
         """The answer in a block, judged by the model."""

@@ -19,7 +19,7 @@ from stiffopt.model.compiled import (
     until_ready,
 )
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.stopping import Cancel, checkpoint, giving_up
+from stiffopt.model.stopping import Cancel, checkpoint, giving_up, stop_flag
 from stiffopt.optimise import diagnosis
 from stiffopt.optimise.fast import CompiledAnswer, FastSolver
 from stiffopt.optimise.local import LocalResult, descend
@@ -119,6 +119,8 @@ class PressureSolver:
         pointing: ArrayLike | None = None,
         orientation: ArrayLike | None = None,
         limits: tuple[ArrayLike, ArrayLike] | None = None,
+        timeout: float | None = None,
+        cancel: Cancel | None = None,
     ) -> WarmAnswer:
         """The answer next to a guess, with as little as possible around the search for it.
 
@@ -134,15 +136,27 @@ class PressureSolver:
             Instead of the unit quaternion (w, x, y, z) in the task's target.
         limits : two (n,), optional
             Lowest and highest pressures in Pa, where they are narrower than the task's.
+        timeout, cancel : optional
+            When to give up, see `solve`; what is not `found` by then has no pressures, or some
+            that do not hold.
 
         Raises
         ------
         InputError
             If an argument is wrong, or not a part of the task's target.
         """
+        if timeout is not None or cancel is not None:
+            with giving_up(timeout, cancel), stop_flag() as stop:
+                return self._warm(position, guess, pointing, orientation, limits, stop)
+        return self._warm(position, guess, pointing, orientation, limits)
+
+    def _warm(
+        self, position: Any, guess: Any, pointing: Any, orientation: Any, limits: Any, stop: int = 0
+    ) -> WarmAnswer:
+        """See `warm`; `stop` is the address of a `StopFlag`."""
         calls = self._warm_calls or self._prepare_warm_calls()
         if calls is not None and limits is None:
-            block = calls.next_to(guess, position, pointing, orientation)
+            block = calls.next_to(guess, position, pointing, orientation, stop)
             if block is not None:
                 return WarmAnswer(calls.fast.pressures(block), self, block)
         task = asked_task(self.task, position, pointing, orientation)

@@ -8,6 +8,13 @@
 
 #include "closest.h"
 
+#ifndef STIFFOPT_LOADED
+void point_rows(void); /* follows the code of `point` */
+#endif
+
+#define CACHE_LINE 64    /* bytes */
+#define MOST_CODE 400000 /* bytes */
+
 /* What is asked for, and what came of it; as fast.py has them. */
 enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, COME, CLOSEST, CLOSEST_FROM };
 enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL, JUDGED, CAME, NEAREST, NOT_FINITE, TOO_SOFT };
@@ -101,6 +108,15 @@ static void solve_row(Program *P, const double *task, int64_t width, double *ans
     solve_by_sight(P, task, answer, EXACT);
 }
 
+/* Fetch code ahead, many lines of the cache at once; a processor that follows code which is not in
+ * its caches, since much else was done, waits for it line by line.  Functions are linked in the
+ * order of their files; were they not, this would be of no use, and no harm. */
+static void fetch(uintptr_t begin, uintptr_t end) {
+    for (uintptr_t at = begin; at < end && at < begin + MOST_CODE; at += CACHE_LINE)
+        __builtin_prefetch((const void *)at, 0, 2);
+    __asm__ volatile(""); /* or a function without effects is left out */
+}
+
 /* For the caller to check that it has the same idea of a Setup. */
 int64_t stiffopt_setup_size(void) { return sizeof(Setup); }
 
@@ -113,8 +129,26 @@ int stiffopt_solve(const Setup *setup, const double *tasks, int64_t task_width, 
     Program program = {.setup = setup, .arg = arg, .res = res, .iw = iw, .w = w};
     program.stop = stop, program.deadline = stop ? now() + stop->seconds : 0;
     if (!add_memory(&program)) return 1;
+#ifndef STIFFOPT_LOADED
+    fetch((uintptr_t)&pose, (uintptr_t)&point_rows); /* the model */
+    fetch((uintptr_t)&dot, (uintptr_t)&stiffopt_solve);
+#endif
     for (int64_t i = begin; i < end; i++)
         solve_row(&program, tasks + i * task_width, task_width, answers + i * answer_width);
     free_memory(&program);
     return 0;
+}
+
+/* A task of its own; mirrors `_OneTask` in fast.py. */
+typedef struct {
+    const Setup *setup;
+    const double *task;
+    double *answer;
+    const Stop *stop;
+} OneTask;
+
+/* Solve it: what came of it, -1 if memory is short. */
+int stiffopt_solve_one(const OneTask *one) {
+    if (stiffopt_solve(one->setup, one->task, 0, one->answer, 0, 0, 1, one->stop)) return -1;
+    return (int)one->answer[0];
 }
