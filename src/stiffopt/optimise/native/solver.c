@@ -88,10 +88,10 @@ static int solve_by_sight(Program *P, const double *task, double *answer, int si
 }
 
 /* Go on from an answer (n), with a closer look at obstacles; whether the body keeps clear then. */
-static int go_on(Program *P, const double *task, int64_t width, double *answer) {
+static int go_on(Program *P, const double *task, double *answer) {
     const Setup *s = P->setup;
-    double next[width], searched[PRESSURES_AT];
-    double *asked = next + width - 1 - s->n;
+    int64_t before = s->parameters + s->balls + 2 * s->n + s->floors + 18 * s->near;
+    double next[before + 1 + s->n], searched[PRESSURES_AT], *asked = next + before;
     memcpy(next, task, sizeof next), memcpy(searched, answer, sizeof searched);
     *asked = GUESS_ALONE;
     memcpy(asked + 1, answer + PRESSURES_AT, (size_t)s->n * sizeof(double));
@@ -102,9 +102,9 @@ static int go_on(Program *P, const double *task, int64_t width, double *answer) 
 }
 
 /* A row of an answer, with a closer look at obstacles where a quick one has not been enough. */
-static void solve_row(Program *P, const double *task, int64_t width, double *answer) {
+static void solve_row(Program *P, const double *task, double *answer) {
     if (solve_by_sight(P, task, answer, QUICK)) return;
-    if ((answer[0] == LOCAL || answer[0] == GLOBAL) && go_on(P, task, width, answer)) return;
+    if ((answer[0] == LOCAL || answer[0] == GLOBAL) && go_on(P, task, answer)) return;
     solve_by_sight(P, task, answer, EXACT);
 }
 
@@ -134,7 +134,7 @@ int stiffopt_solve(const Setup *setup, const double *tasks, int64_t task_width, 
     fetch((uintptr_t)&dot, (uintptr_t)&stiffopt_solve);
 #endif
     for (int64_t i = begin; i < end; i++)
-        solve_row(&program, tasks + i * task_width, task_width, answers + i * answer_width);
+        solve_row(&program, tasks + i * task_width, answers + i * answer_width);
     free_memory(&program);
     return 0;
 }
