@@ -265,6 +265,46 @@ def test_a_scene_that_leaves_no_way(compiled: Path) -> None:
     assert found.clearance < CLEARANCE
 
 
+@pytest.fixture
+def no_general_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have what takes seconds among obstacles fail."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the general method was called")
+
+    monkeypatch.setattr(PressureSolver, "_solve_generally", refuse)
+
+
+@pytest.mark.usefixtures("compiled", "no_general_method")
+def test_a_stiffness_that_cannot_be_had_is_told_by_compiled_code() -> None:
+    robot = load_robot("stiff-flop-2")
+    task = task_with(scene_of(POST))
+    best = solve_pressure(robot, task).stiffness
+    assert best is not None
+    floor = {"direction": (1, 0, 0), "value": 1.5 * best}
+    goal = StiffnessGoal(maximise=[{"direction": (0, 1, 0)}], at_least=[floor])
+    found = solve_pressure(robot, task.model_copy(update={"stiffness": goal}))
+    assert found.status == "unreachable"
+    assert "not this stiffness there" in found.message
+    assert found.stiffnesses[1] == pytest.approx(best, rel=1e-3)
+    assert clearance(robot, found.pressures, task.scene) > CLEARANCE - EXACT
+
+
+@pytest.mark.usefixtures("compiled", "no_general_method")
+def test_an_arm_boxed_in_is_told_by_compiled_code() -> None:
+    """That clear configurations exist, which no start comes to, makes it no slower."""
+    robot = load_robot("stiff-flop-2")
+    p = np.array([0.2, 1.1, 0.4, 0.9, 0.1, 0.3]) * 1e5
+    points = robot.backbone(p, 8)[:, :3, 3].tolist()
+    lumen = {"name": "lumen", "inside_tube": {"points": points, "radius": 0.0215}}
+    scene = scene_of(lumen)
+    assert robot.clearance(p, scene) > CLEARANCE
+    found = solve_pressure(robot, task_with(scene, (0.05, -0.03, 0.18)))
+    assert found.status == "unreachable"
+    assert "no configuration was found" in found.message
+    assert "mm too far out of 'lumen'" in found.message
+
+
 def test_a_cloud_of_points(compiled: Path) -> None:
     """As many objects as there may be: more rows than fit on a stack as square matrices."""
     robot = load_robot("stiff-flop-2")

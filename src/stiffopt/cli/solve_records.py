@@ -211,6 +211,10 @@ def _worth(solution: PressureSolution) -> Record | None:
             _relaxed(term): _quantity(given.per_tolerance.get(term.name), f"{gained}/{term.unit}")
             for term in solution.task.target.terms
         },
+        "clearance": {
+            name: _quantity(value, f"{gained}/m") for name, value in given.per_clearance.items()
+        }
+        or None,
     }
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
+from stiffopt.model.batch import InterpretedFunction
 from stiffopt.schema import BadKeyError, Schema, Vector
 from stiffopt.units import Length, within
 
@@ -116,13 +117,13 @@ class Obstacle(Schema, ABC):
     def distance_of(self, point: Any) -> float:
         """Signed distance of one point (3,), from the formula itself, in m."""
         formula = _function(type(self))
-        return float(formula(point, np.array(self.pieces).T).full().max())
+        return max(float(formula(point, piece)[0][0, 0]) for piece in self.pieces)
 
 
 @cache
-def _function(kind: type[Obstacle]) -> ca.Function:
+def _function(kind: type[Obstacle]) -> InterpretedFunction:
     point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
-    return ca.Function("distance", [point, q], [kind.formula(point, q)])
+    return InterpretedFunction(ca.Function("distance", [point, q], [kind.formula(point, q)]))
 
 
 class BetweenEnds(Obstacle):

@@ -18,6 +18,7 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.distance_grid import (
     DistanceGrid,
     Surface,
+    distance_of,
     grids_about,
     read_surface,
     usual_spacing,
@@ -133,7 +134,7 @@ class Mesh(Obstacle):
         """Signed distance of one point (3,) from the triangles themselves, in m."""
         axes = np.asarray(lie.rotation_from_quaternion(np.array(self.orientation)))
         seen = (np.asarray(point, dtype=float) - np.array(self.centre)) @ axes
-        return float(self.surface.distances(seen[None])[0])
+        return distance_of(self.surface, tuple(seen.tolist()))
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
         """Its size is one that things about this arm have; see `Obstacle.check_against`."""
