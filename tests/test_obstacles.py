@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from stiffopt import (
     Manipulator,
+    PressureSolution,
     PressureSolver,
     Scene,
     StiffnessGoal,
@@ -303,6 +304,30 @@ def test_an_arm_boxed_in_is_told_by_compiled_code() -> None:
     assert found.status == "unreachable"
     assert "no configuration was found" in found.message
     assert "mm too far out of 'lumen'" in found.message
+
+
+def test_a_coarse_mesh_says_so(compiled: Path, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("igl")
+    trimesh.creation.box((0.06, 0.06, 0.02)).export(tmp_path / "wall.stl")
+    robot = load_robot("stiff-flop-2")
+
+    def solved(resolution: float) -> PressureSolution:
+        mesh = {"file": str(tmp_path / "wall.stl"), "scale": 1.0, "resolution": resolution,
+                "centre": (-0.03, 0.0, 0.24)}  # fmt: skip
+        task = task_with(scene_of({"name": "wall", "mesh": mesh}), (-0.03, 0.01, 0.22))
+        return solve_pressure(robot, task)
+
+    coarse, fine = solved(8e-3), solved(3e-3)
+    assert coarse.status == "unreachable"
+    assert coarse.nearest_object == "wall"
+    assert coarse.mesh_error == pytest.approx(6.511e-3, abs=1e-6)
+    assert (
+        "distances from 'wall' are up to 6.5 mm too small: a finer 'resolution'" in coarse.message
+    )
+    assert fine.mesh_error is None
+    assert "resolution" not in fine.message
+    assert fine.position_error < coarse.position_error
 
 
 def test_a_cloud_of_points(compiled: Path) -> None:

@@ -86,6 +86,10 @@ class Obstacle(Schema, ABC):
         """Grids of distances, one for each piece, or none."""
         return ()
 
+    def error_at(self, distance: float) -> float:
+        """By how much a distance in m is too small at most, since it is interpolated."""
+        return 0.0
+
     @abstractmethod
     def outline(self, size: float) -> list[Array]:
         """Surfaces (3, rows, columns) in m that show it, cut off at a size where it has no end."""

@@ -371,7 +371,9 @@ class PressureSolver:
             return None
         active = active_bounds(self.robot, task, p)
         holding = [*map(repr, judgement.touched), *_pressed(active, -answer.slope)]
-        message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task)
+        message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(
+            task, judgement.touched
+        )
 
         def explain() -> Explanation:
             problem = PressureProblem(self.robot, task)
@@ -613,22 +615,25 @@ class PressureSolver:
         freedom = diagnosis.freedom(problem, pressures / problem.unit)
         if not message and not judgement.pose_holds:
             holding = [*map(repr, judgement.touched), *self._holding(result, active)]
-            message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task)
+            message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(
+                task, judgement.touched
+            )
         elif not message and not judgement.holds:
             message = diagnosis.demands_message(judgement)
         elif not message and freedom == 0 and task.stiffness is not None:
             message = diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
         return Explanation(message, tuple(active), freedom, sensitivities)
 
-    def _blocked(self, task: Task) -> str:
+    def _blocked(self, task: Task, touched: Iterable[str]) -> str:
         """What a scene keeps the arm from, if the task is solved without it."""
         if task.scene is None:
             return ""
+        coarse = diagnosis.coarse_meshes(self.robot, task.scene, touched)
         plain = task.model_copy(update={"scene": None})
         found = PressureSolver(self._given, plain, seed=self.seed).solve_at_once()
         if found is None or not found.found or found.pressures is None:
-            return ""
-        return diagnosis.in_the_way(self.robot, task.scene, found.pressures)
+            return coarse
+        return diagnosis.in_the_way(self.robot, task.scene, found.pressures) + coarse
 
     @staticmethod
     def _holding(result: LocalResult, active: dict[str, tuple[int, int]]) -> list[str]:

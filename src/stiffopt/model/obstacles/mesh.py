@@ -93,6 +93,10 @@ class Mesh(Obstacle):
         """By how much the interpolated distance may differ from the true one, in m."""
         return _share_of_cube * self.spacing
 
+    def error_at(self, distance: float) -> float:
+        """See `Obstacle.error_at`: what is subtracted from what is interpolated."""
+        return float(_most_too_large(ca.DM(distance), self.spacing))
+
     @cached_property
     def grids(self) -> tuple[DistanceGrid, ...]:
         """The distances, a grid for each piece; made and kept in the cache folder."""
