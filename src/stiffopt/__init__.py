@@ -66,6 +66,7 @@ if TYPE_CHECKING:
     from stiffopt.optimise.task import Task as Task
     from stiffopt.optimise.task import load_task as load_task
     from stiffopt.optimise.warm import WarmAnswer as WarmAnswer
+    from stiffopt.paths.motion import plan_motion as plan_motion
     from stiffopt.paths.path import Path as Path
     from stiffopt.paths.path import load_path as load_path
     from stiffopt.paths.solution import PathSolution as PathSolution
@@ -122,6 +123,7 @@ _NAMES = {
     "stiffopt.optimise.target": ("Target", "Tolerance"),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
     "stiffopt.optimise.warm": ("WarmAnswer",),
+    "stiffopt.paths.motion": ("plan_motion",),
     "stiffopt.paths.path": ("Path", "load_path"),
     "stiffopt.paths.solution": ("PathSolution",),
     "stiffopt.paths.solver": ("solve_path",),

@@ -127,7 +127,8 @@ def _table(solution: PathSolution) -> RenderableType:
     if solution.worst_index is not None:
         marks[solution.worst_index] = "worst"
     if solution.first_failure is not None:
-        marks[solution.first_failure] = "first that cannot be had"
+        both = ", worst" * (solution.first_failure in marks)
+        marks[solution.first_failure] = f"cannot be had{both}"
     shown = {*range(0, count, max(1, round(count / _ROWS))), count - 1, *marks}
     columns = _columns(solution)
     table = number_table("  point", *columns, "")
@@ -144,8 +145,9 @@ def _columns(solution: PathSolution) -> dict[str, list[str]]:
     margins = rate_margins(solution)
     alone = solution.alone
     share = None if solution.stiffness is None or alone is None else solution.stiffness / alone
+    digits = 2 if solution.times[-1] >= 1 else 4
     found = (
-        ("time s", solution.times, lambda value: f"{value:.2f}"),
+        ("time s", solution.times, lambda value: f"{value:.{digits}f}"),
         ("error mm", solution.position_errors, lambda value: f"{value * MM:.3f}"),
         ("deg", solution.angle_errors, lambda value: f"{degrees(value):.2f}"),
         (unit_text(solution.stiffness_unit), solution.stiffness, figures),

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from math import degrees
-from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stiffopt.errors import InputError, printable
+from stiffopt.errors import InputError
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution
@@ -21,8 +20,6 @@ if TYPE_CHECKING:
 
 _POSES = 5  # of the arm
 _FULL = 0.99  # share of a rate from which a pressure counts as changing at it
-_STATUS = {"solved": "#2a7f3f", "unreachable": "#b35c00", "failed": "#b00020"}
-_LONGEST_NOTE = 120  # characters of the message that fit
 
 
 def plot_path(path: Path, solution: PathSolution, *, title: str | None = None) -> Figure:
@@ -70,12 +67,9 @@ def plot_path(path: Path, solution: PathSolution, *, title: str | None = None) -
     _draw_pressures(list(left), path, solution)
     source = path.source
     name = solution.robot.description.name if source is None else source.stem
-    message = shorten(printable(solution.message), _LONGEST_NOTE, placeholder=" ...")
-    style.draw_head(figure, title or name, _key_numbers(path, solution), message)
-    figure.text(
-        0.975, 1 - 0.34 / height, solution.status, fontsize=13, weight="bold", va="center",
-        ha="right", color=_STATUS[solution.status],
-    )  # fmt: skip
+    style.draw_outcome(
+        figure, title or name, _key_numbers(path, solution), solution.status, solution.message
+    )
     return figure
 
 

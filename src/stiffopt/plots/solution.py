@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import degrees
-from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.errors import InputError, printable
+from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.goal import StiffnessMeasure
@@ -36,11 +35,9 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_LONGEST_NOTE = 120  # characters of the message that fit
 _MOST_LABELS = 15  # pressures with a number on their bar
 _ELLIPSOID_SHARE = 0.22  # of the arm's length: its largest semi-axis
 _ARROW_SHARE = 0.22
-_STATUS = {"solved": "#2a7f3f", "unreachable": "#b35c00", "failed": "#b00020"}
 
 
 def plot_solution(
@@ -91,12 +88,9 @@ def plot_solution(
         _draw_pareto(figure.add_subplot(grid[1, 2]), front, plain)
     source = solution.task.source
     name = robot.description.name if source is None else source.stem
-    message = shorten(printable(solution.message), _LONGEST_NOTE, placeholder=" ...")
-    style.draw_head(figure, title or name, _key_numbers(solution, plain), message)
-    figure.text(
-        0.975, 1 - 0.34 / figure.get_figheight(), solution.status, fontsize=13, weight="bold",
-        va="center", ha="right", color=_STATUS[solution.status],
-    )  # fmt: skip
+    style.draw_outcome(
+        figure, title or name, _key_numbers(solution, plain), solution.status, solution.message
+    )
     return figure
 
 
