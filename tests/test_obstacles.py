@@ -420,6 +420,20 @@ def test_derivatives_of_an_answer_that_two_objects_hold_back(compiled: Path) -> 
     check_derivatives(load_robot("stiff-flop-2"), task_with(scene_of(POST, RIB)))
 
 
+def test_descents_that_a_quick_look_misleads_are_made_with_a_closer_one(compiled: Path) -> None:
+    """Next to the joint of two segments none of 64 descents converged."""
+    centre = (0.02550724, -0.01340549, 0.11061152)
+    scene = scene_of({"name": "post", "sphere": {"centre": centre, "radius": 0.006}})
+    task = task_with(scene).model_copy(
+        update={"target": Target(position=(0.1187035, -1.673e-5, 0.1548174))}
+    )
+    robot = load_robot("stiff-flop-2")
+    at_once = PressureSolver(robot, task).solve_at_once()
+    assert at_once is not None
+    assert at_once.clearance >= task.scene.clearance - 1e-5
+    assert at_once.confidence.reached > 0
+
+
 def test_no_derivatives_where_a_distance_has_an_edge(compiled: Path) -> None:
     robot = load_robot("stiff-flop-2")
     found = solve_pressure(robot, task_with(scene_of(RIB)))

@@ -36,7 +36,8 @@ static int from_guess(Program *P, const double *guess, Point *p, Descent *end, F
 /* Row of an answer: outcome, value, violation, converged, the seven numbers of Found, three
  * counts of evaluations, pressures (n) in Pa, slope (n) per unit of x of the error of the closest
  * configuration, then what judge_at writes: not of a guess alone, which is judged when it is
- * looked at, but where there are obstacles.  Returns whether a body among obstacles keeps clear.
+ * looked at, but where there are obstacles.  Returns 0 where obstacles need
+ * a closer look.
  */
 static int solve_by_sight(Program *P, const double *task, double *answer, int sight) {
     const Setup *s = P->setup;
@@ -82,7 +83,8 @@ static int solve_by_sight(Program *P, const double *task, double *answer, int si
     memcpy(out, slope, sizeof slope), out += s->n;
     int judged = outcome == GLOBAL || outcome == NEAREST || outcome == JUDGED || outcome == TOO_SOFT ||
                  (outcome == LOCAL && (asked != GUESS_ALONE || P->around));
-    if (!judged) return 1;
+    if (!judged) /* a descent may have failed for what a quick look misses */
+        return !(P->around && outcome == NEEDS_GENERAL_METHOD && found.reached);
     if (!judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
     return outcome == JUDGED || is_clear(P, out + s->own_rows);
 }
