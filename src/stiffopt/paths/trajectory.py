@@ -1,16 +1,18 @@
-"""`Trajectory`: targets of the tip over time, as they are given to a controller."""
+"""`Trajectory`: targets over time, with or without pressures, as they are given to a controller."""
 
 from __future__ import annotations
 
 import itertools
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.schema import Items, Schema
-from stiffopt.units import Duration
+from stiffopt.units import Duration, Pressure
 
 MAX_WAYPOINTS = 2_000
 """Of a trajectory; its splines are made between two ticks of the control loop."""
@@ -26,19 +28,25 @@ class Waypoint(Schema):
     ----------
     time : since the beginning of the trajectory, in s; at most a day.
     target : the pose.
+    pressures : the posture in which it is to be there, one for each channel, in Pa; None: the
+        stiffest.
     """
 
     time: Annotated[Duration, Field(ge=0, le=_LONGEST)]
     target: Target
+    pressures: Items[Pressure] | None = None
 
 
 class Trajectory(Schema):
-    """Waypoints through which the tip passes smoothly.
+    """Waypoints through which the tip passes.
+
+    Without pressures it passes them smoothly, and the controller chooses the posture. With
+    pressures the posture goes on straight lines from one waypoint's to the next.
 
     Attributes
     ----------
     waypoints : in order of time, at least 1 ms apart, the first at 0 or 1 ms later; all
-        prescribe the same components of the pose.
+        prescribe the same components of the pose, and all have pressures or none has.
     """
 
     waypoints: Items[Waypoint]
@@ -53,12 +61,20 @@ class Trajectory(Schema):
         kinds = {_kind(w.target) for w in self.waypoints}
         if len(kinds) > 1:
             raise ValueError("all waypoints must ask for the same axes of the pose")
+        _check_counts([w.pressures for w in self.waypoints])
         return self
 
     @property
     def duration(self) -> float:
         """Time of the last waypoint, in s."""
         return self.waypoints[-1].time
+
+    @property
+    def pressures(self) -> NDArray[np.float64] | None:
+        """Those of all waypoints (k, n), in Pa; None where they have none."""
+        if self.waypoints[0].pressures is None:
+            return None
+        return np.array([waypoint.pressures for waypoint in self.waypoints])
 
 
 def check_times(times: list[float]) -> None:
@@ -80,6 +96,22 @@ def check_times(times: list[float]) -> None:
                 f"waypoints must be at least {_CLOSEST:g} s apart, and the first at 0 s or as "
                 f"much later; {after:g} s follows {before:g} s"
             )
+
+
+def _check_counts(pressures: list[tuple[float, ...] | None]) -> None:
+    """Refuse waypoints of which some have pressures, or have more of them than others."""
+    counts = [None if each is None else len(each) for each in pressures]
+    for number, count in enumerate(counts, start=1):
+        if count == counts[0]:
+            continue
+        if count is None or counts[0] is None:
+            have, lack = (1, number) if count is None else (number, 1)
+            raise ValueError(
+                f"waypoint {have} has pressures and waypoint {lack} has none; all have, or none has"
+            )
+        raise ValueError(
+            f"waypoint {number} has {count} pressures, waypoint 1 has {counts[0]}; expected as many"
+        )
 
 
 def _kind(target: Target) -> tuple[object, ...]:
