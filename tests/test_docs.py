@@ -35,6 +35,7 @@ from stiffopt.model.scene import AllowedContact, Scene, SceneObject
 from stiffopt.optimise.goal import MatchMatrix, MatchValue, StiffnessGoal
 from stiffopt.optimise.target import Target, Tolerance
 from stiffopt.optimise.task import Load, PressureRange, Task
+from stiffopt.paths.path import Path as PathDescription
 from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant import settings as simulated
 from stiffopt.registration import Placement, Registration
@@ -82,6 +83,7 @@ SCHEMAS: list[type[BaseModel]] = [
     *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
     *(Scene, SceneObject, AllowedContact, *OBSTACLES.values()),
+    *schemas_of(PathDescription, "stiffopt.paths.path"),
     *(RigDescription, Safety, LogSettings, Registration, Placement),
     *(ControlSettings, ServiceSettings, Trajectory, Waypoint),
     *schemas_of(simulated.PlantSettings, "stiffopt.plant"),
@@ -101,6 +103,7 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.model.obstacles": "Scene file",
     "stiffopt.model": "Robot file",
     "stiffopt.optimise": "Task file",
+    "stiffopt.paths.path": "Path file",
     "stiffopt.paths.trajectory": "Trajectory",
 }
 
@@ -133,6 +136,9 @@ def test_yaml_example_loads(text: str, tmp_path: Path) -> None:
         rig = load_rig_description(path)
         robot = stiffopt.load_robot(rig.robot)
         assert limits_of(rig, robot.description).n == robot.n_pressures
+    elif "stiffopt-path/" in text:
+        followed = stiffopt.load_path(path)
+        followed.end_pressures(followed.resolve_robot())
     elif "stiffopt-scene/" in text:
         stiffopt.load_scene(path).check_against(stiffopt.load_robot("stiff-flop-2").description)
     else:

@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     from stiffopt.optimise.task import Task as Task
     from stiffopt.optimise.task import load_task as load_task
     from stiffopt.optimise.warm import WarmAnswer as WarmAnswer
+    from stiffopt.paths.path import Path as Path
+    from stiffopt.paths.path import load_path as load_path
     from stiffopt.paths.trajectory import Trajectory as Trajectory
     from stiffopt.paths.trajectory import Waypoint as Waypoint
     from stiffopt.rig.interface import Observation as Observation
@@ -82,7 +84,6 @@ __version__ = "0.1.0"
 # Names are imported at their first use: NumPy, CasADi and pydantic take a quarter of a second, for
 # which neither `--help` nor a wrong option should wait.
 _NAMES = {
-    "stiffopt.paths.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.daemon.client": ("Client",),
     "stiffopt.errors": (
         *("CancelledError", "CommandError", "DerivativeError", "DeviceError", "EquilibriumError"),
@@ -119,6 +120,8 @@ _NAMES = {
     "stiffopt.optimise.target": ("Target", "Tolerance"),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
     "stiffopt.optimise.warm": ("WarmAnswer",),
+    "stiffopt.paths.path": ("Path", "load_path"),
+    "stiffopt.paths.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.safety.rigs": ("open_rig",),
     "stiffopt.rig.interface": ("Observation", "PoseSample", "PressureCommand", "Rig"),
     "stiffopt.workspace": ("WorkspaceMap", "map_workspace", "open_workspace_map"),

@@ -71,7 +71,7 @@ class EquilibriumState(NamedTuple):
     loads: Loads
 
 
-class Path(NamedTuple):
+class Continuation(NamedTuple):
     """How far an equilibrium could be followed.
 
     Attributes
@@ -98,7 +98,7 @@ class Equilibrium:
     def __init__(self, shooting: Shooting, at: float | None = None) -> None:
         self.shooting = shooting
         self.at = at
-        self._rest: dict[bytes, Path] = {}
+        self._rest: dict[bytes, Continuation] = {}
 
     def arguments(self, state: EquilibriumState) -> tuple[Vector, ...]:
         """Numbers for the inputs of a `Chain` at an equilibrium."""
@@ -160,7 +160,7 @@ class Equilibrium:
         end: EquilibriumState,
         shortest: float = _SHORTEST_STEP,
         stable: bool = True,
-    ) -> "Path":
+    ) -> "Continuation":
         """Equilibrium reached continuously between two sets of pressures and loads.
 
         Goes the straight way from `start` to `end` (whose shape is not used) in steps no shorter
@@ -176,11 +176,11 @@ class Equilibrium:
             if corrected is None or unstable:
                 step, halved = step / 2, True
                 if step < shortest:
-                    return Path(state, share, unstable)
+                    return Continuation(state, share, unstable)
             else:
                 state, share = corrected, target
                 step, halved = step if halved else 2 * step, False
-        return Path(state, 1.0, False)
+        return Continuation(state, 1.0, False)
 
     def settle(self, pressures: Vector, loads: Loads) -> EquilibriumState:
         """Equilibrium reached from rest: first the arm's weight, then pressures and loads.

@@ -231,6 +231,31 @@ class FastSolver:
         """Have the row of a task keep other limits (n,), in Pa, within those it was made for."""
         row[self._radii.stop : self._radii.stop + 2 * len(lower)] = np.concatenate([lower, upper])
 
+    def next_to(self, row: Vector, guess: Vector, lower: Vector, upper: Vector) -> Vector:
+        """The row of a task that asks for the answer next to a guess (n,), within limits (n,)."""
+        row = row.copy()
+        row[self._asked] = _GUESS_ALONE
+        row[self.guess] = guess
+        self.limit(row, lower, upper)
+        return row
+
+    def judging(self, row: Vector, pressures: Vector) -> Vector:
+        """The row of a task that asks for the judgement of pressures (n,)."""
+        row = row.copy()
+        row[self._asked] = _JUDGE
+        row[self.guess] = pressures
+        return row
+
+    def optima(self, rows: Vector, threads: int | None = None) -> tuple[Vector, Vector]:
+        """Answers to rows of `next_to`, not judged: pressures (N, n), and objectives (N,).
+
+        An objective is infinite where there is no answer.
+        """
+        numbers = self._numbers_of(np.ascontiguousarray(rows), threads)
+        n = self.guess.stop - self.guess.start
+        values = np.where(numbers[:, 0] == ANSWERED, numbers[:, 1], np.inf)
+        return numbers[:, _COUNTS : _COUNTS + n], values
+
     def solve(self, row: Vector) -> CompiledAnswer | None:
         """Answer to one task; None if the general method is needed."""
         return self.answer(self._run_one(row))
@@ -297,7 +322,10 @@ class FastSolver:
 
     def solve_all(self, rows: Vector, threads: int | None = None) -> list[CompiledAnswer | None]:
         """Answers to many tasks, a row each, on all cores unless `threads` says otherwise."""
-        rows = np.ascontiguousarray(rows)
+        return [self.answer(each) for each in self._numbers_of(np.ascontiguousarray(rows), threads)]
+
+    def _numbers_of(self, rows: Vector, threads: int | None) -> Vector:
+        """Numbers (N, w) of the answers to rows."""
         chunk = 1 if self._setup.state else KEPT.chunk  # Ctrl-C waits for a chunk
         numbers = np.empty((len(rows), self._answer_width))
 
@@ -307,7 +335,7 @@ class FastSolver:
 
         with stop_flag() as stop:
             in_parallel(work, range(0, len(rows), chunk), threads)
-        return [self.answer(each) for each in numbers]
+        return numbers
 
     def _run(self, rows: Vector, answers: Vector, begin: int, end: int, stop: int) -> None:
         failed = self._solve(

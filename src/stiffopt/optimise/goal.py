@@ -23,6 +23,7 @@ from stiffopt.units import read_from_file
 __all__ = ["AtLeast", "MatchMatrix", "MatchValue", "StiffnessGoal", "StiffnessMeasure"]
 
 MeasureT = TypeVar("MeasureT")
+MIXED = "mixes translation (N/m) and rotation (N*m/rad), whose smallest has no meaning"
 
 
 def _as_items(value: Any, info: ValidationInfo) -> Any:
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
 else:
     _Maximised, _Floor, _Match = map(_either, ("maximise", "at_least", "match"))
 OneOrMore = Annotated[Items[MeasureT], BeforeValidator(_as_items)]
+"""A list; in a file one mapping stands for a list of one."""
 
 
 class StiffnessGoal(Schema):
@@ -93,9 +95,5 @@ class StiffnessGoal(Schema):
         if self.maximise and self.match is not None:
             raise BadKeyError("match", "cannot be combined with maximise; remove one of the two")
         if len({measure.unit for measure in self.maximise}) > 1:
-            raise BadKeyError(
-                "maximise",
-                "mixes translation (N/m) and rotation (N*m/rad), whose smallest has no meaning; "
-                "ask for one of the kinds with at_least",
-            )
+            raise BadKeyError("maximise", f"{MIXED}; ask for one of the kinds with at_least")
         return self

@@ -71,19 +71,17 @@ def _robot_name(value: Any, info: ValidationInfo) -> Any:
     return os.fspath(value) if isinstance(value, Path) else value
 
 
-class Task(Schema):
-    """Where an arm's tip should be, and how stiff.
+class ForRobot(Schema):
+    """What tasks and paths have in common: the robot, its load and limits, and what is around it.
 
     Attributes
     ----------
-    robot : name of a built-in robot, or path of a robot file relative to the task file.  In code it
-        may be left out: the robot is the one that the task is given to a solver with.
-    target : tip pose.
-    stiffness : stiffness goal, or None: the pose with the least pressure.
+    robot : name of a built-in robot, or path of a robot file relative to this file.  In code it may
+        be left out: the robot is the one that a solver is given.
     load : load at the tip, or None.
     pressure : limits that tighten the robot's.
     scene : what is around the arm, or None.
-    source : the file that the task was read from, or None.
+    source : the file that this was read from, or None.
     """
 
     robot: Annotated[
@@ -91,47 +89,35 @@ class Task(Schema):
         BeforeValidator(_robot_name),
         Field(validate_default=True),
     ] = None
-    target: Target
-    stiffness: StiffnessGoal | None = None
     load: Load | None = None
     pressure: PressureRange = PressureRange()
     scene: SceneOrFile | None = None
     source: SourceFile = None
 
-    def __repr__(self) -> str:
-        parts = [] if self.robot is None else [self.robot]
-        parts.append(repr(self.target))
-        if self.stiffness is not None:
-            parts.append(repr(self.stiffness))
+    def _conditions(self) -> list[str]:
+        """Return in words what makes it harder: load, limits and scene."""
+        parts = []
         if self.load is not None:
             parts.append("with a load")
-        if self.pressure != PressureRange():
+        if self.pressure != type(self.pressure)():
             parts.append("with pressure limits")
         if self.scene is not None:
             parts.append("in a scene")
-        return f"Task({', '.join(parts)})"
-
-    __str__ = __repr__
-
-    @property
-    def measures(self) -> tuple[StiffnessMeasure, ...]:
-        """All stiffnesses that are named: maximised, then matched, then floors."""
-        goal = self.stiffness
-        if goal is None:
-            return ()
-        named = (*goal.first, *goal.at_least)
-        return tuple(cast(StiffnessMeasure, m) for m in named if m.is_stiffness)
+        return parts
 
     def resolve_robot(self) -> RobotDescription:
-        """Return the robot; a relative path starts at the task file's folder.
+        """Return the robot; a relative path starts at the folder of the file.
 
         Raises
         ------
         InputError
-            There is no such robot, or its file is wrong; or the task names none.
+            There is no such robot, or its file is wrong; or none is named.
         """
         if self.robot is None:
-            raise InputError("Task.robot: the task names no robot; name one, or load it yourself")
+            name = type(self).__name__
+            raise InputError(
+                f"{name}.robot: the {name.lower()} names no robot; name one, or load it yourself"
+            )
         here = self.source
         try:
             return load_description(self.robot, base=None if here is None else here.parent)
@@ -156,7 +142,7 @@ class Task(Schema):
     def pressure_bounds(
         self, description: RobotDescription
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the limits that hold for this task: the robot's, tightened by the task's.
+        """Return the limits that hold: the robot's, tightened by those in `pressure`.
 
         Parameters
         ----------
@@ -193,10 +179,47 @@ class Task(Schema):
         return lower, upper
 
     def _error(self, key: str, reason: str) -> InputError:
-        """Return the error that blames a key, in the file if the task was read from one."""
+        """Return the error that blames a key, in the file if this was read from one."""
         if self.source is None:
-            return InputError(f"Task.{key}: {reason}")
+            return InputError(f"{type(self).__name__}.{key}: {reason}")
         return FileError(self.source, reason, line=line_of(self.source, *key.split(".")), key=key)
+
+
+class Task(ForRobot):
+    """Where an arm's tip should be, and how stiff.
+
+    Attributes
+    ----------
+    robot : name of a built-in robot, or path of a robot file relative to the task file.  In code it
+        may be left out: the robot is the one that the task is given to a solver with.
+    target : tip pose.
+    stiffness : stiffness goal, or None: the pose with the least pressure.
+    load : load at the tip, or None.
+    pressure : limits that tighten the robot's.
+    scene : what is around the arm, or None.
+    source : the file that the task was read from, or None.
+    """
+
+    target: Target
+    stiffness: StiffnessGoal | None = None
+
+    def __repr__(self) -> str:
+        parts = [] if self.robot is None else [self.robot]
+        parts.append(repr(self.target))
+        if self.stiffness is not None:
+            parts.append(repr(self.stiffness))
+        return f"Task({', '.join([*parts, *self._conditions()])})"
+
+    __str__ = __repr__
+
+    @property
+    def measures(self) -> tuple[StiffnessMeasure, ...]:
+        """All stiffnesses that are named: maximised, then matched, then floors."""
+        goal = self.stiffness
+        if goal is None:
+            return ()
+        named = (*goal.first, *goal.at_least)
+        return tuple(cast(StiffnessMeasure, m) for m in named if m.is_stiffness)
 
 
 def load_task(path: str | os.PathLike[str]) -> Task:

@@ -1,0 +1,255 @@
+"""The tasks at the points of a path, which differ in target and direction alone."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import EquilibriumError
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.fast import CompiledAnswer
+from stiffopt.optimise.functions import functions
+from stiffopt.optimise.local import descend
+from stiffopt.optimise.prepared import prepared
+from stiffopt.optimise.problem import PressureProblem
+from stiffopt.optimise.program import Program, pressure_ranges
+from stiffopt.optimise.reach import reach
+from stiffopt.optimise.solution import Judgement, are_within, judge
+from stiffopt.optimise.task import Task
+
+Vector = NDArray[np.float64]
+
+
+class Candidate(NamedTuple):
+    """Pressures that solve the task at a point.
+
+    Attributes
+    ----------
+    pressures : ndarray (n,)
+        In Pa.
+    value : float
+        Logarithm of the (smallest) stiffness that is maximised; without any, the negative of the
+        mean square pressure.
+    """
+
+    pressures: Vector
+    value: float
+
+
+class Local(NamedTuple):
+    """A question for the local optimum at a point, next to a guess and within limits, in Pa."""
+
+    point: int
+    guess: Vector
+    lower: Vector
+    upper: Vector
+
+
+class Slopes(NamedTuple):
+    """The tasks at k points, linearised; derivatives are per share of a channel's range.
+
+    Attributes
+    ----------
+    residuals, jacobians : ndarray (k, m), (k, m, n)
+        Of the terms.
+    costs, gradients : ndarray (k, t), (k, t, n)
+        Of what is minimised, the largest first of all: negative logarithms of stiffnesses.
+    """
+
+    residuals: Vector
+    jacobians: Vector
+    costs: Vector
+    gradients: Vector
+
+
+class PathTasks:
+    """Tasks (at least one) that have the load, the scene and the limits of the first.
+
+    Attributes
+    ----------
+    robot : Manipulator
+        The arm, which carries the load.
+    lower, upper, unit : ndarray (n,)
+        Limits, and ranges of the channels, in Pa.
+    is_compiled : bool
+        Whether there is machine code for them.
+    """
+
+    def __init__(self, robot: Manipulator, tasks: Sequence[Task], seed: int) -> None:
+        self.tasks = tuple(tasks)
+        # the robot carries the load
+        self._without_load = [task.model_copy(update={"load": None}) for task in tasks]
+        self._prepared = prepared(robot, tasks[0], seed)
+        self.robot = self._prepared.robot
+        self.lower, self.upper = self._prepared.lower, self._prepared.upper
+        self.unit = pressure_ranges(robot.description)
+        first = Program.of(tasks[0], robot.description)
+        self.programs = [
+            replace(
+                first,
+                terms=task.target.terms,
+                measures=() if task.stiffness is None else task.stiffness.first,
+            )
+            for task in tasks
+        ]
+        self._fast = self._prepared.fast(first)
+        self.is_compiled = self._fast is not None
+        self._rows: dict[int, Vector] = {}
+
+    def __len__(self) -> int:
+        return len(self.tasks)
+
+    def near(self, index: int, count: int) -> Vector:
+        """Sampled pressures (count, n) whose tips are nearest to the target at a point."""
+        table = self._prepared.samples
+        distances = table.distances(self.programs[index].terms, self.robot.length)
+        near: Vector = table.pressures[table.nearest_first(distances, count)]
+        return near
+
+    # -- local optima -----------------------------------------------------------------------
+
+    def locals(self, questions: Sequence[Local]) -> list[Candidate | None]:
+        """Local optima next to guesses; None where none was found that holds."""
+        if self._fast is None:
+            return [self._general(question) for question in questions]
+        solver = self._fast[0]
+        rows = [solver.next_to(self._row(q.point), q.guess, q.lower, q.upper) for q in questions]
+        if not rows:
+            return []
+        threads = None if len(rows) > 64 else 1  # a thread costs as much as some answers
+        pressures, values = solver.optima(np.stack(rows), threads)
+        pairs = zip(pressures, (-values).tolist(), strict=True)
+        return [Candidate(p, value) if value > -np.inf else None for p, value in pairs]
+
+    def bests(self, indices: Sequence[int]) -> list[Candidate | None]:
+        """Best local optima that a global search finds."""
+        if self._fast is None:
+            return [None for _ in indices]
+        rows = np.stack([self._row(index) for index in indices])
+        answers = self._fast[0].solve_all(rows)
+        return [self._accepted(i, answer) for i, answer in zip(indices, answers, strict=True)]
+
+    def _row(self, index: int) -> Vector:
+        """Numbers of the task at a point."""
+        if index not in self._rows:
+            assert self._fast is not None
+            solver, program = self._fast[0], self.programs[index]
+            row = solver.row(program, self.lower, self.upper, np.zeros(0))
+            self._rows[index] = solver.with_target(row, program, None)
+        return self._rows[index]
+
+    def _accepted(self, index: int, answer: CompiledAnswer | None) -> Candidate | None:
+        if answer is None:
+            return None
+        within = are_within(answer.pressures, self.lower, self.upper)
+        judgement = Judgement.of(self.programs[index], answer.judged, within)
+        if not judgement.holds:
+            return None
+        return Candidate(answer.pressures, self.value(index, judgement, answer.pressures))
+
+    def value(self, index: int, judgement: Judgement, pressures: Vector) -> float:
+        """What `Candidate.value` is at judged pressures."""
+        if self.programs[index].measures:
+            return float(np.log(min(judgement.stiffnesses)))
+        return -float(np.mean((pressures / self.programs[index].reference) ** 2))
+
+    def _general(self, question: Local) -> Candidate | None:
+        """The same without machine code."""
+        index = question.point
+        problem = PressureProblem(self.robot, self._without_load[index])
+        problem.lower, problem.upper = question.lower / self.unit, question.upper / self.unit
+        x = np.clip(question.guess / self.unit, problem.lower, problem.upper)
+        try:
+            point = reach(problem, x)
+            if point is None or not point.reached:
+                return None
+            result = descend(problem, point)
+        except EquilibriumError:
+            return None
+        if not result.point.reached:
+            return None
+        pressures = np.clip(result.point.x * self.unit, question.lower, question.upper)
+        return self.candidate(index, pressures)
+
+    # -- evaluation -------------------------------------------------------------------------
+
+    def problem(self, index: int) -> PressureProblem:
+        """The general optimiser's view of a point."""
+        return PressureProblem(self.robot, self._without_load[index])
+
+    def assessed(self, index: int, pressures: Vector) -> list[Candidate]:
+        """Candidates that pressures (k, n) at the target of a point are, if the body is clear."""
+        scene = self.tasks[index].scene
+        if scene is not None and len(pressures):
+            pressures = pressures[self.robot.clearance(pressures, scene) >= scene.clearance]
+        if not len(pressures):
+            return []
+        slopes = self.slopes([index] * len(pressures), pressures)
+        if slopes is None:
+            return []
+        pairs = zip(pressures, slopes.costs.max(axis=1).tolist(), strict=True)
+        return [Candidate(p, -cost) for p, cost in pairs]
+
+    def judged(self, pressures: Vector) -> list[Judgement | None]:
+        """Judgement by the model of pressures (N, n), one of each point; None: no equilibrium."""
+        if self._fast is None:
+            return [self.judged_at(index, p) for index, p in enumerate(pressures)]
+        solver = self._fast[0]
+        rows = [solver.judging(self._row(index), p) for index, p in enumerate(pressures)]
+        found: list[Judgement | None] = []
+        for index, answer in enumerate(solver.solve_all(np.stack(rows))):
+            within = are_within(pressures[index], self.lower, self.upper)
+            program = self.programs[index]
+            found.append(answer and Judgement.of(program, answer.judged, within))
+        return found
+
+    def judged_at(self, index: int, pressures: Vector) -> Judgement | None:
+        """The same of one point."""
+        try:
+            return judge(self.robot, self._without_load[index], pressures)
+        except EquilibriumError:
+            return None
+
+    def candidate(self, index: int, pressures: Vector) -> Candidate | None:
+        """The candidate that pressures (n,) are at a point, if they solve its task."""
+        judgement = self.judged_at(index, pressures)
+        if judgement is None or not judgement.holds:
+            return None
+        return Candidate(pressures, self.value(index, judgement, pressures))
+
+    def slopes(self, indices: Sequence[int], pressures: Vector) -> Slopes | None:
+        """The tasks at some points, linearised at pressures (k, n); None where one has none."""
+        if self.robot.is_loaded:
+            parts = [self._loaded(i, p) for i, p in zip(indices, pressures, strict=True)]
+            known = [part for part in parts if part is not None]
+            if len(known) < len(parts):
+                return None
+            return Slopes(*(np.stack(each) for each in zip(*known, strict=True)))
+        parameters = [self.robot.parameters(self.programs[i].parameters) for i in indices]
+        point = functions(self.robot, self.programs[0])["point"]
+        residuals, jacobians, costs, gradients = point.many(pressures, np.stack(parameters))[:4]
+        return Slopes(
+            residuals[..., 0],
+            jacobians.swapaxes(1, 2) * self.unit,
+            costs[..., 0],
+            gradients.swapaxes(1, 2) * self.unit,
+        )
+
+    def _loaded(self, index: int, pressures: Vector) -> tuple[Vector, ...] | None:
+        """`Slopes` at one point of a loaded arm, which stands up from rest; None if it falls."""
+        program = self.programs[index]
+        if self._fast is not None:
+            parameters = self.robot.parameters(program.parameters)
+            found = self._fast[0].point(parameters, np.array(program.radii), pressures)
+            if found is None:
+                return None
+            own = slice(program.n_own_rows)
+            return found[0][own], found[1][own], found[2], found[3]
+        task = self._without_load[index].model_copy(update={"scene": None})
+        try:
+            point = PressureProblem(self.robot, task).point(pressures / self.unit)
+        except EquilibriumError:
+            return None
+        return point.residual, point.jacobian, point.terms, point.term_gradients

@@ -1,0 +1,378 @@
+"""Joint optimisation of neighbouring points of a path that the rates hold back.
+
+Where no rate binds, each point is at an optimum of its own and nothing can be gained.  Elsewhere
+the pressures x of a window of points are optimised together, by sequential convex programming::
+
+    minimise    max_i e_i + w mean_i e_i                (over the mean: the mean alone)
+    subject to  c_i(x_i) <= e_i                         c: logarithms of stiffness, negative
+                |r_i(x_i)| <= tolerance                 residuals of position and angle
+                |x_{i+1} - x_i| <= steps_i,  lower <= x_i <= upper,  clearance(x_i) >= clearance
+
+In each iteration costs, residuals and clearances are linearised, and second derivatives of the
+Lagrangian enter as a convex quadratic term; Clarabel solves the program, a second-order cone for
+each tolerance.  A trust region and an exact penalty decide whether a step is taken.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import clarabel
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from stiffopt.model.stopping import checkpoint
+from stiffopt.optimise.program import Constraint
+from stiffopt.paths.points import PathTasks, Slopes
+from stiffopt.paths.settings import REFINEMENT
+
+Vector = NDArray[np.float64]
+Entries = tuple[NDArray[Any], NDArray[Any], NDArray[Any]]
+"""Rows, columns and values of entries of a matrix."""
+
+
+def refined(
+    tasks: PathTasks, pressures: Vector, steps: Vector, over: str, fixed: Sequence[int] = ()
+) -> Vector:
+    """Pressures (N, n) that are better where the rates hold them back.
+
+    Parameters
+    ----------
+    tasks : PathTasks
+    pressures : (N, n)
+        In Pa; they solve the tasks and keep the steps.
+    steps : (N - 1, n)
+        Largest changes from point to point, in Pa.
+    over : "worst" or "mean"
+    fixed : indices of points that stay as they are.
+    """
+    for window in _windows(pressures, steps):
+        pressures = _Window(tasks, pressures, steps, over, window, set(fixed)).optimised()
+    return pressures
+
+
+def _windows(pressures: Vector, steps: Vector) -> list[range]:
+    """Points on both sides of steps that are near the rates, those that overlap together."""
+    near = (np.abs(np.diff(pressures, axis=0)) > REFINEMENT.near * steps).any(axis=1)
+    found: list[range] = []
+    for index in np.flatnonzero(near).tolist():
+        begin = max(0, index + 1 - REFINEMENT.margin)
+        end = min(len(pressures), index + 1 + REFINEMENT.margin)
+        if found and begin <= found[-1].stop:
+            found[-1] = range(found[-1].start, end)
+        else:
+            found.append(range(begin, end))
+    return found
+
+
+@dataclass
+class _State:
+    """The points of a window at some pressures.
+
+    Attributes
+    ----------
+    x : ndarray (k, n)
+        As shares of the ranges.
+    slopes : Slopes
+    near, near_slopes : ndarray (k, b), (k, b, n)
+        What one-sided constraints lack, to be at most 0, and their derivatives.
+    merit, excess : what is minimised, and the sum of what constraints lack.
+    """
+
+    x: Vector
+    slopes: Slopes
+    near: Vector
+    near_slopes: Vector
+    merit: float
+    excess: float
+
+
+class _Window:
+    """Some neighbouring points; all others stay as they are."""
+
+    def __init__(
+        self,
+        tasks: PathTasks,
+        pressures: Vector,
+        steps: Vector,
+        over: str,
+        window: range,
+        fixed: set[int],
+    ) -> None:
+        self._tasks, self._pressures, self._over = tasks, pressures, over
+        free = [index for index in window if index not in fixed]
+        self._free = range(free[0], free[-1] + 1)
+        unit = tasks.unit
+        self._x = pressures / unit
+        self._steps = steps / unit * REFINEMENT.inside
+        self._lower, self._upper = tasks.lower / unit, tasks.upper / unit
+        length = tasks.robot.length
+        constraints = tasks.programs[0].constraints(length)
+        own = tasks.programs[0].n_own_rows
+        self._balls = [c for c in constraints if not c.one_sided]
+        self._one_sided = [c for c in constraints if c.one_sided and c.first < own]
+        self._scene = tasks.tasks[0].scene
+        others = [i for i in range(len(pressures)) if i not in self._free]
+        self._floor = -np.inf
+        if over == "worst" and others:
+            slopes = tasks.slopes(others, pressures[others])
+            if slopes is not None:
+                self._floor = float(slopes.costs.max())
+        self._price = REFINEMENT.price
+
+    def optimised(self) -> Vector:
+        """All pressures (N, n), those of the window as good as they become."""
+        state = self._state(self._x[self._free.start : self._free.stop])
+        if state is None:
+            return self._pressures
+        best, radius = state, REFINEMENT.radius
+        weights = np.full(state.slopes.costs.shape, self._weight)
+        pulls = np.zeros(state.slopes.residuals.shape)
+        for _ in range(REFINEMENT.iterations):
+            checkpoint()
+            found = self._step(state, self._curvature(state, weights, pulls), radius)
+            if found is None:
+                radius /= 4
+                if radius < REFINEMENT.last_radius:
+                    break
+                continue
+            d, weights, pulls, promised = found
+            trial = self._state(np.clip(state.x + d, self._lower, self._upper))
+            gained = -np.inf if trial is None else state.merit - trial.merit
+            if trial is not None and gained > 0.1 * promised:
+                state = trial
+                radius = min(2 * radius, 1.0) if gained > 0.7 * promised else radius
+                if state.excess <= REFINEMENT.rounding and state.merit < best.merit:
+                    best = state
+            else:
+                radius = 0.3 * min(radius, float(np.abs(d).max()))
+            if promised < REFINEMENT.last_gain or radius < REFINEMENT.last_radius:
+                break
+        pressures = self._pressures.copy()
+        pressures[self._free.start : self._free.stop] = best.x * self._tasks.unit
+        return pressures
+
+    @property
+    def _weight(self) -> float:
+        """First guess of the multiplier of a cost."""
+        return (1.0 + REFINEMENT.mean) / len(self._free)
+
+    # -- evaluation -----------------------------------------------------------------------------
+
+    def _state(self, x: Vector) -> _State | None:
+        tasks, pressures = self._tasks, x * self._tasks.unit
+        slopes = tasks.slopes(self._free, pressures)
+        if slopes is None or not all(np.isfinite(each).all() for each in slopes):
+            return None
+        near, near_slopes = self._near(slopes, pressures)
+        excess = float(np.maximum(near, 0.0).sum())
+        for ball in self._balls:
+            radius = ball.radius * REFINEMENT.inside
+            sizes = np.linalg.norm(slopes.residuals[:, ball.first : ball.end], axis=1)
+            excess += float(np.maximum(sizes - radius, 0.0).sum()) / ball.scale
+        costs = slopes.costs.max(axis=1)
+        merit = float(costs.mean())
+        if self._over == "worst":
+            merit = max(float(costs.max()), self._floor) + REFINEMENT.mean * merit
+        return _State(x, slopes, near, near_slopes, merit + self._price * excess, excess)
+
+    def _near(self, slopes: Slopes, pressures: Vector) -> tuple[Vector, Vector]:
+        """Inequalities of terms and clearance of objects, each at most 0, over their scales."""
+        k, n = pressures.shape
+        values: list[Vector] = []
+        derivatives: list[Vector] = []
+        for c in self._one_sided:
+            values.append((slopes.residuals[:, c.first] - c.radius) / c.scale)
+            derivatives.append(slopes.jacobians[:, c.first] / c.scale)
+        if self._scene is not None:
+            robot = self._tasks.robot
+            clear = robot.clearances(pressures, self._scene)
+            values += list((self._scene.clearance - clear.distances.T) / robot.length)
+            derivatives += list(-clear.gradients.swapaxes(0, 1) * self._tasks.unit / robot.length)
+        if not values:
+            return np.zeros((k, 0)), np.zeros((k, 0, n))
+        return np.stack(values, axis=1), np.stack(derivatives, axis=1)
+
+    def _curvature(self, state: _State, weights: Vector, pulls: Vector) -> Vector:
+        """Convex parts (k, n, n) of the second derivatives of the Lagrangian."""
+        k, n = state.x.shape
+        h = REFINEMENT.difference
+
+        def gradients(x: Vector) -> Vector | None:
+            slopes = self._tasks.slopes(self._free, x * self._tasks.unit)
+            if slopes is None:
+                return None
+            found: Vector = np.einsum("kt,ktn->kn", weights, slopes.gradients)
+            found += np.einsum("km,kmn->kn", pulls, slopes.jacobians)
+            return found
+
+        here = gradients(state.x)
+        columns = []
+        for index in range(n):
+            shifted = state.x.copy()
+            shifted[:, index] += h
+            there = gradients(shifted)
+            if here is None or there is None:
+                return np.tile(1e-3 * np.eye(n), (k, 1, 1))
+            columns.append((there - here) / h)
+        H = np.stack(columns, axis=2)
+        values, vectors = np.linalg.eigh((H + H.swapaxes(1, 2)) / 2)
+        values = np.maximum(values, 1e-6)
+        convex: Vector = (vectors * values[:, np.newaxis, :]) @ vectors.swapaxes(1, 2)
+        return convex
+
+    # -- the convex program ---------------------------------------------------------------------
+
+    def _step(
+        self, state: _State, curvature: Vector, radius: float
+    ) -> tuple[Vector, Vector, Vector, float] | None:
+        """Step (k, n), multipliers of costs (k, t) and residuals (k, m), and promised gain."""
+        k, n = state.x.shape
+        costs = state.slopes.costs
+        worst = self._over == "worst"
+        # variables: d (k n), e (k), slack (k), and the worst cost
+        size = k * n + 2 * k + worst
+        e, slack = k * n, k * n + k
+        rows = _Rows(size)
+        identity = np.arange(k * n)
+        low = np.maximum(self._lower - state.x, -radius).ravel()
+        high = np.minimum(self._upper - state.x, radius).ravel()
+        rows.add(high, (np.arange(k * n), identity, np.ones(k * n)))
+        rows.add(-low, (np.arange(k * n), identity, -np.ones(k * n)))
+        self._add_rates(rows, state.x)
+        rows.add(np.zeros(k), (np.arange(k), slack + np.arange(k), -np.ones(k)))
+        if worst:
+            index = np.arange(k)
+            rows.add(
+                np.zeros(k),
+                (index, e + index, np.ones(k)),
+                (index, np.full(k, size - 1), -np.ones(k)),
+            )
+            if np.isfinite(self._floor):
+                rows.add(np.array([-self._floor]), (np.zeros(1), np.array([size - 1]), -np.ones(1)))
+        b = state.near.shape[1]
+        if b:
+            point = np.repeat(np.arange(k), b)
+            index = np.arange(k * b)
+            rows.add(
+                -state.near.ravel(),
+                (np.repeat(index, n), _columns(point, n), state.near_slopes.ravel()),
+                (index, slack + point, -np.ones(k * b)),
+            )
+        costs_from = rows.count
+        t = costs.shape[1]
+        point, index = np.repeat(np.arange(k), t), np.arange(k * t)
+        rows.add(
+            -costs.ravel(),
+            (np.repeat(index, n), _columns(point, n), state.slopes.gradients.ravel()),
+            (index, e + point, -np.ones(k * t)),
+        )
+        cones: list[object] = [clarabel.NonnegativeConeT(rows.count)]
+        balls_from = rows.count
+        for ball in self._balls:
+            self._add_ball(rows, state, ball, slack)
+            cones += [clarabel.SecondOrderConeT(1 + ball.end - ball.first)] * k
+        P = sparse.block_diag(
+            [*curvature, sparse.csc_matrix((size - k * n, size - k * n))], format="csc"
+        )
+        q = np.zeros(size)
+        q[e : e + k] = (REFINEMENT.mean if worst else 1.0) / k
+        q[slack : slack + k] = self._price
+        if worst:
+            q[-1] = 1.0
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        settings.max_threads = 1
+        A, bounds = rows.matrix()
+        solution = clarabel.DefaultSolver(
+            sparse.triu(P, format="csc"), q, A, bounds, cones, settings
+        ).solve()
+        if str(solution.status) not in ("Solved", "AlmostSolved"):
+            return None
+        x, z = np.array(solution.x), np.array(solution.z)
+        d = x[: k * n].reshape(k, n)
+        pulls = np.zeros(state.slopes.residuals.shape)
+        at = balls_from
+        for ball in self._balls:
+            width = 1 + ball.end - ball.first
+            own = z[at : at + k * width].reshape(k, width)
+            pulls[:, ball.first : ball.end] = -own[:, 1:] / ball.scale
+            at += k * width
+        weights = z[costs_from : costs_from + k * t].reshape(k, t)
+        hoped = float(q @ x)
+        return d, weights, pulls, state.merit - hoped
+
+    def _add_rates(self, rows: "_Rows", x: Vector) -> None:
+        """Steps between points of the window, and to their neighbours outside."""
+        k, n = x.shape
+        first, last = self._free.start, self._free.stop - 1
+        steps = self._steps[first:last]
+        apart = np.diff(x, axis=0)
+        index = np.arange((k - 1) * n)
+        for side in (1.0, -1.0):
+            rows.add(
+                np.maximum(steps - side * apart, 0.0).ravel(),
+                (index, index + n, np.full(len(index), side)),
+                (index, index, np.full(len(index), -side)),
+            )
+        for outside, inside, step in (
+            (first - 1, 0, first - 1),
+            (last + 1, k - 1, last),
+        ):
+            if not 0 <= outside < len(self._x):
+                continue
+            own = inside * n + np.arange(n)
+            gap = x[inside] - self._x[outside]
+            for side in (1.0, -1.0):
+                rows.add(
+                    np.maximum(self._steps[step] - side * gap, 0.0),
+                    (np.arange(n), own, np.full(n, side)),
+                )
+
+    def _add_ball(self, rows: "_Rows", state: _State, ball: Constraint, slack: int) -> None:
+        """Cones ``(radius + slack, r + J d)`` of one constraint, over its scale."""
+        k, n = state.x.shape
+        width = 1 + ball.end - ball.first
+        own = slice(ball.first, ball.end)
+        bounds = np.zeros((k, width))
+        bounds[:, 0] = ball.radius * REFINEMENT.inside / ball.scale
+        bounds[:, 1:] = state.slopes.residuals[:, own] / ball.scale
+        tops = np.arange(k) * width
+        below = (tops[:, np.newaxis] + np.arange(1, width)).ravel()
+        point = np.repeat(np.arange(k), width - 1)
+        rows.add(
+            bounds.ravel(),
+            (tops, slack + np.arange(k), -np.ones(k)),
+            (
+                np.repeat(below, n),
+                _columns(point, n),
+                -state.slopes.jacobians[:, own].ravel() / ball.scale,
+            ),
+        )
+
+
+class _Rows:
+    """Rows of ``A x + s = b``, collected."""
+
+    def __init__(self, size: int) -> None:
+        self._size, self.count = size, 0
+        self._bounds: list[Vector] = []
+        self._entries: list[Entries] = []
+
+    def add(self, bounds: Vector, *entries: Entries) -> None:
+        """Add rows with these b, and entries (row from the first of them, column, value)."""
+        self._bounds.append(bounds)
+        self._entries += [(row + self.count, column, value) for row, column, value in entries]
+        self.count += len(bounds)
+
+    def matrix(self) -> tuple[sparse.csc_matrix, Vector]:
+        """A and b."""
+        row, column, value = (np.concatenate(each) for each in zip(*self._entries, strict=True))
+        A = sparse.csc_matrix((value, (row, column)), shape=(self.count, self._size))
+        return A, np.concatenate(self._bounds)
+
+
+def _columns(points: NDArray[np.intp], n: int) -> NDArray[np.intp]:
+    """Columns of the variables of some points, n for each."""
+    return (points[:, np.newaxis] * n + np.arange(n)).ravel()

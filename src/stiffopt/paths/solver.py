@@ -1,0 +1,445 @@
+"""`solve_path`: the stiffest pressures with which the tip follows a path within the rates."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.stopping import Cancel, giving_up
+from stiffopt.optimise.solution import Judgement, PressureSolution
+from stiffopt.optimise.solver import PressureSolver
+from stiffopt.optimise.task import Task
+from stiffopt.paths.candidates import candidates, lanes
+from stiffopt.paths.path import Path
+from stiffopt.paths.points import Candidate, PathTasks
+from stiffopt.paths.rates import least_times, slew_limits, step_limits
+from stiffopt.paths.refinement import refined
+from stiffopt.paths.route import Route, RouteSearch
+from stiffopt.paths.settings import CANDIDATES, LANES, RATES, ROUTE
+from stiffopt.paths.solution import PathSolution
+
+Vector = NDArray[np.float64]
+
+# what is tried until it is good enough: whether with lanes, and rounds of crossings
+_STAGES = ((False, ROUTE.first_rounds), (True, 0), (True, ROUTE.rounds))
+
+
+def solve_path(
+    robot: Manipulator,
+    path: Path,
+    *,
+    seed: int = 0,
+    timeout: float | None = None,
+    cancel: Cancel | None = None,
+) -> PathSolution:
+    """Find pressures over time with which the tip follows a path, as stiff as possible.
+
+    Every point is within its tolerance, the body keeps the clearance of the scene, and no
+    pressure changes faster than the rates of robot and path allow.  At each point several local
+    optima are found; a search over their sequences chooses where to change from one to another,
+    and then points that the rates hold back are optimised together.
+
+    Parameters
+    ----------
+    robot : Manipulator
+    path : Path
+    seed : int
+        Of the searches.  The same seed gives the same answer.
+    timeout, cancel : optional
+        As for `PressureSolver.solve`; the status is "failed" where they end it.
+
+    Raises
+    ------
+    InputError
+        If the path does not suit the robot: limits, scene, or pressures at its ends that are not
+        at the first or the last point.  Nothing is raised for a path that cannot be followed:
+        the solution says where and why, and holds the nearest path that can.
+    """
+    if not isinstance(robot, Manipulator):
+        raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
+    if not isinstance(path, Path):
+        raise InputError(f"path must be a Path, see load_path; got {shown(path)}")
+    begin = perf_counter()
+    with giving_up(timeout, cancel):
+        solution = _PathSolver(robot, path, seed).solve()
+    solution.timings["total"] = perf_counter() - begin
+    return solution
+
+
+@dataclass
+class _Attempt:
+    """What was found for tasks with given steps.
+
+    Attributes
+    ----------
+    tasks : PathTasks
+    route : Route or None
+    alone : (N,) array
+        Best value of each point alone.
+    starts : local optimisations that looked for branches.
+    branches : most candidates that a point has.
+    """
+
+    tasks: PathTasks
+    route: Route | None
+    alone: Vector
+    starts: int
+    branches: int
+
+
+class _PathSolver:
+    """One path on one arm."""
+
+    def __init__(self, robot: Manipulator, path: Path, seed: int) -> None:
+        self._robot, self._path, self._seed = robot, path, seed
+        self._points = path.points()
+        self._tasks = [
+            path.task(target, goal)
+            for target, goal in zip(self._points.targets, self._points.goals, strict=True)
+        ]
+        self._slew = slew_limits(robot.description, path.pressure.slew)
+        self._ends = path.end_pressures(robot.description)
+        self._over = "mean" if path.stiffness is None else path.stiffness.over
+        self._unreachable: tuple[int, str] | None = None  # the first point, and why
+        self._lanes: list[list[Candidate]] | None = None
+
+    def solve(self) -> PathSolution:
+        """Answer; see `solve_path`."""
+        tasks = PathTasks(self._robot, self._tasks, self._seed)
+        self._check_ends(tasks)
+        try:
+            layers, starts = candidates(tasks)
+            tasks, layers = self._with_reachable(tasks, layers)
+            for index, pressures in ((0, self._ends[0]), (-1, self._ends[1])):
+                if pressures is not None:
+                    index %= len(layers)
+                    layers[index] = [Candidate(pressures, self._value_at(tasks, index, pressures))]
+            return self._answer(tasks, layers, starts)
+        except StoppedError as error:
+            return self._failed(str(error))
+        except EquilibriumError as error:
+            return self._failed(str(error))
+
+    # -- ends and points that cannot be had ----------------------------------------------------
+
+    def _check_ends(self, tasks: PathTasks) -> None:
+        """Refuse pressures at an end of the path that do not bring the tip there."""
+        for key, index, pressures in (
+            ("start", 0, self._ends[0]),
+            ("end", len(self._tasks) - 1, self._ends[1]),
+        ):
+            if pressures is None:
+                continue
+            judgement = tasks.judged_at(index, pressures)
+            if judgement is not None and judgement.pose_holds and judgement.is_clear:
+                continue
+            where = "the arm does not stand at these pressures"
+            if judgement is not None and not judgement.pose_holds:
+                terms = tasks.programs[index].terms
+                off = [
+                    term.words(judgement.errors[term.name])
+                    for term in terms
+                    if not term.holds(judgement.errors[term.name])
+                ]
+                where = f"the tip is {' and '.join(off)} off that point"
+            elif judgement is not None:
+                where = f"the body is too near to '{next(iter(judgement.intruders))}'"
+            raise self._path._error(
+                f"{key}.pressures",
+                f"are not at the {'first' if index == 0 else 'last'} point of the path: {where}; "
+                "give pressures that are, or none, and plan a motion there (stiffopt plan)",
+            )
+
+    def _value_at(self, tasks: PathTasks, index: int, pressures: Vector) -> float:
+        judgement = tasks.judged_at(index, pressures)
+        assert judgement is not None  # the ends were checked
+        return tasks.value(index, judgement, pressures)
+
+    def _with_reachable(
+        self, tasks: PathTasks, layers: list[list[Candidate]]
+    ) -> tuple[PathTasks, list[list[Candidate]]]:
+        """Tasks and candidates with, for points out of reach, the nearest that can be had."""
+        moved = list(self._tasks)
+        for index, layer in enumerate(layers):
+            if layer:
+                continue
+            solution = PressureSolver(self._robot, self._tasks[index], seed=self._seed).solve()
+            if solution.found and solution.pressures is not None:
+                candidate = tasks.candidate(index, solution.pressures)
+                layers[index] = [] if candidate is None else [candidate]
+                continue
+            if solution.status == "failed" or solution.tip_position is None:
+                raise EquilibriumError(f"{self._name(index)}: {solution.message}")
+            if self._unreachable is None:
+                self._unreachable = index, solution.message
+            moved[index] = _at_tip(self._tasks[index], solution)
+        if self._unreachable is None:
+            return tasks, layers
+        nearest = PathTasks(self._robot, moved, self._seed)
+        found, _ = candidates(nearest)
+        return nearest, found
+
+    # -- the answer ----------------------------------------------------------------------------
+
+    def _answer(self, tasks: PathTasks, layers: list[list[Candidate]], starts: int) -> PathSolution:
+        times = self._points.times
+        slowed = 1.0
+        steps = self._steps(tasks, times)
+        route = self._best_route(tasks, layers, steps)
+        stuck = None
+        if route is None and times is not None and all(layers):
+            stuck = RouteSearch(tasks, layers, steps, self._over).furthest
+            slowed, route = self._slower(tasks, layers, steps)
+            times = times * slowed
+            steps = steps * slowed
+        if route is None:
+            return self._without_route(tasks, layers, steps)
+        pressures = np.array([each.pressures for each in route.candidates])
+        fixed = [
+            index % len(pressures)
+            for index, end in zip((0, -1), self._ends, strict=True)
+            if end is not None or self._path.closed
+        ]
+        pressures = refined(tasks, pressures, steps, self._over, fixed)
+        if times is None:
+            times = self._fastest(pressures)
+        alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
+        solution = self._judged(tasks, pressures, times, alone)
+        branches = max(map(len, layers))
+        confidence = (
+            f"{starts} starts found at most {branches} local optima at a point; "
+            f"the best sequence changes {route.crossings} times between branches"
+        )
+        solution = replace(solution, confidence=confidence)
+        if stuck is not None:
+            return self._too_fast(solution, stuck, slowed)
+        return solution
+
+    def _steps(self, tasks: PathTasks, times: Vector | None) -> Vector:
+        """Largest changes (N - 1, n) of the pressures from point to point."""
+        if times is None or self._slew is None:
+            return np.tile(RATES.largest_step * tasks.unit, (len(tasks) - 1, 1))
+        return step_limits(times, self._slew)
+
+    def _best_route(
+        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector
+    ) -> Route | None:
+        """The best sequence, over further configurations where the local optima are not enough."""
+        if not all(layers):
+            return None
+        hope = RouteSearch(tasks, layers, steps, self._over)
+        best: Route | None = None
+        for with_lanes, rounds in _STAGES:
+            if with_lanes and tasks.robot.is_loaded:
+                break
+            some = self._with_lanes(tasks, layers) if with_lanes else layers
+            route = self._best_of(tasks, some, steps, rounds)
+            found = [each for each in (best, route) if each is not None]
+            best = max(found, key=lambda each: each.value(self._over), default=None)
+            if hope.comes_up_to(best, LANES.enough):
+                break
+        return best
+
+    def _with_lanes(self, tasks: PathTasks, layers: list[list[Candidate]]) -> list[list[Candidate]]:
+        """Candidates with further ones, but where the pressures are given."""
+        if self._lanes is None:
+            self._lanes = lanes(tasks)
+        given = {0: self._ends[0], len(layers) - 1: self._ends[1]}
+        return [
+            layer if given.get(index) is not None else [*layer, *lane]
+            for index, (layer, lane) in enumerate(zip(layers, self._lanes, strict=True))
+        ]
+
+    def _best_of(
+        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector, rounds: int
+    ) -> Route | None:
+        """The best sequence of candidates; that of a closed path ends where it begins."""
+        if not self._path.closed:
+            return RouteSearch(tasks, layers, steps, self._over).best(rounds)
+        found: list[Route] = []
+        for first in layers[0][: CANDIDATES.kept]:
+            closed = [[first], *layers[1:-1], [first]]
+            route = RouteSearch(tasks, closed, steps, self._over).best(rounds)
+            if route is not None:
+                found.append(route)
+        return max(found, key=lambda each: each.value(self._over), default=None)
+
+    def _slower(
+        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector
+    ) -> tuple[float, Route | None]:
+        """By how much slower the path can be followed, to a few per cent, and how."""
+        factor, route = 1.0, None
+        while route is None and factor < RATES.slowest:
+            factor *= 2
+            route = self._best_route(tasks, layers, steps * factor)
+        low = factor / 2
+        while route is not None and factor / low > 1.05:
+            middle = (low * factor) ** 0.5
+            quicker = self._best_route(tasks, layers, steps * middle)
+            if quicker is None:
+                low = middle
+            else:
+                factor, route = middle, quicker
+        return factor, route
+
+    def _fastest(self, pressures: Vector) -> Vector:
+        """Times (N,) at which the points come as soon as the rates allow."""
+        if self._slew is None:
+            raise self._path._error(
+                "timing.fastest", "needs to know the rates; give pressure.slew here or in the robot"
+            )
+        least = np.maximum(least_times(pressures, self._slew), RATES.least_time)
+        return np.concatenate([[0.0], np.cumsum(least)])
+
+    # -- judgement ------------------------------------------------------------------------------
+
+    def _judged(
+        self, tasks: PathTasks, pressures: Vector, times: Vector, alone: Vector
+    ) -> PathSolution:
+        """The solution at pressures (N, n), judged by the model against the path as given."""
+        own = PathTasks(self._robot, self._tasks, self._seed)
+        judgements = own.judged(pressures)
+        known = [j for j in judgements if j is not None]
+        if len(known) < len(judgements):
+            index = judgements.index(None)
+            return self._failed(f"{self._name(index)}: the arm has no stable equilibrium there")
+        measured = self._path.stiffness is not None
+        stiffness = np.array([min(j.stiffnesses) for j in known]) if measured else None
+        if stiffness is not None:
+            alone = np.fmax(np.exp(alone), stiffness)
+        scene = self._path.scene
+        solution = PathSolution(
+            status="solved",
+            message="",
+            robot=own.robot,
+            times=times,
+            pressures=pressures,
+            tip_poses=np.stack([j.tip_pose for j in known]),
+            slew=self._slew,
+            stiffness=stiffness,
+            stiffness_unit=own.tasks[0].measures[0].unit if measured else None,
+            alone=alone if measured else None,
+            position_errors=_errors(known, "position"),
+            angle_errors=_errors(known, "angle"),
+            clearance=None if scene is None else own.robot.clearance(pressures, scene),
+        )
+        wrong = [i for i, j in enumerate(known) if not j.holds]
+        if self._unreachable is not None:
+            index, why = self._unreachable
+            message = (
+                f"{self._name(index)} cannot be reached: {why.removeprefix('unreachable: ')}.  "
+                "The nearest path that can be followed is given."
+            )
+            return replace(solution, status="unreachable", message=message, first_failure=index)
+        if wrong:
+            message = f"{self._name(wrong[0])} does not hold: {_what_is_wrong(known[wrong[0]])}"
+            return replace(solution, status="unreachable", message=message, first_failure=wrong[0])
+        if self._slew is not None and self._points.times is not None:
+            limits = step_limits(times, self._slew)
+            assert (np.abs(np.diff(pressures, axis=0)) <= limits * (1 + 1e-6) + 1e-6).all()
+        return replace(solution, message=self._notes(solution))
+
+    def _notes(self, solution: PathSolution) -> str:
+        """What the user should know of a path that can be followed."""
+        notes: list[str] = []
+        if self._slew is None:
+            notes.append("No rate of change is known, of the robot or of the path; none was kept.")
+        middle = (solution.pressures[1:] + solution.pressures[:-1]) / 2
+        if len(middle) and self._points.targets[0].position is not None:
+            lengths = (self._points.lengths[1:] + self._points.lengths[:-1]) / 2
+            tips = solution.robot.tip_pose(middle)[:, :3, 3]
+            off = np.linalg.norm(tips - self._points.at(lengths), axis=1)
+            index, allowed = int(off.argmax()), self._path.tolerance.position
+            if off[index] > 2 * allowed:
+                notes.append(
+                    f"Between points {index + 1} and {index + 2} the tip is up to "
+                    f"{1e3 * off[index]:.2g} mm off the path; with more points, or lower rates, "
+                    "it stays nearer."
+                )
+        return " ".join(notes)
+
+    def _too_fast(self, solution: PathSolution, index: int, slowed: float) -> PathSolution:
+        message = (
+            f"The path is too fast for the rates: beyond point {index + 1} of {len(self._tasks)} "
+            f"({1e3 * self._points.lengths[index]:.4g} mm along it) no pressures keep them"
+            f"{self._binding(solution)}.  It can be followed {slowed:.3g} times slower, as given."
+        )
+        if solution.status != "solved":
+            return solution
+        return replace(
+            solution, status="unreachable", message=message.replace("  ", " "), first_failure=index
+        )
+
+    def _binding(self, solution: PathSolution) -> str:
+        """The channel whose rate is used most where the path is slowed down."""
+        if self._slew is None:
+            return ""
+        rates = np.abs(np.diff(solution.pressures, axis=0)) / np.diff(solution.times)[:, np.newaxis]
+        share = rates / self._slew
+        channel = int(np.unravel_index(share.argmax(), share.shape)[1])
+        name = self._robot.description.channel_name(channel)
+        return f"; {name} with {self._slew[channel] * 1e-5:g} bar/s holds it back most"
+
+    def _without_route(
+        self, tasks: PathTasks, layers: Sequence[Sequence[Candidate]], steps: Vector
+    ) -> PathSolution:
+        """The answer where no sequence of pressures is continuous, however slow."""
+        empty = next((i for i, layer in enumerate(layers) if not layer), None)
+        if empty is not None:
+            return self._failed(f"{self._name(empty)}: no pressures were found near the target")
+        index = RouteSearch(tasks, list(map(list, layers)), steps, self._over).furthest
+        return replace(
+            self._failed(
+                f"{self._name(index)} is the last that pressures follow without a jump: beyond "
+                "it the arm would have to change to another configuration while the tip stays "
+                "on the path"
+            ),
+            status="unreachable",
+            first_failure=index,
+        )
+
+    def _failed(self, message: str) -> PathSolution:
+        n = self._robot.n_pressures
+        none = np.zeros((0, n))
+        return PathSolution(
+            "failed", message, self._robot, np.zeros(0), none, np.zeros((0, 4, 4)), self._slew
+        )
+
+    def _name(self, index: int) -> str:
+        length = 1e3 * self._points.lengths[index]
+        return f"point {index + 1} of {len(self._tasks)} ({length:.4g} mm along the path)"
+
+
+def _at_tip(task: Task, solution: PressureSolution) -> Task:
+    """The task with the tip's pose of a solution as its target."""
+    assert solution.tip_position is not None
+    assert solution.tip_pose is not None
+    target = task.target
+    parts: dict[str, object] = {}
+    if target.position is not None:
+        pairs = zip(target.position, solution.tip_position.tolist(), strict=True)
+        parts["position"] = tuple(None if axis is None else own for axis, own in pairs)
+    if target.pointing is not None:
+        parts["pointing"] = tuple(solution.tip_pose[:3, 2].tolist())
+    if target.orientation is not None and solution.tip_quaternion is not None:
+        parts["orientation"] = tuple(solution.tip_quaternion.tolist())
+    return task.model_copy(update={"target": target.model_copy(update=parts)})
+
+
+def _errors(judgements: Sequence[Judgement], name: str) -> Vector | None:
+    if name not in judgements[0].errors:
+        return None
+    return np.array([judgement.errors[name] for judgement in judgements])
+
+
+def _what_is_wrong(judgement: Judgement) -> str:
+    if not judgement.is_clear:
+        name, missing = max(judgement.intruders.items(), key=lambda item: item[1])
+        return f"the body is {1e3 * missing:.3g} mm too near to '{name}'"
+    if not judgement.limits_hold:
+        return "a pressure is beyond its limits"
+    return "the tip is off its target"
