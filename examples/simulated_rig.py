@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from stiffopt import Trajectory, load_robot
+from stiffopt import Manipulator, Trajectory, load_robot
 from stiffopt.control.controller import TipController
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.ways import ClearanceWatch
@@ -30,20 +30,23 @@ class SimulatedArm:
     ----------
     rig :
         The rig file, or its content; its supply and tracker are simulated.
-    base :
-        Folder to which the robot in the rig's content is relative.
+    model :
+        The arm as the controller knows it; by default the rig's robot.
     """
 
-    def __init__(self, rig: str | os.PathLike[str] | RigDescription) -> None:
+    def __init__(
+        self, rig: str | os.PathLike[str] | RigDescription, model: Manipulator | None = None
+    ) -> None:
         described = isinstance(rig, RigDescription)
         description = rig if described else load_rig_description(rig)
         robot = load_robot(description.robot)
+        model = model or robot
         self.scene: Scene | None = description.scene
         self.rig: Any = make_rig(description, robot.description)
         self.period, safety = 1 / description.rate, description.safety
         plant = description.plant
         self.controller = TipController(
-            robot,
+            model,
             self.rig.supply.limits,
             self.rig.slew,
             period=self.period,
@@ -58,7 +61,7 @@ class SimulatedArm:
             gate_before(self.rig, safety, self.period),
             safety=safety,
             period=self.period,
-            clearance=None if self.scene is None else ClearanceWatch(robot, self.scene),
+            clearance=None if self.scene is None else ClearanceWatch(model, self.scene),
         )
         self.radii = np.array([each.outer_radius for each in robot.description.segments])
         self.loop.configure()
@@ -71,20 +74,29 @@ class SimulatedArm:
         Returns
         -------
         dict
-            ``times`` (N,) in s, ``commanded`` (N, n) in Pa, ``plan`` (N, n): the planned posture,
-            ``tips`` (N, 3), ``bodies`` (N, m, 3): nodes of the true centre line, ``errors`` (N,):
-            of the estimated tip, in m, and ``states`` (N,).
+            ``times`` (N,) in s; ``commanded``, ``plan`` and ``pressures`` (N, n) in Pa: those that
+            are commanded, those of the planned posture, and the true ones; ``tips`` (N, 3) and
+            ``bodies`` (N, m, 3): the true tip, and nodes of the true centre line; ``errors`` (N,)
+            of the estimated tip, in m; ``states`` (N,) of the control loop.
         """
-        rows: dict[str, list[Any]] = {
-            key: [] for key in ("times", "commanded", "plan", "tips", "bodies", "errors", "states")
-        }
+        rows: dict[str, list[Any]] = {}
         for _ in range(round(duration / self.period)):
             self.rig.clock.sleep(self.period)
             self.loop.tick()
-            now, body = self.loop.snapshot(), self.rig.world.plant.poses()[:, :3, 3]
-            values = (now.time, now.commanded, now.plan, body[-1], body, now.position_error)
-            for key, value in zip(rows, (*values, str(now.state)), strict=True):
-                rows[key].append(value)
+            now, world = self.loop.snapshot(), self.rig.world
+            body = world.plant.poses()[:, :3, 3]
+            row = {
+                "times": now.time,
+                "commanded": now.commanded,
+                "plan": now.plan,
+                "pressures": world.pressures.copy(),
+                "tips": body[-1],
+                "bodies": body,
+                "errors": now.position_error,
+                "states": str(now.state),
+            }
+            for key, value in row.items():
+                rows.setdefault(key, []).append(value)
         return {key: np.array(values) for key, values in rows.items()}
 
     def play(self, trajectory: Trajectory, rest: float = 1.0) -> dict[str, np.ndarray]:

@@ -23,6 +23,7 @@ _PIECE = 1e4  # Pa, of the longest piece of a way, over which each point of the 
 _CURVED = 1.1  # how much longer the way of a point is than the one straight between two states
 _FORGIVEN = 1e-4  # m, by which a state may be nearer than the clearance
 _UNSEEN = 2e-4  # m, by which the body may be nearer between two states
+_EXACT = 5e-4  # m, to which a shortfall is found
 _STATIONS = 13  # along the body, whose ways are measured
 _SAMPLES = 64  # pressures at which the body's speed is measured
 _FASTER = 1.5  # than there, it may be elsewhere
@@ -55,21 +56,23 @@ class Ways:
             least = min(self._scene.clearance, float(clearance[0]))
             while True:
                 worst = int(np.argmin(clearance))
-                if not clearance[worst] >= least - _FORGIVEN:
-                    where = f"to waypoint {legs[worst]}" if waypoints else "there"
-                    reason = shortfall(robot, self._scene, states[worst])
-                    return f"on the way {where} {reason}"
+                is_clear = clearance[worst] >= least - _FORGIVEN
+                limit = least - _UNSEEN if is_clear else clearance[worst] - _EXACT
                 motion = np.linalg.norm(np.diff(lines, axis=0), axis=-1).max(axis=1)
                 between = (clearance[:-1] + clearance[1:] - _CURVED * motion) / 2
-                open_ = np.flatnonzero(between < least - _UNSEEN)
+                open_ = np.flatnonzero(between < limit)
                 if not len(open_):
-                    return ""
+                    break
                 middle = (states[open_] + states[open_ + 1]) / 2
                 found = self._clearance(middle), self._lines(middle)
                 states = np.insert(states, open_ + 1, middle, axis=0)
                 legs = np.insert(legs, open_ + 1, legs[open_ + 1])
                 clearance = np.insert(clearance, open_ + 1, found[0])
                 lines = np.insert(lines, open_ + 1, found[1], axis=0)
+            if is_clear:
+                return ""
+            where = f"to waypoint {legs[worst]}" if waypoints else "there"
+            return f"on the way {where} {shortfall(robot, self._scene, states[worst])}"
         except StiffoptError as error:
             return f"the model has no answer on the way: {error}"
 

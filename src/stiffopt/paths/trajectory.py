@@ -17,7 +17,8 @@ from stiffopt.units import Duration, Pressure
 MAX_WAYPOINTS = 2_000
 """Of a trajectory; its splines are made between two ticks of the control loop."""
 _LONGEST = 86_400.0  # s, of a trajectory
-_CLOSEST = 1e-3  # s, between waypoints
+CLOSEST = 1e-3
+"""Between waypoints, in s."""
 _ROUNDING = 1e-6  # of that
 
 
@@ -91,11 +92,37 @@ def check_times(times: list[float]) -> None:
             )
     begun = times if times[0] == 0 else [0.0, *times]  # the trajectory begins where the tip is
     for before, after in itertools.pairwise(begun):
-        if after - before < _CLOSEST * (1 - _ROUNDING):
+        if after - before < CLOSEST * (1 - _ROUNDING):
             raise InputError(
-                f"waypoints must be at least {_CLOSEST:g} s apart, and the first at 0 s or as "
+                f"waypoints must be at least {CLOSEST:g} s apart, and the first at 0 s or as "
                 f"much later; {after:g} s follows {before:g} s"
             )
+
+
+def without_straight(
+    times: NDArray[np.float64], values: NDArray[np.float64], tolerance: float
+) -> NDArray[np.intp]:
+    """Indices (k,) of those of N points that make up the same line in time, to a tolerance.
+
+    The first and the last are among them; the others are those farthest from the line through the
+    ones before (Ramer, Douglas and Peucker), in any of the values (N, n), which are interpolated
+    in time (N,).
+    """
+    kept, open_ = {0, len(times) - 1}, [(0, len(times) - 1)]
+    while open_:
+        first, last = open_.pop()
+        if last - first < 2:
+            continue
+        inner = slice(first + 1, last)
+        share = ((times[inner] - times[first]) / (times[last] - times[first]))[:, None]
+        line = values[first] + share * (values[last] - values[first])
+        away = np.abs(values[inner] - line).max(axis=1)
+        farthest = int(np.argmax(away))
+        if away[farthest] > tolerance:
+            index = first + 1 + farthest
+            kept.add(index)
+            open_ += [(first, index), (index, last)]
+    return np.array(sorted(kept))
 
 
 def _check_counts(pressures: list[tuple[float, ...] | None]) -> None:
