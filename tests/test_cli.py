@@ -17,7 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 import stiffopt
-from stiffopt.cli import exits, solve_run
+from stiffopt.cli import batch, exits, solve_run
 from stiffopt.cli import main as entry
 from stiffopt.cli.console import plain_data
 from stiffopt.cli.solve_files import find_tasks
@@ -720,7 +720,7 @@ def test_no_error_is_written_into_the_progress_bar(
     shown: list[str] = []  # what the bar says now
     errors = []
 
-    class Bar(solve_run.ProgressBar):
+    class Bar(batch.ProgressBar):
         def report(self, done: float, total: float | None, text: str) -> None:
             shown[:] = [text]
 
@@ -735,8 +735,8 @@ def test_no_error_is_written_into_the_progress_bar(
         assert "drawing" in shown[0]
         raise FileError("one.png", "cannot be written")
 
-    monkeypatch.setattr(solve_run, "ProgressBar", Bar)
-    monkeypatch.setattr(solve_run, "report_error", report_error)
+    monkeypatch.setattr(batch, "ProgressBar", Bar)
+    monkeypatch.setattr(batch, "report_error", report_error)
     monkeypatch.setattr(solve_run.solve_files, "draw", fail)
     paths = [write("bad.yaml", "format: stiffopt-task/1"), write("one.yaml", ONE)]
     assert entry.main(["solve", *paths, "--plot", str(tmp_path / "x.png")]) == exits.BAD_INPUT

@@ -83,7 +83,7 @@ SCHEMAS: list[type[BaseModel]] = [
     *(Calibration, FittedParameter),
     *(Task, Target, Tolerance, StiffnessGoal, MatchValue, MatchMatrix, Load, PressureRange),
     *(Scene, SceneObject, AllowedContact, *OBSTACLES.values()),
-    *schemas_of(PathDescription, "stiffopt.paths.path"),
+    *schemas_of(PathDescription, "stiffopt.paths."),
     *(RigDescription, Safety, LogSettings, Registration, Placement),
     *(ControlSettings, ServiceSettings, Trajectory, Waypoint),
     *schemas_of(simulated.PlantSettings, "stiffopt.plant"),
@@ -104,6 +104,7 @@ SECTIONS = {  # of files.md, by how the module of a schema begins; the first tha
     "stiffopt.model": "Robot file",
     "stiffopt.optimise": "Task file",
     "stiffopt.paths.path": "Path file",
+    "stiffopt.paths.shapes": "Path file",
     "stiffopt.paths.trajectory": "Trajectory",
 }
 

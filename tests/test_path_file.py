@@ -272,8 +272,8 @@ CIRCLE = (
 @pytest.mark.parametrize(
     ("line", "text", "message"),
     [
-        (3, "path: {}\n" + SPEED, "path: goes nowhere; expected the key line, arc, circle,"),
-        (3, LINE.replace("{line", "{spline: [], line") + SPEED, "is a second path, beside line"),
+        (3, "path: {}\n" + SPEED, "path: is empty; expected the key line, arc, circle,"),
+        (3, LINE.replace("{line", "{spline: [], line") + SPEED, "cannot be combined with line"),
         (3, LINE.replace("to: [-30 mm, 20", "to: [-30 mm, -20") + SPEED, "is where the line"),
         (3, LINE.replace("line", "lnie") + SPEED, "path.lnie: unknown key; did you mean 'line'?"),
         (3, LINE.replace("190 mm]}", ".nan]}") + SPEED, "nan is not a finite number"),
@@ -286,6 +286,8 @@ CIRCLE = (
         (3, "path: {spline: [[0 m, 0 m, 0 m]]}\n" + SPEED, "path.spline: expected at least 2"),
         (3, "path: {spline: [[0 m, 0 m, 0 m], [0 m, 0 m, 0 m]]}\n" + SPEED,
          "path.spline[1]: is the point before it again"),
+        (3, "path: {spline: [[0 m, 0 m, 0 m], [9 mm, 0 m, 0 m]]}\nclosed: true\n" + SPEED,
+         "path.spline: expected at least 3 points, as the path is closed"),
         (3, POINTS % ", {position: [free, 0 m, 0 m]}" + "timing: {fastest: true}\n",
          "path.through[2]: needs all three coordinates of its position"),
         (3, POINTS % ", {position: [1 mm, 0 m, 0 m], pointing: [0, 0, 1]}"
@@ -296,12 +298,17 @@ CIRCLE = (
         (4, LINE + SPEED.replace("5", "2.5"), "points: input should be a valid integer"),
         (1, LINE + "timing: {speed: 1 mm/s}\n", "needs the key points or spacing, and not both"),
         (4, LINE + SPEED.replace("points: 5", "spacing: 1 um"), "spacing: makes 40001 points of"),
+        (4, LINE + SPEED.replace("points: 5", "spacing: 1.0e-300 mm"), "at most 5000 are allowed"),
+        (4, CIRCLE % "[20 mm, 0 m, 180 mm]" + SPEED.replace("5", "2"),
+         "points: must be at least 3 on a path that is closed"),
+        (5, LINE + SPEED.replace("10 mm/s", "1.0e-9 mm/s"), "takes 4e+10 s; expected a day"),
+        (5, LINE + SPEED.replace("10 mm/s", "1.0e-310 mm/s"), "takes inf s; expected a day"),
         (4, LINE + SPEED.replace("points: 5", "spacing: 0 mm"), "spacing: must be greater than 0"),
         (4, POINTS % "" + SPEED, "points: cannot be chosen: path.through is the points"),
         (4, POINTS % "" + "spacing: 1 mm\ntiming: {fastest: true}\n",
          "spacing: is 1 mm, but points 1 and 2 of path.through are 9 mm apart"),
         (1, LINE + "points: 5\n", "the key 'timing' is missing; expected a speed, times or"),
-        (5, LINE + "points: 5\ntiming: {}\n", "timing: says nothing; expected the key"),
+        (5, LINE + "points: 5\ntiming: {}\n", "timing: is empty; expected the key speed"),
         (5, LINE + "points: 5\ntiming: {speed: 0 mm/s}\n", "timing.speed: must be greater than"),
         (5, LINE + "points: 5\ntiming: {speed: -1 mm/s}\n", "timing.speed: must be greater than"),
         (5, LINE + "points: 5\ntiming: {speed: 10 mm}\n", "'mm' is not a unit of speed"),
@@ -349,6 +356,7 @@ def test_a_mistake_in_a_path_file(tmp_path: FilePath, line: int, text: str, mess
         (3, "x_m,y_m,z_m\n0,0,0.18\n0,,0.18\n", "y_m is missing"),
         (3, "x_m,y_m,z_m\n0,0,0.18\n0,nan,0.18\n", "'nan' is not a finite number"),
         (3, "x_m,y_m,z_m\n0,0,0.18\n0,0.18\n", "expected 3 fields, found 2"),
+        (3, "x_m,y_m,z_m\n0,0,0.18\n0,1e300,0\n", "is more than 1000 m from the base"),
         (0, "x_m,y_m,z_m\n0,0,0.18\n", "has 1 points; expected at least 2"),
         (2, "time_s,x_m,y_m,z_m\n1,0,0,0.18\n2,0,0,0.19\n", "time_s begins at 1 s; expected 0 s"),
         (3, "time_s,x_m,y_m,z_m\n0,0,0,0.18\n0,0,0,0.19\n", "time_s is 0 s after 0 s"),
@@ -384,7 +392,9 @@ def test_too_many_points() -> None:
 
 def test_a_path_that_stays_has_no_axes() -> None:
     measure = {"direction": (1, 0, 0), "frame": "path"}
-    with pytest.raises(InputError, match="frame: path has no axes, as the path stays where it is"):
+    with pytest.raises(
+        InputError, match="frame: path has no axes at point 1, where the path has no"
+    ):
         through((0, 0, 0.18), (0, 0, 0.18), stiffness={"maximise": measure})
 
 

@@ -66,8 +66,11 @@ if TYPE_CHECKING:
     from stiffopt.optimise.task import Task as Task
     from stiffopt.optimise.task import load_task as load_task
     from stiffopt.optimise.warm import WarmAnswer as WarmAnswer
+    from stiffopt.paths.motion import plan_motion as plan_motion
     from stiffopt.paths.path import Path as Path
     from stiffopt.paths.path import load_path as load_path
+    from stiffopt.paths.solution import PathSolution as PathSolution
+    from stiffopt.paths.solver import solve_path as solve_path
     from stiffopt.paths.trajectory import Trajectory as Trajectory
     from stiffopt.paths.trajectory import Waypoint as Waypoint
     from stiffopt.rig.interface import Observation as Observation
@@ -120,7 +123,10 @@ _NAMES = {
     "stiffopt.optimise.target": ("Target", "Tolerance"),
     "stiffopt.optimise.task": ("Load", "Task", "load_task"),
     "stiffopt.optimise.warm": ("WarmAnswer",),
+    "stiffopt.paths.motion": ("plan_motion",),
     "stiffopt.paths.path": ("Path", "load_path"),
+    "stiffopt.paths.solution": ("PathSolution",),
+    "stiffopt.paths.solver": ("solve_path",),
     "stiffopt.paths.trajectory": ("Trajectory", "Waypoint"),
     "stiffopt.safety.rigs": ("open_rig",),
     "stiffopt.rig.interface": ("Observation", "PoseSample", "PressureCommand", "Rig"),

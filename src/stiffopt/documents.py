@@ -244,6 +244,10 @@ class _Dumper(yaml.SafeDumper):
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
+    def write_plain(self, text: str, split: bool = True) -> None:
+        """Break lines between the items of a list, not within one such as ``0.5 bar``."""
+        super().write_plain(text, split and not self.flow_level)
+
     def represent_text(self, text: str) -> yaml.ScalarNode:
         quote = None if isinstance(_resolve(text), str) else "'"
         return self.represent_scalar("tag:yaml.org,2002:str", text, style=quote)

@@ -22,6 +22,7 @@ from stiffopt.cli.lab import LAB_EPILOG, LAB_HELP, lab
 from stiffopt.cli.log import log_app
 from stiffopt.cli.map import map_app
 from stiffopt.cli.options import Version, command_group
+from stiffopt.cli.path import PATH_EPILOG, PATH_HELP, path
 from stiffopt.cli.robots import robots
 from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
 from stiffopt.cli.solve import EXAMPLES, HELP, solve
@@ -31,6 +32,7 @@ _SETTINGS = {"help_option_names": ["-h", "--help"]}
 
 app = command_group(context_settings=_SETTINGS)
 app.command("solve", help=HELP, epilog=EXAMPLES.format(command="stiffopt solve"))(solve)
+app.command("path", help=PATH_HELP, epilog=PATH_EPILOG)(path)
 app.command("robots")(robots)
 app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
 app.command("vent", help=VENT_HELP, epilog=VENT_EPILOG)(vent)

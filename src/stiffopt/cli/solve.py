@@ -87,6 +87,6 @@ def solve(
     version: Version = False,
 ) -> int:
     """Solve task files."""
-    from stiffopt.cli.solve_run import Batch  # here, so that --help waits for no numerics
+    from stiffopt.cli.solve_run import TaskBatch  # here, so that --help waits for no numerics
 
-    return Batch(as_json, out, plot, pareto, seed, quiet).run(tasks)
+    return TaskBatch(as_json, out, plot, pareto, seed, quiet).run(tasks)

@@ -78,7 +78,7 @@ def _other_kind(path: str) -> str | None:
     return None if kind in ("task", "") else kind
 
 
-def check_result_file(path: str, tasks: Sequence[str]) -> None:
+def check_result_file(path: str, tasks: Sequence[str], result: str = RESULT_FORMAT) -> None:
     """Check the path of --out: only another result file is overwritten."""
     check_writable(path)
     if os.path.exists(path) and not os.path.isfile(path):
@@ -87,16 +87,16 @@ def check_result_file(path: str, tasks: Sequence[str]) -> None:
     if not os.path.exists(path):
         return
     if any(os.path.exists(task) and os.path.samefile(path, task) for task in tasks):
-        raise FileError(path, "is one of the tasks; give --out another name")
-    if not _is_result_file(path):
+        raise FileError(path, "is one of the files to solve; give --out another name")
+    if not _begins(path, result):
         raise FileError(
-            path, f"exists and is no result file ('format: {RESULT_FORMAT}'); give another name"
+            path, f"exists and is no result file ('format: {result}'); give another name"
         )
 
 
-def _is_result_file(path: str) -> bool:
+def _begins(path: str, result: str) -> bool:
     """Whether a file may be overwritten: it begins as a result file does, or is empty."""
-    kind = RESULT_FORMAT.partition("/")[0]
+    kind = result.partition("/")[0]
     try:
         with open(path, "rb") as stream:
             start = stream.read(64)
@@ -106,13 +106,20 @@ def _is_result_file(path: str) -> bool:
 
 
 def picture_names(plot: str | None, tasks: Sequence[str]) -> tuple[str | None, ...]:
-    """Return the checked path of each task's figure; None without --plot.
-
-    Of one task it is FILE.png itself, of several FILE-<task>.png.
-    """
+    """Return the checked path of each task's figure; None without --plot."""
     if plot is None:
         return (None,) * len(tasks)
-    stem, ending = os.path.splitext(plot)
+    names = names_for_each(plot, tasks)
+    for name in names:
+        check_picture(name)
+    return names
+
+
+def names_for_each(path: str, tasks: Sequence[str]) -> tuple[str, ...]:
+    """Return the file for each task: of one task FILE itself, of several FILE-<task>."""
+    if len(tasks) == 1:
+        return (path,)
+    stem, ending = os.path.splitext(path)
     names: list[str] = []
     for task in tasks:
         name = first = f"{stem}-{Path(task).stem}"
@@ -121,10 +128,6 @@ def picture_names(plot: str | None, tasks: Sequence[str]) -> tuple[str | None, .
             count += 1
             name = f"{first}-{count}"
         names.append(f"{name}{ending}")
-    if len(tasks) == 1:
-        names = [plot]
-    for name in names:
-        check_picture(name)
     return tuple(names)
 
 

@@ -1,7 +1,6 @@
 """Solved tasks as text for the terminal: a block for each task, and a summary of several."""
 
-import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from math import degrees
 from typing import Any
 
@@ -12,7 +11,7 @@ from rich.text import Text
 
 from stiffopt.cli.solve_records import priced
 from stiffopt.cli.solved_task import SolvedTask
-from stiffopt.cli.tables import labelled, number_table
+from stiffopt.cli.tables import STATUS_COLOURS, labelled
 from stiffopt.errors import printable
 from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
 from stiffopt.optimise.measure import Measure
@@ -30,7 +29,6 @@ from stiffopt.plots.wording import (
     vector_text,
 )
 
-_COLOURS = {"solved": "green", "unreachable": "yellow", "failed": "red", "bad input": "red"}
 _PARTS = {
     "parameters": "the errors of the calibrated parameters",
     "hysteresis": "hysteresis: it matters where the arm was before",
@@ -47,7 +45,7 @@ def block(solved: SolvedTask) -> RenderableType:
     heading = Text.assemble(
         (printable(solved.file), "bold"),
         "  ",
-        (solution.status, f"bold {_COLOURS[solution.status]}"),
+        (solution.status, f"bold {STATUS_COLOURS[solution.status]}"),
         f"  {solution.timings.get('total', 0.0):.2f} s",
     )
     return Group(heading, labelled(_lines(solved)), "")
@@ -57,7 +55,7 @@ def _lines(solved: SolvedTask) -> Iterable[Line]:
     solution = solved.solution
     if solution.message:
         message = solution.message.removeprefix("unreachable: ")
-        yield "note", Text(message, style=_COLOURS[solution.status])
+        yield "note", Text(message, style=STATUS_COLOURS[solution.status])
     yield "robot", Text(_robot(solved))
     if solution.pressures is None or solution.tip_pose is None:
         return
@@ -309,22 +307,3 @@ def summary_row(solved: SolvedTask, seconds: float) -> tuple[str, ...]:
         gain_text(solution.stiffnesses[0], solved.plain[0]) if solved.plain else "",
         f"{seconds:.1f}",
     )
-
-
-def summary(rows: Sequence[tuple[str, ...]]) -> RenderableType:
-    """Return one line for each task, and how many have which status.
-
-    A row is a `summary_row`, or the file and the status alone.
-    """
-    names = [os.path.basename(file) for file, *_ in rows]
-    if len(set(names)) < len(rows):
-        names = [file for file, *_ in rows]
-    table = number_table("task", "status", "error mm", "deg", "stiffness", "gain", "time s")
-    table.columns[0].no_wrap = False
-    table.columns[0].overflow = "fold"
-    table.columns[1].justify = "left"
-    for name, (_, status, *numbers) in zip(names, rows, strict=True):
-        table.add_row(Text(printable(name)), Text(status, _COLOURS[status]), *numbers)
-    counts = {each: sum(status == each for _, status, *_ in rows) for each in _COLOURS}
-    words = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-    return Group(table, "", Text(f"{len(rows)} tasks: {words}"))

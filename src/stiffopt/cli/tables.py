@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from stiffopt.errors import printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+STATUS_COLOURS = {"solved": "green", "unreachable": "yellow", "failed": "red", "bad input": "red"}
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,25 @@ def labelled(lines: Iterable[tuple[str, RenderableType]]) -> Table:
     for label, content in lines:
         grid.add_row(f"  {label}", content)
     return grid
+
+
+def summary(rows: Sequence[tuple[str, ...]], headings: Sequence[str]) -> RenderableType:
+    """Return one line for each file, and how many have which status.
+
+    The first column is the file, the second its status; of a bad one there is no more.
+    """
+    names = [os.path.basename(file) for file, *_ in rows]
+    if len(set(names)) < len(rows):
+        names = [file for file, *_ in rows]
+    table = number_table(*headings)
+    table.columns[0].no_wrap = False
+    table.columns[0].overflow = "fold"
+    table.columns[1].justify = "left"
+    for name, (_, status, *numbers) in zip(names, rows, strict=True):
+        table.add_row(Text(printable(name)), Text(status, STATUS_COLOURS[status]), *numbers)
+    counts = {each: sum(status == each for _, status, *_ in rows) for each in STATUS_COLOURS}
+    words = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+    return Group(table, "", Text(f"{len(rows)} {headings[0]}s: {words}"))
 
 
 def title(text: str) -> Text:

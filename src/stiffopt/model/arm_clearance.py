@@ -121,8 +121,8 @@ class ArmClearance:
     """Distances of an arm's body from a scene, at pressures (N, n) in Pa that are finite."""
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:
-        self._arm, self._scene = arm, measured_scene(scene)
-        self._ranges = arm.kept("ranges", lambda: Ranges.of(range_ends(arm.description)))
+        self._arm, self.scene = arm, measured_scene(scene)
+        self.ranges = arm.kept("ranges", lambda: Ranges.of(range_ends(arm.description)))
 
     def least(self, p: Array) -> Array:
         """The least of all distances, (N,)."""
@@ -133,7 +133,7 @@ class ArmClearance:
 
     def each(self, p: Array) -> Clearances:
         """The distances of all objects."""
-        slopes = np.empty((len(p), len(self._scene.names), self._arm.n_pressures))
+        slopes = np.empty((len(p), len(self.scene.names), self._arm.n_pressures))
         found, missing = self._in_c(p, slopes)
         for row in missing:
             nearest = self._of(p[row])
@@ -141,7 +141,7 @@ class ArmClearance:
             for index, each in enumerate(nearest):
                 found[row, index] = [*each[:3], *each.position, *each.normal]
         return Clearances(
-            self._scene.names, found[..., 0], found[..., 1], found[..., 3:6], found[..., 6:],
+            self.scene.names, found[..., 0], found[..., 1], found[..., 3:6], found[..., 6:],
             slopes,
         )  # fmt: skip
 
@@ -149,9 +149,9 @@ class ArmClearance:
 
     def _of(self, p: Array) -> list[Nearest]:
         """Nearest points of all objects at pressures (n,)."""
-        line = _CentreLine(self._arm, p, self._ranges.bounds)
-        ranges = survey(line, self._ranges.ends)
-        return [nearest_point(line, item, ranges) for item in self._scene.items]
+        line = _CentreLine(self._arm, p, self.ranges.bounds)
+        ranges = survey(line, self.ranges.ends)
+        return [nearest_point(line, item, ranges) for item in self.scene.items]
 
     # -- in machine code --------------------------------------------------------------------
 
@@ -161,18 +161,18 @@ class ArmClearance:
         And which rows are missing: all without machine code, and those at whose pressures the arm
         has no shape, of which the other way says why.
         """
-        width = 1 if gradients is None else len(self._scene.names)
+        width = 1 if gradients is None else len(self.scene.names)
         found = np.full((len(p), width, 9), np.nan)
         outcome = np.ones(len(p), dtype=np.int64)
         body = self._arm._body.machine_code(len(p))
         code = scene_library() if body is not None else None
         if body is not None and code is not None:
-            objects, p = self._scene.in_c(code), np.ascontiguousarray(p)
+            objects, p = self.scene.in_c(code), np.ascontiguousarray(p)
             address = None if gradients is None else gradients.ctypes.data
             call = partial(
                 _clearances(body), body.address, ctypes.addressof(objects), len(objects),
-                self._ranges.bounds.ctypes.data, self._ranges.counts.ctypes.data,
-                len(self._ranges.ends),
+                self.ranges.bounds.ctypes.data, self.ranges.counts.ctypes.data,
+                len(self.ranges.ends),
                 p.ctypes.data, found.ctypes.data, address, outcome.ctypes.data,
             )  # fmt: skip
             _in_chunks(call, len(p))

@@ -13,21 +13,21 @@ from numpy.typing import NDArray
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.reach import reach_all
-from stiffopt.paths.points import Candidate, Local, PathTasks
+from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.settings import CANDIDATES, LANES
 
 Vector = NDArray[np.float64]
 
 
-def candidates(tasks: PathTasks) -> tuple[list[list[Candidate]], int]:
+def candidates(tasks: PathTasks) -> tuple[list[list[PathCandidate]], int]:
     """Distinct candidates at each point, the best first, and how many starts were tried."""
     count = len(tasks)
     n_knots = CANDIDATES.knots if tasks.is_compiled else CANDIDATES.general_knots
     knots = np.unique(np.linspace(0, count - 1, min(count, n_knots)).round().astype(int)).tolist()
     at_knots, starts = _at_knots(tasks, knots)
-    found: list[list[Candidate]] = []
-    new: list[list[Candidate]] = []  # those that did not come from the point before
-    live: list[Candidate] = []
+    found: list[list[PathCandidate]] = []
+    new: list[list[PathCandidate]] = []  # those that did not come from the point before
+    live: list[PathCandidate] = []
     for index in range(count):
         came = _next_to(tasks, index, live)
         live = distinct(tasks, [*came, *at_knots.get(index, [])])
@@ -41,13 +41,13 @@ def candidates(tasks: PathTasks) -> tuple[list[list[Candidate]], int]:
     return found, starts
 
 
-def _is_one_of(candidate: Candidate, some: Iterable[Candidate]) -> bool:
+def _is_one_of(candidate: PathCandidate, some: Iterable[PathCandidate]) -> bool:
     return any(candidate is each for each in some)
 
 
-def distinct(tasks: PathTasks, some: Iterable[Candidate]) -> list[Candidate]:
+def distinct(tasks: PathTasks, some: Iterable[PathCandidate]) -> list[PathCandidate]:
     """Those of some candidates that are unlike each other, the first of each; the best first."""
-    kept: list[Candidate] = []
+    kept: list[PathCandidate] = []
     tolerance = CANDIDATES.same * tasks.unit
     for each in some:
         if all((abs(each.pressures - other.pressures) > tolerance).any() for other in kept):
@@ -56,7 +56,7 @@ def distinct(tasks: PathTasks, some: Iterable[Candidate]) -> list[Candidate]:
     return sorted(kept, key=lambda each: -each.value)[:most]
 
 
-def lanes(tasks: PathTasks) -> list[list[Candidate]]:
+def lanes(tasks: PathTasks) -> list[list[PathCandidate]]:
     """Further candidates at each point of a free arm: any pressures that solve the task there.
 
     Some are spread over all that reach the target at a few points, and follow the path from there
@@ -106,7 +106,7 @@ def _spread(tasks: PathTasks, pressures: Vector, most: int = LANES.kept) -> Vect
     return pressures[chosen]
 
 
-def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[Candidate]], int]:
+def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[PathCandidate]], int]:
     """Candidates at some points, from samples near their targets."""
     starts = CANDIDATES.starts_loaded if tasks.robot.is_loaded else CANDIDATES.starts
     if not tasks.is_compiled:
@@ -119,7 +119,7 @@ def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[Ca
     checkpoint()
     answers = tasks.locals(questions)
     best = tasks.bests(knots)
-    found: dict[int, list[Candidate]] = {}
+    found: dict[int, list[PathCandidate]] = {}
     for index, candidate in (
         *zip(knots, best, strict=True),
         *((q.point, a) for q, a in zip(questions, answers, strict=True)),
@@ -129,7 +129,7 @@ def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[Ca
     return {index: distinct(tasks, some) for index, some in found.items()}, len(questions)
 
 
-def _next_to(tasks: PathTasks, index: int, some: Sequence[Candidate]) -> list[Candidate]:
+def _next_to(tasks: PathTasks, index: int, some: Sequence[PathCandidate]) -> list[PathCandidate]:
     """Candidates at a point, next to those at its neighbour."""
     checkpoint()
     questions = [Local(index, each.pressures, tasks.lower, tasks.upper) for each in some]

@@ -14,6 +14,7 @@ from stiffopt.optimise.target import Target
 Vector = NDArray[np.float64]
 
 _SAMPLES = 20_000  # of a spline, for its arc length
+_STRAIGHT = 1e-6  # sine of the angle between two chords up to which three points are on one line
 _ALONG_Z = 1e-6  # sine of a tangent's angle to the base's z axis below which x stands in for it
 
 
@@ -159,7 +160,7 @@ def arc_through(start: Vector, via: Vector, end: Vector) -> ArcCurve | None:
     u, v = via - start, end - start
     normal = np.cross(u, v)
     square = float(normal @ normal)
-    if square <= 1e-18 * float(u @ u) * float(v @ v):
+    if square <= _STRAIGHT**2 * float(u @ u) * float(v @ v):
         return None
     centre = start + np.cross((u @ u) * v - (v @ v) * u, normal) / (2 * square)
     axis = normal / np.sqrt(square)

@@ -22,7 +22,7 @@ from stiffopt.optimise.task import Task
 Vector = NDArray[np.float64]
 
 
-class Candidate(NamedTuple):
+class PathCandidate(NamedTuple):
     """Pressures that solve the task at a point.
 
     Attributes
@@ -110,7 +110,7 @@ class PathTasks:
 
     # -- local optima -----------------------------------------------------------------------
 
-    def locals(self, questions: Sequence[Local]) -> list[Candidate | None]:
+    def locals(self, questions: Sequence[Local]) -> list[PathCandidate | None]:
         """Local optima next to guesses; None where none was found that holds."""
         if self._fast is None:
             return [self._general(question) for question in questions]
@@ -121,9 +121,9 @@ class PathTasks:
         threads = None if len(rows) > 64 else 1  # a thread costs as much as some answers
         pressures, values = solver.optima(np.stack(rows), threads)
         pairs = zip(pressures, (-values).tolist(), strict=True)
-        return [Candidate(p, value) if value > -np.inf else None for p, value in pairs]
+        return [PathCandidate(p, value) if value > -np.inf else None for p, value in pairs]
 
-    def bests(self, indices: Sequence[int]) -> list[Candidate | None]:
+    def bests(self, indices: Sequence[int]) -> list[PathCandidate | None]:
         """Best local optima that a global search finds."""
         if self._fast is None:
             return [None for _ in indices]
@@ -140,22 +140,22 @@ class PathTasks:
             self._rows[index] = solver.with_target(row, program, None)
         return self._rows[index]
 
-    def _accepted(self, index: int, answer: CompiledAnswer | None) -> Candidate | None:
+    def _accepted(self, index: int, answer: CompiledAnswer | None) -> PathCandidate | None:
         if answer is None:
             return None
         within = are_within(answer.pressures, self.lower, self.upper)
         judgement = Judgement.of(self.programs[index], answer.judged, within)
         if not judgement.holds:
             return None
-        return Candidate(answer.pressures, self.value(index, judgement, answer.pressures))
+        return PathCandidate(answer.pressures, self.value(index, judgement, answer.pressures))
 
     def value(self, index: int, judgement: Judgement, pressures: Vector) -> float:
-        """What `Candidate.value` is at judged pressures."""
+        """What `PathCandidate.value` is at judged pressures."""
         if self.programs[index].measures:
             return float(np.log(min(judgement.stiffnesses)))
         return -float(np.mean((pressures / self.programs[index].reference) ** 2))
 
-    def _general(self, question: Local) -> Candidate | None:
+    def _general(self, question: Local) -> PathCandidate | None:
         """The same without machine code."""
         index = question.point
         problem = PressureProblem(self.robot, self._without_load[index])
@@ -179,7 +179,7 @@ class PathTasks:
         """The general optimiser's view of a point."""
         return PressureProblem(self.robot, self._without_load[index])
 
-    def assessed(self, index: int, pressures: Vector) -> list[Candidate]:
+    def assessed(self, index: int, pressures: Vector) -> list[PathCandidate]:
         """Candidates that pressures (k, n) at the target of a point are, if the body is clear."""
         scene = self.tasks[index].scene
         if scene is not None and len(pressures):
@@ -190,7 +190,7 @@ class PathTasks:
         if slopes is None:
             return []
         pairs = zip(pressures, slopes.costs.max(axis=1).tolist(), strict=True)
-        return [Candidate(p, -cost) for p, cost in pairs]
+        return [PathCandidate(p, -cost) for p, cost in pairs]
 
     def judged(self, pressures: Vector) -> list[Judgement | None]:
         """Judgement by the model of pressures (N, n), one of each point; None: no equilibrium."""
@@ -212,12 +212,12 @@ class PathTasks:
         except EquilibriumError:
             return None
 
-    def candidate(self, index: int, pressures: Vector) -> Candidate | None:
+    def candidate(self, index: int, pressures: Vector) -> PathCandidate | None:
         """The candidate that pressures (n,) are at a point, if they solve its task."""
         judgement = self.judged_at(index, pressures)
         if judgement is None or not judgement.holds:
             return None
-        return Candidate(pressures, self.value(index, judgement, pressures))
+        return PathCandidate(pressures, self.value(index, judgement, pressures))
 
     def slopes(self, indices: Sequence[int], pressures: Vector) -> Slopes | None:
         """The tasks at some points, linearised at pressures (k, n); None where one has none."""

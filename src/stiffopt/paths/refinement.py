@@ -14,8 +14,8 @@ each tolerance.  A trust region and an exact penalty decide whether a step is ta
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import clarabel
 import numpy as np
@@ -24,6 +24,7 @@ from scipy import sparse
 
 from stiffopt.model.stopping import checkpoint
 from stiffopt.optimise.program import Constraint
+from stiffopt.optimise.settings import DESCENT
 from stiffopt.paths.points import PathTasks, Slopes
 from stiffopt.paths.settings import REFINEMENT
 
@@ -88,6 +89,15 @@ class _State:
     excess: float
 
 
+class _Step(NamedTuple):
+    """Step d (k, n), multipliers of costs (k, t) and residuals (k, m), and the promised gain."""
+
+    d: Vector
+    weights: Vector
+    pulls: Vector
+    promised: float
+
+
 class _Window:
     """Some neighbouring points; all others stay as they are."""
 
@@ -131,23 +141,25 @@ class _Window:
         pulls = np.zeros(state.slopes.residuals.shape)
         for _ in range(REFINEMENT.iterations):
             checkpoint()
-            found = self._step(state, self._curvature(state, weights, pulls), radius)
+            curvature = self._curvature(state, weights, pulls)
+            found = self._step(state, curvature, radius)
             if found is None:
-                radius /= 4
-                if radius < REFINEMENT.last_radius:
-                    break
-                continue
-            d, weights, pulls, promised = found
-            trial = self._state(np.clip(state.x + d, self._lower, self._upper))
+                break
+            trial = self._state(np.clip(state.x + found.d, self._lower, self._upper))
+            if trial is not None and trial.excess > 0:  # constraints are curved: correct the step
+                corrected = self._step(self._bent(state, trial, found.d), curvature, radius)
+                if corrected is not None:
+                    trial = self._state(np.clip(state.x + corrected.d, self._lower, self._upper))
             gained = -np.inf if trial is None else state.merit - trial.merit
-            if trial is not None and gained > 0.1 * promised:
+            weights, pulls = found.weights, found.pulls
+            if trial is not None and gained > 0.1 * found.promised:
                 state = trial
-                radius = min(2 * radius, 1.0) if gained > 0.7 * promised else radius
-                if state.excess <= REFINEMENT.rounding and state.merit < best.merit:
+                radius = min(2 * radius, 1.0) if gained > 0.7 * found.promised else radius
+                if state.excess == 0 and state.merit < best.merit:
                     best = state
             else:
-                radius = 0.3 * min(radius, float(np.abs(d).max()))
-            if promised < REFINEMENT.last_gain or radius < REFINEMENT.last_radius:
+                radius = 0.3 * min(radius, float(np.abs(found.d).max()))
+            if found.promised < REFINEMENT.last_gain or radius < REFINEMENT.last_radius:
                 break
         pressures = self._pressures.copy()
         pressures[self._free.start : self._free.stop] = best.x * self._tasks.unit
@@ -160,6 +172,14 @@ class _Window:
 
     # -- evaluation -----------------------------------------------------------------------------
 
+    @staticmethod
+    def _bent(state: _State, trial: _State, d: Vector) -> _State:
+        """A state whose linear constraints are true after a step d (second-order correction)."""
+        bend = np.einsum("kmn,kn->km", state.slopes.jacobians, d)
+        residuals = trial.slopes.residuals - bend
+        near = trial.near - np.einsum("kbn,kn->kb", state.near_slopes, d)
+        return replace(state, slopes=state.slopes._replace(residuals=residuals), near=near)
+
     def _state(self, x: Vector) -> _State | None:
         tasks, pressures = self._tasks, x * self._tasks.unit
         slopes = tasks.slopes(self._free, pressures)
@@ -168,7 +188,7 @@ class _Window:
         near, near_slopes = self._near(slopes, pressures)
         excess = float(np.maximum(near, 0.0).sum())
         for ball in self._balls:
-            radius = ball.radius * REFINEMENT.inside
+            radius = ball.radius * DESCENT.inside
             sizes = np.linalg.norm(slopes.residuals[:, ball.first : ball.end], axis=1)
             excess += float(np.maximum(sizes - radius, 0.0).sum()) / ball.scale
         costs = slopes.costs.max(axis=1)
@@ -188,7 +208,8 @@ class _Window:
         if self._scene is not None:
             robot = self._tasks.robot
             clear = robot.clearances(pressures, self._scene)
-            values += list((self._scene.clearance - clear.distances.T) / robot.length)
+            wanted = self._scene.clearance + REFINEMENT.aside
+            values += list((wanted - clear.distances.T) / robot.length)
             derivatives += list(-clear.gradients.swapaxes(0, 1) * self._tasks.unit / robot.length)
         if not values:
             return np.zeros((k, 0)), np.zeros((k, 0, n))
@@ -224,10 +245,8 @@ class _Window:
 
     # -- the convex program ---------------------------------------------------------------------
 
-    def _step(
-        self, state: _State, curvature: Vector, radius: float
-    ) -> tuple[Vector, Vector, Vector, float] | None:
-        """Step (k, n), multipliers of costs (k, t) and residuals (k, m), and promised gain."""
+    def _step(self, state: _State, curvature: Vector, radius: float) -> _Step | None:
+        """The step that solves the convex program; None where that fails."""
         k, n = state.x.shape
         costs = state.slopes.costs
         worst = self._over == "worst"
@@ -301,7 +320,7 @@ class _Window:
             at += k * width
         weights = z[costs_from : costs_from + k * t].reshape(k, t)
         hoped = float(q @ x)
-        return d, weights, pulls, state.merit - hoped
+        return _Step(d, weights, pulls, state.merit - hoped)
 
     def _add_rates(self, rows: "_Rows", x: Vector) -> None:
         """Steps between points of the window, and to their neighbours outside."""

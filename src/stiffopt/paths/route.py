@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.stopping import checkpoint
-from stiffopt.paths.points import Candidate, Local, PathTasks
+from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.settings import RATES, ROUTE
 
 Vector = NDArray[np.float64]
@@ -33,7 +33,7 @@ class _Crossing:
     b: int
     worst: float
     total: float
-    between: list[Candidate] | None = None
+    between: list[PathCandidate] | None = None
 
 
 @dataclass
@@ -42,11 +42,11 @@ class Route:
 
     Attributes
     ----------
-    candidates : list of Candidate
+    candidates : list of PathCandidate
     crossings : number of crossings from branch to branch.
     """
 
-    candidates: list[Candidate]
+    candidates: list[PathCandidate]
     crossings: int
 
     def value(self, over: str) -> float:
@@ -82,7 +82,7 @@ class RouteSearch:
     Parameters
     ----------
     tasks : PathTasks
-    layers : list of list of Candidate
+    layers : list of list of PathCandidate
         At each of N points.
     steps : (N - 1, n)
         Largest changes of pressure from point to point, in Pa.
@@ -91,7 +91,7 @@ class RouteSearch:
     """
 
     def __init__(
-        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector, over: str
+        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector, over: str
     ) -> None:
         self._tasks, self._layers, self._steps, self._over = tasks, layers, steps, over
         self._values = [np.array([each.value for each in layer]) for layer in layers]
@@ -220,7 +220,7 @@ class RouteSearch:
         return best
 
     def _route(self, found: _Sequence) -> Route:
-        candidates: list[Candidate] = []
+        candidates: list[PathCandidate] = []
         crossings = 0
         for each in found.steps:
             if isinstance(each, _Crossing):
@@ -275,13 +275,13 @@ class RouteSearch:
 
 def crossed(
     tasks: PathTasks, begin: int, start: Vector, goal: Vector, steps: Vector
-) -> list[Candidate] | None:
+) -> list[PathCandidate] | None:
     """Candidates at the points between point `begin`, at pressures `start`, and the goal.
 
     At each point the stiffest pressures are taken from which the goal is still within reach of
     the steps (k, n) that are left.  None where the tip cannot stay on the path on the way.
     """
-    found: list[Candidate] = []
+    found: list[PathCandidate] = []
     here = start
     for k in range(len(steps) - 1):
         left = steps[k + 1 :].sum(axis=0) * ROUTE.within

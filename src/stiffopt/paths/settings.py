@@ -86,7 +86,7 @@ class RefinementSettings:
     last_radius : at which the method ends.
     last_gain : of the objective, below which it ends.
     price : of what a constraint lacks, as a share of the arm's length or in rad.
-    rounding : of the same, below which it holds.
+    aside : of obstacles, more than the clearance that is asked, in m.
     mean : weight of the mean stiffness where the worst is maximised.
     difference : of pressures, for second derivatives.
     inside : share of the tolerances and rates that is used, so that rounding stays within them.
@@ -99,10 +99,10 @@ class RefinementSettings:
     last_radius: float = 1e-5
     last_gain: float = 1e-5
     price: float = 100.0
-    rounding: float = 1e-9
+    aside: float = 1e-6
     mean: float = 1e-2
     difference: float = 1e-5
-    inside: float = 1 - 1e-6
+    inside: float = 1 - 1e-4
 
 
 @dataclass(frozen=True)

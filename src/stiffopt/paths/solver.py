@@ -15,7 +15,7 @@ from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.task import Task
 from stiffopt.paths.candidates import candidates, lanes
 from stiffopt.paths.path import Path
-from stiffopt.paths.points import Candidate, PathTasks
+from stiffopt.paths.points import PathCandidate, PathTasks
 from stiffopt.paths.rates import least_times, slew_limits, step_limits
 from stiffopt.paths.refinement import refined
 from stiffopt.paths.route import Route, RouteSearch
@@ -105,7 +105,7 @@ class _PathSolver:
         self._ends = path.end_pressures(robot.description)
         self._over = "mean" if path.stiffness is None else path.stiffness.over
         self._unreachable: tuple[int, str] | None = None  # the first point, and why
-        self._lanes: list[list[Candidate]] | None = None
+        self._lanes: list[list[PathCandidate]] | None = None
 
     def solve(self) -> PathSolution:
         """Answer; see `solve_path`."""
@@ -117,7 +117,9 @@ class _PathSolver:
             for index, pressures in ((0, self._ends[0]), (-1, self._ends[1])):
                 if pressures is not None:
                     index %= len(layers)
-                    layers[index] = [Candidate(pressures, self._value_at(tasks, index, pressures))]
+                    layers[index] = [
+                        PathCandidate(pressures, self._value_at(tasks, index, pressures))
+                    ]
             return self._answer(tasks, layers, starts)
         except StoppedError as error:
             return self._failed(str(error))
@@ -160,8 +162,8 @@ class _PathSolver:
         return tasks.value(index, judgement, pressures)
 
     def _with_reachable(
-        self, tasks: PathTasks, layers: list[list[Candidate]]
-    ) -> tuple[PathTasks, list[list[Candidate]]]:
+        self, tasks: PathTasks, layers: list[list[PathCandidate]]
+    ) -> tuple[PathTasks, list[list[PathCandidate]]]:
         """Tasks and candidates with, for points out of reach, the nearest that can be had."""
         moved = list(self._tasks)
         for index, layer in enumerate(layers):
@@ -185,7 +187,9 @@ class _PathSolver:
 
     # -- the answer ----------------------------------------------------------------------------
 
-    def _answer(self, tasks: PathTasks, layers: list[list[Candidate]], starts: int) -> PathSolution:
+    def _answer(
+        self, tasks: PathTasks, layers: list[list[PathCandidate]], starts: int
+    ) -> PathSolution:
         times = self._points.times
         slowed = 1.0
         steps = self._steps(tasks, times)
@@ -226,7 +230,7 @@ class _PathSolver:
         return step_limits(times, self._slew)
 
     def _best_route(
-        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector
+        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
     ) -> Route | None:
         """The best sequence, over further configurations where the local optima are not enough."""
         if not all(layers):
@@ -244,7 +248,9 @@ class _PathSolver:
                 break
         return best
 
-    def _with_lanes(self, tasks: PathTasks, layers: list[list[Candidate]]) -> list[list[Candidate]]:
+    def _with_lanes(
+        self, tasks: PathTasks, layers: list[list[PathCandidate]]
+    ) -> list[list[PathCandidate]]:
         """Candidates with further ones, but where the pressures are given."""
         if self._lanes is None:
             self._lanes = lanes(tasks)
@@ -255,7 +261,7 @@ class _PathSolver:
         ]
 
     def _best_of(
-        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector, rounds: int
+        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector, rounds: int
     ) -> Route | None:
         """The best sequence of candidates; that of a closed path ends where it begins."""
         if not self._path.closed:
@@ -269,7 +275,7 @@ class _PathSolver:
         return max(found, key=lambda each: each.value(self._over), default=None)
 
     def _slower(
-        self, tasks: PathTasks, layers: list[list[Candidate]], steps: Vector
+        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
     ) -> tuple[float, Route | None]:
         """By how much slower the path can be followed, to a few per cent, and how."""
         factor, route = 1.0, None
@@ -385,7 +391,7 @@ class _PathSolver:
         return f"; {name} with {self._slew[channel] * 1e-5:g} bar/s holds it back most"
 
     def _without_route(
-        self, tasks: PathTasks, layers: Sequence[Sequence[Candidate]], steps: Vector
+        self, tasks: PathTasks, layers: Sequence[Sequence[PathCandidate]], steps: Vector
     ) -> PathSolution:
         """The answer where no sequence of pressures is continuous, however slow."""
         empty = next((i for i, layer in enumerate(layers) if not layer), None)

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import degrees
-from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.errors import InputError, printable
+from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
-from stiffopt.plots.scene import draw_objects
+from stiffopt.plots.arm import ArmDrawing
 from stiffopt.plots.style import literal, new_figure, tidy
 from stiffopt.plots.wording import (
     BAR,
@@ -36,13 +35,9 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 
-_LONGEST_NOTE = 120  # characters of the message that fit
 _MOST_LABELS = 15  # pressures with a number on their bar
-_STATIONS = 24  # of the tube, per segment
-_SPOKES = 28  # of the tube, around
 _ELLIPSOID_SHARE = 0.22  # of the arm's length: its largest semi-axis
 _ARROW_SHARE = 0.22
-_STATUS = {"solved": "#2a7f3f", "unreachable": "#b35c00", "failed": "#b00020"}
 
 
 def plot_solution(
@@ -93,12 +88,9 @@ def plot_solution(
         _draw_pareto(figure.add_subplot(grid[1, 2]), front, plain)
     source = solution.task.source
     name = robot.description.name if source is None else source.stem
-    message = shorten(printable(solution.message), _LONGEST_NOTE, placeholder=" ...")
-    style.draw_head(figure, title or name, _key_numbers(solution, plain), message)
-    figure.text(
-        0.975, 1 - 0.34 / figure.get_figheight(), solution.status, fontsize=13, weight="bold",
-        va="center", ha="right", color=_STATUS[solution.status],
-    )  # fmt: skip
+    style.draw_outcome(
+        figure, title or name, _key_numbers(solution, plain), solution.status, solution.message
+    )
     return figure
 
 
@@ -267,30 +259,22 @@ def _draw_arm(
     axes = figure.add_subplot(place, projection="3d", computed_zorder=False)
     drawing = _Drawing(axes, robot, solution)
     drawing.draw_base()
-    drawing.draw_tube()
+    drawing.draw_tube(np.asarray(solution.pressures))
+    drawing.explain_segments()
     drawing.draw_ellipsoid()
     drawing.draw_directions()
     drawing.draw_target()
     drawing.draw_loads()
     if scene is not None:
         drawing.draw_objects(scene)
-    drawing.finish()
+    drawing.finish(drawing.tip)
 
 
 @dataclass
-class _Drawing:
-    """Axes in 3-D and what has been drawn in them, in mm."""
+class _Drawing(ArmDrawing):
+    """The arm at a solution's pressures, and what was asked of it."""
 
-    axes: Any
-    robot: Manipulator
     solution: PressureSolution
-    corners: list[Vector] = field(default_factory=list)
-    handles: list[Any] = field(default_factory=list)
-
-    @property
-    def size(self) -> float:
-        """Length of the arm in mm."""
-        return self.robot.length * MM
 
     @property
     def tip(self) -> Vector:
@@ -301,41 +285,6 @@ class _Drawing:
     def rotation(self) -> Vector:
         """Orientation of the tip."""
         return np.asarray(self.solution.tip_pose)[:3, :3]
-
-    # -- the arm ----------------------------------------------------------------------------
-
-    def draw_base(self) -> None:
-        """Base plate: a disc on which the arm stands."""
-        radius = 1.7 * self.robot.description.segments[0].outer_radius * MM
-        angle, share = np.meshgrid(np.linspace(0, 2 * np.pi, 49), [0.0, 1.0])
-        x, y = radius * share * np.cos(angle), radius * share * np.sin(angle)
-        self.axes.plot_surface(x, y, 0 * x, color="#8d99a6", alpha=0.55, linewidth=0, zorder=1)
-        rim = np.stack([x[1], y[1], 0 * x[1]])
-        self.axes.plot(*rim, color="#5c6670", linewidth=1.2, zorder=1)
-        self.corners.append(rim.T)
-
-    def draw_tube(self) -> None:
-        """Tube with each segment in its colour, its backbone, and a ring at each end."""
-        description = self.robot.description
-        poses = _poses(self.robot, self.solution)
-        angle = np.linspace(0, 2 * np.pi, _SPOKES + 1)
-        for number, segment in enumerate(description.segments):
-            mine = poses[number]
-            ring = segment.outer_radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle])
-            tube = (mine[:, :3, 3, None] + mine[:, :3, :3] @ ring) * MM  # (k, 3, spokes)
-            x, y, z = tube.transpose(1, 0, 2)
-            self.axes.plot_surface(
-                x, y, z, color=style.segment_colour(number), alpha=0.38, linewidth=0, rstride=1,
-                cstride=1, shade=True, zorder=2,
-            )  # fmt: skip
-            for end in (tube[0], tube[-1]):
-                self.axes.plot(
-                    *end, color=style.segment_text_colour(number), linewidth=1.0, zorder=3
-                )
-            line = mine[:, :3, 3].T * MM
-            self.axes.plot(*line, color=style.segment_text_colour(number), linewidth=2.2, zorder=4)
-            self.corners.append(tube.transpose(0, 2, 1).reshape(-1, 3))
-            self._patch(style.segment_colour(number), f"segment {number + 1}")
 
     # -- stiffness --------------------------------------------------------------------------
 
@@ -362,7 +311,7 @@ class _Drawing:
             self.axes.plot(*ends.T, color=style.ELLIPSOID, linewidth=1.3, zorder=6)
         self.corners.append(np.stack([x, y, z], axis=-1).reshape(-1, 3))
         listed = ", ".join(f"{value:.3g}" for value in values[::-1])
-        self._patch(
+        self.add_patch(
             style.ELLIPSOID, f"stiffness ellipsoid, radius² ∝ k:\n{listed} N/m\nalong its axes"
         )
 
@@ -375,8 +324,8 @@ class _Drawing:
             shade = style.DIRECTIONS[number % len(style.DIRECTIONS)]
             way = np.asarray(measure.direction)
             way = self.rotation @ way if measure.frame == "tip" else way
-            self._arrow(self.tip, way * _ARROW_SHARE * self.size, shade, 9)
-            self._line(
+            self.draw_arrow(self.tip, way * _ARROW_SHARE * self.size, shade, 9)
+            self.add_line(
                 shade,
                 f"{figures(value)} {unit_text(measure.unit)}\n{direction_text(measure)}\n"
                 f"{measure.frame} axes, {measure.boundary}",
@@ -395,8 +344,8 @@ class _Drawing:
             self._draw_point(point, free)
         length = 0.2 * self.size
         if target.pointing is not None:
-            self._arrow(point, length * np.array(target.pointing), style.TARGET, 8, "--")
-            self._line(style.TARGET, "target pointing", "--")
+            self.draw_arrow(point, length * np.array(target.pointing), style.TARGET, 8, "--")
+            self.add_line(style.TARGET, "target pointing", "--")
         if target.orientation is not None:
             self._draw_triad(point, target.orientation, length)
 
@@ -413,7 +362,9 @@ class _Drawing:
             self.corners.append(ends)
         names = ", ".join("xyz"[k] for k in free)
         label = f"target ({names} free)" if free else "target"
-        self._line(style.TARGET, label, "none", marker="X", markersize=9, markeredgecolor="white")
+        self.add_line(
+            style.TARGET, label, "none", marker="X", markersize=9, markeredgecolor="white"
+        )
         miss = np.linalg.norm(point - self.tip)
         if miss > 0.01 * self.size:
             self.axes.plot(
@@ -423,10 +374,10 @@ class _Drawing:
     def _draw_triad(self, point: Vector, quaternion: Any, length: float) -> None:
         wanted = np.asarray(lie.rotation_from_quaternion(np.array(quaternion)))
         for k, shade in enumerate(("#d62728", "#2ca02c", "#1f4fd6")):
-            self._arrow(point, 0.8 * length * wanted[:, k], shade, 8, "--")
-            self._arrow(self.tip, 0.5 * length * self.rotation[:, k], shade, 8)
-        self._line("#555555", "target orientation\n(x red, y green, z blue)", "--")
-        self._line("#555555", "orientation of the tip")
+            self.draw_arrow(point, 0.8 * length * wanted[:, k], shade, 8, "--")
+            self.draw_arrow(self.tip, 0.5 * length * self.rotation[:, k], shade, 8)
+        self.add_line("#555555", "target orientation\n(x red, y green, z blue)", "--")
+        self.add_line("#555555", "orientation of the tip")
 
     def draw_loads(self) -> None:
         """The force at the tip and the pull of gravity."""
@@ -434,102 +385,11 @@ class _Drawing:
         if load is not None and any(load.force):
             force = np.array(load.force)
             way = (self.rotation @ force if load.frame == "tip" else force) / np.linalg.norm(force)
-            self._arrow(self.tip - 0.2 * self.size * way, 0.2 * self.size * way, style.LOAD, 9)
-            self._line(style.LOAD, f"load {np.linalg.norm(force):.3g} N")
+            self.draw_arrow(self.tip - 0.2 * self.size * way, 0.2 * self.size * way, style.LOAD, 9)
+            self.add_line(style.LOAD, f"load {np.linalg.norm(force):.3g} N")
         gravity = np.array(self.robot.description.gravity)
         if gravity.any():
             way = gravity / np.linalg.norm(gravity)
             start = np.array([0.45, 0.45, 0.0]) * self.size
-            self._arrow(start, 0.18 * self.size * way, "#666666", 9)
+            self.draw_arrow(start, 0.18 * self.size * way, "#666666", 9)
             self.axes.text(*start, "gravity ", color="#666666", fontsize=9, ha="right")
-
-    def draw_objects(self, scene: Scene) -> None:
-        """What is around the arm."""
-        self.corners.append(draw_objects(self.axes, scene, self.size, np.vstack(self.corners)))
-        self._patch(style.OBSTACLE, "scene")
-
-    # -- parts ------------------------------------------------------------------------------
-
-    def _arrow(
-        self, start: Vector, vector: Vector, colour: str, zorder: int, linestyle: str = "-"
-    ) -> None:
-        """A shaft with a cone as its head, to the scale of the figure."""
-        end = start + vector
-        self.axes.plot(
-            *np.stack([start, start + 0.82 * vector]).T, color=colour, linewidth=2.0,
-            linestyle=linestyle, zorder=zorder,
-        )  # fmt: skip
-        length = float(np.linalg.norm(vector))
-        if length > 0:
-            x, y, z = _cone(end, vector / length, 0.2 * length)
-            self.axes.plot_surface(x, y, z, color=colour, linewidth=0, shade=False, zorder=zorder)
-        self.corners.append(np.stack([start, end]))
-
-    def _patch(self, colour: str, label: str) -> None:
-        from matplotlib.patches import Patch
-
-        self.handles.append(Patch(color=colour, alpha=0.6, label=label))
-
-    def _line(self, colour: str, label: str, linestyle: Any = "-", **look: Any) -> None:
-        from matplotlib.lines import Line2D
-
-        look = {"color": colour, "linestyle": linestyle, "linewidth": 2, **look}
-        self.handles.append(Line2D([], [], label=label, **look))
-
-    def finish(self) -> None:
-        """One scale for all axes, a view across the arm's bend, labels and legend."""
-        points = np.vstack(self.corners)
-        low, high = points.min(axis=0), points.max(axis=0)
-        middle, sides = (low + high) / 2, (high - low) + 0.06 * self.size
-        sides = np.maximum(sides, 0.55 * sides.max())  # room for the labels of a slender arm
-        for name, centre, side in zip("xyz", middle, sides, strict=True):
-            start = 0.0 - 0.03 * self.size if name == "z" and low[2] > -1e-9 else centre - side / 2
-            self.axes.set(**{f"{name}lim": (start, start + side), f"{name}label": f"{name} (mm)"})
-        self.axes.set_box_aspect(sides, zoom=0.97)
-        hangs = self.robot.description.gravity[2] > 0
-        azimuth = _across(self.tip[:2])
-        self.axes.view_init(elev=-18 if hangs else 18, azim=azimuth, roll=180 if hangs else 0)
-        self.axes.tick_params(labelsize=8, pad=1)
-        from matplotlib.ticker import MaxNLocator
-
-        for axis, side in zip(
-            (self.axes.xaxis, self.axes.yaxis, self.axes.zaxis), sides, strict=True
-        ):
-            axis.set_major_locator(MaxNLocator(max(2, round(6 * side / sides.max()))))
-        self.axes.figure.legend(
-            handles=self.handles, loc="upper left", bbox_to_anchor=(0.02, 0.84), fontsize=9,
-            frameon=False,
-        )  # fmt: skip
-
-
-def _poses(robot: Manipulator, solution: PressureSolution) -> list[Vector]:
-    """Poses along each segment with its connector."""
-    description = robot.description
-    count = _STATIONS * robot.n_segments
-    poses = robot.backbone(np.asarray(solution.pressures), 4 * count + 1)
-    stations = np.linspace(0.0, robot.length, len(poses))
-    parts, start = [], 0.0
-    for segment in description.segments:
-        end = start + segment.length + segment.connector
-        wanted = np.linspace(start, end, _STATIONS)
-        parts.append(poses[np.abs(stations[:, None] - wanted).argmin(axis=0)])
-        start = end
-    return parts
-
-
-def _cone(point: Vector, way: Vector, length: float) -> Vector:
-    """Surface (3, 2, k) of a cone that ends in a point."""
-    aside = np.eye(3)[np.abs(way).argmin()]
-    across = np.cross(way, aside)
-    across /= np.linalg.norm(across)
-    angle = np.linspace(0, 2 * np.pi, 13)
-    ring = np.outer(across, np.cos(angle)) + np.outer(np.cross(way, across), np.sin(angle))
-    base = (point - length * way)[:, None] + 0.35 * length * ring
-    return np.stack([base, np.repeat(point[:, None], len(angle), axis=1)], axis=1)
-
-
-def _across(bend: Vector) -> float:
-    """Azimuth in degrees from which a bend towards this side is seen from the side."""
-    if np.linalg.norm(bend) < 1e-6:
-        return -60.0
-    return float(np.degrees(np.arctan2(bend[1], bend[0]))) - 65.0

@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,6 +49,7 @@ LOAD = "#111111"
 OBSTACLE = "#8a6d5c"
 ARM = "#39424b"
 """Of the arm in outline."""
+STATUS = {"solved": "#2a7f3f", "unreachable": "#b35c00", "failed": "#b00020"}
 GREY = "#8a8f96"
 DARK = "#333333"
 
@@ -72,6 +74,7 @@ def channel_colour(channel: int) -> str:
 
 _WIDE = 11.0  # inches
 _DPI = 130
+_LONGEST_NOTE = 120  # characters of a message that fit
 
 
 def require_matplotlib() -> None:
@@ -161,6 +164,17 @@ def draw_head(figure: Figure, title: str, *lines: str) -> None:
     for number, line in enumerate(lines):
         y = 1 - (0.68 + 0.26 * number) / height
         figure.text(0.025, y, literal(line), fontsize=10, va="center")
+
+
+def draw_outcome(figure: Figure, title: str, numbers: str, status: str, message: str) -> None:
+    """Write the head of a solution's figure: title, numbers, message, and its status beside it."""
+    draw_head(
+        figure, title, numbers, shorten(printable(message), _LONGEST_NOTE, placeholder=" ...")
+    )
+    figure.text(
+        0.975, 1 - 0.34 / figure.get_figheight(), status, fontsize=13, weight="bold", va="center",
+        ha="right", color=STATUS[status],
+    )  # fmt: skip
 
 
 def legend_beside(axes: Any, **settings: Any) -> None:

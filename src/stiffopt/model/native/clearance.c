@@ -49,6 +49,51 @@ static int least_of_all(const CentreLine *line, const SceneObject *objects, int6
     return 1;
 }
 
+/* All that finds the clearance of an arm's poses. */
+typedef struct {
+    const Work *work;
+    Body body;
+    BodyLine arm;
+    CentreLine line;
+    const SceneObject *objects;
+    int64_t n_objects;
+    const double *ends; /* (ranges, 2) */
+    Range *ranges;
+    int64_t n_ranges;
+    double *state; /* the equilibrium */
+    BodyPoint *points;
+} Scenery;
+
+static int64_t scenery_size(const BodyModel *model, const int64_t *counts, int64_t n_ranges) {
+    int64_t total = 0;
+    for (int64_t r = 0; r < n_ranges; r++) total += counts[r];
+    return state_size(model) + body_size(model) +
+           total * (int64_t)(sizeof(BodyPoint) / sizeof(double)) + 1;
+}
+
+/* Places in memory, and what follows them there. */
+static double *furnish(Scenery *a, const BodyModel *model, const int64_t *counts, double *memory) {
+    double *body = memory + state_size(model);
+    a->state = memory;
+    a->body = body_in(model, body);
+    a->arm = (BodyLine){a->work, &a->body};
+    a->line = (CentreLine){body_line_station, &a->arm};
+    a->points = (BodyPoint *)(body + body_size(model));
+    BodyPoint *next = a->points;
+    for (int64_t r = 0; r < a->n_ranges; next += counts[r++])
+        a->ranges[r] = (Range){counts[r], next};
+    return memory + scenery_size(model, counts, a->n_ranges);
+}
+
+/* The body at some pressures, with coarse stations on its ranges. */
+static int survey_body(Scenery *a, const double *pressures, int moving) {
+    int outcome = settle_body(a->work, &a->body, pressures, a->state, moving);
+    for (int64_t r = 0; outcome == FOUND && r < a->n_ranges; r++)
+        if (!survey(&a->line, a->ends[2 * r], a->ends[2 * r + 1], a->ranges + r))
+            outcome = NO_EQUILIBRIUM;
+    return outcome;
+}
+
 /* For pressures begin to end - 1 of rows (n): the least distance, which alone of found (N) is then
  * valid; or, where gradients is not NULL, the nearest point of each object, found (N, objects), and
  * the changes of distances (N, objects, n).  And how it went for each row.  Ranges have ends
@@ -58,30 +103,26 @@ int stiffopt_clearances(const BodyModel *model, const SceneObject *objects, int6
                         const double *pressures, Nearest *found, double *gradients,
                         int64_t *outcome, int64_t begin, int64_t end) {
     NEW_WORK(work);
-    int64_t n = model->n, states = state_size(model), total = 0, used = 0;
-    for (int64_t r = 0; r < n_ranges; r++) total += counts[r];
-    double *memory = malloc((size_t)(body_size(model) + states + 1) * sizeof(double));
-    BodyPoint *points = malloc((size_t)total * sizeof(BodyPoint));
     Range ranges[n_ranges];
-    for (int64_t r = 0; r < n_ranges; used += counts[r++])
-        ranges[r] = (Range){counts[r], points + used};
-    if (!memory || !points) return free(memory), free(points), 1;
-    Body body = body_in(model, memory + states);
-    BodyLine arm = {&work, &body};
-    CentreLine line = {body_line_station, &arm};
-    int64_t width = gradients ? n_objects : 1;
+    Scenery a = {.work = &work, .objects = objects, .n_objects = n_objects, .ends = ends,
+                 .ranges = ranges, .n_ranges = n_ranges};
+    double *memory =
+        malloc((size_t)scenery_size(model, counts, n_ranges) * sizeof(double));
+    if (!memory) return 1;
+    furnish(&a, model, counts, memory);
+    int64_t n = model->n, width = gradients ? n_objects : 1;
     for (int64_t i = begin; i < end; i++) {
         Nearest *to = found + i * width;
-        outcome[i] = settle_body(&work, &body, pressures + i * n, memory, gradients != NULL);
-        int good = outcome[i] == FOUND;
-        for (int64_t r = 0; good && r < n_ranges; r++)
-            good = survey(&line, ends[2 * r], ends[2 * r + 1], ranges + r);
-        good = good && (gradients ? nearest_of_each : least_of_all)(&line, objects, n_objects, ranges,
-                                                                    n_ranges, to);
+        outcome[i] = survey_body(&a, pressures + i * n, gradients != NULL);
+        if (outcome[i] != FOUND) continue;
+        int good = (gradients ? nearest_of_each : least_of_all)(&a.line, objects, n_objects, ranges,
+                                                                n_ranges, to);
         for (int64_t j = 0; good && gradients && j < n_objects; j++)
-            good = put_gradient(&work, &body, to + j, gradients + (i * n_objects + j) * n);
-        if (!good && outcome[i] == FOUND) outcome[i] = NO_EQUILIBRIUM;
+            good = put_gradient(&work, &a.body, to + j, gradients + (i * n_objects + j) * n);
+        if (!good) outcome[i] = NO_EQUILIBRIUM;
     }
-    free(memory), free(points);
+    free(memory);
     return 0;
 }
+
+#include "motion.h"

@@ -1,0 +1,177 @@
+"""Solved paths as text for the terminal: a block for each path, with a table of some points."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import degrees
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from stiffopt.cli.path_records import SolvedPath, rate_margins
+from stiffopt.cli.tables import STATUS_COLOURS, labelled, number_table
+from stiffopt.errors import printable
+from stiffopt.paths.solution import PathSolution
+from stiffopt.plots.wording import BAR, MM, figures, unit_text
+
+_ROWS = 10  # of the table, about
+
+
+def block(solved: SolvedPath) -> RenderableType:
+    """Return the full report of one path, about 80 columns wide."""
+    solution = solved.solution
+    heading = Text.assemble(
+        (printable(solved.file), "bold"),
+        "  ",
+        (solution.status, f"bold {STATUS_COLOURS[solution.status]}"),
+        f"  {solution.timings.get('total', 0.0):.2f} s",
+    )
+    parts: list[RenderableType] = [heading, labelled(_lines(solved))]
+    if len(solution.times):
+        parts += ["", _table(solution)]
+    return Group(*parts, "")
+
+
+def summary_row(solved: SolvedPath, seconds: float) -> tuple[str, ...]:
+    """Return the line of the summary for a path that took this time altogether."""
+    solution = solved.solution
+    worst = "" if solution.worst is None else _stiffness(solution.worst, solution)
+    last = f"{solution.times[-1]:.4g}" if len(solution.times) else ""
+    count = str(len(solution.times)) if len(solution.times) else ""
+    return solved.file, solution.status, count, last, worst, f"{seconds:.1f}"
+
+
+def _lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]:
+    path, solution = solved.path, solved.solution
+    if solution.message:
+        message = solution.message.removeprefix("unreachable: ")
+        yield "note", Text(message, style=STATUS_COLOURS[solution.status])
+    robot = solution.robot
+    yield "robot", Text(f"{printable(robot.description.name)}, {robot.n_pressures} channels")
+    if not len(solution.times):
+        return
+    length = path.points().curve.length * MM
+    closed = "closed " if path.closed else ""
+    yield (
+        "path",
+        Text(
+            f"{closed}{path.path.kind} of {length:.4g} mm, {len(solution.times)} points "
+            f"in {solution.times[-1]:.4g} s"
+        ),
+    )
+    yield from _stiffness_lines(solved)
+    yield from _rates(solution)
+    if solution.clearance is not None and path.scene is not None:
+        index = int(np.argmin(solution.clearance))
+        yield (
+            "clearance",
+            Text.assemble(
+                (f"{solution.clearance[index] * MM:.3f} mm", "bold"),
+                f" at point {index + 1}, required: at least {path.scene.clearance * MM:g} mm",
+            ),
+        )
+    if solution.confidence:
+        yield "search", Text(solution.confidence)
+
+
+def _stiffness_lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]:
+    """The worst stiffness and the mean; what is maximised is marked."""
+    path, solution = solved.path, solved.solution
+    index = solution.worst_index
+    if solution.stiffness is None or index is None or path.stiffness is None:
+        return
+    share = ""
+    if solution.alone is not None:
+        share = f", {solution.stiffness[index] / solution.alone[index]:.1%} of that alone"
+    over = path.stiffness.over
+    what = "\n".join(measure.words() for measure in path.stiffness.maximise)
+    yield (
+        "stiffness",
+        Text.assemble(
+            (_stiffness(solution.stiffness[index], solution), "bold"),
+            f" at its worst, point {index + 1}{share}{' (maximised)' * (over == 'worst')}\n",
+            (_stiffness(float(solution.stiffness.mean()), solution), "bold"),
+            f" in the mean{' (maximised)' * (over == 'mean')}\n{what}",
+        ),
+    )
+
+
+def _rates(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
+    """Where the pressures are nearest to their rates."""
+    margins = rate_margins(solution)
+    if margins is None or solution.slew is None:
+        yield "rates", Text("not known: neither robot nor path says a slew")
+        return
+    index = int(np.argmin(margins))
+    if index == 0:  # nothing moves
+        return
+    step = np.abs(solution.pressures[index] - solution.pressures[index - 1])
+    channel = int(np.argmax(step / solution.slew))
+    rate = step[channel] / (solution.times[index] - solution.times[index - 1])
+    name = solution.robot.description.channel_name(channel)
+    yield (
+        "rates",
+        Text.assemble(
+            (f"{rate * BAR:.3g} of {solution.slew[channel] * BAR:.3g} bar/s", "bold"),
+            f" at most, by {name} on the way to point {index + 1}",
+        ),
+    )
+
+
+def _table(solution: PathSolution) -> RenderableType:
+    """Every so many points, and those that matter."""
+    count = len(solution.times)
+    marks: dict[int, str] = {}
+    if solution.worst_index is not None:
+        marks[solution.worst_index] = "worst"
+    if solution.first_failure is not None:
+        marks[solution.first_failure] = "first that cannot be had"
+    shown = {*range(0, count, max(1, round(count / _ROWS))), count - 1, *marks}
+    columns = _columns(solution)
+    table = number_table("  point", *columns, "")
+    table.columns[0].justify = "right"
+    table.columns[-1].justify = "left"
+    for index in sorted(shown):
+        cells = [values[index] for values in columns.values()]
+        table.add_row(str(index + 1), *cells, Text(marks.get(index, ""), "yellow"))
+    return _explained(table, solution)
+
+
+def _columns(solution: PathSolution) -> dict[str, list[str]]:
+    """Headings and cells of what there is, a cell for each point."""
+    margins = rate_margins(solution)
+    alone = solution.alone
+    share = None if solution.stiffness is None or alone is None else solution.stiffness / alone
+    found = (
+        ("time s", solution.times, lambda value: f"{value:.2f}"),
+        ("error mm", solution.position_errors, lambda value: f"{value * MM:.3f}"),
+        ("deg", solution.angle_errors, lambda value: f"{degrees(value):.2f}"),
+        (unit_text(solution.stiffness_unit), solution.stiffness, figures),
+        ("of alone", share, lambda value: f"{value:.1%}"),
+        ("clear mm", solution.clearance, lambda value: f"{value * MM:.2f}"),
+        ("rate left", margins, lambda value: f"{value:.0%}".replace("-0%", "0%")),
+    )
+    cells = {
+        heading: [shown(value) for value in values.tolist()]
+        for heading, values, shown in found
+        if values is not None
+    }
+    if margins is not None:
+        cells["rate left"][0] = ""  # there is no way to the first point
+    return cells
+
+
+def _explained(table: Table, solution: PathSolution) -> RenderableType:
+    """Add below the table what its headings mean."""
+    notes = []
+    if solution.alone is not None:
+        notes.append("of alone: share of what the point could have by itself")
+    if solution.slew is not None:
+        notes.append("rate left: to the fastest channel, on the way to it")
+    return Group(table, *(Text(f"  {note}", "dim") for note in notes))
+
+
+def _stiffness(value: float, solution: PathSolution) -> str:
+    return f"{figures(value)} {unit_text(solution.stiffness_unit)}"

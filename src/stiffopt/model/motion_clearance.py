@@ -1,0 +1,278 @@
+"""Whether an arm's body stays clear of a scene while its pressures change, at all times.
+
+Between two rows of pressures these change linearly.  Poses on the way are looked at as closely as
+it takes to know of all between them (see native/motion.h, of which this is the same in Python).
+Two bounds on how the body moves stand behind that; both are sampled for each arm, with a margin:
+the most that any of its points moves per change of a segment's pressures, and how much such ways
+bend.  An arm under gravity must not snap from one equilibrium to another on the way.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise, product
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import EquilibriumError, PressureError
+from stiffopt.model.arm_clearance import ArmClearance
+from stiffopt.model.distances import scene_library
+from stiffopt.model.scene import Scene
+from stiffopt.model.stations import Pieces
+from stiffopt.model.stopping import checkpoint
+
+if TYPE_CHECKING:
+    from stiffopt.model.manipulator import Manipulator
+
+Array = NDArray[np.float64]
+
+MOTION_ERROR = 3e-5
+"""m, by which the distance of a motion that is clear may be less than was asked, at most."""
+
+_ALLOWED = 2e-5  # m, by which poses that are looked at may be too near
+_SAG, _MOST_POSES, _STEEPEST = 1e-5, 512, 1.5  # as motion.h has them, but for the poses
+_CLEAR, _BLOCKED, _NO_SHAPE = range(3)  # as motion.h has them
+_SAMPLES = {False: 256, True: 64}  # of the bounds, by whether the arm is loaded
+_CORNERS = 512  # of the pressures' range, at most
+_SPEED_MARGIN, _BEND_MARGIN = 1.1, 1.5
+_STEP = 0.02  # of the pressures' range, of second differences
+
+_integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+
+
+class MotionBounds(NamedTuple):
+    """How the body of an arm moves at most, over the range of its pressures.
+
+    Attributes
+    ----------
+    speeds : (pieces,), way of any point per change (Euclidean) of a piece's pressures, in m/Pa.
+    bend : in m; along a straight way in pressures, second derivatives of positions are at most
+        the square of the speed, by `speeds`, over this.
+    """
+
+    speeds: Array
+    bend: float
+
+
+@dataclass(frozen=True)
+class MotionClearance:
+    """What was found on the way along pressures.
+
+    Attributes
+    ----------
+    clear : whether the body keeps what was asked for, to `MOTION_ERROR`.
+    least : the least distance of the poses that were looked at, in m.
+    poses : their number.
+    blocked_at : pressures (n,) on the way at which it is blocked, or None.
+    """
+
+    clear: bool
+    least: float
+    poses: int
+    blocked_at: Array | None = None
+
+
+class ClearMotions:
+    """Judges motions of one arm in one scene; for one thread at a time.
+
+    Parameters
+    ----------
+    arm : with its load.
+    scene : its own clearance is left aside.
+    """
+
+    def __init__(self, arm: Manipulator, scene: Scene) -> None:
+        self._arm = arm
+        self._clearance = ArmClearance(arm, scene)
+        key = "motion bounds", arm.tip_load
+        self.bounds: MotionBounds = arm.kept(key, lambda: motion_bounds(arm))
+        self.piece_of = Pieces(arm).piece_of
+        self._found = np.empty(2 + arm.n_pressures)
+        self._function: Callable[..., int] | None = None
+
+    def along(self, p: Array, asked: float) -> MotionClearance:
+        """Judge the way along rows of pressures (N, n) in Pa, by the clearance asked of it in m."""
+        p = np.ascontiguousarray(p, dtype=float)
+        function = self._function or self._prepare(len(p))
+        if function is None:
+            checkpoint()
+            return self._interpreted(p, asked - _ALLOWED)
+        outcome = function(self._given, p.ctypes.data, len(p), asked - _ALLOWED, self._results)
+        least, poses = self._found[:2].tolist()
+        if outcome == _NO_SHAPE:
+            least = -np.inf
+        at = self._found[2:].copy() if outcome == _BLOCKED else None
+        return MotionClearance(outcome == _CLEAR, least, int(poses), at)
+
+    # -- in machine code --------------------------------------------------------------------
+
+    def _prepare(self, rows: int) -> Callable[..., int] | None:
+        """The function in C, with all that it needs; None where it is not there (yet)."""
+        body = self._arm._body.machine_code(rows)
+        code = scene_library() if body is not None else None
+        if body is None or code is None:
+            return None
+        ranges, objects = self._clearance.ranges, self._clearance.scene.in_c(code)
+        motions = _Motions(
+            model=body.address,
+            objects=ctypes.addressof(objects),
+            n_objects=len(objects),
+            ends=ranges.bounds.ctypes.data,
+            counts=ranges.counts.ctypes.data,
+            n_ranges=len(ranges.ends),
+            speeds=self.bounds.speeds.ctypes.data,
+            bend=self.bounds.bend,
+        )
+        self._given, self._results = ctypes.addressof(motions), self._found.ctypes.data
+        size = body.code.cdll.stiffopt_motion_memory
+        size.argtypes, size.restype = [_pointer], _integer
+        memory = np.empty(size(self._given))
+        motions.memory = memory.ctypes.data
+        self._keep = (body, objects, motions, memory)
+        function = body.code.cdll.stiffopt_motions
+        function.argtypes = [_pointer, _pointer, _integer, _double, _pointer]
+        self._function = function
+        return self._function
+
+    # -- without machine code ---------------------------------------------------------------
+
+    def _interpreted(self, p: Array, asked: float) -> MotionClearance:
+        least, poses = np.inf, 0
+        for a, b in pairwise(p):
+            found = self._stretch(a, b, asked)
+            least, poses = min(least, found.least), poses + found.poses
+            if not found.clear:
+                return MotionClearance(False, least, poses, found.blocked_at)
+        return MotionClearance(True, least, poses)
+
+    def _stretch(self, a: Array, b: Array, asked: float) -> MotionClearance:
+        """All poses of a row of halves at a time."""
+        steep = (
+            _STEEPEST if any(item.is_interpolated for item in self._clearance.scene.items) else 1
+        )
+        change = np.bincount(self.piece_of, (b - a) ** 2, len(self.bounds.speeds))
+        way = steep * float(self.bounds.speeds @ np.sqrt(change))
+        shares, spare, least = np.empty(0), np.empty(0), np.inf
+        new = np.array([0.0, 1.0])
+        while len(new):
+            values, tip_clear = self._look(a + new[:, None] * (b - a))
+            least = min(least, float(values.min()))
+            if (values < asked).any():
+                at = a + new[int(values.argmin())] * (b - a)
+                return MotionClearance(False, least, len(shares) + len(new), at)
+            order = np.argsort(np.concatenate([shares, new]))
+            shares = np.concatenate([shares, new])[order]
+            spare = np.concatenate([spare, np.minimum(values - asked, tip_clear)])[order]
+            open_ = spare[1:] + spare[:-1] - way * np.diff(shares) < -2 * _SAG
+            new = ((shares[1:] + shares[:-1]) / 2)[open_]
+            if len(shares) + len(new) > _MOST_POSES:
+                return MotionClearance(False, least, len(shares), a + new[0] * (b - a))
+        return MotionClearance(True, least, len(shares))
+
+    def _look(self, p: Array) -> tuple[Array, Array]:
+        """Distances (N,), and how far (N,) the tip is from rings that it is through."""
+        try:
+            values = self._clearance.least(p)
+        except (PressureError, EquilibriumError):
+            return np.full(len(p), -np.inf), np.zeros(len(p))
+        far = np.full(len(p), np.inf)
+        for item in self._clearance.scene.items:
+            if item.is_ring:
+                tips = self._arm.tip_pose(p)[:, :3, 3]
+                far = np.minimum(far, item.passages(tips).from_disc)
+        return values, far
+
+
+class _Motions(ctypes.Structure):
+    """`Motions` of native/motion.h."""
+
+    _fields_ = [
+        *((name, _pointer) for name in ("model", "objects")),
+        ("n_objects", _integer),
+        *((name, _pointer) for name in ("ends", "counts")),
+        ("n_ranges", _integer),
+        ("speeds", _pointer),
+        ("bend", _double),
+        ("memory", _pointer),
+    ]
+
+
+# -- bounds ---------------------------------------------------------------------------------
+
+
+def motion_bounds(arm: Manipulator) -> MotionBounds:
+    """The bounds of an arm, sampled at corners of its pressures' range and within it."""
+    pieces = Pieces(arm)
+    at = np.linspace(0.0, arm.length, 4 * arm.n_segments + 1)[1:]
+    p = _that_settle(arm, _spread(arm))
+    moves = _moves(arm, p, at)  # (N, k, 4, n)
+    speeds = np.zeros(len(pieces.ends))
+    for piece in np.unique(pieces.piece_of):
+        block = moves[..., pieces.piece_of == piece]
+        speeds[piece] = _SPEED_MARGIN * np.linalg.svd(block, compute_uv=False)[..., 0].max()
+    return MotionBounds(speeds, _bend(arm, p, at, speeds, pieces.piece_of))
+
+
+def _spread(arm: Manipulator) -> Array:
+    """Pressures (N, n) at corners of the range, and within it."""
+    rng = np.random.default_rng(0)
+    n, low, high = arm.n_pressures, arm.pressure_min, arm.pressure_max
+    count = _SAMPLES[arm.is_loaded]
+    if 2**n <= (_CORNERS if not arm.is_loaded else count):
+        corners = np.array(list(product((0.0, 1.0), repeat=n)))
+    else:
+        corners = rng.integers(0, 2, (count, n)).astype(float)
+        corners[:2] = [[0.0], [1.0]]
+    shares = np.concatenate([corners, rng.random((count, n))])
+    return np.asarray(low + shares * (high - low))
+
+
+def _that_settle(arm: Manipulator, p: Array) -> Array:
+    """Those of pressures (N, n) at which the arm has a shape."""
+    if not arm.is_loaded:
+        return p
+    kept = []
+    for row in p:
+        try:
+            arm._body.poses(row[None], np.array([arm.length]))
+        except EquilibriumError:
+            continue
+        kept.append(row)
+    return np.array(kept).reshape(-1, p.shape[1])
+
+
+def _moves(arm: Manipulator, p: Array, at: Array) -> Array:
+    """Derivatives of positions and radii (N, k, 4, n) by the pressures, in m/Pa."""
+    moves = arm._body.jacobians(p, at)[:, :, :3]  # their length is the same in all axes
+    step = 1e-4 * (arm.pressure_max - arm.pressure_min)
+    slopes = [
+        (arm._body.radii(p, at) - arm._body.radii(p - aside, at)) / step[k]
+        for k, aside in enumerate(np.diag(step))
+    ]
+    return np.concatenate([moves, np.stack(slopes, axis=-1)[:, :, None]], axis=2)
+
+
+def _bend(
+    arm: Manipulator, p: Array, at: Array, speeds: Array, piece_of: NDArray[np.int64]
+) -> float:
+    """The square of speeds over second derivatives, at least, from second differences."""
+    rng = np.random.default_rng(1)
+    low, high = arm.pressure_min, arm.pressure_max
+    shares = rng.choice([-1.0, 0.0, 1.0], p.shape) * rng.random(p.shape)
+    shares[np.arange(len(p)), rng.integers(0, p.shape[1], len(p))] = 1.0
+    step = _STEP * (high - low) * shares
+    middle = np.clip(p, low + np.abs(step), high - np.abs(step))
+    try:
+        before, here, after = (
+            arm._body.line(q, at)[..., :3] for q in (middle - step, middle, middle + step)
+        )
+    except EquilibriumError:  # near where it buckles
+        return float(arm.length) / 10
+    second = np.linalg.norm(before - 2 * here + after, axis=-1).max(axis=1)
+    squares = [step[:, piece_of == piece] ** 2 for piece in range(len(speeds))]
+    change = np.sqrt(np.stack([each.sum(axis=1) for each in squares], axis=-1))
+    return float(((change @ speeds) ** 2 / second).min()) / _BEND_MARGIN

@@ -1,0 +1,131 @@
+"""Where a motion may end: pressures as they are given, or configurations that solve a task."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import InputError
+from stiffopt.model.arguments import checked_vector
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.optimise.goal import StiffnessMeasure
+from stiffopt.optimise.solver import PressureSolver
+from stiffopt.optimise.task import Task
+
+Vector = NDArray[np.float64]
+End = ArrayLike | Task
+
+_LOCAL = 3  # searches from random guesses, for other local optima
+_NEAR = 8  # searches for the best answer near a random guess
+_NEARNESS = 0.4  # of a channel's range, about such a guess
+_ALIKE = 0.02  # of the ranges, by which configurations differ that count as one
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """Pressures at which a motion may end.
+
+    Attributes
+    ----------
+    pressures : (n,), in Pa.
+    worth : its stiffness as a share of the best known for its task; 1 where nothing is maximised.
+    """
+
+    pressures: Vector
+    worth: float = 1.0
+
+
+class Unsolved(Exception):  # noqa: N818
+    """A task at an end of the motion has no solution; the text says why."""
+
+
+def several(goal: End | Sequence[End]) -> list[End]:
+    """The goals, of one or of several."""
+    if isinstance(goal, Task):
+        return [goal]
+    if isinstance(goal, np.ndarray):
+        return list(goal) if goal.ndim == 2 and len(goal) else [goal]
+    if isinstance(goal, Sequence) and not len(goal):
+        return []
+    if isinstance(goal, Sequence) and any(
+        isinstance(each, Task | Sequence | np.ndarray) and not isinstance(each, str)
+        for each in goal
+    ):
+        return list(goal)
+    return [cast(End, goal)]
+
+
+def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Vector:
+    """Pressures (n,) within the robot's limits."""
+    p = checked_vector(f"the {name}'s pressures", pressures, robot.n_pressures)
+    low, high = robot.pressure_min, robot.pressure_max
+    for index in np.flatnonzero((p < low) | (p > high)):
+        channel = robot.description.channel_name(int(index))
+        raise InputError(
+            f"{name}: {channel} is at {p[index] * 1e-5:g} bar, outside of its limits "
+            f"{low[index] * 1e-5:g} to {high[index] * 1e-5:g} bar"
+        )
+    return p
+
+
+class TaskConfigurations:
+    """The configurations that solve a task, as far as they are looked for.
+
+    Parameters
+    ----------
+    name : of the end, for messages.
+    robot : without the task's load.
+    task : with the scene and the clearance of the motion.
+
+    Attributes
+    ----------
+    best : the optimum.
+    limits : of the pressures, two (n,).
+
+    Raises
+    ------
+    Unsolved
+    """
+
+    def __init__(self, name: str, robot: Manipulator, task: Task, seed: int) -> None:
+        self._solver, self._seed = PressureSolver(robot, task, seed=seed), seed
+        self.limits = task.pressure_bounds(robot.description)
+        solution = self._solver.solve()
+        if not solution.found or solution.pressures is None:
+            raise Unsolved(f"{name}: {solution.status}: {solution.message}")
+        self.best = Configuration(solution.pressures)
+        self._maximised = len(maximised(task))
+        self._most = min(solution.stiffnesses[: self._maximised], default=None)
+
+    def others(self, start: Vector) -> list[Configuration]:
+        """More of them, near the start of a motion and near random guesses."""
+        low, high = self.limits
+        span = high - low
+        rng = np.random.default_rng(self._seed)
+        guesses = [start, *(low + span * rng.random((_LOCAL + _NEAR, len(low))))]
+        found: list[Configuration] = []
+        for index, guess in enumerate(guesses):
+            near = None
+            if not 0 < index <= _LOCAL:
+                reach = _NEARNESS * span
+                near = np.clip(guess - reach, low, high), np.clip(guess + reach, low, high)
+            answer = self._solver.solve_at_once(guess=guess, limits=near)
+            if answer is None or not answer.found or answer.pressures is None:
+                continue
+            p = answer.pressures
+            known = [self.best.pressures, *(each.pressures for each in found)]
+            if all((np.abs(p - each) > _ALIKE * span).any() for each in known):
+                worth = 1.0
+                if self._most is not None:
+                    worth = min(answer.stiffnesses[: self._maximised]) / self._most
+                found.append(Configuration(p, worth))
+        return found
+
+
+def maximised(task: Task) -> tuple[StiffnessMeasure, ...]:
+    """The directional stiffnesses that a task maximises."""
+    return task.stiffness.maximise if task.stiffness is not None else ()

@@ -1,0 +1,351 @@
+"""`plan_motion`: from one configuration to another, the whole body clear of a scene all the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import EquilibriumError, StoppedError
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
+from stiffopt.model.scene import Scene
+from stiffopt.model.stopping import giving_up
+from stiffopt.optimise.goal import StiffnessMeasure
+from stiffopt.optimise.task import Load, Task
+from stiffopt.paths.configurations import (
+    Configuration,
+    End,
+    TaskConfigurations,
+    Unsolved,
+    maximised,
+)
+from stiffopt.paths.motion_request import MotionRequest
+from stiffopt.paths.rates import least_times
+from stiffopt.paths.shortening import rounded, shortened
+from stiffopt.paths.solution import PathSolution
+from stiffopt.paths.stiffness import least_stiffness
+from stiffopt.paths.tree_search import TreeSearch
+
+Vector = NDArray[np.float64]
+
+_NEARLY_AS_STIFF = 0.95  # of the best, which is not worth looking for stiffer ones
+_MORE = 50  # motions tried for a stiffer goal, beyond as many as for the first
+_LEAST_STEP = 1.1e-3  # s, between points: what a trajectory takes
+_STEPS = 50  # into which the motion is divided at least, unless they are shorter than:
+_SHORT = 5e-3  # s
+
+
+def plan_motion(
+    robot: Manipulator,
+    start: End,
+    goal: End | Sequence[End],
+    *,
+    scene: Scene | None = None,
+    clearance: float | None = None,
+    slew: float | ArrayLike | None = None,
+    load: Load | None = None,
+    seed: int = 0,
+    timeout: float | None = 10.0,
+) -> PathSolution:
+    """Find pressures over time from a start to a goal with the body clear of a scene all the way.
+
+    Ways are straight in the space of pressures where that is clear, else found by two trees that
+    grow towards each other (RRTConnect of OMPL); then they are shortened, rounded and timed.  Each
+    piece of what is returned was judged as a whole, not only at points of it (see
+    `stiffopt.model.motion_clearance`): pressures that are interpolated linearly keep the clearance
+    to 0.03 mm.
+
+    Parameters
+    ----------
+    robot : Manipulator
+    start : (n,) or Task
+        Pressures in Pa, or a task, whose solution is meant.
+    goal : (n,) or Task, or several of them
+        A task means all configurations that solve it: the stiffest, and others.  The stiffest to
+        which the straight way is clear is taken; if there is none, whichever the trees reach.
+        Where that one is softer than 0.95 of the best that is known, as many motions again are
+        tried to reach one that is not.
+    scene : Scene, optional
+        Instead of that of the tasks.  Without any, the way is straight.
+    clearance : float, optional
+        To be kept by the body, in m; that of the scene if absent.  A calibrated robot's body keeps
+        as much more as the calibration leaves unknown of the tip (`Manipulator.tip_uncertainty`).
+    slew : float or (n,), optional
+        Greatest rates of change in Pa/s; the robot's own hold too, and one of both must be known.
+    load : Load, optional
+        At the tip all the way, instead of that of the tasks.
+    seed : int
+        Of the search.  The same gives the same motion, unless time ended the search.
+    timeout : float, optional
+        Seconds after which to give up.
+
+    Returns
+    -------
+    PathSolution
+        "unreachable" where no way was found; the message says what is blocked.
+
+    Raises
+    ------
+    InputError
+        An argument is wrong; pressures are outside of the robot's limits; tasks differ in load.
+    MissingExtraError
+        The straight way is not clear, and OMPL is not installed.
+    """
+    begin = perf_counter()
+    request = MotionRequest.of(robot, start, goal, scene, clearance, slew, load, seed)
+    timings: dict[str, float] = {}
+    with giving_up(timeout):
+        try:
+            found = _Planner(request, timings).solution()
+        except Unsolved as reason:
+            found = request.without_answer(str(reason), "unreachable")
+        except (StoppedError, EquilibriumError) as error:
+            found = request.without_answer(str(error), "failed")
+    timings["total"] = perf_counter() - begin
+    found.timings.update(timings)
+    return found
+
+
+@dataclass
+class _Planner:
+    """Finds and describes the motion of a request."""
+
+    request: MotionRequest
+    timings: dict[str, float]
+    poses: int = 0
+    known: int = 0
+    searched: bool = False
+    motions: ClearMotions | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        scene = self.request.scene
+        self.motions = None if scene is None else ClearMotions(self.request.robot, scene)
+
+    def is_clear(self, rows: Vector) -> bool:
+        """Whether the way along pressures (N, n) is clear."""
+        if self.motions is None:
+            return True
+        found = self.motions.along(rows, self.request.asked)
+        self.poses += found.poses
+        return found.clear
+
+    def solution(self) -> PathSolution:
+        """Plan, or raise `Unsolved` with what is in the way."""
+        begin = perf_counter()
+        start = self._start()
+        tasks, goals = self._first_goals()
+        self.timings["goals"] = perf_counter() - begin
+        way, end = self._straight(start, goals)
+        if way is None or end is None:
+            begin = perf_counter()
+            goals = [*goals, *(each for task in tasks for each in task.others(start))]
+            self.known = len(goals)
+            self.timings["goals"] += perf_counter() - begin
+            way, end = self._search(start, goals, tasks)
+        begin = perf_counter()
+        if len(way) > 2:
+            way = shortened(way, self.is_clear, self.request.slew, self.request.seed)
+            way = rounded(way, self.is_clear, self.request.slew)
+        self.timings["shorten"] = perf_counter() - begin
+        begin = perf_counter()
+        found = self._described(way)
+        self.timings["describe"] = perf_counter() - begin
+        return found
+
+    # -- ends -------------------------------------------------------------------------------
+
+    def _start(self) -> Vector:
+        request = self.request
+        given = request.start
+        if isinstance(given, Task):
+            task = request.posed(given)
+            return TaskConfigurations("start", request.bare, task, request.seed).best.pressures
+        self._check("start", given)
+        return given
+
+    def _first_goals(self) -> tuple[list[TaskConfigurations], list[Configuration]]:
+        """The tasks among the goals that can be solved, and the best of each goal."""
+        request = self.request
+        tasks, goals, refused = [], [], []
+        for number, goal in enumerate(request.goals, start=1):
+            name = "goal" if len(request.goals) == 1 else f"goal {number}"
+            try:
+                if isinstance(goal, Task):
+                    task = TaskConfigurations(name, request.bare, request.posed(goal), request.seed)
+                    tasks.append(task)
+                    goals.append(task.best)
+                else:
+                    self._check(name, goal)
+                    goals.append(Configuration(goal))
+            except Unsolved as reason:
+                refused.append(str(reason))
+        self.known = len(goals)
+        if not goals:
+            raise Unsolved("; ".join(refused))
+        return tasks, goals
+
+    def _check(self, name: str, p: Vector) -> None:
+        """Refuse an end that is not clear."""
+        if self.motions is not None and not self.is_clear(np.stack([p, p])):
+            raise Unsolved(f"{name}: {self._in_the_way(p)}")
+
+    def _in_the_way(self, p: Vector) -> str:
+        """Which object is the nearest at pressures, and how it is."""
+        request = self.request
+        assert request.scene is not None
+        near = request.robot.clearances(p, request.scene)
+        index = int(np.argmin(near.distances))
+        distance, name = float(near.distances[index]), near.names[index]
+        shape = next(item.shape for item in request.scene.objects if item.name == name)
+        text = f"the body is {(request.asked - distance) * 1e3:.3g} mm {shape.amiss} '{name}'"
+        if request.asked:
+            text += f", where {request.asked * 1e3:.3g} mm of clearance are asked"
+        if request.margin:
+            text += f", {request.margin * 1e3:.3g} mm of them for what the calibration leaves open"
+        return text
+
+    # -- ways -------------------------------------------------------------------------------
+
+    def _straight(
+        self, start: Vector, goals: list[Configuration]
+    ) -> tuple[Vector | None, Configuration | None]:
+        """The straight way to the best goal of those to which it is clear."""
+        for goal in sorted(goals, key=lambda each: -each.worth):
+            way = np.stack([start, goal.pressures])
+            if self.is_clear(way):
+                return way, goal
+        return None, None
+
+    def _search(
+        self, start: Vector, goals: list[Configuration], tasks: list[TaskConfigurations]
+    ) -> tuple[Vector, Configuration]:
+        """A way around; see `plan_motion` for which goal."""
+        begin = perf_counter()
+        assert self.motions is not None  # or the straight way was clear
+        weights = self.motions.bounds.speeds[self.motions.piece_of]
+        limits = self._limits(start, goals, tasks)
+        search = TreeSearch(self.is_clear, *limits, weights, self.request.seed)
+        way, end = self._straight(start, goals)
+        if way is None or end is None:
+            self.searched = True
+            way, reached = search.way(start, _all(goals), np.inf)
+            if way is None:
+                raise Unsolved(self._no_way(reached))
+            end = _nearest(goals, way[-1])
+            way = np.concatenate([[start], way[1:-1], [end.pressures]])
+        best = max(goal.worth for goal in goals)
+        stiff = [goal for goal in goals if goal.worth >= _NEARLY_AS_STIFF * best]
+        if end not in stiff:
+            way, end = self._stiffer(search, way, end, stiff)
+        self.timings["search"] = perf_counter() - begin
+        return way, end
+
+    def _stiffer(
+        self, search: TreeSearch, way: Vector, end: Configuration, stiff: list[Configuration]
+    ) -> tuple[Vector, Configuration]:
+        """On to one of the stiff goals, if that is soon found."""
+        further, goal = self._straight(end.pressures, stiff)
+        if further is not None and goal is not None:
+            return np.concatenate([way, further[1:]]), goal
+        found, _ = search.way(end.pressures, _all(stiff), search.tried + _MORE)
+        if found is None:
+            return way, end
+        goal = _nearest(stiff, found[-1])
+        return np.concatenate([way, found[1:-1], [goal.pressures]]), goal
+
+    def _limits(
+        self, start: Vector, goals: list[Configuration], tasks: list[TaskConfigurations]
+    ) -> tuple[Vector, Vector]:
+        """Limits of the way: those of the tasks, if all goals are tasks, but all ends within."""
+        robot = self.request.robot
+        if len(tasks) == len(self.request.goals):
+            low = np.min([task.limits[0] for task in tasks], axis=0)
+            high = np.max([task.limits[1] for task in tasks], axis=0)
+        else:
+            low, high = robot.pressure_min, robot.pressure_max
+        ends = np.stack([start, *(goal.pressures for goal in goals)])
+        return np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
+
+    def _no_way(self, reached: Vector | None) -> str:
+        text = "no clear way was found in the time given, which is no proof that there is none"
+        if reached is not None and self.request.scene is not None:
+            nearest = self.request.robot.clearances(reached, self.request.scene).nearest
+            text += f"; where the search from the start ended, '{nearest}' is the nearest"
+        return text
+
+    # -- the answer -------------------------------------------------------------------------
+
+    def _described(self, way: Vector) -> PathSolution:
+        """The motion with its times and all that the model says of it."""
+        request = self.request
+        robot = request.robot
+        p, times = timed(way, request.slew)
+        measures = _measures(request.goals)
+        clearance = None if request.scene is None else robot.clearance(p, request.scene)
+        return PathSolution(
+            status="solved",
+            message=self._message(clearance),
+            robot=robot,
+            times=times,
+            pressures=p,
+            tip_poses=robot.pose(p, robot.length),
+            slew=request.slew,
+            stiffness=least_stiffness(robot, p, measures) if measures else None,
+            stiffness_unit=measures[0].unit if measures else None,
+            clearance=clearance,
+            confidence=self._confidence(),
+        )
+
+    def _message(self, clearance: Vector | None) -> str:
+        if clearance is None:
+            return ""
+        margin = self.request.margin
+        counted = (
+            "this counts no error of the model, as the robot is not calibrated"
+            if margin is None
+            else f"{margin * 1e3:.3g} mm of it are kept for what the calibration leaves open (95 %)"
+        )
+        return f"the body is at least {clearance.min() * 1e3:.3g} mm clear of the scene; {counted}"
+
+    def _confidence(self) -> str:
+        if self.motions is None:
+            return "a straight way in pressures; there is no scene"
+        goals = "" if self.known == 1 else f" to one of {self.known} goal configurations"
+        how = "RRTConnect" if self.searched else "a straight way in pressures"
+        kept = f"the way between them is clear to {MOTION_ERROR * 1e3:g} mm"
+        return f"{how}{goals}, {self.poses} poses looked at; {kept}"
+
+
+def timed(way: Vector, rates: Vector) -> tuple[Vector, Vector]:
+    """Points (N, n) on the way, divided evenly in time, and their times (N,), as soon as can be."""
+    if len(way) < 2 or not np.ptp(way, axis=0).any():
+        return way[:1], np.zeros(1)
+    least = np.maximum(least_times(way, rates), _LEAST_STEP)
+    longest = max(float(least.sum()) / _STEPS, _SHORT)
+    points, times = [way[:1]], [np.zeros(1)]
+    for a, b, time in zip(way[:-1], way[1:], least, strict=True):
+        count = int(np.ceil(time / longest - 1e-9))
+        shares = np.arange(1, count + 1)[:, None] / count
+        points.append(a + shares * (b - a))
+        points[-1][-1] = b
+        times.append(times[-1][-1] + shares[:, 0] * time)
+    return np.concatenate(points), np.concatenate(times)
+
+
+def _all(goals: Sequence[Configuration]) -> Vector:
+    return np.stack([goal.pressures for goal in goals])
+
+
+def _nearest(goals: Sequence[Configuration], p: Vector) -> Configuration:
+    """The goal at pressures (n,), but for rounding."""
+    return min(goals, key=lambda goal: float(np.abs(goal.pressures - p).max()))
+
+
+def _measures(goals: Sequence[Vector | Task]) -> tuple[StiffnessMeasure, ...]:
+    """What the first task among the goals maximises."""
+    tasks = (goal for goal in goals if isinstance(goal, Task))
+    return next((found for found in map(maximised, tasks) if found), ())

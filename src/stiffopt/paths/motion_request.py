@@ -1,0 +1,166 @@
+"""`MotionRequest`: what is asked of a motion, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import InputError, shown
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
+from stiffopt.optimise.task import Load, Task
+from stiffopt.paths.configurations import End, checked_pressures, several
+from stiffopt.paths.rates import slew_limits
+from stiffopt.paths.solution import PathSolution, Status
+
+Vector = NDArray[np.float64]
+
+_MARGIN_SAMPLES = 12  # pressures at which a calibration is asked for the error
+
+
+@dataclass(frozen=True)
+class MotionRequest:
+    """What is asked of a motion, checked.
+
+    Attributes
+    ----------
+    bare, robot : without and with the load of the motion.
+    margin : of the asked clearance, for what a calibration leaves unknown; None: nothing is known.
+    """
+
+    bare: Manipulator
+    robot: Manipulator
+    load: Load | None
+    start: Vector | Task
+    goals: list[Vector | Task]
+    scene: Scene | None
+    clearance: float
+    margin: float | None
+    slew: Vector
+    seed: int
+
+    @classmethod
+    def of(
+        cls,
+        robot: Manipulator,
+        start: End,
+        goal: End | Sequence[End],
+        scene: Scene | None,
+        clearance: float | None,
+        slew: float | ArrayLike | None,
+        load: Load | None,
+        seed: int,
+    ) -> MotionRequest:
+        """Check the arguments of `plan_motion`."""
+        if not isinstance(robot, Manipulator):
+            raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
+        goals = several(goal)
+        if not goals:
+            raise InputError("a motion needs a goal; got an empty list")
+        tasks = [each for each in (*goals, start) if isinstance(each, Task)]
+        load = _load_of(tasks, load)
+        bearer = robot.with_load(load.force, load.moment, load.frame) if load else robot
+        scene = scene or next((task.scene for task in tasks if task.scene is not None), None)
+        if scene is not None:
+            if not isinstance(scene, Scene):
+                raise InputError(f"scene must be a Scene, see load_scene; got {shown(scene)}")
+            if clearance is not None:
+                scene = scene.model_copy(update={"clearance": _checked_clearance(clearance)})
+            scene.check_against(robot.description)
+        elif clearance is not None:
+            raise InputError("a clearance needs a scene, to whose objects it is kept")
+        ends = [
+            each if isinstance(each, Task) else checked_pressures(name, robot, each)
+            for name, each in (("start", start), *(("goal", each) for each in goals))
+        ]
+        return cls(
+            bare=robot,
+            robot=bearer,
+            load=load,
+            start=ends[0],
+            goals=ends[1:],
+            scene=scene,
+            clearance=0.0 if scene is None else scene.clearance,
+            margin=None if scene is None else _margin(bearer),
+            slew=_rates(robot, slew),
+            seed=seed,
+        )
+
+    @property
+    def asked(self) -> float:
+        """Clearance that is kept by the model's body, in m."""
+        return self.clearance + (self.margin or 0.0)
+
+    def posed(self, task: Task) -> Task:
+        """A task with the load, the scene and the clearance of the motion."""
+        scene = self.scene
+        if scene is not None:
+            scene = scene.model_copy(update={"clearance": self.asked})
+        return task.model_copy(update={"load": self.load, "scene": scene})
+
+    def without_answer(self, message: str, status: Status) -> PathSolution:
+        """Solution with nothing but its message."""
+        n = self.robot.n_pressures
+        return PathSolution(
+            status, message, self.robot, np.empty(0), np.empty((0, n)), np.empty((0, 4, 4)),
+            slew=self.slew,
+        )  # fmt: skip
+
+
+def _load_of(tasks: list[Task], load: Load | None) -> Load | None:
+    """The load of the whole motion."""
+    if load is not None:
+        if not isinstance(load, Load):
+            raise InputError(f"load must be a Load; got {shown(load)}")
+        return load
+    loads = [task.load for task in tasks]
+    if any(each != loads[0] for each in loads):
+        raise InputError("the tasks of a motion must have the same load; give one for all of them")
+    return loads[0] if loads else None
+
+
+def _checked_clearance(clearance: float) -> float:
+    if not isinstance(clearance, int | float) or not 0 <= clearance < np.inf:
+        raise InputError(f"clearance must be a length in m, not negative; got {shown(clearance)}")
+    return float(clearance)
+
+
+def _rates(robot: Manipulator, slew: float | ArrayLike | None) -> Vector:
+    """Greatest rates (n,) of the pressures."""
+    own = None
+    if slew is not None:
+        try:
+            own = np.broadcast_to(np.asarray(slew, dtype=float), robot.n_pressures)
+        except (TypeError, ValueError):
+            own = np.zeros(0)
+        if not own.size or not ((own > 0) & np.isfinite(own)).all():
+            raise InputError(
+                f"slew must be one rate above 0 in Pa/s or {robot.n_pressures} of them; "
+                f"got {shown(slew)}"
+            )
+    rates = slew_limits(robot.description, None if own is None else tuple(own.tolist()))
+    if rates is None:
+        raise InputError(
+            "a motion needs to know the rates of the pressures; give slew, or pressure.slew in "
+            "the robot file"
+        )
+    return rates
+
+
+def _margin(robot: Manipulator) -> float | None:
+    """What a calibration leaves unknown of the tip, in m; the largest over the pressures."""
+    if robot.description.calibration is None:
+        return None
+
+    def find() -> float:
+        rng = np.random.default_rng(0)
+        shares = rng.random((_MARGIN_SAMPLES, robot.n_pressures))
+        shares[:2] = [[0.0], [1.0]]
+        low, high = robot.pressure_min, robot.pressure_max
+        pressures = low + shares * (high - low)
+        return max(float(robot.tip_uncertainty(p).semi_axes[0]) for p in pressures)
+
+    return robot.kept(("margin of motions", robot.tip_load), find)

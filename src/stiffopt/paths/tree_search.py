@@ -1,0 +1,140 @@
+"""A way between pressures by OMPL: two trees that grow towards each other (RRTConnect).
+
+Motions are judged whole, by a function that is given: no resolution is set.  Distances in the
+space of pressures are ways of the body at most, so that channels count by how far they move it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import StoppedError, require_package
+from stiffopt.model.stopping import checkpoint
+
+Vector = NDArray[np.float64]
+IsClear = Callable[[Vector], bool]
+"""From rows of pressures (N, n) to whether the way along them is clear."""
+
+_RANGE = 0.3  # longest branch, as a share of the space's diagonal
+
+
+class TreeSearch:
+    """Searches for ways between pressures (n,) in Pa.
+
+    Parameters
+    ----------
+    is_clear : judges motions.
+    low, high : limits of the pressures, (n,).
+    weights : way of the body per pressure, (n,).
+    seed : the same gives the same ways, unless time ends the search.
+
+    Raises
+    ------
+    MissingExtraError
+    """
+
+    def __init__(
+        self, is_clear: IsClear, low: Vector, high: Vector, weights: Vector, seed: int
+    ) -> None:
+        require_package("ompl", "plan")
+        self._is_clear, self._seed = is_clear, seed
+        self._free = np.flatnonzero(high > low)
+        self._low, self._high = low, high
+        self._weights = weights[self._free]
+        self.tried = 0
+
+    def way(self, start: Vector, goals: Vector, most: float) -> tuple[Vector | None, Vector | None]:
+        """A way (k, n) from the start to one of the goals (N, n), or None; tried `most` motions.
+
+        And, where there is none, how far the tree from the start came (n,), if that is known.
+        """
+        from ompl import base, geometric, util
+
+        if not len(self._free):
+            return None, None
+        with _quiet(util):
+            util.RNG.setSeed(self._seed + 1)  # zero is no seed there
+            space = base.RealVectorStateSpace(len(self._free))
+            bounds = base.RealVectorBounds(len(self._free))
+            for index, channel in enumerate(self._free):
+                bounds.setLow(index, float(self._weights[index] * self._low[channel]))
+                bounds.setHigh(index, float(self._weights[index] * self._high[channel]))
+            space.setBounds(bounds)
+            info = base.SpaceInformation(space)
+            info.setStateValidityChecker(_always)
+            info.setMotionValidator(self._validator(base, info, start))
+            info.setup()
+            problem = base.ProblemDefinition(info)
+            problem.addStartState(self._state(info, start))
+            ends = base.GoalStates(info)
+            for goal in goals:
+                ends.addState(self._state(info, goal))
+            problem.setGoal(ends)
+            planner = geometric.RRTConnect(info)
+            planner.setRange(_RANGE * space.getMaximumExtent())
+            planner.setProblemDefinition(problem)
+            planner.setup()
+            last = self.tried + most
+
+            def is_over() -> bool:
+                try:
+                    checkpoint()
+                except StoppedError:
+                    return True
+                return self.tried >= last
+
+            planner.solve(base.PlannerTerminationCondition(is_over))
+            found = problem.getSolutionPath()
+            if found is None:
+                return None, None
+            path = np.array([self._pressures(state, start) for state in found.getStates()])
+            if problem.hasExactSolution():
+                return path, None
+            return None, path[-1]
+
+    def _validator(self, base: Any, info: Any, start: Vector) -> Any:
+        """OMPL's judge of motions between two states."""
+        search, count = self, len(self._free)
+        rows, weights = np.stack([start, start]), self._weights
+        all_move = count == len(start)
+
+        class Motions(base.MotionValidator):  # type: ignore[misc]
+            def checkMotion(self, first: Any, second: Any) -> bool:  # noqa: N802
+                search.tried += 1
+                states = np.array([first[0:count], second[0:count]]) / weights
+                if all_move:
+                    return search._is_clear(states)
+                rows[:, search._free] = states
+                return search._is_clear(rows)
+
+        return Motions(info)
+
+    def _state(self, info: Any, p: Vector) -> Any:
+        state = info.allocState()
+        state[0 : len(self._free)] = (self._weights * p[self._free]).tolist()
+        return state
+
+    def _pressures(self, state: Any, start: Vector) -> Vector:
+        p = start.copy()
+        p[self._free] = state[0 : len(self._free)] / self._weights
+        return np.clip(p, self._low, self._high)
+
+
+def _always(_: Any) -> bool:
+    return True
+
+
+@contextmanager
+def _quiet(util: Any) -> Iterator[None]:
+    """Keep OMPL from printing."""
+    before = util.getLogLevel()
+    util.setLogLevel(util.LogLevel.LOG_NONE)
+    try:
+        yield
+    finally:
+        util.setLogLevel(before)

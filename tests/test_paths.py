@@ -1,0 +1,259 @@
+"""Paths: the stiffest pressures along them, within the rates, and what cannot be followed."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicSpline
+
+import stiffopt as so
+from stiffopt.errors import InputError
+from stiffopt.optimise.solver import PressureSolver
+from stiffopt.paths.candidates import candidates
+from stiffopt.paths.path import Path
+from stiffopt.paths.points import PathTasks
+from stiffopt.paths.refinement import refined
+from stiffopt.paths.route import RouteSearch
+from stiffopt.paths.solver import solve_path
+
+LINE = {"line": {"from": (-0.03, -0.02, 0.19), "to": (-0.03, 0.02, 0.19)}}
+
+
+@pytest.fixture
+def robot():
+    return so.load_robot("stiff-flop-2")
+
+
+def path_of(path=LINE, *, over="worst", frame="base", **options):
+    keys = {
+        "path": path,
+        "points": 21,
+        "timing": {"speed": 0.01},
+        "tolerance": {"position": 1e-4},
+        "stiffness": {"maximise": {"direction": (1, 0, 0), "frame": frame, "over": over}},
+    }
+    keys |= options
+    return Path(**{key: value for key, value in keys.items() if value is not None})
+
+
+def through(positions):
+    return {"through": [{"position": tuple(map(float, x))} for x in positions]}
+
+
+def wandering(robot, seed, begin, end, step=1e-3):
+    """Positions 1 mm apart on a spline through random tips; some of the points of the whole."""
+    rng = np.random.default_rng(seed)
+    low, high = np.array(robot.pressure_min) + 1e4, 0.8 * np.array(robot.pressure_max)
+    curve = CubicSpline(
+        np.arange(6), robot.tip_pose(rng.uniform(low, high, (6, len(low))))[:, :3, 3]
+    )
+    at = np.linspace(0, 5, 4000)
+    lengths = np.insert(np.linalg.norm(np.diff(curve(at), axis=0), axis=1).cumsum(), 0, 0.0)
+    return curve(np.interp(np.arange(begin, end) * step, lengths, at))
+
+
+def check(robot, path, solution):
+    """That a solution keeps what it claims, by tip poses, differences and stiffnesses alone."""
+    points = path.points()
+    assert solution.found, solution.message
+    tips = np.array([robot.tip_pose(p)[:3, 3] for p in solution.pressures])
+    assert np.linalg.norm(tips - points.positions, axis=1).max() <= path.tolerance.position
+    lower, upper = path.pressure_bounds(robot.description)
+    assert (solution.pressures >= lower).all()
+    assert (solution.pressures <= upper).all()
+    rates = np.abs(np.diff(solution.pressures, axis=0)) / np.diff(solution.times)[:, np.newaxis]
+    assert (rates <= np.array(solution.slew) * (1 + 1e-6)).all()
+    if solution.stiffness is not None:
+        own = [
+            robot.stiffness(p, goal.maximise[0].direction, frame=goal.maximise[0].frame)
+            for p, goal in zip(solution.pressures, points.goals, strict=True)
+        ]
+        np.testing.assert_allclose(solution.stiffness, own, rtol=1e-9)
+        assert solution.worst == min(solution.stiffness)
+        assert (solution.stiffness <= solution.alone * (1 + 1e-9)).all()
+
+
+def warm_started(robot, positions):
+    """What following by warm starts gives: pressures and stiffness at each point."""
+    goal = so.StiffnessGoal(maximise=so.StiffnessMeasure(direction=(1, 0, 0)))
+    task = so.Task(target=so.Target(position=tuple(positions[0])), stiffness=goal)
+    solver, p, found = PressureSolver(robot, task), None, []
+    for place in positions:
+        solution = solver.solve(so.Target(position=tuple(place)), guess=p)
+        p = solution.pressures
+        found.append((p, solution.stiffness))
+    return np.array([p for p, _ in found]), np.array([k for _, k in found])
+
+
+def test_a_line_is_followed_as_stiffly_as_its_points_can_be(robot, compiled):
+    path = path_of()
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    _, stiffness = warm_started(robot, path.points().positions)
+    assert solution.worst >= stiffness.min() * (1 - 1e-6)
+    np.testing.assert_allclose(solution.times, np.linspace(0, 4, 21))
+
+
+def test_a_line_is_followed_without_a_compiler(robot):
+    path = path_of(points=4, pressure={"slew": 1e6})
+    check(robot, path, solve_path(robot, path))
+
+
+def test_the_same_seed_gives_the_same_answer(robot, compiled):
+    a, b = (solve_path(robot, path_of(), seed=3) for _ in range(2))
+    np.testing.assert_array_equal(a.pressures, b.pressures)
+
+
+@pytest.mark.parametrize("slew", [5e5, 1e5, 0.5e5])
+def test_where_warm_starts_jump_the_rates_are_kept(slew, robot, compiled):
+    positions = wandering(robot, 3, 20, 60)
+    jumping, stiffness = warm_started(robot, positions)
+    jump = np.abs(np.diff(jumping, axis=0)).max()
+    path = path_of(through(positions), points=None, pressure={"slew": slew})
+    assert jump > slew * 0.1  # which takes more than the time between two points
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    assert solution.worst >= stiffness.min() * (1 - 1e-6)
+
+
+def test_a_way_between_branches_is_found_over_other_configurations(robot, compiled):
+    positions = wandering(robot, 8, 200, 250)
+    path = path_of(through(positions), points=None)
+    check(robot, path, solve_path(robot, path))
+
+
+def test_points_that_the_rates_hold_back_are_optimised_together(robot, compiled):
+    positions = wandering(robot, 3, 20, 60)
+    path = path_of(through(positions), points=None, over="mean")
+    points = path.points()
+    pairs = zip(points.targets, points.goals, strict=True)
+    tasks = PathTasks(robot, [path.task(target, goal) for target, goal in pairs], 0)
+    layers, _ = candidates(tasks)
+    steps = np.full((len(points) - 1, robot.n_pressures), 0.05e5)
+    route = RouteSearch(tasks, layers, steps, "mean").best()
+    pressures = np.array([each.pressures for each in route.candidates])
+    better = refined(tasks, pressures, steps, "mean")
+    judged = [tasks.judged(p) for p in (pressures, better)]
+    assert all(judgement.holds for each in judged for judgement in each)
+    before, after = (np.mean([np.log(j.stiffnesses[0]) for j in each]) for each in judged)
+    assert after > before + 1e-4
+    assert (np.abs(np.diff(better, axis=0)) <= steps * (1 + 1e-9) + 1e-6).all()
+
+
+def test_the_mean_is_maximised_where_it_is_asked_for(robot, compiled):
+    path = path_of(over="mean")
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    assert solution.stiffness.mean() >= 0.999 * solution.alone.mean()
+
+
+def test_the_direction_turns_with_the_path(robot, compiled):
+    circle = {"centre": (0, 0, 0.19), "normal": (0, 0, 1), "radius": 0.025,
+              "start": (0.025, 0, 0.19)}  # fmt: skip
+    path = path_of({"circle": circle}, frame="path", points=25, timing={"speed": 0.02})
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    np.testing.assert_array_equal(solution.pressures[0], solution.pressures[-1])
+    tangent = path.points().tangents[5]
+    assert solution.stiffness[5] == pytest.approx(robot.stiffness(solution.pressures[5], tangent))
+
+
+def test_as_fast_as_the_rates_allow(robot, compiled):
+    solution = solve_path(robot, path_of(timing={"fastest": True}))
+    steps = np.abs(np.diff(solution.pressures, axis=0))
+    least = (steps / solution.slew).max(axis=1)
+    np.testing.assert_allclose(np.diff(solution.times), np.maximum(least, 1e-3))
+
+
+def test_a_speed_that_no_rate_allows_names_the_rate_and_what_can_be_followed(robot, compiled):
+    path = path_of(timing={"speed": 10.0})
+    solution = solve_path(robot, path)
+    assert solution.status == "unreachable"
+    assert "too fast for the rates" in solution.message
+    assert "with 5 bar/s holds it back most" in solution.message
+    slower = path_of(timing={"speed": 0.04 / solution.times[-1]})
+    check(robot, slower, solution.__class__(**{**vars(solution), "status": "solved"}))
+
+
+def test_pressures_at_the_start_are_kept(robot, compiled):
+    free = solve_path(robot, path_of())
+    target = so.Target(position=tuple(path_of().points().positions[0]))
+    stiff_in_y = so.StiffnessGoal(maximise=so.StiffnessMeasure(direction=(0, 1, 0)))
+    start = so.solve_pressure(robot, so.Task(target=target, stiffness=stiff_in_y)).pressures
+    assert np.abs(start - free.pressures[0]).max() > 1e3
+    path = path_of(start={"pressures": tuple(start)})
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    np.testing.assert_array_equal(solution.pressures[0], start)
+
+
+def test_pressures_at_the_start_that_are_elsewhere_are_refused(robot):
+    path = path_of(points=3, start={"pressures": (0.0,) * 6})
+    with pytest.raises(InputError, match=r"start\.pressures.* mm off that point"):
+        solve_path(robot, path)
+
+
+def test_a_point_out_of_reach_is_named_with_the_nearest_path(robot, compiled):
+    path = path_of({"line": {"from": (-0.03, 0, 0.19), "to": (-0.16, 0, 0.19)}})
+    solution = solve_path(robot, path)
+    assert solution.status == "unreachable"
+    index = solution.first_failure
+    assert f"point {index + 1} of 21" in solution.message
+    assert "segment 2 channel 2 max" in solution.message
+    reached = solution.position_errors <= 1e-4
+    assert reached[:index].all()
+    assert not reached[index]
+    alone = so.solve_pressure(robot, path.task(path.points().targets[-1], None))
+    assert solution.position_errors[-1] == pytest.approx(alone.position_error, abs=2e-4)
+
+
+def test_the_body_keeps_clear_of_a_scene(robot, compiled):
+    free = solve_path(robot, path_of())
+    outer = robot.description.segments[0].outer_radius
+    beside = robot.pose(free.pressures[-1], 0.12)
+    centre = beside[:3, 3] + beside[:3, :3] @ [0, outer + 0.005, 0]  # 1 mm from the body
+    post = {"name": "post", "sphere": {"centre": tuple(centre), "radius": 0.004}}
+    scene = so.Scene(clearance=0.003, objects=[post])
+    assert robot.clearance(free.pressures, scene).min() < 0.003
+    path = path_of(scene={"clearance": 0.003, "objects": [post]})
+    solution = solve_path(robot, path)
+    check(robot, path, solution)
+    for p, said in zip(solution.pressures, solution.clearance, strict=True):
+        line = robot.backbone(p, 400)[:, :3, 3]
+        own = np.linalg.norm(line - centre, axis=1).min() - 0.004 - outer
+        assert own == pytest.approx(said, abs=1e-4)
+        assert said >= 0.003 - 5e-5
+
+
+def test_an_arm_under_gravity_follows_a_path(compiled):
+    robot = so.load_robot("stiff-flop-2-hanging")
+    tip = robot.tip_pose(np.full(6, 0.3e5) + np.arange(6) * 1e4)[:3, 3]
+    line = {"line": {"from": tuple(tip), "to": tuple(tip + np.array([0, 0.006, 0]))}}
+    path = path_of(line, points=5)
+    check(robot, path, solve_path(robot, path))
+
+
+def test_giving_up_says_so(robot, compiled):
+    solution = solve_path(robot, path_of(), cancel=lambda: True)
+    assert solution.status == "failed"
+    assert "cancelled" in solution.message
+    assert solution.pressures.shape == (0, 6)
+
+
+def test_steps_that_are_asked_of_a_crossing_are_kept(robot, compiled):
+    """Sequences over every pair of candidates are as good as the search says."""
+    positions = wandering(robot, 3, 28, 44)
+    path = path_of(through(positions), points=None)
+    points = path.points()
+    pairs = zip(points.targets, points.goals, strict=True)
+    tasks = PathTasks(robot, [path.task(target, goal) for target, goal in pairs], 0)
+    layers, _ = candidates(tasks)
+    small = [layer[:2] for layer in layers[:8]]
+    steps = np.full((7, robot.n_pressures), 1.5e5)
+    route = RouteSearch(tasks, small, steps, "mean").best()
+    values = [
+        np.mean([each.value for each in some])
+        for some in itertools.product(*small)
+        if (np.abs(np.diff([each.pressures for each in some], axis=0)) <= 1.5e5).all()
+    ]
+    assert route.value("mean") >= max(values) - 2e-3
