@@ -30,7 +30,7 @@ def block(solved: SolvedPath) -> RenderableType:
     )
     parts: list[RenderableType] = [heading, labelled(_lines(solved))]
     if len(solution.times):
-        parts += ["", _table(solution)]
+        parts += ["", points_table(solution)]
     return Group(*parts, "")
 
 
@@ -62,7 +62,7 @@ def _lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]:
         ),
     )
     yield from _stiffness_lines(solved)
-    yield from _rates(solution)
+    yield from rate_lines(solution)
     if solution.clearance is not None and path.scene is not None:
         index = int(np.argmin(solution.clearance))
         yield (
@@ -98,7 +98,7 @@ def _stiffness_lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]
     )
 
 
-def _rates(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
+def rate_lines(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
     """Where the pressures are nearest to their rates."""
     margins = rate_margins(solution)
     if margins is None or solution.slew is None:
@@ -120,14 +120,15 @@ def _rates(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
     )
 
 
-def _table(solution: PathSolution) -> RenderableType:
+def points_table(solution: PathSolution) -> RenderableType:
     """Every so many points, and those that matter."""
     count = len(solution.times)
     marks: dict[int, str] = {}
     if solution.worst_index is not None:
         marks[solution.worst_index] = "worst"
     if solution.first_failure is not None:
-        marks[solution.first_failure] = "first that cannot be had"
+        both = ", worst" * (solution.first_failure in marks)
+        marks[solution.first_failure] = f"cannot be had{both}"
     shown = {*range(0, count, max(1, round(count / _ROWS))), count - 1, *marks}
     columns = _columns(solution)
     table = number_table("  point", *columns, "")
@@ -144,8 +145,9 @@ def _columns(solution: PathSolution) -> dict[str, list[str]]:
     margins = rate_margins(solution)
     alone = solution.alone
     share = None if solution.stiffness is None or alone is None else solution.stiffness / alone
+    digits = 2 if solution.times[-1] >= 1 else 4
     found = (
-        ("time s", solution.times, lambda value: f"{value:.2f}"),
+        ("time s", solution.times, lambda value: f"{value:.{digits}f}"),
         ("error mm", solution.position_errors, lambda value: f"{value * MM:.3f}"),
         ("deg", solution.angle_errors, lambda value: f"{degrees(value):.2f}"),
         (unit_text(solution.stiffness_unit), solution.stiffness, figures),

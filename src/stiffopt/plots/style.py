@@ -74,7 +74,7 @@ def channel_colour(channel: int) -> str:
 
 _WIDE = 11.0  # inches
 _DPI = 130
-_LONGEST_NOTE = 120  # characters of a message that fit
+_LONGEST_NOTE = 160  # characters of a message that fit
 
 
 def require_matplotlib() -> None:
