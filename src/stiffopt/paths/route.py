@@ -6,7 +6,6 @@ stays on the path.  How stiff the arm is on a crossing is computed only for thos
 sequence would use; until then a crossing counts as good as its ends.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -18,22 +17,31 @@ from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.settings import RATES, ROUTE
 
 Vector = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 
-@dataclass(eq=False)
-class _Crossing:
-    """From candidate `a` of a point to candidate `b` of one `length` steps later.
+@dataclass
+class _Crossings:
+    """Crossings in the order of the points where they end; arrays have a value for each.
 
-    `between`: the candidates at the points between, once they are computed.
+    Attributes
+    ----------
+    begin, a : from which candidate of which point.
+    end, b : to which.
+    worst, total : values on the way; until a crossing is computed they are guessed.
+    between : the candidates at the points between, of those that are computed.
     """
 
-    begin: int
-    a: int
-    length: int
-    b: int
-    worst: float
-    total: float
-    between: list[PathCandidate] | None = None
+    begin: Indices
+    a: Indices
+    end: Indices
+    b: Indices
+    worst: Vector
+    total: Vector
+    between: dict[int, list[PathCandidate]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.known = np.zeros(len(self.begin), dtype=bool)
 
 
 @dataclass
@@ -56,19 +64,22 @@ class Route:
 
 
 class _Sequence(NamedTuple):
-    """Candidates (point, number) and crossings in order, with their worst value and mean."""
+    """Candidates (point, number) and numbers of crossings in order; worst value and mean."""
 
-    steps: list[tuple[int, int] | _Crossing]
+    steps: list[tuple[int, int] | int]
     worst: float
     mean: float
 
 
 @dataclass
 class _Best:
-    """Of the best sequences to each candidate of each point: value, and where it came from."""
+    """Of the best sequences to each candidate: value, and where it came from.
+
+    `before` counts candidates of the point before, and crossings as ``-1 - number``.
+    """
 
     values: list[Vector] = field(default_factory=list)
-    before: list[list[tuple[int, int, _Crossing | None] | None]] = field(default_factory=list)
+    before: list[Indices] = field(default_factory=list)
 
 
 def steps_are_kept(pressures: Vector, steps: Vector) -> bool:
@@ -99,15 +110,16 @@ class RouteSearch:
             np.array([each.pressures for each in layer]).reshape(len(layer), len(tasks.unit))
             for layer in layers
         ]
-        self._may_follow = [
-            (np.abs(after - before[:, np.newaxis]) <= step * (1 + RATES.rounding) + 1e-9).all(
-                axis=2
-            )
+        # from each candidate (columns) to each of the next point (rows): 0, or -inf
+        self._bars = [
+            _bars(before, after, step * (1 + RATES.rounding) + 1e-9)
             for before, after, step in zip(
                 self._pressures[:-1], self._pressures[1:], steps, strict=True
             )
         ]
-        self._crossings: dict[int, list[_Crossing]] = {}  # by the point where they end
+        self._first = np.cumsum([0, *map(len, layers)])  # candidate of each point, of all
+        none, nothing = np.zeros(0, dtype=np.intp), np.zeros(0)
+        self._crossings = _Crossings(none, none, none, none, nothing, nothing)
 
     def best(self, rounds: int = ROUTE.rounds) -> Route | None:
         """The best sequence; None if there is none.
@@ -118,21 +130,21 @@ class RouteSearch:
         direct = self._sequence()
         if not rounds or (direct is not None and self._is_about(direct, self._hope())):
             return None if direct is None else self._route(direct)
-        for crossing in self._all_crossings():
-            self._crossings.setdefault(crossing.begin + crossing.length, []).append(crossing)
+        self._crossings = self._all_crossings()
         for _ in range(rounds):
             hoped = self._sequence()
             if hoped is None:
                 return None
-            unknown = [c for c in hoped.steps if isinstance(c, _Crossing) and c.between is None]
+            used = [each for each in hoped.steps if isinstance(each, int)]
+            unknown = [each for each in used if not self._crossings.known[each]]
             if not unknown:
                 return self._route(hoped)
             known = self._sequence(computed=True)
             if known is not None and self._is_about(known, hoped):
                 return self._route(known)
-            for crossing in unknown:
+            for number in unknown:
                 checkpoint()
-                self._compute(crossing)
+                self._compute(number)
         known = self._sequence(computed=True)
         return None if known is None else self._route(known)
 
@@ -178,43 +190,47 @@ class RouteSearch:
             return None
         point, number = len(self._layers) - 1, int(np.argmax(best.values[-1]))
         mean = float(best.values[-1][number]) / len(self._layers)
-        found: list[tuple[int, int] | _Crossing] = [(point, number)]
-        while (came := best.before[point][number]) is not None:
-            point, number, crossing = came
-            if crossing is not None:
-                found.append(crossing)
+        found: list[tuple[int, int] | int] = [(point, number)]
+        while point:
+            came = int(best.before[point][number])
+            if came >= 0:
+                point, number = point - 1, came
+            else:
+                found.append(-1 - came)
+                point = int(self._crossings.begin[-1 - came])
+                number = int(self._crossings.a[-1 - came])
             found.append((point, number))
         return _Sequence(found[::-1], worst, mean)
 
     def _best(self, least: float, *, bottleneck: bool, computed: bool = False) -> _Best:
         """Best worst value (`bottleneck`), or sum of values that are all at least `least`."""
-        best = _Best()
+        best, every = _Best(), np.full(self._first[-1], -np.inf)
+        crossings = self._crossings
+        usable = np.flatnonzero((crossings.worst >= least) & (crossings.known | (not computed)))
+        starts = np.searchsorted(crossings.end[usable], np.arange(len(self._values) + 1))
+        origin = self._first[crossings.begin] + crossings.a
+        price = crossings.worst if bottleneck else crossings.total
         for point, own in enumerate(self._values):
-            values = np.where(own >= least, own, -np.inf)
-            before: list[tuple[int, int, _Crossing | None] | None] = [None] * len(own)
-            if point:
-                values = np.full(len(own), -np.inf)
-                earlier = best.values[-1]
-                if len(own) and len(earlier):
-                    reached = np.where(self._may_follow[point - 1].T, earlier, -np.inf)
-                    origin = reached.argmax(axis=1)
-                    value = reached[np.arange(len(own)), origin]
-                    values = np.minimum(value, own) if bottleneck else value + own
-                    values = np.where(own >= least, values, -np.inf)
-                    before = [(point - 1, int(k), None) for k in origin]
-            for crossing in self._crossings.get(point, ()):
-                if computed and crossing.between is None:
-                    continue
-                earlier_value = best.values[crossing.begin][crossing.a]
-                if bottleneck:
-                    value = min(earlier_value, crossing.worst, own[crossing.b])
-                elif crossing.worst < least or own[crossing.b] < least:
-                    continue
-                else:
-                    value = earlier_value + crossing.total + own[crossing.b]
-                if value > values[crossing.b]:
-                    values[crossing.b] = value
-                    before[crossing.b] = (crossing.begin, crossing.a, crossing)
+            values = np.full(len(own), -np.inf if point else np.inf if bottleneck else 0.0)
+            before = np.zeros(len(own), dtype=np.intp)
+            if point and len(own) and len(best.values[-1]):
+                reached = self._bars[point - 1] + best.values[-1]
+                before = reached.argmax(axis=1)
+                values = reached[np.arange(len(own)), before]
+            some = usable[starts[point] : starts[point + 1]]
+            if len(some):
+                came, passed = every[origin[some]], price[some]
+                came = np.minimum(came, passed) if bottleneck else came + passed
+                order = np.argsort(came, kind="stable")  # so that the best stays
+                over, number = np.full(len(own), -np.inf), np.zeros(len(own), dtype=np.intp)
+                goals = crossings.b[some[order]]
+                over[goals] = came[order]
+                number[goals] = some[order]
+                before = np.where(over > values, -1 - number, before)
+                values = np.maximum(values, over)
+            values = np.minimum(values, own) if bottleneck else values + own
+            values = np.where(own >= least, values, -np.inf)
+            every[self._first[point] : self._first[point + 1]] = values
             best.values.append(values)
             best.before.append(before)
         return best
@@ -223,8 +239,8 @@ class RouteSearch:
         candidates: list[PathCandidate] = []
         crossings = 0
         for each in found.steps:
-            if isinstance(each, _Crossing):
-                candidates += each.between or []
+            if isinstance(each, int):
+                candidates += self._crossings.between[each]
                 crossings += 1
             else:
                 candidates.append(self._layers[each[0]][each[1]])
@@ -232,45 +248,72 @@ class RouteSearch:
 
     # -- crossings ------------------------------------------------------------------------------
 
-    def _all_crossings(self) -> Iterator[_Crossing]:
+    def _all_crossings(self) -> _Crossings:
         """Crossings from some points, where candidates are too far apart for a step."""
         count = len(self._layers)
         point = np.repeat(np.arange(count), [len(layer) for layer in self._layers])
-        number = np.concatenate([np.arange(len(layer)) for layer in self._layers])
         pressures = np.concatenate(self._pressures)
         reach = np.concatenate([np.zeros((1, len(self._tasks.unit))), self._steps.cumsum(axis=0)])
+        widest = np.ptp(pressures, axis=0)
+        none = np.zeros(0, dtype=np.intp)
+        origins, goals = [none], [none]
         for begin in range(0, count - 2, max(1, count // ROUTE.crossings)):
-            later = np.flatnonzero(point > begin + 1)
+            lengths = np.arange(2, count - begin)
+            limits = np.maximum((reach[begin + 2 :] - reach[begin]) * ROUTE.within, 1e-9)
+            needed = (widest / limits).max(axis=1) * lengths  # steps, by the widest apart
+            longest = lengths[np.ceil(max(ROUTE.lengths) * np.maximum(needed, 1.0)) >= lengths]
+            last = begin + longest.max(initial=1)
+            later = np.arange(self._first[begin + 2], self._first[last + 1])
             length = point[later] - begin
-            limits = (reach[point[later]] - reach[begin]) * ROUTE.within
-            for a, origin in enumerate(self._pressures[begin]):
-                apart = np.abs(pressures[later] - origin)
-                share = np.max(apart / np.maximum(limits, 1e-9), axis=1)
-                needed = share * length  # steps, if all of them are as large
+            for origin in range(self._first[begin], self._first[begin + 1]):
+                apart = np.abs(pressures[later] - pressures[origin])
+                # steps, if all of them are as large
+                needed = np.max(apart / limits[length - 2], axis=1) * length
                 for more in ROUTE.lengths:
                     fits = (np.ceil(more * np.maximum(needed, 1.0)) == length) & (needed > 1)
-                    nearest = np.flatnonzero(fits)[np.argsort(needed[fits], kind="stable")]
-                    for k in later[nearest[: ROUTE.nearest]]:
-                        yield self._guessed(begin, a, int(point[k]) - begin, int(number[k]))
+                    nearest = np.flatnonzero(fits)
+                    nearest = nearest[np.argsort(needed[nearest], kind="stable")[: ROUTE.nearest]]
+                    origins.append(np.full(len(nearest), origin))
+                    goals.append(later[nearest])
+        return self._guessed(np.concatenate(origins), np.concatenate(goals), point)
 
-    def _guessed(self, begin: int, a: int, length: int, b: int) -> _Crossing:
-        ends = self._values[begin][a], self._values[begin + length][b]
-        mean = sum(ends) / 2 - ROUTE.price
-        return _Crossing(begin, a, length, b, min(ends) - ROUTE.price, (length - 1) * mean)
+    def _guessed(self, origin: Indices, goal: Indices, point: Indices) -> _Crossings:
+        """Crossings from candidates to candidates, of all those of all points."""
+        order = np.argsort(goal, kind="stable")
+        origin, goal = origin[order], goal[order]
+        begin, end = point[origin], point[goal]
+        values = np.concatenate(self._values)
+        mean = (values[origin] + values[goal]) / 2 - ROUTE.price
+        return _Crossings(
+            begin=begin,
+            a=origin - self._first[begin],
+            end=end,
+            b=goal - self._first[end],
+            worst=np.minimum(values[origin], values[goal]) - ROUTE.price,
+            total=(end - begin - 1) * mean,
+        )
 
-    def _compute(self, crossing: _Crossing) -> None:
+    def _compute(self, number: int) -> None:
         """Follow a crossing; it counts as impossible where that fails."""
-        goal = self._pressures[crossing.begin + crossing.length][crossing.b]
-        start = self._pressures[crossing.begin][crossing.a]
-        steps = self._steps[crossing.begin : crossing.begin + crossing.length]
-        between = crossed(self._tasks, crossing.begin, start, goal, steps)
-        crossing.between = between or []
-        if between is None:
-            crossing.worst = crossing.total = -np.inf
-            return
-        values = [each.value for each in between]
-        crossing.worst = min(values) - ROUTE.price
-        crossing.total = sum(values) - ROUTE.price * len(values)
+        every = self._crossings
+        begin, end = int(every.begin[number]), int(every.end[number])
+        start, goal = self._pressures[begin][every.a[number]], self._pressures[end][every.b[number]]
+        between = crossed(self._tasks, begin, start, goal, self._steps[begin:end])
+        every.known[number] = True
+        every.between[number] = between or []
+        every.worst[number] = every.total[number] = -np.inf
+        if between is not None:
+            values = [each.value for each in between]
+            every.worst[number] = min(values) - ROUTE.price
+            every.total[number] = sum(values) - ROUTE.price * len(values)
+
+
+def _bars(before: Vector, after: Vector, step: Vector) -> Vector:
+    """0 where candidates after (rows) may follow those before (columns), -inf elsewhere."""
+    may = np.ones((len(after), len(before)), dtype=bool)
+    for own, other, most in zip(after.T, before.T, step, strict=True):
+        may &= np.abs(own[:, np.newaxis] - other) <= most
+    return np.where(may, 0.0, -np.inf)
 
 
 def crossed(
