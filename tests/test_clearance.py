@@ -184,12 +184,13 @@ def test_a_mounted_arm_that_is_clear_has_no_disc_nearer_to_its_plate(asked):
     most = model.pressure_max
     ends = np.array([[k >> i & 1 for i in range(6)] for k in range(64)]) * most
     p = np.vstack([ends, np.random.default_rng(2).uniform(0, most, (200, 6))])
-    at = np.linspace(0, model.length, 181)[1:]
+    begin = 1.25 * (0.015 + asked)
+    at = np.sort(np.append(np.linspace(0, model.length, 181)[1:], begin))
     poses = model.pose(p, at)
     rims = poses[..., 2, 3] - 0.015 * np.sqrt(1 - np.minimum(poses[..., 2, 2] ** 2, 1))
     balls = poses[..., 2, 3] - 0.015
     found = model.clearance(p, plate)
-    counted = at >= 1.25 * (0.015 + asked)
+    counted = at >= begin
     np.testing.assert_allclose(found, balls[:, counted].min(axis=1), atol=4e-4)
     assert (balls[:, np.argmax(counted)] > asked + 1e-3).all()  # bent arms are clear there too
     clear = found >= asked
