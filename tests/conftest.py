@@ -44,8 +44,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     if not is_long():
         skip = pytest.mark.skip(reason="long: run with --long or STIFFOPT_LONG=1")
         for item in items:
-            if "long" in item.keywords:
+            if "long" in item.keywords or not _is_sampled(item):
                 item.add_marker(skip)
+
+
+def _is_sampled(item: pytest.Item) -> bool:
+    """Say whether the ordinary form runs this case of a test that is marked `one_in(n, *names)`.
+
+    It does where the places of its parameters in their lists, of all or of those that are named,
+    have a sum that n divides: of one list every n-th, and of several of at least n each all values.
+    """
+    marker = item.get_closest_marker("one_in")
+    if marker is None:
+        return True
+    every, *names = marker.args
+    places: dict[str, int] = item.callspec.indices  # type: ignore[attr-defined]
+    return bool(sum(places[name] for name in names or places) % every == 0)
 
 
 @pytest.fixture(scope="session")

@@ -91,6 +91,7 @@ def run(folder: Path, names: list[str]) -> dict[str, str]:
     """Try the mutants of these names and return what became of each."""
     begin = [sys.executable, "-m", "mutmut"]
     environment = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "COLUMNS": "200"}
+    environment["STIFFOPT_LONG"] = "1"  # all cases of a test, also where one in some is usual
     environment.pop("PYTHONPATH", None)
     children = ["--max-children", str(os.cpu_count() or 1)]
     how = {"cwd": folder, "env": environment, "text": True}

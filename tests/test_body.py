@@ -68,6 +68,7 @@ def assert_close(found, expected, share):
         assert np.abs(found[rows] - expected[rows]).max() <= share * scale
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("case", [*FREE, *INDEPENDENT_LOADED])
 def test_poses_are_those_of_an_independent_integration(case):
     model, (arm, _) = robot(case), CASES[case]
@@ -86,6 +87,7 @@ def test_between_steps_poses_are_nearly_as_exact_as_at_their_ends():
     assert off[:, :3, :3].max() < 1e-5
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("size", [0.7e5, 0.0])
 def test_jacobians_are_derivatives_of_poses(case, size):
@@ -175,6 +177,7 @@ def test_the_radius_is_what_the_law_says():
     assert radii == pytest.approx([0.014, 0.012, 0.012], abs=0)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("case", ["mixed", "hanging, mixed", "follower"])
 def test_machine_code_gives_what_the_vm_gives(case, compiled, monkeypatch):
     monkeypatch.setattr(body, "LOOKED_UP_FROM", 10**9)
@@ -200,6 +203,7 @@ def test_an_arm_of_more_kinds_of_sections_than_fit_has_no_machine_code(compiled)
     assert body.native_body(so.Manipulator(so.RobotDescription(**arm.mapping()))) is None
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("case", ["neo-Hookean", "hanging, neo-Hookean"])
 def test_the_header_serves_other_libraries(case, compiled):
     """Position, tangent and radius, and their derivatives by pressures."""

@@ -63,7 +63,7 @@ def by_many_stations(model: stiffopt.Manipulator, p: np.ndarray, count: int) -> 
     at = np.linspace(0.0, model.length, count)
     positions = model._body.poses(p[None], at)[0, :, :3, 3]
     radii = model.body_radius(p, at)
-    measured = arm_clearance.MeasuredScene(scene())
+    measured = arm_clearance.measured_scene(scene(), model.description)
     items = [item for item in measured.items if not item.is_ring]
     return np.array([(item.distances(positions).values - radii).min() for item in items])
 
@@ -172,6 +172,47 @@ def test_a_body_passes_through_a_trocar_beside_it_or_not_at_all():
     assert of((0.0, 0.0, 0.19)) == pytest.approx(-0.01, abs=1e-9)  # not reached
     assert of((0.0, 0.05, 0.22)) == pytest.approx(-0.05, abs=1e-9)
     assert of((0.0, 0.0, 0.0)) == pytest.approx(0.005, abs=1e-9)
+
+
+PLATE = {"name": "plate", "half_space": {"point": (0.0, 0.0, 0.0), "normal": (0.0, 0.0, 1.0)}}
+
+
+@pytest.mark.parametrize("asked", [0.0, 2e-3])
+def test_a_mounted_arm_that_is_clear_has_no_disc_nearer_to_its_plate(asked):
+    model = stiffopt.load_robot("stiff-flop-2")
+    plate = Scene(clearance=asked, objects=[PLATE])
+    most = model.pressure_max
+    ends = np.array([[k >> i & 1 for i in range(6)] for k in range(64)]) * most
+    p = np.vstack([ends, np.random.default_rng(2).uniform(0, most, (200, 6))])
+    begin = 1.25 * (0.015 + asked)
+    at = np.sort(np.append(np.linspace(0, model.length, 181)[1:], begin))
+    poses = model.pose(p, at)
+    rims = poses[..., 2, 3] - 0.015 * np.sqrt(1 - np.minimum(poses[..., 2, 2] ** 2, 1))
+    balls = poses[..., 2, 3] - 0.015
+    found = model.clearance(p, plate)
+    counted = at >= begin
+    np.testing.assert_allclose(found, balls[:, counted].min(axis=1), atol=4e-4)
+    assert (balls[:, np.argmax(counted)] > asked + 1e-3).all()  # bent arms are clear there too
+    clear = found >= asked
+    assert 20 < clear.sum() < len(p)
+    assert (rims[clear] > -1e-9).all()
+    assert (rims[clear][:, at > 1.5 * asked] >= asked).all()
+
+
+@pytest.mark.usefixtures("machine_code")
+def test_machine_code_counts_a_mounted_arm_as_python_does(monkeypatch):
+    model, p = robot("free"), pressures("free", 6, seed=7)
+    p[0] = [0.0, 0.0, 1.5e5, 0.0, 0.0, 1.5e5]
+    p[1] = 0.0
+    assert model._body.machine_code(10_000) is not None
+    plate = Scene(clearance=0.002, objects=[PLATE, *scene().objects[:1]])
+    fast, least = model.clearances(p, plate), model.clearance(p, plate)
+    assert fast.at[1, 0] == pytest.approx(1.25 * 0.017)
+    monkeypatch.setattr(arm_clearance, "scene_library", lambda: None)
+    slow = model.clearances(p, plate)
+    np.testing.assert_allclose(fast.distances, slow.distances, atol=2e-8)
+    np.testing.assert_allclose(least, slow.distances.min(axis=1), atol=5e-6)
+    np.testing.assert_allclose(fast.gradients, slow.gradients, atol=1e-9)
 
 
 def test_an_arm_that_swells_has_less_clearance():

@@ -98,6 +98,7 @@ def test_values_of_machine_code_and_of_the_vm():
         assert function(np.zeros(0))[0] == 3
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("count", [0, 1, 255, 256, 257, 10_000])
 @pytest.mark.parametrize("rows_of", [(True, True, True), (True, False, True), (True, True, False)])
 def test_a_batch_is_row_by_row(count, rows_of, monkeypatch):
@@ -463,6 +464,7 @@ CALLS = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["stiff-flop-1", "stiff-flop-3"])
 def test_compiled_maps_are_those_of_the_vm(name, cache, monkeypatch):
     reference = so.load_robot(name)

@@ -31,6 +31,15 @@ def _machine_code(compiled):
     """Truth and controllers are too slow without."""
 
 
+@pytest.fixture
+def short_steps(monkeypatch):
+    """Half the time for each target: with inertia it takes all of it to tell swings apart."""
+    monkeypatch.setattr(control_runs, "HOLD", 5.0)
+    monkeypatch.setattr(control_runs, "FROM", 3.0)
+    monkeypatch.setattr(control_runs, "EARLY", (2.0, 3.0))
+    monkeypatch.setattr(control_runs, "LATE", (4.0, 5.0))
+
+
 @cache
 def drawn():
     """A case of one target, for all tests that only read it."""
@@ -62,7 +71,7 @@ def test_a_case_is_what_the_bars_say_and_its_truth_is_that_of_the_arm():
     assert choice.least < case.truth.stiffness(aim.drawn, direction) < choice.most * (1 + 1e-9)
 
 
-def test_feedback_beats_the_model_alone_and_the_table_says_so():
+def test_feedback_beats_the_model_alone_and_the_table_says_so(short_steps):
     case = drawn()
 
     def slow(rig, robot, dynamics):
@@ -112,7 +121,7 @@ def test_a_robot_file_with_another_base_gets_targets_and_poses_in_that_base():
     assert np.linalg.norm(seen.position - tip) > 2e-3
 
 
-def test_what_a_file_calls_the_tip_is_what_goes_to_the_target():
+def test_what_a_file_calls_the_tip_is_what_goes_to_the_target(short_steps):
     nominal = drawn()
     off = Placement(position=(4e-3, 0.0, 0.0))
     recordings = Recordings(registration=Registration(tip_in_sensor=off))
@@ -124,7 +133,9 @@ def test_what_a_file_calls_the_tip_is_what_goes_to_the_target():
 def test_a_calibrated_file_comes_from_a_recording_without_the_run_s_noise_and_is_kept(
     tmp_path, monkeypatch
 ):
-    case = draw_case(3, targets=1, payload=0.01)
+    nominal = drawn()
+    loaded = nominal.description.plant.model_copy(update={"payload": 0.01})
+    case = replace(nominal, description=nominal.description.model_copy(update={"plant": loaded}))
     asked = []
 
     def recorded(rig, robot, sizes, folder):

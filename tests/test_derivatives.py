@@ -26,6 +26,7 @@ def points(n):
     }
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("where", ["in general", "equal pressures", "near zero"])
 @pytest.mark.parametrize("arm", list(robots()))
 def test_first_derivative_of_the_pose(arm, where):
@@ -37,6 +38,7 @@ def test_first_derivative_of_the_pose(arm, where):
         assert J[half] == pytest.approx(expected[half], abs=2e-7 * np.abs(expected[half]).max())
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("where", ["in general", "equal pressures", "near zero"])
 @pytest.mark.parametrize("arm", list(robots()))
 def test_second_derivative_of_the_pose(arm, where):
@@ -49,6 +51,7 @@ def test_second_derivative_of_the_pose(arm, where):
         assert H[half] == pytest.approx(expected[half], abs=1e-5 * np.abs(expected[half]).max())
 
 
+@pytest.mark.one_in(3, "arm", "where", "kind")
 @pytest.mark.parametrize("where", ["in general", "equal pressures"])
 @pytest.mark.parametrize("arm", list(robots()))
 @pytest.mark.parametrize(

@@ -68,6 +68,7 @@ def no_general_method(monkeypatch):
     monkeypatch.setattr(so.PressureSolver, "_general", refuse)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", KINDS)
 def test_answers_as_the_general_method_does(kind, robot, monkeypatch):
     rng = np.random.default_rng(sorted(KINDS).index(kind))

@@ -72,6 +72,7 @@ def own_shape(description):
     return ca.Function("own", [tip.pressures], [tip.transform, tip.jacobian, tip.compliance])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("calibrated", [False, True])
 @pytest.mark.parametrize("eccentric", [False, True])
 @pytest.mark.parametrize("law", strain_laws())

@@ -49,6 +49,7 @@ def batch(arm, count=2, seed=0):
     return np.random.default_rng(seed).uniform(0.1e5, 0.9e5, (count, arm.n_pressures))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("method", METHODS)
 def test_single_batch_and_empty(name, method):
@@ -103,6 +104,7 @@ VARIANTS = list(
 )
 
 
+@pytest.mark.one_in(3, "name", "kind")
 @pytest.mark.parametrize(("kind", "boundary", "frame"), VARIANTS)
 @pytest.mark.parametrize("name", ["free", "mixed", "hanging"])
 def test_stiffness_by_its_definition(name, kind, boundary, frame):

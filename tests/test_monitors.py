@@ -78,6 +78,7 @@ class Regulators:
         return None, seconds
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("frequency", [0.1, 0.5, 1.0, 3.0])
 @pytest.mark.parametrize("lag", [0.02, 0.06, 0.09])
 def test_9_a_set_point_that_moves_is_no_leak(frequency: float, lag: float) -> None:
@@ -355,6 +356,7 @@ def test_9_10_arms_that_are_slow_by_their_robot_file_are_neither_leaking_nor_stu
     assert not bench.was_saturated
 
 
+@pytest.mark.one_in(3, "lag", "frequency")
 @pytest.mark.parametrize(("lag", "falling"), [(0.06, 0.5), (0.5, 0.06), (0.3, 0.8), (1.0, 0.06)])
 @pytest.mark.parametrize("frequency", [0.3, 1.0, 2.0])
 def test_9_10_regulators_that_rise_and_fall_unequally_are_well(
@@ -376,6 +378,7 @@ def test_9_10_a_short_pulse_and_a_short_dip_are_neither_stuck_nor_leaking() -> N
     assert not bench.was_saturated
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("seed", range(6))
 def test_9_10_no_regulator_that_is_fast_enough_is_ever_wrong(seed: int) -> None:
     draw = np.random.default_rng(seed)

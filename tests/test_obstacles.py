@@ -179,6 +179,28 @@ def test_every_kind_of_object_is_kept_clear_of(kind: str, compiled: Path) -> Non
     assert 0 < found.stiffness < free.stiffness
 
 
+PLATE = {"name": "plate", "half_space": {"point": (0.0, 0.0, 0.0), "normal": (0.0, 0.0, 1.0)}}
+
+
+def test_an_arm_on_a_plate_is_solved_as_without_it(way: str) -> None:
+    robot = load_robot("stiff-flop-2")
+    free = solve_pressure(robot, task_with(scene_of(POST)))
+    found = solve_pressure(robot, task_with(scene_of(PLATE, POST)))
+    assert found.found, found.message
+    assert found.stiffness == pytest.approx(free.stiffness, rel=1e-6)
+    assert found.nearest_object == "post"
+
+
+def test_an_arm_does_not_reach_behind_its_plate(compiled: Path) -> None:
+    robot = load_robot("stiff-flop-2")
+    p = robot.pressure_max * [0, 0, 1, 0, 0, 1]
+    behind = tuple(robot.tip_pose(p)[:3, 3].tolist())
+    assert solve_pressure(robot, task_with(None, behind)).found
+    found = solve_pressure(robot, task_with(scene_of(PLATE), behind))
+    assert found.status == "unreachable"
+    assert "'plate'" in found.message
+
+
 def test_both_methods_find_the_same(way: str) -> None:
     robot = load_robot("stiff-flop-2")
     scene = scene_of(POST, RIB)

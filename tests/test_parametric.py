@@ -84,6 +84,7 @@ def rebuilt(name: str, law: str, coordinates: Vector) -> Manipulator:
     return Manipulator(with_values(description, values))
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("law", ["paper", "rest-length", "neo-hookean"])
 @pytest.mark.parametrize("name", ARMS)
 def test_it_is_the_robot_that_is_built_anew(name: str, law: str) -> None:
@@ -115,6 +116,7 @@ def stiffness_of(robot: Manipulator, p: Vector, measure: DirectionalMeasure) -> 
     )
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("at", [None, MIDDLE], ids=["tip", "middle"])
 @pytest.mark.parametrize("name", ARMS)
 def test_poses_by_differences(name: str, at: float | None) -> None:
@@ -142,6 +144,7 @@ def test_poses_by_differences(name: str, at: float | None) -> None:
     assert {key for key, moved in zip(KEYS, moves, strict=True) if not moved} == still
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("measure", MEASURES)
 @pytest.mark.parametrize("name", ARMS)
 def test_stiffnesses_by_differences(name: str, measure: str) -> None:

@@ -80,6 +80,7 @@ def test_elastica(share, tubes):
     assert np.arctan2(T[0, 2], T[2, 2]) == pytest.approx(angle, abs=5e-3)
 
 
+@pytest.mark.one_in(2, "share")
 @pytest.mark.parametrize(("tubes", "share"), [(1, 1.0), (1, 5.0), (2, 5.0), (2, 13.0)])
 def test_elastica_that_shears_and_stretches(share, tubes):
     arm = Arm((FLOP,) * tubes)
@@ -120,6 +121,7 @@ PRESSED = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", PRESSED)
 def test_small_load_compliance(name):
     arm, bar = PRESSED[name]
@@ -149,6 +151,7 @@ LOADED = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", LOADED)
 def test_load_against_the_rod_shot_from_its_tip(name):
     (load,) = LOADED[name]
@@ -169,6 +172,7 @@ MOUNTINGS = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", MOUNTINGS)
 def test_gravity_in_every_mounting(name):
     arm = TWO.under(MOUNTINGS[name], 0.02)
@@ -365,6 +369,7 @@ def test_stretching_in_time():
     assert frequency == pytest.approx(expected, rel=0.01)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("damping", [0.02, 0.1])
 @pytest.mark.parametrize("step", [1e-3, 5e-4])
 def test_free_decay(damping, step):
@@ -378,6 +383,7 @@ def test_free_decay(damping, step):
     assert decrement / np.hypot(2 * np.pi, decrement) == pytest.approx(damping, rel=0.01)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("step", [2e-3, 1e-3])
 @pytest.mark.parametrize("size", [0.01, 1.0])
 def test_nothing_damps_but_the_material(size, step):
@@ -602,6 +608,7 @@ def test_refining_a_twisted_arm_under_weight_converges():
     assert errors[2] < 2e-6
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("arm", [TWO, TWO.under(DOWN, 0.02)], ids=["weightless", "hanging"])
 def test_refining_the_step_converges_with_its_square(arm):
     """A swing of 2 s, compared every 32 ms."""

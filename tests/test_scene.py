@@ -577,6 +577,49 @@ def test_a_scene_built_in_code_is_refused_by_its_place():
         scene.check_against(robot)
 
 
+def half_space(z: float, normal: tuple[float, ...] = (0, 0, 1)) -> dict[str, Any]:
+    return {"half_space": {"point": (0, 0, z), "normal": normal}}
+
+
+def box(top: float, x: float = 0.0) -> dict[str, Any]:
+    return {"box": {"centre": (x, 0, top - 0.01), "size": (0.2, 0.2, 0.02)}}
+
+
+@pytest.mark.parametrize("shape", [half_space(0), half_space(-0.005), box(0), box(-0.001, 0.08)])
+@pytest.mark.parametrize("clearance", [0.0, 0.002])
+def test_an_arm_may_be_mounted_on_a_plate(shape, clearance):
+    robot = stiffopt.load_robot("stiff-flop-2")
+    scene = Scene(clearance=clearance, objects=[{"name": "plate", **shape}])
+    scene.check_against(robot.description)
+    kind = scene.objects[0].shape
+    depth = kind.distance_of((0, 0, 0))
+    begin = 1.25 * (0.015 + clearance - depth)
+    assert kind.begin(0.015, clearance) == pytest.approx(begin, abs=1e-9)
+    assert robot.clearance(np.zeros(6), scene) == pytest.approx(begin + depth - 0.015, abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        half_space(0.001), half_space(0, (0.01, 0, 1)), half_space(0, (0, 0, -1)), box(0.001),
+        box(0, 0.105), {"sphere": {"centre": (0.015, 0, 0), "radius": 0.006}},
+        {"inside_tube": {"points": [(0, 0, 0.01), (0, 0, 0.3)], "radius": 0.016}},
+    ],
+)  # fmt: skip
+def test_an_object_that_the_base_is_in_or_beside_is_no_mount(shape):
+    robot = stiffopt.load_robot("stiff-flop-2").description
+    scene = Scene(clearance=0.0005, objects=[{"name": "plate", **shape}])
+    with pytest.raises(InputError, match="the arm's base, a body of radius 15 mm"):
+        scene.check_against(robot)
+
+
+def test_a_clearance_that_leaves_out_too_much_of_a_mounted_arm_is_refused():
+    robot = stiffopt.load_robot("stiff-flop-2").description
+    scene = Scene(clearance=0.03, objects=[{"name": "plate", **half_space(0)}])
+    with pytest.raises(InputError, match=r"counts from 56\.25 mm up the arm; expected less than"):
+        scene.check_against(robot)
+
+
 def test_a_rig_file_may_have_a_scene_which_is_checked_against_its_arm(folder):
     rig = Path(__file__).parent.parent / "rig" / "sim-two-segment.yaml"
     text = rig.read_text() + "scene: scene.yaml\n"

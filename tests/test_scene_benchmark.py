@@ -30,6 +30,8 @@ OBJECTS: tuple[dict[str, Any], ...] = (
                                       "radius": 0.04}},
     {"name": "port", "trocar": {"centre": (0.002, 0.0, 0.05), "axis": (0, 0, 1), "radius": 0.025}},
 )  # fmt: skip
+PLATE = {"name": "plate", "half_space": {"point": (0.0, 0.0, 0.0), "normal": (0.0, 0.0, 1.0)}}
+CURLED = np.array([0.0, 0.0, 1.5, 0.0, 0.0, 1.5]) * 1e5  # its tip is behind the base
 PRESSURES = np.array([0.1, 0.3, 0.2, 0.5, 0.1, 0.3]) * 1e5
 
 
@@ -38,6 +40,16 @@ def test_the_judge_and_stiffopt_measure_the_same():
     found = judge.clearances(OBJECTS, line, FLOP.outer_radius)
     expected = load_robot("stiff-flop-2").clearances(PRESSURES, Scene(objects=OBJECTS))
     np.testing.assert_allclose(found, expected.distances, atol=1e-5)
+
+
+def test_the_judge_sees_what_stiffopt_sees_of_a_plate_under_the_base():
+    line = centre_line(Arm((FLOP, FLOP)), CURLED, 2000)
+    robot = load_robot("stiff-flop-2")
+    for asked in (0.0, 2e-3):
+        found = judge.clearances((PLATE,), line, FLOP.outer_radius, asked)
+        expected = robot.clearance(CURLED, Scene(clearance=asked, objects=[PLATE]))
+        assert found[0] == pytest.approx(expected, abs=1e-5)
+        assert found[0] < 0
 
 
 def test_the_centre_line_under_weight_ends_at_the_tip_of_the_rod():

@@ -43,6 +43,7 @@ def test_enough_is_recorded():
     assert len(RECORDED["stiff-flop-3 position"]["best"]) >= 5
 
 
+@pytest.mark.one_in(3, "name")
 @pytest.mark.parametrize(("name", "kind", "seed", "number", "best"), recorded_cases())
 def test_answer_reaches_the_pose_and_is_as_good_as_the_reference(name, kind, seed, number, best):
     arm = robot(name)
@@ -70,6 +71,7 @@ def test_answer_reaches_the_pose_and_is_as_good_as_the_reference(name, kind, see
         assert all(there >= floor.value for there, floor in zip(have, floors, strict=True))
 
 
+@pytest.mark.one_in(2, "name")
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

@@ -105,6 +105,7 @@ SPATIAL = {
 }
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", SPATIAL)
 def test_spatial_equilibrium_against_shooting_from_the_base(name):
     arm, loads = SPATIAL[name]
@@ -144,6 +145,7 @@ def test_facts_of_the_hanging_arm():
     assert np.abs(hanging.tip_pose(bar)[0, 3]) < 0.5 * np.abs(free.tip_pose(bar)[0, 3])
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize("name", ["stiff-flop-2", "stiff-flop-2-hanging"])
 @pytest.mark.parametrize("at", [None, 0.05, 0.13])
 def test_compliance_is_the_derivative_of_the_equilibrium(name, at):
@@ -214,6 +216,7 @@ def column(length, share):
     return robot(bare.under((0, 0, -share * critical)))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("length", [0.3, 1.0])
 def test_a_standing_column_buckles_under_its_weight(length):
     # shear and shortening matter by (radius / length)^2: a few per cent at 0.3 m
@@ -261,6 +264,7 @@ def test_pressure_that_bends_a_standing_arm_over_is_reported():
         arm.tip_pose(np.full(6, 1.4e5))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("n_segments", [4, 5])
 def test_long_hanging_arms_settle(n_segments):
     arm = Arm((FLOP,) * n_segments).under(HANGING, 0.02)

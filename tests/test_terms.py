@@ -250,6 +250,7 @@ def above(height, **options):
     return WIDE.model_copy(update={**options, "above": so.Target(above=plane).above})
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_tip_stays_above_the_plane_where_that_costs(name, compiled):
     arm = so.load_robot(name)

@@ -44,6 +44,7 @@ def scaled_difference(found, expected):
     )
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("case", CASES)
 def test_is_that_of_the_model(case, compiled):
     model = robot(case)

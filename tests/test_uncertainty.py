@@ -128,6 +128,7 @@ def test_errors_of_the_parameters_move_the_tip_under_a_load() -> None:
     np.testing.assert_array_equal(free.tip_uncertainty(P).covariance, before)  # each its own
 
 
+@pytest.mark.one_in(2, "name")
 @pytest.mark.parametrize(
     ("name", "load"), [("stiff-flop-1", None), ("stiff-flop-1", (0.05, 0.0, 0.1))]
 )

@@ -101,7 +101,7 @@ def _timed(solve: partial[PressureSolution], task: Task) -> tuple[float, Pressur
 def _lack(name: str, case: Case, p: np.ndarray) -> float:
     """By how much the body lacks the clearance, in m."""
     line = centre_line(ARMS[name][1], p, POINTS[name == "hanging"])
-    return CLEARANCE - min(clearances(case.objects, line, RADIUS))
+    return CLEARANCE - min(clearances(case.objects, line, RADIUS, CLEARANCE))
 
 
 def _compared(

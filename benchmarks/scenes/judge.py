@@ -21,15 +21,30 @@ Vector = NDArray[np.float64]
 GRID, AROUND = 1.25, 25.0  # mm: cubes of the distances of meshes, which IPOPT and tasks use
 
 
-def clearances(objects: Any, line: Vector, radius: float) -> list[float]:
-    """Least distances of a tube of this radius about points (k, 3), one for each object."""
-    found = []
+def clearances(objects: Any, line: Vector, radius: float, asked: float = 0.0) -> list[float]:
+    """Least distances of a tube of this radius about points (k, 3), one for each object.
+
+    A plate behind the base, on which the arm is mounted, sees the tube from a quarter more than the
+    way along it on which a straight one is as far away as `asked`.
+    """
+    found, whole = [], line
+    way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(whole, axis=0), axis=1)))
     for item in objects:
+        line = whole
+        if _is_plate(item):
+            line = whole[way > 1.25 * (radius + asked + item["half_space"]["point"][2])]
         if "inside_tube" in item or "trocar" in item:
             found.append(float(distances(item, line).min()) - radius)
         else:
             found.append(_by_coal(item, line, radius))
     return found
+
+
+def _is_plate(item: dict[str, Any]) -> bool:
+    if "half_space" not in item:
+        return False
+    x, y, z = item["half_space"]["normal"]
+    return bool(x == y == 0 < z and item["half_space"]["point"][2] <= 0)
 
 
 def _by_coal(item: dict[str, Any], line: Vector, radius: float) -> float:

@@ -16,6 +16,7 @@ from stiffopt.model.batch import in_parallel
 from stiffopt.model.body import NativeBody
 from stiffopt.model.clearance import Nearest, nearest_point, range_ends, survey
 from stiffopt.model.compiled import Library
+from stiffopt.model.description import RobotDescription
 from stiffopt.model.distances import MeasuredObject, SceneObjectInC, scene_library
 from stiffopt.model.scene import Scene
 
@@ -78,11 +79,14 @@ class SceneKey:
 
 
 class MeasuredScene:
-    """The objects of a scene with their numbers."""
+    """The objects of a scene with their numbers, for arms whose base has a radius in m."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, base_radius: float) -> None:
         self.names = tuple(item.name for item in scene.objects)
-        self.items = tuple(MeasuredObject(item.shape) for item in scene.objects)
+        shapes = (item.shape for item in scene.objects)
+        self.items = tuple(
+            MeasuredObject(shape, shape.begin(base_radius, scene.clearance)) for shape in shapes
+        )
         self._in_c: tuple[Library, ctypes.Array[SceneObjectInC]] | None = None
 
     def in_c(self, code: Library) -> ctypes.Array[SceneObjectInC]:
@@ -93,14 +97,14 @@ class MeasuredScene:
         return self._in_c[1]
 
 
-def measured_scene(scene: Scene) -> MeasuredScene:
-    """The objects of a scene with their numbers, made once."""
-    return _measured(SceneKey(scene))
+def measured_scene(scene: Scene, robot: RobotDescription) -> MeasuredScene:
+    """The objects of a scene with their numbers for an arm, made once."""
+    return _measured(SceneKey(scene), robot.segments[0].outer_radius)
 
 
 @lru_cache(maxsize=64)
-def _measured(key: SceneKey) -> MeasuredScene:
-    return MeasuredScene(key.scene)
+def _measured(key: SceneKey, base_radius: float) -> MeasuredScene:
+    return MeasuredScene(key.scene, base_radius)
 
 
 class Ranges(NamedTuple):
@@ -121,7 +125,7 @@ class ArmClearance:
     """Distances of an arm's body from a scene, at pressures (N, n) in Pa that are finite."""
 
     def __init__(self, arm: Manipulator, scene: Scene) -> None:
-        self._arm, self.scene = arm, measured_scene(scene)
+        self._arm, self.scene = arm, measured_scene(scene, arm.description)
         self.ranges = arm.kept("ranges", lambda: Ranges.of(range_ends(arm.description)))
 
     def least(self, p: Array) -> Array:

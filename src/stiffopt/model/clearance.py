@@ -1,13 +1,14 @@
 """How near the body of an arm comes to the objects of a scene: exact minima along it.
 
-The body is the union of spheres of the outer radius about the centre line, from base to tip. This
-is native/scene.h a second time, for where there is no machine code; a test proves them equal.
+The body is the union of spheres of the outer radius about the centre line, from base to tip; for
+what the arm is mounted on, from where `Obstacle.begin` says. This is native/scene.h a second time,
+for where there is no machine code; a test proves them equal.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import asin, inf, isfinite, sqrt
 from typing import NamedTuple
@@ -141,7 +142,8 @@ def nearest_point(
         A distance above this, in m, is only known to be above it.
     """
     search = _Search(station, item, inf if item.is_ring else cutoff)
-    for each in ranges:
+    first, *others = ranges
+    for each in (search.counted(first), *others):
         search.look_at(each)
     search.sharpen()
     assert search.best is not None  # every range has stations
@@ -162,6 +164,14 @@ class _Search:
         """A station of the body."""
         position, tangent, radius = self.station(np.array([s]))
         return BodyPoint(s, position[0], tangent[0], float(radius[0]))
+
+    def counted(self, stretch: BodyRange) -> BodyRange:
+        """A range from where the object counts the body on."""
+        points = stretch.points
+        if points[0].s >= self.item.begin:
+            return stretch
+        first = self.point_at(min(self.item.begin, points[-1].s))
+        return replace(stretch, points=(first, *(each for each in points if each.s > first.s)))
 
     def look_at(self, stretch: BodyRange) -> None:
         """The least distance of a range, if it is less than what the search has."""
@@ -197,8 +207,8 @@ class _Search:
         m = _MORE_CURVED * stretch.speed * stretch.turn
         if least >= self._to_beat:
             return least
-        if self.item.along == "concave" and a.piece == b.piece:
-            return max(least, min(a.value, b.value) - m * h * h / 8)
+        if self.item.along == "concave":
+            return max(least, self._least_of_pieces(a, b) - m * h * h / 8)
         first, second = a.value + a.point.radius, b.value + b.point.radius
         if self.item.along == "any" and first > 0 and second > 0:
             chord = float(np.linalg.norm(b.point.position - a.point.position))
@@ -213,6 +223,16 @@ class _Search:
             return max(least, b.value)
         u = (b.value - a.value - up * h) / (down - up)
         return max(least, a.value + down * min(max(u, 0.0), h))
+
+    def _least_of_pieces(self, a: Probe, b: Probe) -> float:
+        """The least, along straight lines, of the larger of the pieces' distances at the probes."""
+        if a.piece == b.piece:
+            return min(a.value, b.value)
+        of_a_at_b = self.item.piece_distance(a.piece, b.point.position) - b.point.radius
+        of_b_at_a = self.item.piece_distance(b.piece, a.point.position) - a.point.radius
+        crossing = a.value - of_b_at_a + b.value - of_a_at_b
+        share = (a.value - of_b_at_a) / crossing if crossing > 0 else 0.0
+        return min(a.value, b.value, a.value + (of_a_at_b - a.value) * share)
 
     def _refine(self, a: Probe, b: Probe, stretch: BodyRange) -> None:
         """Look closer between two probes for as long as there may be something nearer."""

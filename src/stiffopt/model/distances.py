@@ -115,6 +115,7 @@ class SceneObjectInC(ctypes.Structure):
     _fields_ = [
         *((name, _pointer) for name in ("distance", "cell", "passage")),
         *((name, _integer) for name in ("course", "pieces", "size")),
+        ("begin", ctypes.c_double),
         *((name, _pointer) for name in ("parameters", "grids", "shapes")),
     ]  # fmt: skip
 
@@ -128,10 +129,11 @@ class MeasuredObject:
     along : see `Obstacle`.
     is_ring : whether the arm passes through it.
     is_interpolated : whether its distances come from grids.
+    begin : arc length at rest from which the body counts, see `Obstacle.begin`, in m.
     """
 
-    def __init__(self, shape: Obstacle) -> None:
-        self.key, self.along = shape.key, shape.along
+    def __init__(self, shape: Obstacle, begin: float = 0.0) -> None:
+        self.key, self.along, self.begin = shape.key, shape.along, begin
         self.is_ring = shape.is_ring
         self.is_interpolated = shape.is_interpolated
         self._parameters = np.array(shape.pieces, dtype=float)  # (pieces, size)
@@ -146,6 +148,10 @@ class MeasuredObject:
         normals = np.stack([normal for _, normal in found])  # (pieces, k, 3)
         pieces, rows = values.argmax(axis=0), np.arange(len(points))
         return Distances(values[pieces, rows], normals[pieces, rows], pieces)
+
+    def piece_distance(self, index: int, point: Array) -> float:
+        """Distance of a point (3,) from one piece."""
+        return float(self._of_piece(index, point[None])[0][0])
 
     def _of_piece(self, index: int, points: Array) -> tuple[Array, Array]:
         parameters = self._parameters[index]
@@ -180,6 +186,7 @@ class MeasuredObject:
             course=_COURSES[self.along],
             pieces=len(self._parameters),
             size=self._parameters.shape[1],
+            begin=self.begin,
             parameters=self._parameters.ctypes.data,
             grids=self._addresses.ctypes.data,
             shapes=self._shapes.ctypes.data,

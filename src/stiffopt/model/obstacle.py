@@ -32,6 +32,10 @@ Point = Vector[Annotated[Length, within(1e3, "m")]]
 Radius = Annotated[Length, Field(gt=0, le=1e3)]
 """In m."""
 
+_RISEN = 1.25  # of the arc length at which a straight arm is clear of what it is mounted on
+_FLUSH = 1e-9  # m that an object may rise above the plane of the base
+_ABOVE = 1e-4  # m above the base, over which the direction to an object shows
+_STRAIGHT = 1e-9  # share by which a distance may grow less than the height: 0.05 mrad
 _TINY = 1e-24  # m^2 under roots, so that a gradient exists where a distance is zero
 
 
@@ -106,9 +110,17 @@ class Obstacle(Schema, ABC):
         ------
         BadKeyError
         """
-        radius = robot.segments[0].outer_radius
+        radius, length = robot.segments[0].outer_radius, robot.segments[0].length
+        begin = self.begin(radius, clearance)
+        if begin > 0.5 * length:
+            raise BadKeyError(
+                self.key,
+                f"the arm is mounted on it, and a clearance of {clearance * 1e3:g} mm from it "
+                f"counts from {begin * 1e3:.4g} mm up the arm; expected less than half the first "
+                f"segment, {500 * length:g} mm",
+            )
         left = self.distance_of((0.0, 0.0, 0.0)) - radius
-        if left >= clearance:
+        if begin > 0 or left >= clearance:
             return
         has = f"has {left * 1e3:.4g} mm of the clearance of {clearance * 1e3:g} mm asked for"
         lies = f"lies {-left * 1e3:.4g} mm {self.wrong_side} it, where it can never be clear"
@@ -117,6 +129,34 @@ class Obstacle(Schema, ABC):
             f"the arm's base, a body of radius {radius * 1e3:g} mm about the origin, "
             f"{has if left >= 0 else lies}",
         )
+
+    def begin(self, base_radius: float, clearance: float) -> float:
+        """Arc length at rest from which an arm's body counts: 0 but for what it is mounted on.
+
+        An arm is mounted on a convex object of which the point nearest to its base lies straight
+        behind that, so that all of it is behind a plane that the base does not cross, but the round
+        end of a body there would be nearer than the clearance. The straight arm is clear of it from
+        radius plus clearance on, less the distance; a quarter is added, as a bent arm rises less.
+        What is left out needs no judging: along an arc that leaves the plane at a right angle, the
+        disc of a section at arc length s is (1/k - radius) sin(k s) above it for a curvature k,
+        which is no less anywhere than at both ends.
+
+        Parameters
+        ----------
+        base_radius :
+            Of the arm, in m.
+        clearance :
+            That is asked for, in m.
+        """
+        missing = base_radius + clearance - self.distance_of((0.0, 0.0, 0.0))
+        return _RISEN * missing if missing > 0 and self._is_behind_base else 0.0
+
+    @property
+    def _is_behind_base(self) -> bool:
+        if self.along != "convex" or self.distance_of((0.0, 0.0, 0.0)) < -_FLUSH:
+            return False
+        rise = self.distance_of((0.0, 0.0, 2 * _ABOVE)) - self.distance_of((0.0, 0.0, _ABOVE))
+        return rise > (1 - _STRAIGHT) * _ABOVE
 
     def distance_of(self, point: Any) -> float:
         """Signed distance of one point (3,), from the formula itself, in m."""

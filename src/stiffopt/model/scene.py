@@ -150,9 +150,9 @@ class Scene(Schema):
         Raises
         ------
         InputError
-            The arm's base lies within an object or is nearer to it than the clearance; a ring or
-            a tube is narrower than the arm; a mesh is of another scale. With file, line and key
-            where the scene is from a file.
+            The arm's base lies within an object or is nearer to it than the clearance, and is not
+            mounted on it (see `Obstacle.begin`); a ring or a tube is narrower than the arm; a mesh
+            is of another scale. With file, line and key where the scene is from a file.
         """
         for index, item in enumerate(self.objects):
             try:

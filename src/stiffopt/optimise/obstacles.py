@@ -58,7 +58,9 @@ def _quickly_nearest(
     body: ArmBody, item: MeasuredObject, ranges: Sequence[tuple[float, float, int]]
 ) -> Nearest:
     """The nearest point of a stretch of the body: around the best of some stations, ever closer."""
-    s = np.concatenate([np.linspace(start, end, 2 * count) for start, end, count in ranges])
+    s = np.concatenate(
+        [np.linspace(max(start, item.begin), end, 2 * count) for start, end, count in ranges]
+    )
     for _ in range(OBSTACLES.turns):
         positions, _, radii = body(s)
         seen = item.distances(positions)
@@ -137,7 +139,7 @@ class Obstacles:
     def __post_init__(self) -> None:
         counts = [1 + (segment.connector > 0) for segment in self.description.segments]
         object.__setattr__(self, "range_groups", tuple(np.cumsum(counts).tolist()))
-        measured = measured_scene(self.scene)
+        measured = measured_scene(self.scene, self.description)
         object.__setattr__(self, "measured", measured)
         rows = [
             index

@@ -27,12 +27,15 @@ static int not_above(const SceneObject *objects, int64_t count, const Range *ran
     double distance, normal[3];
     int64_t piece;
     *least = INFINITY;
-    for (int64_t i = 0; i < count; i++)
+    for (int64_t i = 0; i < count; i++) {
+        double most[objects[i].pieces];
+        PieceBounds bounds = no_bounds(objects + i, most);
         for (int64_t r = 0; r < n_ranges && !objects[i].passage; r++) {
             const BodyPoint *end = ranges[r].points + ranges[r].count - 1;
-            if (!object_distance(objects + i, end->position, &distance, normal, &piece)) return 0;
+            if (!object_distance(objects + i, &bounds, end->position, &distance, normal, &piece)) return 0;
             *least = fmin(*least, distance - end->radius);
         }
+    }
     return 1;
 }
 

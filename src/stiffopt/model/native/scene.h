@@ -50,6 +50,7 @@ typedef struct {
     Formula passage;  /* of a ring: to height, how far beyond, distance of the disc, its gradient */
     int64_t course;   /* of the distance along a straight line */
     int64_t pieces, size;     /* the largest of the pieces' distances counts */
+    double begin;             /* arc length at rest in the first range, from which the body counts */
     const double *parameters; /* (pieces, size) */
     const float *const *grids;
     const int64_t *shapes; /* (pieces, 3) of the grids */
@@ -82,6 +83,13 @@ typedef struct {
     int64_t piece;
 } Probe;
 
+/* What the pieces' distances are at most at the point that was looked at last, most (pieces): a
+ * distance changes by no more than the way.  `nearest` is the piece of the largest there. */
+typedef struct {
+    double point[3], *most;
+    int64_t nearest;
+} PieceBounds;
+
 typedef struct {
     const CentreLine *line;
     const SceneObject *object;
@@ -90,6 +98,7 @@ typedef struct {
     Nearest *best;
     double slope;        /* at the best */
     const Range *within; /* that has the best */
+    PieceBounds bounds;
 } NearestSearch;
 
 static double scene_dot(const double *a, const double *b) {
@@ -121,26 +130,48 @@ static int put_corners(const SceneObject *o, int64_t piece, const double *point,
     return 1;
 }
 
-/* Distance of a point from an object, its gradient, and the piece that it is of. */
-static int object_distance(const SceneObject *o, const double *point, double *distance,
-                           double *normal, int64_t *nearest) {
+/* Distance of a point from one piece, and its gradient. */
+static int piece_distance(const SceneObject *o, int64_t piece, const double *point,
+                          double *distance, double *gradient) {
     double w[SCENE_MEMORY], with_corners[MOST_PARAMETERS];
+    const double *q = o->parameters + piece * o->size;
+    if (o->cell) {
+        for (int64_t k = 0; k < o->size; k++) with_corners[k] = q[k];
+        if (!put_corners(o, piece, point, with_corners)) return 0;
+        q = with_corners;
+    }
+    const double *arg[2] = {point, q};
+    double *res[2] = {distance, gradient};
+    return !o->distance(arg, res, 0, w, 0) && isfinite(*distance);
+}
+
+static PieceBounds no_bounds(const SceneObject *o, double *most) {
+    for (int64_t i = 0; i < o->pieces; i++) most[i] = INFINITY;
+    return (PieceBounds){.most = most};
+}
+
+/* How much a distance changes with the way at most. */
+static double steepest(const SceneObject *o) { return o->cell ? STEEPEST : 1; }
+
+/* Distance of a point from an object, its gradient, and the piece that it is of; pieces that
+ * cannot have the largest distance are passed over. */
+static int object_distance(const SceneObject *o, PieceBounds *bounds, const double *point,
+                           double *distance, double *normal, int64_t *nearest) {
+    double way = steepest(o) * scene_far(point, bounds->point), value, gradient[3];
+    int64_t first = bounds->nearest;
     *distance = -INFINITY;
-    for (int64_t i = 0; i < o->pieces; i++) {
-        const double *q = o->parameters + i * o->size;
-        if (o->cell) {
-            for (int64_t k = 0; k < o->size; k++) with_corners[k] = q[k];
-            if (!put_corners(o, i, point, with_corners)) return 0;
-            q = with_corners;
-        }
-        double value, gradient[3];
-        const double *arg[2] = {point, q};
-        double *res[2] = {&value, gradient};
-        if (o->distance(arg, res, 0, w, 0) || !isfinite(value)) return 0;
+    for (int64_t k = 0; k < o->pieces; k++) {
+        int64_t i = k == 0 ? first : k <= first ? k - 1 : k;
+        bounds->most[i] += way;
+        if (bounds->most[i] <= *distance) continue;
+        if (!piece_distance(o, i, point, &value, gradient)) return 0;
+        bounds->most[i] = value;
         if (value <= *distance) continue;
         *distance = value, *nearest = i;
-        for (int k = 0; k < 3; k++) normal[k] = gradient[k];
+        for (int j = 0; j < 3; j++) normal[j] = gradient[j];
     }
+    bounds->nearest = *nearest;
+    for (int j = 0; j < 3; j++) bounds->point[j] = point[j];
     return 1;
 }
 
@@ -168,12 +199,26 @@ static int survey(const CentreLine *line, double s0, double s1, Range *range) {
     return 1;
 }
 
+/* A range from where an object counts the body on; `points` is memory for as many as it has. */
+static int counted_range(const CentreLine *line, const SceneObject *object, const Range *range,
+                         BodyPoint *points, Range *counted) {
+    const BodyPoint *p = range->points;
+    *counted = *range;
+    if (p->s >= object->begin) return 1;
+    double s = fmin(object->begin, p[range->count - 1].s);
+    counted->points = points, counted->count = 1;
+    for (int64_t i = 0; i < range->count; i++)
+        if (p[i].s > s) points[counted->count++] = p[i];
+    return body_point(line, s, points);
+}
+
 /* -- minima along a range ------------------------------------------------------------------ */
 
 static int probe_at(NearestSearch *search, const BodyPoint *point, Probe *probe) {
     Nearest *best = search->best;
     double distance;
-    if (!object_distance(search->object, point->position, &distance, probe->normal, &probe->piece))
+    if (!object_distance(search->object, &search->bounds, point->position, &distance, probe->normal,
+                         &probe->piece))
         return 0;
     probe->point = point;
     probe->value = distance - point->radius;
@@ -192,7 +237,7 @@ static double to_beat(const NearestSearch *search) {
 
 /* By how much a distance changes with arc length at rest at most. */
 static double steepness(const NearestSearch *search) {
-    return search->range->speed * (search->object->cell ? STEEPEST : 1);
+    return search->range->speed * steepest(search->object);
 }
 
 /* How near to the chord between two points something is at least that is nowhere nearer to them than
@@ -203,13 +248,32 @@ static double outside_spheres(double chord, double first, double second) {
     return x >= chord ? second : sqrt(fmax(first * first - x * x, 0));
 }
 
+/* Where the larger of two distances, each along a straight line, is least: of the one from a0 to
+ * b0, of the other from a1 to b1, the first being the larger at the start, the other at the end. */
+static double least_larger(double a0, double b0, double a1, double b1) {
+    double crossing = a0 - a1 + b1 - b0;
+    double there = crossing > 0 ? a0 + (b0 - a0) * (a0 - a1) / crossing : a0;
+    return fmin(fmin(a0, b1), there);
+}
+
+/* The same between two probes, of the pieces that have the largest distances at either. */
+static double least_of_pieces(const NearestSearch *search, const Probe *a, const Probe *b) {
+    double of_b_at_a, of_a_at_b, unused[3];
+    if (a->piece == b->piece) return fmin(a->value, b->value);
+    if (!piece_distance(search->object, b->piece, a->point->position, &of_b_at_a, unused) ||
+        !piece_distance(search->object, a->piece, b->point->position, &of_a_at_b, unused))
+        return -INFINITY;
+    return least_larger(a->value, of_a_at_b - b->point->radius, of_b_at_a - a->point->radius, b->value);
+}
+
 /* What the distance between two probes is at least.
  *
  * It changes by no more than the way, and between two points outside of an object by less, as none
  * of it is within either distance; a centre line is within m h^2 / 8 of its chord, see m here.  Along a centre line of speed v and curvature c, a distance
  * that is convex along straight lines has second derivatives of at least -m, m = v^2 c.  With
  * m u (h - u) / 2 taken away it is convex, the same at both ends, and above its tangents there; m
- * h^2 / 8 below its chord lies what is concave along straight lines. */
+ * h^2 / 8 below its chord lies what is concave along straight lines, and of several pieces the
+ * distance is the largest. */
 static double least_between(const NearestSearch *search, const Probe *a, const Probe *b) {
     const Range *range = search->range;
     int64_t course = search->object->course;
@@ -217,8 +281,7 @@ static double least_between(const NearestSearch *search, const Probe *a, const P
     double least = (a->value + b->value - steepness(search) * h) / 2;
     double m = MORE_CURVED * range->speed * range->turn;
     if (least >= to_beat(search)) return least;
-    if (course == CONCAVE && a->piece == b->piece)
-        return fmax(least, fmin(a->value, b->value) - m * h * h / 8);
+    if (course == CONCAVE) return fmax(least, least_of_pieces(search, a, b) - m * h * h / 8);
     double first = a->value + a->point->radius, second = b->value + b->point->radius;
     if (course == ANY_COURSE && first > 0 && second > 0) {
         double chord = scene_far(a->point->position, b->point->position);
@@ -351,11 +414,15 @@ static int ring_nearest(NearestSearch *search, const Range *ranges, int64_t coun
 /* The nearest point of an object along ranges that have been surveyed. */
 static int object_nearest(const CentreLine *line, const SceneObject *object, const Range *ranges,
                           int64_t count, double cutoff, Nearest *nearest) {
-    NearestSearch search = {line, object, ranges, cutoff, nearest, 0, ranges};
+    double most[object->pieces];
+    NearestSearch search = {line, object, ranges, cutoff, nearest, 0, ranges, no_bounds(object, most)};
     nearest->distance = INFINITY;
     if (object->passage) return ring_nearest(&search, ranges, count);
+    BodyPoint points[ranges->count];
+    Range first;
+    if (!counted_range(line, object, ranges, points, &first)) return 0;
     for (int64_t r = 0; r < count; r++)
-        if (!search_range(&search, ranges + r)) return 0;
+        if (!search_range(&search, r ? ranges + r : &first)) return 0;
     return sharpen(&search);
 }
 

@@ -97,10 +97,11 @@ typedef struct {
     double value, slope, normal[3];
 } Look;
 
-static int look_at(const SceneObject *object, const Range *range, const BodyPoint *point, Look *to) {
+static int look_at(const SceneObject *object, PieceBounds *bounds, const Range *range,
+                   const BodyPoint *point, Look *to) {
     int64_t piece;
     to->point = *point;
-    if (!object_distance(object, point->position, &to->value, to->normal, &piece)) return 0;
+    if (!object_distance(object, bounds, point->position, &to->value, to->normal, &piece)) return 0;
     to->value -= point->radius;
     to->slope = range->speed * scene_dot(to->normal, point->tangent);
     return 1;
@@ -111,16 +112,21 @@ static int look_at(const SceneObject *object, const Range *range, const BodyPoin
 static int quickly_nearest(const Surroundings *around, const SceneObject *object, int64_t begin,
                            int64_t end, double cutoff, double near, Nearest *nearest) {
     Look best, look, other;
+    BodyPoint points[around->ranges[begin].count];
+    double most[object->pieces];
+    PieceBounds bounds = no_bounds(object, most);
+    Range first;
     const Range *in = NULL;
     int64_t index = 0;
     best.value = INFINITY;
+    if (!counted_range(&around->line, object, around->ranges + begin, points, &first)) return 0;
     for (int64_t k = begin; k < end; k++) {
-        const Range *range = around->ranges + k;
+        const Range *range = k > begin ? around->ranges + k : &first;
         double skip = -INFINITY;
         for (int64_t i = 0; i < range->count; i++) {
             const BodyPoint *point = range->points + i;
             if (point->s < skip && i + 1 < range->count) continue;
-            if (!look_at(object, range, point, &look)) return 0;
+            if (!look_at(object, &bounds, range, point, &look)) return 0;
             /* within this way nothing is nearer than what was seen, or matters */
             skip = point->s + (look.value - fmin(best.value, cutoff)) / range->speed;
             if (look.value < best.value) best = look, in = range, index = i;
@@ -128,13 +134,15 @@ static int quickly_nearest(const Surroundings *around, const SceneObject *object
     }
     int64_t next = best.slope < 0 ? index + 1 : index - 1;
     if (best.value < near && next >= 0 && next < in->count) {
-        if (!look_at(object, in, in->points + next, &other)) return 0;
+        if (!look_at(object, &bounds, in, in->points + next, &other)) return 0;
         Look edge = best;
         for (int turn = 0; turn < QUICK_TURNS && edge.slope * other.slope < 0; turn++) {
             BodyPoint middle;
             double share = fmin(fmax(edge.slope / (edge.slope - other.slope), 0.05), 0.95);
             double s = edge.point.s + share * (other.point.s - edge.point.s);
-            if (!body_point(&around->line, s, &middle) || !look_at(object, in, &middle, &look)) return 0;
+            if (!body_point(&around->line, s, &middle) ||
+                !look_at(object, &bounds, in, &middle, &look))
+                return 0;
             if (look.value < best.value) best = look;
             double curved = (edge.slope - other.slope) / (edge.point.s - other.point.s);
             if (look.slope * look.slope < 2 * fabs(curved) * QUICK_ERROR) break;
