@@ -22,7 +22,7 @@ import environment
 import plots
 import report
 from report import Section
-from sections import body, calls, full_task, kinds, kinematics, pose, processes, rates
+from sections import body, calls, full_task, kinds, kinematics, paths, pose, processes, rates
 from settings import Settings, quick
 
 HERE = Path(__file__).resolve().parent
@@ -41,6 +41,7 @@ SECTIONS: dict[str, Callable[[Settings], Section]] = {
     "evaluations": kinematics.section,
     "body": body.section,
     "pose": pose.section,
+    "paths": paths.section,
     "simulator": rates.simulated_arm,
 }
 
