@@ -98,6 +98,9 @@ class IntegralFeedback:
         times = self._way[0]
         return np.array([np.interp(now, times, column) for column in values.T])
 
+    def check_ahead(self, request: Any) -> None:
+        """Nothing to do: there is no scene."""
+
     def resume(self, now: float) -> None:
         """Nothing to do: it goes on from what was commanded."""
 

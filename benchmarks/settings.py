@@ -78,3 +78,6 @@ UNREACHABLE_MS = 60.0  # CPU, under gravity or a load
 BATCH_POSES, BATCH_STIFFNESSES = 1.5e6, 0.5e6  # per second, two segments
 PATH_SECONDS = {2: 0.5, 3: 1.5}  # CPU, 250 points
 PATH_SHARE = 0.99  # of the stiffness that a reference finds
+MOTION_MS, MOTION_LOADED_MS = 100.0, 1000.0  # p95, to a timed motion
+MOTIONS_SOLVED = 0.98
+MOTION_BELOW_MM = 0.05

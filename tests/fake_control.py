@@ -64,6 +64,9 @@ class FakeController:
         self.accident("follow")
         self.calls.append("follow")
 
+    def check_ahead(self, request: Task | Target | Trajectory) -> None:
+        self.accident("check_ahead")
+
     def resume(self, now: float) -> None:
         self.accident("resume")
         self.calls.append("resume")

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from simulated_loop import TASK, Lab
@@ -47,6 +48,7 @@ from stiffopt.units import Length, Number, Speed, TranslationalStiffness
 
 PROBLEMS = Path(__file__).resolve().parent.parent / "problems"
 LIMITS = PressureLimits([0.0] * 3, [1.5e5] * 3)  # type: ignore[arg-type]
+SLEW = np.full(3, 5e5)
 X = (1.0, 0.0, 0.0)
 MESSAGES: tuple[type[Schema], ...] = (
     *(Task, Target, Tolerance, StiffnessGoal, StiffnessMeasure, AtLeast, MatchValue, MatchMatrix),
@@ -186,7 +188,7 @@ def test_a_message_of_a_target_or_trajectory_says_all_of_it() -> None:
         with pytest.raises(InputError, match=f"{key}: the daemon's messages cannot say"):
             TrajectoryMessage.of(trajectory)
         with pytest.raises(InputError, match=f"{key}: unknown key"):
-            check_trajectory(trajectory)
+            check_trajectory(trajectory, LIMITS, SLEW)
 
 
 def test_the_loop_refuses_what_its_steering_does_not_understand() -> None:
@@ -282,6 +284,7 @@ EVERYTHING: list[Schema] = [
         )
     ),
     Trajectory(waypoints=[Waypoint(time=t, target=TASK.target) for t in (0.0, 0.5)]),
+    Trajectory(waypoints=[Waypoint(time=0.0, target=TASK.target, pressures=(1e4, 0.0, 2e4))]),
 ]  # fmt: skip
 """Descriptions in which each field has another value than by default, once at least."""
 

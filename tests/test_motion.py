@@ -5,6 +5,7 @@ Distances are measured once more, with formulas in NumPy on many stations of the
 
 from __future__ import annotations
 
+import json
 import sys
 from importlib.util import find_spec
 from itertools import pairwise
@@ -28,6 +29,7 @@ from stiffopt import (
     load_robot,
     plan_motion,
 )
+from stiffopt.cli.main import main
 from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.paths.motion import timed
 from stiffopt.paths.shortening import rounded, shortened
@@ -390,3 +392,57 @@ def test_what_does_not_fit_together(two: Manipulator) -> None:
     slow = Manipulator(two.description.model_copy(update={"pressure": silent}))
     with pytest.raises(InputError, match="give slew"):
         plan_motion(slow, LEFT, RIGHT)
+
+
+# -- the command ----------------------------------------------------------------------------
+
+A, B = "1, 0, 0, 1, 0, 0 bar", "0 bar, 1 bar, 0 bar, 0 bar, 100 kPa, 0 bar"
+SCENE = """\
+format: stiffopt-scene/1
+clearance: 2 mm
+objects: [{name: table, half_space: {point: [0 mm, 0 mm, %s mm], normal: [0, 0, -1]}}]
+"""
+
+
+def planned(*arguments: str) -> int:
+    return main(["plan", "--from", A, "--to", B, *arguments])
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    robot = ("--robot", "stiff-flop-2")
+    files = [str(tmp_path / name) for name in ("motion.csv", "motion.yaml", "motion.png")]
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(SCENE % "300")
+    given = (*robot, "--scene", str(scene), "--slew", "2 bar/s")
+    out = ("--out", files[0], "--out", files[1], "--plot", files[2])
+    assert planned(*given, "--json", *out) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["status"] == "solved"
+    assert record["pressures_pa"][-1] == RIGHT.tolist()
+    assert record["times_s"][-1] == pytest.approx(0.5)
+    assert min(record["clearance_m"]) > ASKED
+    assert all(Path(file).stat().st_size for file in files)
+    assert planned(*given, "--clearance", "3 mm") == 0
+    assert "required: at least 3 mm" in capsys.readouterr().out
+    scene.write_text(SCENE % "70")
+    assert planned(*given) == 3
+    assert "too near 'table'" in " ".join(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ((), "--robot: name a robot"),
+        (("--robot", "stiff-flop-2", "--to", "2 bar"), "must be 6"),
+        (("--robot", "stiff-flop-2", "--to", "0, 0 mm"), "--to: "),
+        (("--robot", "stiff-flop-2", "--slew", "2 bar"), "--slew: "),
+        (("--robot", "stiff-flop-2", "--clearance", "2 mm"), "a clearance needs a scene"),
+        (("--robot", "stiff-flop-2", "--to", "missing.yaml"), "missing.yaml"),
+        (("--robot", "stiff-flop-2", "--timeout", "-1 s"), "timeout must be"),
+    ],
+)
+def test_bad_options(
+    arguments: tuple[str, ...], text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert planned(*arguments) == 2
+    assert text in capsys.readouterr().err

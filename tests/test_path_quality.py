@@ -1,4 +1,4 @@
-"""Paths against references that share nothing with `solve_path`; see ``benchmarks/sections/paths``."""
+"""Paths against references that share nothing with `solve_path`."""
 
 import sys
 from pathlib import Path as FilePath
@@ -12,7 +12,7 @@ from stiffopt.paths.solver import solve_path
 
 sys.path.insert(0, str(FilePath(__file__).parents[1] / "benchmarks"))
 
-import path_reference as reference  # noqa: E402
+import path_reference as reference
 
 Vector = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ def test_two_segments_against_a_lattice_of_the_null_space(compiled: FilePath) ->
     robot = load_robot("stiff-flop-2")
     path = path_of(robot, 24, SLEW)
     asked, program = question(path, 6), reference.PathProgram(robot, 24)
-    best = reference.lattice(robot, program, asked, 700, seed=0)
+    best = reference.lattice(robot, program, asked, 500, seed=0)
     assert best is not None
     assert program.holds(asked, best)
     solution = solve_path(robot, path)
@@ -64,7 +64,7 @@ def test_three_segments_against_refined_random_starts(compiled: FilePath) -> Non
     robot = load_robot("stiff-flop-3")
     path = path_of(robot, 12, SLEW)
     asked, program = question(path, 9), reference.PathProgram(robot, 12)
-    starts = reference.followed(robot, asked, 4, seed=0)
+    starts = reference.followed(robot, asked, 2, seed=0)
     refined = [program.improved(asked, start, 60) for start in starts]
     values = [program.value(asked, each) for each in refined if each is not None]
     assert values

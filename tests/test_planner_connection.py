@@ -103,9 +103,10 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
         del line.connection.send_bytes
         return set(pickle.loads(sent.pop()))
 
-    everything = {"serial", "task", "target", "offset", "pressure_offset", "search"}
+    arrays = {"offset", "pressure_offset", "way"}
+    everything = {"serial", "task", "target", "search", "last", *arrays}
     assert news(ends.ours, first) == everything
-    assert news(ends.ours, replace(first, offset=0 * OFFSET)) == {"offset", "pressure_offset"}
+    assert news(ends.ours, replace(first, offset=0 * OFFSET)) == arrays
     other = Ends()
     assert news(other.ours, first) == everything
     other.close()

@@ -23,6 +23,7 @@ from stiffopt.cli.log import log_app
 from stiffopt.cli.map import map_app
 from stiffopt.cli.options import Version, command_group
 from stiffopt.cli.path import PATH_EPILOG, PATH_HELP, path
+from stiffopt.cli.plan import PLAN_EPILOG, PLAN_HELP, plan
 from stiffopt.cli.robots import robots
 from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
 from stiffopt.cli.solve import EXAMPLES, HELP, solve
@@ -33,6 +34,7 @@ _SETTINGS = {"help_option_names": ["-h", "--help"]}
 app = command_group(context_settings=_SETTINGS)
 app.command("solve", help=HELP, epilog=EXAMPLES.format(command="stiffopt solve"))(solve)
 app.command("path", help=PATH_HELP, epilog=PATH_EPILOG)(path)
+app.command("plan", help=PLAN_HELP, epilog=PLAN_EPILOG)(plan)
 app.command("robots")(robots)
 app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
 app.command("vent", help=VENT_HELP, epilog=VENT_EPILOG)(vent)

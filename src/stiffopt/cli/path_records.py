@@ -45,9 +45,12 @@ def rate_margins(solution: PathSolution) -> Vector | None:
 
 def json_record(solved: SolvedPath) -> dict[str, Any]:
     """Return a solution for JSON, in SI units."""
-    solution = solved.solution
+    return {"path": solved.file, **solution_values(solved.solution)}
+
+
+def solution_values(solution: PathSolution) -> dict[str, Any]:
+    """Return what a solution says, in SI units."""
     return {
-        "path": solved.file,
         "status": solution.status,
         "found": solution.found,
         "times_s": solution.times,
@@ -94,13 +97,16 @@ def is_result_csv(file: FilePath) -> bool:
 
 
 def result_record(solved: SolvedPath) -> dict[str, Any]:
-    """Return a solution as the entry of a result file: numbers of seven digits with their units."""
-    solution = solved.solution
+    """Return a solution as the entry of a result file."""
+    return {"path": solved.file, **solution_quantities(solved.solution)}
+
+
+def solution_quantities(solution: PathSolution) -> dict[str, Any]:
+    """Return what a solution says as text: numbers of seven digits with their units."""
     description = solution.robot.description
     unit = solution.stiffness_unit or ""
     channels = range(solution.pressures.shape[1]) if len(solution.times) else ()
     record: dict[str, Any] = {
-        "path": solved.file,
         "robot": description.name,
         "status": solution.status,
         "message": solution.message or None,

@@ -30,7 +30,7 @@ def block(solved: SolvedPath) -> RenderableType:
     )
     parts: list[RenderableType] = [heading, labelled(_lines(solved))]
     if len(solution.times):
-        parts += ["", _table(solution)]
+        parts += ["", points_table(solution)]
     return Group(*parts, "")
 
 
@@ -62,7 +62,7 @@ def _lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]:
         ),
     )
     yield from _stiffness_lines(solved)
-    yield from _rates(solution)
+    yield from rate_lines(solution)
     if solution.clearance is not None and path.scene is not None:
         index = int(np.argmin(solution.clearance))
         yield (
@@ -98,7 +98,7 @@ def _stiffness_lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]
     )
 
 
-def _rates(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
+def rate_lines(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
     """Where the pressures are nearest to their rates."""
     margins = rate_margins(solution)
     if margins is None or solution.slew is None:
@@ -120,7 +120,7 @@ def _rates(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
     )
 
 
-def _table(solution: PathSolution) -> RenderableType:
+def points_table(solution: PathSolution) -> RenderableType:
     """Every so many points, and those that matter."""
     count = len(solution.times)
     marks: dict[int, str] = {}

@@ -35,8 +35,8 @@ class PathBatch(Batch[SolvedPath]):
     def run(self, files: Sequence[str]) -> int:
         """Solve path files; return the exit code."""
         for out in self.out:
-            if _is_csv(out):
-                _check_csv(out, files)
+            if is_csv(out):
+                check_csv(out, files)
             else:
                 check_result_file(out, files, RESULT_FORMAT)
         pictures = picture_names(self.plot, files)
@@ -48,7 +48,7 @@ class PathBatch(Batch[SolvedPath]):
         return self.exit_code
 
     def _write(self, out: str, files: Sequence[str]) -> None:
-        if not _is_csv(out):
+        if not is_csv(out):
             results = [path_records.result_record(each) for each in self.answers]
             write_file(out, {"format": RESULT_FORMAT, "results": results})
             return
@@ -99,11 +99,12 @@ class PathBatch(Batch[SolvedPath]):
         return len(answer.solution.times) > 0
 
 
-def _is_csv(out: str) -> bool:
+def is_csv(out: str) -> bool:
+    """Whether a file is to be CSV, by its name."""
     return out.lower().endswith(".csv")
 
 
-def _check_csv(out: str, files: Sequence[str]) -> None:
+def check_csv(out: str, files: Sequence[str]) -> None:
     """Check the paths of CSV files: only what an earlier command wrote is overwritten."""
     for name in map(FilePath, names_for_each(out, files)):
         check_writable(str(name))

@@ -9,6 +9,8 @@ from stiffopt.errors import InputError, shown
 from stiffopt.units import parse_quantity
 
 _LIST = re.compile(r"\s*([-+0-9.,:eE\s]*[0-9.])\s*([A-Za-z].*?)\s*")
+_NUMBER = re.compile(r"[-+0-9.eE]+")
+_LAST_UNIT = re.compile(r"[-+0-9.eE]+\s*([A-Za-z].*)")
 _AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 _MOST = 1000  # values of a range
 
@@ -52,6 +54,15 @@ def pressures(option: str, text: str) -> tuple[float, ...]:
     if count > _MOST:
         raise InputError(f"{option}: these are {count} pressures; at most {_MOST} are allowed")
     return tuple(round(start + step * k, 6) for k in range(count))
+
+
+def listed(option: str, text: str, unit: str, what: str) -> tuple[float, ...]:
+    """Return quantities in SI from ``0.2 bar, 0 bar, 30 kPa`` or ``0.2, 0, 0.3 bar``."""
+    parts = [part.strip() for part in text.split(",")]
+    last = _LAST_UNIT.fullmatch(parts[-1])
+    if last is not None and all(_NUMBER.fullmatch(part) for part in parts[:-1]):
+        parts[:-1] = [f"{part} {last[1]}" for part in parts[:-1]]
+    return tuple(quantity(option, part, unit, what) for part in parts)
 
 
 def directions(option: str, text: str) -> tuple[tuple[float, ...], ...]:

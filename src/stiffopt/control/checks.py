@@ -29,6 +29,7 @@ Array = NDArray[np.float64]
 ModelT = TypeVar("ModelT", bound=Schema)
 
 _NOT_CONTENT = frozenset({"source"})  # the file that a description was read from
+_ROUNDING = 1e-6  # of a rate
 _LISTED = 5  # keys that an error names
 
 
@@ -63,15 +64,50 @@ def check_target(target: Target) -> None:
         validated(target, Target)
 
 
-def check_trajectory(trajectory: Trajectory) -> None:
-    """Refuse a trajectory that is not valid."""
+def check_trajectory(trajectory: Trajectory, limits: PressureLimits, slew: Array) -> None:
+    """Refuse a trajectory that is not valid, or whose pressures break limits or slew (n,)."""
     with refusing("trajectory"):
         if not isinstance(trajectory, Trajectory):
             raise InputError(f"expected a Trajectory, not {type(trajectory).__name__}")
         # one by one: all at once would hold Python's lock, and so the control thread, for too long
         waypoints = tuple(validated(waypoint, Waypoint) for waypoint in trajectory.waypoints)
         validated(trajectory.model_copy(update={"waypoints": waypoints[:1]}), Trajectory)
-        Trajectory(waypoints=waypoints)
+        checked = Trajectory(waypoints=waypoints)
+        if checked.pressures is not None:
+            times = np.array([waypoint.time for waypoint in waypoints])
+            _check_pressures(checked.pressures, limits)
+            check_rates(times, checked.pressures, slew)
+
+
+def _check_pressures(pressures: Array, limits: PressureLimits) -> None:
+    """Refuse pressures (k, n) of waypoints that are not of this arm, or beyond its limits."""
+    n = pressures.shape[1]
+    if n != limits.n:
+        raise InputError(
+            f"waypoints[0].pressures: expected {limits.n}, one for each channel, not {n}"
+        )
+    beyond = (pressures < limits.low - limits.slack) | (pressures > limits.high + limits.slack)
+    for index, channel in np.argwhere(beyond):
+        raise InputError(
+            f"waypoints[{index}].pressures: {pressures[index, channel] * 1e-5:g} bar is beyond the "
+            f"limits of channel {channel + 1}, {limits.low[channel] * 1e-5:g} to "
+            f"{limits.high[channel] * 1e-5:g} bar"
+        )
+
+
+def check_rates(times: Array, pressures: Array, slew: Array, *, before_first: int = 0) -> None:
+    """Refuse waypoints at times (k,), in s, with pressures (k, n) that change faster than slew.
+
+    `before_first` of them are no waypoints: there the arm is before.
+    """
+    rates = np.abs(np.diff(pressures, axis=0)) / np.diff(times)[:, None]
+    for index, channel in np.argwhere(rates > slew * (1 + _ROUNDING)):
+        since, until = index + 1 - before_first, index + 2 - before_first
+        way = f"from waypoint {since} to {until}" if since else f"on the way to waypoint {until}"
+        raise InputError(
+            f"{way}, channel {channel + 1} would change by "
+            f"{rates[index, channel] * 1e-5:.4g} bar/s; at most {slew[channel] * 1e-5:g} bar/s"
+        )
 
 
 def highest_pressures(task: Task, limits: PressureLimits) -> Array:

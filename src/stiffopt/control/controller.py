@@ -17,13 +17,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
-from stiffopt.control.checks import limited_range, refusing
+from stiffopt.control.checks import check_rates, limited_range, refusing
 from stiffopt.control.course import Course
 from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.feedback import GainSchedule, tracking_rows
+from stiffopt.control.forecast import Forecast, Present
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LinearisedTip
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
+from stiffopt.control.posture import PostureCourse
 from stiffopt.control.reference import Reference
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.replanning import Pursuit, Replanner
@@ -33,9 +35,10 @@ from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
-from stiffopt.optimise.tip import TipAt
+from stiffopt.optimise.tip import TipAt, TipModel
 from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureLimits, PressureReading
 from stiffopt.rig.settings import ControlSettings, Safety
@@ -43,6 +46,8 @@ from stiffopt.rig.settings import ControlSettings, Safety
 Array = NDArray[np.float64]
 
 _MOST_STEPS = 50  # of the estimators in one tick, after a pause
+_HELD = 2.5  # periods without a command, after which others have commanded
+_SLACK = 1e-3  # Pa, of a limit, by rounding
 
 
 class TipController:
@@ -62,10 +67,16 @@ class TipController:
         Settings of the rig.
     vibrates :
         Whether the arm vibrates as its robot file implies, where the settings leave that open.
+    scene :
+        What the arm has to keep clear of; None: nothing is checked.
     plan_in_process :
         Whether plans are made in a process of their own; otherwise at once, for simulated time.
     tuning :
         Of the parts.
+
+    Attributes
+    ----------
+    forecast : of requests that are to be checked against the scene; None without one.
     """
 
     def __init__(
@@ -78,6 +89,7 @@ class TipController:
         control: ControlSettings | None = None,
         safety: Safety | None = None,
         vibrates: bool = True,
+        scene: Scene | None = None,
         plan_in_process: bool = False,
         tuning: ControlTuning | None = None,
     ) -> None:
@@ -85,7 +97,7 @@ class TipController:
         control, safety = control or ControlSettings(), safety or Safety()
         self._tuning = tuning = tuning or ControlTuning()
         self._period, n = period, robot.n_pressures
-        slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
+        self._slew = slew = np.broadcast_to(np.asarray(slew, dtype=float), n).copy()
         if control.vibration != "auto":
             vibrates = control.vibration == "modelled"
         mode = BendingMode.of(robot.description) if vibrates else None
@@ -114,11 +126,16 @@ class TipController:
             control.solver,
             tuning.feedback,
         )
-        planner = ProcessPlanner(robot) if plan_in_process else InlinePlanner(robot)
-        self.replanner = Replanner(planner, tuning.replanning, period, dead_time)
+        Planner = ProcessPlanner if plan_in_process else InlinePlanner
+        self.replanner = Replanner(Planner(robot, scene), tuning.replanning, period, dead_time)
+        self.forecast: Forecast | None = None
+        if scene is not None:
+            self.forecast = Forecast(Planner(robot, scene), tuning.forecast)
+        self._lead = dead_time + 0.5 * period
         self._errors = TipErrors()
         self._model: LinearisedTip | None = None  # at the effective pressures
         self._path_model: LinearisedTip | None = None  # on the reference's path
+        self._waypoint_model: TipModel | None = None  # at a trajectory's waypoints
         self.begin(0.0)
 
     def check(self) -> None:
@@ -133,6 +150,7 @@ class TipController:
                 "install one (Debian: apt install gcc) or set STIFFOPT_COMPILER"
             )
         self._model, self._path_model = model, path_model
+        self._waypoint_model = TipModel(self.robot)
         self.begin(self._now)
 
     def begin(self, now: float) -> None:
@@ -151,6 +169,8 @@ class TipController:
             self._tip = self._model.at(zero)
             self._estimator.advance(now, zero, self._tip)
         self._at_rest = True  # the reference begins at the present pressures
+        self._computed_at = now
+        self._led_to: Target | None = None  # by a trajectory of pressures, now
 
     def set_task(self, task: Task) -> None:
         """Pursue a task; see `Controller.set_task`."""
@@ -165,26 +185,111 @@ class TipController:
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory; see `Controller.follow`."""
         with refusing("trajectory"):
+            if trajectory.pressures is not None:
+                self._follow_posture(trajectory, trajectory.pressures, now)
+                return
             estimate = self._estimator.estimate
             course = Course(trajectory, now, estimate.position, estimate.rotation)
             self._pursue_target(course.at(now), course)
 
-    def _pursue_task(self, task: Task, course: Course | None = None) -> None:
+    def _follow_posture(self, trajectory: Trajectory, pressures: Array, now: float) -> None:
+        """Follow a trajectory of pressures (k, n) as the posture.
+
+        It begins later by the delay of the reference, which so does not cut off its beginning.
+        """
+        start, n = self._start(now), pressures.shape[1]
+        if self.forecast is not None:
+            self.forecast.confirm(trajectory, start[:n])
+        self._check_beginning(trajectory.waypoints[0].time, pressures[0], start[:n])
+        task = self.replanner.pursuit.task
+        if task is not None:
+            _check_within(pressures, *task.pressure_bounds(self.robot.description))
+        self._models()
+        assert self._waypoint_model is not None
+        model = self._waypoint_model
+        self._set_reference_rate()
+        begin = now + self._reference.delay + self._lead
+        course = PostureCourse(trajectory, begin, start, lambda p: model.at(p).pose)
+        self._pursue_target(course.at(now), course)
+        self._computed_at, self._led_to = now, None
+
+    def _start(self, now: float) -> Array:
+        """Where a motion begins: pressures and the offset of the tip that goes with them (n + 6,).
+
+        That is where the reference leads, or else the pressures that are held.
+        """
+        if not self._is_held(now):
+            return self._reference.goal
+        pressures = self._pressures
+        posture = pressures.command + pressures.history_offset
+        return np.concatenate([posture, self._estimator.offset])
+
+    def _is_held(self, now: float) -> bool:
+        """Whether the pressures are not those that the reference leads to."""
+        return self._at_rest or now - self._computed_at > _HELD * self._period
+
+    def _check_beginning(self, time: float, first: Array, start: Array) -> None:
+        """Refuse a first waypoint (n,), at a time in s, that cannot be had from the start (n,)."""
+        if time > 0:
+            check_rates(np.array([0.0, time]), np.stack([start, first]), self._slew, before_first=1)
+            return
+        for channel in np.flatnonzero(np.abs(first - start) > self._tuning.posture.there):
+            raise InputError(
+                f"waypoint 1 is at 0 s and has {first[channel] * 1e-5:.4g} bar in channel "
+                f"{channel + 1}, which has {start[channel] * 1e-5:.4g} bar now; give it a later "
+                "time, in which the arm goes there, or go there before"
+            )
+
+    def _pursue_task(self, task: Task, course: Course | PostureCourse | None = None) -> None:
         limited = _within_limits(task, self.robot, self.limits)
         lower, upper = limited.pressure_bounds(self.robot.description)
         self.replanner.pursue(Pursuit.of(task, limited, course))
         self._allocation.limit(lower, upper)  # last, since it cannot fail: the pursuit has changed
 
-    def _pursue_target(self, target: Target, course: Course | None = None) -> None:
+    def _pursue_target(self, target: Target, course: Course | PostureCourse | None = None) -> None:
         """Go to a target, with goal and limits of the task, if there is one."""
         pursuit = self.replanner.pursuit
         if pursuit.task is None:
-            self._pursue_task(Task(robot=self.robot.description.name, target=target), course)
+            self._pursue_task(self._plain_task(target), course)
         else:
             self.replanner.pursue(pursuit.to(target, course))
 
+    def _plain_task(self, target: Target) -> Task:
+        return Task(robot=self.robot.description.name, target=target)
+
+    def check_ahead(self, request: Task | Target | Trajectory) -> None:
+        """Refuse what would lead the arm too near to the scene; any thread may ask."""
+        forecast = self.forecast
+        if forecast is None:
+            return
+        if isinstance(request, Trajectory) and request.pressures is not None:
+            forecast.check_posture(request, request.pressures)
+            return
+        here, course, task = forecast.here(), None, None
+        if isinstance(request, Trajectory):
+            course = Course(request, 0.0, here.position, here.rotation)
+            target = course.at(0.0)
+        elif isinstance(request, Task):
+            target, task = request.target, request
+        else:
+            target = request
+        if task is None and here.pursuit.task is not None:
+            forecast.check(here.pursuit.to(target, course))
+            return
+        task = task or self._plain_task(target)
+        limited = _within_limits(task, self.robot, self.limits)
+        forecast.check(Pursuit.of(task, limited, course))
+
     def resume(self, now: float) -> None:
-        """Control again from where the pressures are."""
+        """Control again from where the pressures are.
+
+        A trajectory of pressures goes on where it was: its way is clear, a shorter one may not be.
+        """
+        course = self.replanner.pursuit.course
+        pause = now - self._computed_at - self._period
+        if isinstance(course, PostureCourse) and pause > 0:
+            course.wait(pause)
+        self._computed_at = now
         offset, pressures = self._estimator.offset, self._pressures
         self._corrected_offset = offset
         self._reference.begin(
@@ -208,13 +313,34 @@ class TipController:
         for step in range(steps):
             moment = now - (steps - 1 - step) * self._period
             self._estimator.advance(moment, effective, tip)
-        return self._estimator.take(samples)
+        counts = self._estimator.take(samples)
+        if self.forecast is not None:
+            self.forecast.present = self._present(now)
+        return counts
+
+    def _present(self, now: float) -> Present:
+        estimate, replanner = self._estimator.estimate, self.replanner
+        return Present(
+            replanner.pursuit, replanner.plan, self._way(now), self._estimator.offset,
+            self._pressures.command_offset, estimate.position, estimate.rotation,
+        )  # fmt: skip
+
+    def _way(self, now: float) -> Array:
+        """Effective pressures (2, n) on the reference's path now, and where that leads."""
+        n, goal = self.robot.n_pressures, self._start(now)
+        here = goal if self._is_held(now) else self._reference.path
+        return np.stack([here[:n], goal[:n]])
 
     def compute(self, now: float) -> ControlOutput:
         """Compute the next command; see `Controller.compute`."""
+        output = self._compute(now)
+        self._computed_at = now
+        return replace(output, posture=output.pressures + self._pressures.command_offset)
+
+    def _compute(self, now: float) -> ControlOutput:
         reference, estimator, pressures = self._reference, self._estimator, self._pressures
         omega, command_offset = estimator.omega, pressures.command_offset
-        plan = self.replanner.update(now, estimator.offset, command_offset, omega, reference.delay)
+        plan = self._plan(now)
         last, n = pressures.command, len(pressures.command)
         if plan is None:  # nothing to do, or no plan yet
             self._at_rest = True
@@ -223,13 +349,14 @@ class TipController:
             self.resume(now)
         if self._model_is_wrong():
             return ControlOutput(last.copy(), False, self._saturated.copy())
-        tuning = self._tuning.reference
-        reference.rate = tuning.rigid_rate
-        if self._gains is not None:
-            reference.rate = min(reference.rate, tuning.vibrating_rate * omega)
+        self._set_reference_rate()
         reference.omega = omega
         reference.advance(plan)
         tip = self._models()[1].at(reference.path[:n])
+        course = self.replanner.pursuit.course
+        self._led_to = None
+        if isinstance(course, PostureCourse):
+            self._led_to = course.target(tip.pose, reference.path[n:])
         self._update_corrected_offset(omega)
         correction = reference.path[n:] - self._corrected_offset
         prescribed = self.replanner.pursuit.prescribed
@@ -244,13 +371,33 @@ class TipController:
         self._saturated = held if reported else np.zeros(n, dtype=bool)
         return ControlOutput(command, True, self._saturated.copy())
 
+    def _plan(self, now: float) -> Array | None:
+        """Pressures and offset (n + 6,) that the reference is to lead to; None without a plan."""
+        reference, estimator, replanner = self._reference, self._estimator, self.replanner
+        course, tuning = replanner.pursuit.course, self._tuning
+        if isinstance(course, PostureCourse):
+            reference.slew_share = tuning.posture.slew_share
+            return course.goal(now + reference.delay + self._lead)
+        reference.slew_share = tuning.reference.slew_share
+        way = None if self.forecast is None else self._way(now)
+        return replanner.update(
+            now, estimator.offset, self._pressures.command_offset, estimator.omega,
+            reference.delay, way,
+        )  # fmt: skip
+
+    def _set_reference_rate(self) -> None:
+        tuning, rate = self._tuning.reference, self._tuning.reference.rigid_rate
+        if self._gains is not None:
+            rate = min(rate, tuning.vibrating_rate * self._estimator.omega)
+        self._reference.rate = rate
+
     def status(self, now: float) -> ControllerStatus:
         """Return the controller's part of the state; see `Controller.status`."""
         n, tip, pursuit = self.robot.n_pressures, self._tip, self.replanner.pursuit
         if tip is None:
             return ControllerStatus(plan=np.full(n, np.nan))
         estimate = self._estimator.estimate
-        target = pursuit.target_at(now)
+        target = self._led_to or pursuit.target_at(now)
         position, pointing, quaternion = target_arrays(target)
         position_error, angle_error = self._errors.at(target, estimate.position, estimate.rotation)
         sample, plan = self._estimator.sample, self.replanner.plan
@@ -259,7 +406,9 @@ class TipController:
             stiffness = pursuit.stiffness(tip.compliance, tip.pose[:3, :3])
         turn = estimate.turn if self._estimator.turn_known else None
         planned = np.full(n, np.nan)
-        if plan is not None:
+        if self._led_to is not None:
+            planned = self._reference.goal[:n] - self._pressures.history_offset
+        elif plan is not None:
             planned = plan.pressures - self._pressures.history_offset
         return ControllerStatus(
             plan=planned,
@@ -294,8 +443,10 @@ class TipController:
         return notices
 
     def close(self) -> None:
-        """End the planner."""
+        """End the planners."""
         self.replanner.close()
+        if self.forecast is not None:
+            self.forecast.close()
 
     def _model_is_wrong(self) -> bool:
         """Whether the offset is too large to be an error of this arm's model."""
@@ -333,6 +484,17 @@ class TipController:
             self._gains.at(estimator.omega), self._pressures.effective_ahead,
             self._reference.chamber, motion[0, :n], motion[1, :n],
         )  # fmt: skip
+
+
+def _check_within(pressures: Array, low: Array, high: Array) -> None:
+    """Refuse waypoints' pressures (k, n) beyond the limits of the task that is pursued."""
+    beyond = (pressures < low - _SLACK) | (pressures > high + _SLACK)
+    for index, channel in np.argwhere(beyond):
+        raise InputError(
+            f"waypoints[{index}].pressures: {pressures[index, channel] * 1e-5:g} bar is beyond the "
+            f"limits of the task in channel {channel + 1}, {low[channel] * 1e-5:g} to "
+            f"{high[channel] * 1e-5:g} bar"
+        )
 
 
 def _within_limits(task: Task, robot: Manipulator, limits: PressureLimits) -> Task:

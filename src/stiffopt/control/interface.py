@@ -39,6 +39,8 @@ class ControlOutput:
     pressures: Array  # (n,), in Pa
     valid: bool  # whether they are a solution; else the solver failed and they are the last ones
     saturated: NDArray[np.bool_]  # channels (n,) at a limit that keeps the tip from its target
+    # effective pressures (n,) to which the command leads, in Pa; None: the command
+    posture: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,12 @@ class Controller(Protocol):
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory that begins now; the same errors."""
+
+    def check_ahead(self, request: Task | Target | Trajectory) -> None:
+        """Raise `InputError` if the way there is not clear of the rig's scene.
+
+        Called from the threads of those who ask, before the request is handed over.
+        """
 
     def resume(self, now: float) -> None:
         """Control again after others have commanded the pressures, without a jump."""

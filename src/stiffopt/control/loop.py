@@ -10,13 +10,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stiffopt.control.checks import check_target, check_task, check_trajectory
+from stiffopt.control.checks import check_target, check_task, check_trajectory, refusing
 from stiffopt.control.interface import Controller
 from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.request_queue import RequestQueue, current_requester
 from stiffopt.control.state import ControllerStatus, Snapshot, State, Timing
 from stiffopt.control.supervisor import Supervisor
 from stiffopt.control.tuning import SupervisionTuning
+from stiffopt.control.ways import ClearanceWatch
 from stiffopt.errors import CommandError, InputError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -58,6 +59,8 @@ class ControlLoop:
         Between ticks, in s.
     tuning :
         Of the supervision.
+    clearance :
+        Keeps commands clear of the rig's scene; None: there is none.
     """
 
     def __init__(
@@ -69,13 +72,14 @@ class ControlLoop:
         safety: Safety,
         period: float,
         tuning: SupervisionTuning | None = None,
+        clearance: ClearanceWatch | None = None,
     ) -> None:
         if not 0 < period < math.inf:
             raise InputError(f"the period must be above 0 s, not {period:g} s")
         self.rig = rig
         self.period = period
         tuning = tuning or SupervisionTuning()
-        self._supervisor = Supervisor(rig, controller, outlet, safety, period, tuning)
+        self._supervisor = Supervisor(rig, controller, outlet, safety, period, tuning, clearance)
         self._requests = RequestQueue()
         self._configuring = False
         self._timing = TickTiming(period)
@@ -116,19 +120,29 @@ class ControlLoop:
         """Pursue a task; refused unless the loop is armed and the task valid on this rig."""
         self._check_started()
         check_task(task, self._supervisor.outlet.limits)
+        self._check_ahead(task)
         self._carry_out(lambda now: self._supervisor.set_task(now, task))
 
     def set_target(self, target: Target) -> None:
         """Go to another target, with the stiffness goal and limits of the task, if there is one."""
         self._check_started()
         check_target(target)
+        self._check_ahead(target)
         self._carry_out(lambda now: self._supervisor.set_target(now, target))
 
     def follow_trajectory(self, trajectory: Trajectory) -> None:
         """Follow a trajectory that begins now."""
         self._check_started()
-        check_trajectory(trajectory)  # in this thread: the control thread has to tick
+        limits = self._supervisor.outlet.limits
+        check_trajectory(trajectory, limits, self.rig.slew)
+        self._check_ahead(trajectory)
         self._carry_out(lambda now: self._supervisor.follow_trajectory(now, trajectory))
+
+    def _check_ahead(self, request: Task | Target | Trajectory) -> None:
+        """Have it checked in this thread, which may take long: the control thread has to tick."""
+        if self._supervisor.lifecycle.armed:  # or else it is refused for that
+            with refusing("request"):
+                self._supervisor.controller.check_ahead(request)
 
     def hold(self, reason: str = "asked to") -> None:
         """Keep the pressures as they are until the next task, target or trajectory."""

@@ -29,22 +29,28 @@ from stiffopt.control.planning import Plan, Planning, PlanRequest
 from stiffopt.control.state import Severity
 from stiffopt.errors import StiffoptError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 
 _RESTART_AFTER = 1.0  # s between two starts of the process
 _PREPARATION = 0.5  # s; a new task that takes longer is reported
 _NICE = 5  # of the process: the control loop comes first
 _IDLE = 1.0  # s without a request, after which compiled code is asked for
-_ARRAYS = ("offset", "pressure_offset")  # of a request: compared and sent by value, every time
-_OBJECTS = ("serial", "task", "target", "search")  # immutable: compared by identity
+_ARRAYS = (
+    "offset",
+    "pressure_offset",
+    "way",
+)  # of a request: compared and sent by value, every time
+_OBJECTS = ("serial", "task", "target", "search", "last")  # immutable: compared by identity
 
 
 class InlinePlanner:
     """Plans within the request, while time stands still, as in a simulation."""
 
-    def __init__(self, robot: Manipulator) -> None:
-        self._planning = Planning(robot)
+    def __init__(self, robot: Manipulator, scene: Scene | None = None) -> None:
+        self._planning = Planning(robot, scene)
         self._plan: Plan | None = None
         self._notices: tuple[Notice, ...] = ()
+        self.failures = 0  # requests that had no answer
 
     def request(self, request: PlanRequest) -> None:
         """Plan."""
@@ -52,6 +58,7 @@ class InlinePlanner:
             self._plan = self._planning.plan(request)
             self._notices = ()
         except StiffoptError as error:
+            self.failures += 1
             self._notices = (Notice("planner", f"the planner failed: {error}", standing=True),)
 
     def latest(self) -> Plan | None:
@@ -76,17 +83,22 @@ class ProcessPlanner:
     ----------
     robot :
         The arm.
+    scene :
+        What the ways to plans have to be clear of.
     patience :
         Duration of a plan beyond which there is an alarm, in s. The first of a kind of task may be
         compiled, which takes seconds.
     """
 
-    def __init__(self, robot: Manipulator, patience: float = 5.0) -> None:
-        self._robot, self._patience = robot, patience
+    def __init__(
+        self, robot: Manipulator, scene: Scene | None = None, patience: float = 5.0
+    ) -> None:
+        self._robot, self._scene, self._patience = robot, scene, patience
         self._waiting: PlanRequest | None = None
         self._serial = -1  # of the last request that was sent
         self._plan: Plan | None = None
         self._failure, self._closed = "", False
+        self.failures = 0  # requests that had no answer
         self._start()
 
     def _start(self) -> None:
@@ -101,7 +113,7 @@ class ProcessPlanner:
         self._end = PlannerEnd(ours.detach())
         self._busy_since: float | None = math.inf  # until the process is ready
         self._started_at = time.monotonic()
-        self._end.connection.send(self._robot)
+        self._end.connection.send((self._robot, self._scene))
 
     def request(self, request: PlanRequest) -> None:
         """Have a plan made as soon as the process is free; it replaces a request that waits."""
@@ -153,6 +165,7 @@ class ProcessPlanner:
                     self._plan, self._failure = answer, ""
                 elif answer is not None:  # None: the process is ready
                     self._failure = f"the planner failed and begins anew: {answer}"
+                    self.failures += 1
             if self._waiting is not None and self._busy_since is None:
                 self._end.send(self._waiting)
                 self._serial = self._waiting.serial
@@ -162,6 +175,7 @@ class ProcessPlanner:
 
     def _start_again(self) -> None:
         self._failure = "the planner died and is started again; the last plan stays"
+        self.failures += 1
         if time.monotonic() - self._started_at < _RESTART_AFTER:
             return
         self._end.connection.close()
@@ -238,19 +252,20 @@ class PlanningEnd:
     def answer(self, answer: Plan | str | None) -> None:
         """Send the plan for the last request, or why there is none; None: the process is ready."""
         if isinstance(answer, Plan):
-            own = {name: getattr(answer, name) for name in ("reached", "stiffness", "message")}
+            names = ("reached", "stiffness", "message", "blocked")
+            own = {name: getattr(answer, name) for name in names}
             self.connection.send({"pressures": answer.pressures.tolist(), **own})
         else:
             self.connection.send(answer)
 
 
 def main(end: PlanningEnd) -> None:
-    """Receive the arm, answer None, then each request with a plan or the reason why there is none.
+    """Receive arm and scene, answer None, then each request with a plan or why there is none.
 
     It ends when the other end is closed.
     """
-    robot: Manipulator = end.connection.recv()
-    planning = Planning(robot)
+    robot, scene = end.connection.recv()
+    planning = Planning(robot, scene)
     end.answer(None)
     while True:
         while not end.connection.poll(_IDLE):
@@ -260,7 +275,7 @@ def main(end: PlanningEnd) -> None:
             end.answer(planning.plan(request))
         except Exception as error:  # whatever it is, the next request may succeed
             end.answer(f"{type(error).__name__}: {error}")
-            planning = Planning(robot)
+            planning = Planning(robot, scene)
 
 
 if __name__ == "__main__":

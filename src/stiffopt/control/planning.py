@@ -5,12 +5,14 @@ the pressures that are stiffest on the arm as it is, but for errors of the model
 plan is the local optimum next to the last plan. When the offset has changed much and the arm is at
 rest, all configurations are searched again, and the arm leaves its own only for one that is clearly
 better. For a target that is out of reach, the plan is the configuration nearest to it.
+
+On a rig with a scene a plan also says whether the body keeps clear of it on the way there.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import daqp
 import numpy as np
@@ -18,7 +20,10 @@ from numpy.typing import NDArray
 
 from stiffopt.control.tip_errors import TipErrors
 from stiffopt.control.tuning import FeedbackTuning, NearestTuning, PlanningTuning
+from stiffopt.control.ways import Ways
+from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target, Tolerance
@@ -36,11 +41,14 @@ class PlanRequest:
     """Everything that a plan is made for."""
 
     serial: int  # number of the task; a plan for an earlier one is discarded
-    task: Task  # stiffness goal and limits
-    target: Target  # takes the place of the task's own
+    task: Task | None  # stiffness goal and limits; None: there is only a way to be checked
+    target: Target | None  # takes the place of the task's own
     offset: Array  # tip pose relative to the model's (6,), m and rad (rotation vector), base axes
     pressure_offset: Array  # effective pressures relative to commands (n,), in Pa
     search: bool = False  # whether all configurations are to be searched, as for a new target
+    # where a scene is to be kept: effective pressures (k, n) on the way before the plan, in Pa
+    way: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    last: Plan | None = None  # takes the place of the planner's own last plan
 
 
 @dataclass(frozen=True)
@@ -50,17 +58,19 @@ class Plan:
     serial: int
     pressures: Array  # effective (n,), in Pa
     offset: Array  # of the tip (6,), for which the plan was made
-    target: Target
+    target: Target | None
     reached: bool  # whether the model reaches it
     stiffness: float  # along the task's first direction; NaN where it names none
     message: str  # why it is not reached
+    blocked: str = ""  # why the way there is not clear of the scene
 
 
 class Planning:
     """Makes plans for an arm, each from the last one."""
 
-    def __init__(self, robot: Manipulator) -> None:
+    def __init__(self, robot: Manipulator, scene: Scene | None = None) -> None:
         self._robot, self._tuning = robot, PlanningTuning()
+        self._ways = None if scene is None else Ways(robot, scene)
         self._search = NearestSearch(TipModel(robot), FeedbackTuning().lever, NearestTuning())
         self._serial, self._is_compiled = -1, False
         self._last: Plan | None = None
@@ -74,16 +84,31 @@ class Planning:
 
     def plan(self, request: PlanRequest) -> Plan:
         """Return the plan for a request; `StiffoptError`: the optimiser could not be run."""
+        if request.task is None or request.target is None:
+            return self._checked(request)
+        plan = self._planned(request, request.task, request.target)
+        if self._ways is None or not len(request.way):
+            return plan
+        blocked = self._ways.blocked(np.vstack([request.way, plan.pressures]))
+        return replace(plan, blocked=blocked)
+
+    def _checked(self, request: PlanRequest) -> Plan:
+        """No plan, but whether the way of a request, through waypoints, is clear."""
+        if self._ways is None:
+            raise InputError("a request without a task, and no scene to check its way")
+        blocked = self._ways.blocked(request.way, waypoints=True)
+        pressures = request.way[-1]
+        return Plan(request.serial, pressures, request.offset, None, True, math.nan, "", blocked)
+
+    def _planned(self, request: PlanRequest, task: Task, asked: Target) -> Plan:
         if request.serial != self._serial or self._last is None:
-            exact = request.target.model_copy(update={"tolerance": _EXACT})
-            self._solver = PressureSolver(
-                self._robot, request.task.model_copy(update={"target": exact})
-            )
+            exact = asked.model_copy(update={"tolerance": _EXACT})
+            self._solver = PressureSolver(self._robot, task.model_copy(update={"target": exact}))
             self._is_compiled = self._solver.compile()
             self._serial, self._last = request.serial, None
-        target = model_target(request.target, request.offset)
+        target = model_target(asked, request.offset)
         self._limits = self._effective_limits(request.pressure_offset)
-        last = self._last
+        last = self._last = request.last or self._last
         if last is None or request.search:
             self._searched_at = request.offset
             self._advantage, self._refused = self._tuning.advantage, 0
@@ -94,11 +119,9 @@ class Planning:
         if solution is not None and solution.pressures is not None:
             pressures = np.array(solution.pressures, dtype=float)
             stiffness = math.nan if solution.stiffness is None else float(solution.stiffness)
-            self._last = Plan(
-                request.serial, pressures, request.offset, request.target, True, stiffness, ""
-            )
+            self._last = Plan(request.serial, pressures, request.offset, asked, True, stiffness, "")
         else:
-            self._last = self._nearest(request, target)
+            self._last = self._nearest(request, task, target)
         return self._last
 
     def _effective_limits(self, offset: Array) -> tuple[Array, Array]:
@@ -156,13 +179,13 @@ class Planning:
         solution = self._solver.solve(target, guess)
         return solution if solution.found else None
 
-    def _nearest(self, request: PlanRequest, target: Target) -> Plan:
+    def _nearest(self, request: PlanRequest, task: Task, target: Target) -> Plan:
         """Plan for a target that is out of reach, or cannot be had with the stiffness required."""
         start = 0.5 * (self._limits[0] + self._limits[1])
         if self._last is not None:
             start = np.clip(self._last.pressures, *self._limits)
         pressures, distance, angle = self._search.find(target, self._limits, start)
-        tolerance = request.task.target.tolerance
+        tolerance = task.target.tolerance
         if distance <= tolerance.position and angle <= tolerance.angle:
             message = "the pose can be reached, but not with the stiffness that is asked for"
         else:
@@ -175,7 +198,9 @@ class Planning:
 
     def _displacement(self, last: Plan, target: Target) -> Array:
         """Displacement (3,) of the model's target from that of the last plan, in m."""
-        before = model_target(last.target, last.offset).position
+        before = None
+        if last.target is not None:
+            before = model_target(last.target, last.offset).position
         if before is None or target.position is None:
             return np.zeros(3)
         pairs = zip(before, target.position, strict=True)

@@ -47,7 +47,8 @@ class Reference:
         slew_share: float = 0.9,
     ) -> None:
         self._period, self._lag, self._damping = period, lag, damping
-        self._step = _step(slew * period, extra, slew_share)
+        self._step = _step(slew * period, extra)
+        self.slew_share = slew_share  # of the slew, which the pressures may take
         self._filter_of: tuple[float, float] | None = None  # rate and omega
         self._filter: tuple[Array, ...] = ()
         self.rate = 1.0  # a of the four lags, in 1/s
@@ -66,6 +67,12 @@ class Reference:
         return _LAGS / self.rate
 
     @property
+    def goal(self) -> Array:
+        """Where the path comes to rest if the plan stays where it has come to (n + m,)."""
+        value: Array = self._states[0]
+        return value
+
+    @property
     def path(self) -> Array:
         """The path now (n + m,)."""
         value: Array = self.motion[0]
@@ -79,7 +86,7 @@ class Reference:
         if self._filter_of != (self.rate, self.omega):
             self._filter_of, self._filter = (self.rate, self.omega), self._matrices()
         self._states, self.motion, self.command, self.chamber = self._step(
-            self._states, plan, *self._filter
+            self._states, plan, *self._filter, self.slew_share
         )
 
     def _matrices(self) -> tuple[Array, ...]:
@@ -101,18 +108,19 @@ class Reference:
         )
 
 
-def _step(reach: Array, extra: int, slew_share: float) -> Formula:
+def _step(reach: Array, extra: int) -> Formula:
     """States (5, n + m), motion (4, n + m), command and chamber (n,) after a step.
 
     Inputs: states, whose first is the input of the lags; the plan (n + m,); transition matrix (5,
-    5); differences (4, 5); weights (4,) of the motion in command and chamber. The n pressures
-    change by at most `slew_share` of `reach` in a step.
+    5); differences (4, 5); weights (4,) of the motion in command and chamber; the share of `reach`
+    by which the n pressures change at most in a step.
     """
     n = len(reach)
     states, plan = ca.SX.sym("states", _LAGS + 1, n + extra), ca.SX.sym("plan", n + extra)
     transition = ca.SX.sym("transition", _LAGS + 1, _LAGS + 1)
     differences = ca.SX.sym("differences", _LAGS, _LAGS + 1)
     command, chamber = ca.SX.sym("command", _LAGS), ca.SX.sym("chamber", _LAGS)
+    slew_share = ca.SX.sym("slew_share")
     way = plan.T - states[0, :]
     # all channels go the share of their way that the slowest one can go in a step
     needed = ca.mmax(ca.fabs(way[:n]).T / ca.DM(reach))
@@ -121,6 +129,6 @@ def _step(reach: Array, extra: int, slew_share: float) -> Formula:
     after = transition @ begun
     motion = differences @ after
     pressures = motion[:, :n].T
-    inputs = [states, plan, transition, differences, command, chamber]
+    inputs = [states, plan, transition, differences, command, chamber, slew_share]
     outputs = [after, motion, pressures @ command, pressures @ chamber]
     return Formula(inputs, outputs, [states, after, motion])

@@ -14,6 +14,7 @@ from stiffopt.control.feedback import prescribed_components
 from stiffopt.control.interface import Notice
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Plan, PlanRequest
+from stiffopt.control.posture import PostureCourse
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
 from stiffopt.control.tuning import ReplanningTuning
 from stiffopt.optimise.target import Target
@@ -28,19 +29,20 @@ class Pursuit:
 
     task: Task | None = None  # within the limits of the rig; None: nothing is pursued
     target: Target | None = None  # takes the place of the task's own
-    course: Course | None = None  # a trajectory under way, which takes the place of the target
+    # a trajectory under way, which takes the place of the target
+    course: Course | PostureCourse | None = None
     prescribed: Array = field(default_factory=lambda: np.zeros(5))  # see `prescribed_components`
     stiffness: Callable[[Array, Array], float] | None = None  # in the task's first direction
     unit: str = "N/m"  # of that stiffness
 
     @classmethod
-    def of(cls, task: Task, limited: Task, course: Course | None = None) -> Pursuit:
+    def of(cls, task: Task, limited: Task, course: Course | PostureCourse | None = None) -> Pursuit:
         """Return the pursuit of a task, given with the limits of the rig as well."""
         prescribed = prescribed_components(task.target)
         unit = task.measures[0].unit if task.measures else "N/m"
         return cls(limited, task.target, course, prescribed, stiffness_function(task), unit)
 
-    def to(self, target: Target, course: Course | None = None) -> Pursuit:
+    def to(self, target: Target, course: Course | PostureCourse | None = None) -> Pursuit:
         """Return the pursuit of another target, or course that begins there."""
         prescribed = prescribed_components(target)
         return replace(self, target=target, course=course, prescribed=prescribed)
@@ -48,6 +50,14 @@ class Pursuit:
     def target_at(self, now: float) -> Target | None:
         """Return the target at a moment, in s."""
         return self.target if self.course is None else self.course.at(now)
+
+    def is_new_after(self, before: Pursuit) -> bool:
+        """Whether it is planned for from the beginning, not from the plan before."""
+        if self.task is not before.task or before.target is None:
+            return True
+        if bool((self.prescribed != before.prescribed).any()):
+            return True
+        return isinstance(self.course, PostureCourse) or isinstance(before.course, PostureCourse)
 
     @property
     def kind(self) -> str:
@@ -85,22 +95,30 @@ class Replanner:
     def pursue(self, pursuit: Pursuit) -> None:
         """Pursue something else from now on; an error changes nothing."""
         before = self.pursuit
-        new = pursuit.task is not before.task or before.target is None
-        new = new or bool((pursuit.prescribed != before.prescribed).any())
-        far = _is_far(before.target, pursuit.target, self._tuning)
+        far_position, far_angle = self._tuning.far_position, self._tuning.far_angle
+        new = pursuit.is_new_after(before)
+        far = is_far(before.target, pursuit.target, far_position, far_angle)
         self.pursuit = pursuit
         if new:
             self._renew()
+        if isinstance(pursuit.course, PostureCourse):
+            self.plan = None  # of another posture than that which the arm is led to
         self._search = self._search or far
         self._requested_at = -math.inf
 
     def _renew(self) -> None:
         self._serial += 1
-        self._search = True
+        self._search, self._blocked = True, ""
         self._requested_at = -math.inf
 
     def update(
-        self, now: float, offset: Array, pressure_offset: Array, omega: float, delay: float
+        self,
+        now: float,
+        offset: Array,
+        pressure_offset: Array,
+        omega: float,
+        delay: float,
+        way: Array | None = None,
     ) -> Array | None:
         """Request a plan when it is time, and take the newest.
 
@@ -114,6 +132,8 @@ class Replanner:
             Angular frequency of the vibration, in rad/s.
         delay :
             Of the reference behind the plan, in s.
+        way :
+            See `PlanRequest`; None without a scene.
 
         Returns
         -------
@@ -130,18 +150,19 @@ class Replanner:
             time = max(self._tuning.offset_time, self._tuning.offset_periods / omega)
             share = 1.0 if search else -math.expm1(-interval / time)
             self._offset = self._offset + share * (offset - self._offset)
-            self._planner.request(
-                PlanRequest(
-                    self._serial, task, target, self._offset.copy(), pressure_offset, search
-                )
+            request = PlanRequest(
+                self._serial, task, target, self._offset.copy(), pressure_offset, search
             )
+            self._planner.request(request if way is None else replace(request, way=way))
         return self.latest()
 
     def latest(self) -> Array | None:
-        """Take the newest plan; see `update`."""
+        """Take the newest plan, unless the way there is blocked; see `update`."""
         plan = self._planner.latest()
         if plan is not None and plan.serial == self._serial:
-            self.plan = plan
+            self._blocked = plan.blocked
+            if not plan.blocked:
+                self.plan = plan
         if self.plan is None:
             return None
         return np.concatenate([self.plan.pressures, self.plan.offset])
@@ -152,6 +173,9 @@ class Replanner:
         if plan is not None and plan.serial == self._serial and not plan.reached:
             text = f"the target cannot be reached: {plan.message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
+        if self._blocked:
+            text = f"the arm does not go on: {self._blocked}"
+            notices = (*notices, Notice("blocked", text, standing=True))
         return notices
 
     def close(self) -> None:
@@ -159,14 +183,14 @@ class Replanner:
         self._planner.close()
 
 
-def _is_far(before: Target | None, target: Target | None, tuning: ReplanningTuning) -> bool:
-    """Whether another configuration may be better for a target than for the one before."""
+def is_far(before: Target | None, target: Target | None, position: float, angle: float) -> bool:
+    """Whether a target is farther from the one before than a distance, in m, or an angle."""
     (here, *directions), (there, *others) = target_arrays(before), target_arrays(target)
     if here is not None and there is not None:
         distance = float(np.linalg.norm(np.nan_to_num(there - here)))
-        if distance > tuning.far_position:
+        if distance > position:
             return True
-    cosine = math.cos(tuning.far_angle)
+    cosine = math.cos(angle)
     return any(
         abs(float(a @ b)) < cosine
         for a, b in zip(directions, others, strict=True)

@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.checks import check_rig, check_vented_arm, highest_pressures, refusing
-from stiffopt.control.interface import Controller
+from stiffopt.control.interface import Controller, ControlOutput
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.state import Severity, State
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.control.tuning import SupervisionTuning
+from stiffopt.control.ways import ClearanceWatch
 from stiffopt.errors import CommandError, DeviceError, GuardTripped, InputError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
@@ -52,7 +53,8 @@ class Supervisor:
 
     Requests raise `InputError` with the reason when they are refused; nothing has changed then.
     A failure while something changes is a fault. `ControlLoop` has checked their arguments.
-    `now` is the time on the rig's clock, in s.
+    `now` is the time on the rig's clock, in s. A `clearance` watch keeps commands clear of the
+    scene; None: there is none.
     """
 
     def __init__(
@@ -63,9 +65,10 @@ class Supervisor:
         safety: Safety,
         period: float,
         tuning: SupervisionTuning,
+        clearance: ClearanceWatch | None = None,
     ) -> None:
         self.rig, self.controller, self.outlet = rig, controller, outlet
-        self._tuning = tuning
+        self._tuning, self._clearance = tuning, clearance
         self._clock, self._safety = rig.clock, safety
         self.lifecycle = Lifecycle(in_real_time=isinstance(rig.clock, SystemClock))
         self.events = EventBuffer()
@@ -245,10 +248,20 @@ class Supervisor:
         if not output.valid or p.shape != (n,) or not np.isfinite(p).all():
             self._count_failure(now, "the solver has no answer")
             self._command(now, self.commanded)
+        elif too_near := self._too_near(output):
+            self._command(now, self.commanded)
+            self._hold(now, "clearance", too_near)
         elif self._command(now, p, controlled=True):
             self._failures = 0
             self.alarms.clear(now, "solver")
             self.saturated = self.saturated | output.saturated
+
+    def _too_near(self, output: ControlOutput) -> str:
+        """Why a command would bring the body too near to the scene; empty if it does not."""
+        if self._clearance is None:
+            return ""
+        posture = output.pressures if output.posture is None else output.posture
+        return self._clearance.too_near(posture)
 
     def _count_failure(self, now: float, text: str) -> None:
         """Count failures of the controller in a row; after some the pressures are held."""
@@ -384,6 +397,8 @@ class Supervisor:
                     self.rig.tracker.open()
                 self.outlet.open()
                 problems = list(check_rig(self.rig, self.outlet, self.controller))
+                if self._clearance is not None:
+                    self._clearance.prepare()
                 reading = self.outlet.read()  # after the checks, which may compile the model
             except StiffoptError as error:
                 raise CommandError(f"devices: {error}") from error
@@ -416,6 +431,8 @@ class Supervisor:
         try:
             self.outlet.arm()
             self.controller.begin(now)
+            if self._clearance is not None:
+                self._clearance.begin()
         except BaseException as error:
             self._try_to_vent(now)
             if not self.vented:
@@ -466,7 +483,7 @@ class Supervisor:
     def _go_on(self, now: float, event: str, text: str) -> None:
         if text:
             self.events.add(now, event, text)
-        for kind in ("asked", "solver"):
+        for kind in ("asked", "solver", "clearance"):
             self._holds.pop(kind, None)
         try:
             self._resume(now)

@@ -99,6 +99,30 @@ class ReplanningTuning:
 
 
 @dataclass(frozen=True)
+class PostureTuning:
+    """How trajectories of pressures are followed."""
+
+    # share of the slew that the reference may take on them: they are within it already
+    slew_share: float = 1.0
+    # distance in pressure at which the arm is where a trajectory begins, in Pa
+    there: float = 1e4
+
+
+@dataclass(frozen=True)
+class ForecastTuning:
+    """How requests are checked against the rig's scene before they are accepted."""
+
+    patience: float = 8.0  # in which a way must have been checked, in s
+    look: float = 2e-3  # between looks for the planner's answer, in s
+    # distance and angle between targets of a trajectory for which plans are made, in m and rad
+    spacing: float = 1e-3
+    turn: float = math.radians(1)
+    most: int = 1000  # such targets
+    # distance in pressure that the arm may have moved since a way was checked, in Pa
+    moved: float = 1e4
+
+
+@dataclass(frozen=True)
 class PlanningTuning:
     """When a plan may change to another configuration of the arm."""
 
@@ -163,3 +187,5 @@ class ControlTuning:
     reference: ReferenceTuning = field(default_factory=ReferenceTuning)
     feedback: FeedbackTuning = field(default_factory=FeedbackTuning)
     replanning: ReplanningTuning = field(default_factory=ReplanningTuning)
+    posture: PostureTuning = field(default_factory=PostureTuning)
+    forecast: ForecastTuning = field(default_factory=ForecastTuning)

@@ -18,6 +18,7 @@ from stiffopt.control.controller import TipController
 from stiffopt.control.lifecycle import ARMED
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import Severity, Snapshot, State
+from stiffopt.control.ways import ClearanceWatch
 from stiffopt.daemon.calls import call_in_thread, ends_within
 from stiffopt.daemon.keeper import Keeper, LogEvents, ServiceManager
 from stiffopt.daemon.secret import Secret, bracketed, check_exposure
@@ -125,7 +126,7 @@ class Daemon:
         self._manager = ServiceManager()
         guarded, self.link = guarded_rig(description, self.robot.description, json_lines=json_lines)
         self._clock = guarded.clock
-        period = 1 / description.rate
+        period, scene = 1 / description.rate, description.scene
         self._controller = TipController(
             self.robot,
             self.link.limits,
@@ -134,10 +135,16 @@ class Daemon:
             control=description.control,
             safety=description.safety,
             vibrates=_vibrates(description),
+            scene=scene,
             plan_in_process=True,
         )
         self.loop = ControlLoop(
-            guarded, self._controller, self.link, safety=description.safety, period=period
+            guarded,
+            self._controller,
+            self.link,
+            safety=description.safety,
+            period=period,
+            clearance=None if scene is None else ClearanceWatch(self.robot, scene),
         )
         self._secret = Secret(description.service, self._folder, description.name)
         self._telemetry = self._make_telemetry(service)

@@ -39,6 +39,7 @@ _CLEAR, _BLOCKED, _NO_SHAPE = range(3)  # as motion.h has them
 _SAMPLES = {False: 256, True: 64}  # of the bounds, by whether the arm is loaded
 _CORNERS = 512  # of the pressures' range, at most
 _SPEED_MARGIN, _BEND_MARGIN = 1.1, 1.5
+_EXPECTED = 500  # poses for each motion, while there is no machine code
 _STEP = 0.02  # of the pressures' range, of second differences
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
@@ -112,7 +113,7 @@ class ClearMotions:
 
     def _prepare(self, rows: int) -> Callable[..., int] | None:
         """The function in C, with all that it needs; None where it is not there (yet)."""
-        body = self._arm._body.machine_code(rows)
+        body = self._arm._body.machine_code(rows + _EXPECTED)
         code = scene_library() if body is not None else None
         if body is None or code is None:
             return None
@@ -242,7 +243,9 @@ def _that_settle(arm: Manipulator, p: Array) -> Array:
         except EquilibriumError:
             continue
         kept.append(row)
-    return np.array(kept).reshape(-1, p.shape[1])
+    if not kept:
+        raise EquilibriumError("the arm has no stable equilibrium that is reached from rest")
+    return np.array(kept)
 
 
 def _moves(arm: Manipulator, p: Array, at: Array) -> Array:

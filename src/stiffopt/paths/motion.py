@@ -98,13 +98,15 @@ def plan_motion(
     begin = perf_counter()
     request = MotionRequest.of(robot, start, goal, scene, clearance, slew, load, seed)
     timings: dict[str, float] = {}
-    with giving_up(timeout):
-        try:
-            found = _Planner(request, timings).solution()
-        except Unsolved as reason:
-            found = request.without_answer(str(reason), "unreachable")
-        except (StoppedError, EquilibriumError) as error:
-            found = request.without_answer(str(error), "failed")
+    try:
+        planner = _Planner(request, timings)
+        with giving_up(timeout):
+            way = planner.way()
+        found = planner.described(way)
+    except Unsolved as reason:
+        found = request.without_answer(str(reason), "unreachable")
+    except (StoppedError, EquilibriumError) as error:
+        found = request.without_answer(str(error), "failed")
     timings["total"] = perf_counter() - begin
     found.timings.update(timings)
     return found
@@ -133,8 +135,15 @@ class _Planner:
         self.poses += found.poses
         return found.clear
 
-    def solution(self) -> PathSolution:
-        """Plan, or raise `Unsolved` with what is in the way."""
+    def is_still_clear(self, rows: Vector) -> bool:
+        """The same, but nothing is clear any more when the time is over."""
+        try:
+            return self.is_clear(rows)
+        except StoppedError:
+            return False
+
+    def way(self) -> Vector:
+        """A way (k, n) in pressures, or raise `Unsolved` with what is in the way."""
         begin = perf_counter()
         start = self._start()
         tasks, goals = self._first_goals()
@@ -148,13 +157,10 @@ class _Planner:
             way, end = self._search(start, goals, tasks)
         begin = perf_counter()
         if len(way) > 2:
-            way = shortened(way, self.is_clear, self.request.slew, self.request.seed)
-            way = rounded(way, self.is_clear, self.request.slew)
+            way = shortened(way, self.is_still_clear, self.request.slew, self.request.seed)
+            way = rounded(way, self.is_still_clear, self.request.slew)
         self.timings["shorten"] = perf_counter() - begin
-        begin = perf_counter()
-        found = self._described(way)
-        self.timings["describe"] = perf_counter() - begin
-        return found
+        return way
 
     # -- ends -------------------------------------------------------------------------------
 
@@ -228,7 +234,7 @@ class _Planner:
         assert self.motions is not None  # or the straight way was clear
         weights = self.motions.bounds.speeds[self.motions.piece_of]
         limits = self._limits(start, goals, tasks)
-        search = TreeSearch(self.is_clear, *limits, weights, self.request.seed)
+        search = TreeSearch(self.is_still_clear, *limits, weights, self.request.seed)
         way, end = self._straight(start, goals)
         if way is None or end is None:
             self.searched = True
@@ -279,14 +285,15 @@ class _Planner:
 
     # -- the answer -------------------------------------------------------------------------
 
-    def _described(self, way: Vector) -> PathSolution:
+    def described(self, way: Vector) -> PathSolution:
         """The motion with its times and all that the model says of it."""
+        begin = perf_counter()
         request = self.request
         robot = request.robot
         p, times = timed(way, request.slew)
         measures = _measures(request.goals)
         clearance = None if request.scene is None else robot.clearance(p, request.scene)
-        return PathSolution(
+        found = PathSolution(
             status="solved",
             message=self._message(clearance),
             robot=robot,
@@ -299,6 +306,8 @@ class _Planner:
             clearance=clearance,
             confidence=self._confidence(),
         )
+        self.timings["describe"] = perf_counter() - begin
+        return found
 
     def _message(self, clearance: Vector | None) -> str:
         if clearance is None:

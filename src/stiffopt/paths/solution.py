@@ -6,10 +6,20 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.paths.trajectory import Trajectory
+from stiffopt.optimise.target import Target
+from stiffopt.paths.trajectory import (
+    CLOSEST,
+    MAX_WAYPOINTS,
+    Trajectory,
+    Waypoint,
+    without_straight,
+)
 
 Vector = NDArray[np.float64]
+_ON_THE_LINE = 1e-3  # of the range of a pressure
+
 Status = Literal["solved", "unreachable", "failed"]
 
 
@@ -87,9 +97,40 @@ class PathSolution:
         index = self.worst_index
         return None if self.stiffness is None or index is None else float(self.stiffness[index])
 
-    def trajectory(self) -> Trajectory:
-        """What a `ControlLoop` follows: the pressures, and the tip positions that they give."""
-        raise NotImplementedError
+    def trajectory(self, begin: float = 0.0) -> Trajectory:
+        """What a `ControlLoop` follows: the pressures, and the tip positions that they give.
+
+        Of more points than a trajectory may have waypoints, or of points that follow each other
+        sooner than these may, those are left out that lie on the straight lines between the others,
+        to a thousandth of the range of each pressure.
+
+        Parameters
+        ----------
+        begin :
+            When to be at the first point, in s, for an arm that has to go there.
+
+        Raises
+        ------
+        InputError
+            There are no pressures, or too many points that cannot be left out.
+        """
+        if not len(self.times):
+            raise InputError(f"there is nothing to follow: {self.message}")
+        kept = np.arange(len(self.times))
+        close = (np.diff(self.times) < CLOSEST).any()
+        if len(kept) > MAX_WAYPOINTS or close:
+            ranges = self.robot.pressure_max - self.robot.pressure_min
+            kept = without_straight(self.times, self.pressures / ranges, _ON_THE_LINE)
+        return Trajectory(
+            waypoints=tuple(
+                Waypoint(
+                    time=begin + float(self.times[index]),
+                    target=Target(position=tuple(self.tip_poses[index, :3, 3].tolist())),
+                    pressures=tuple(self.pressures[index].tolist()),
+                )
+                for index in kept
+            )
+        )
 
     def __repr__(self) -> str:
         if not len(self.times):

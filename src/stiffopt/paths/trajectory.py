@@ -1,21 +1,24 @@
-"""`Trajectory`: targets of the tip over time, as they are given to a controller."""
+"""`Trajectory`: targets over time, with or without pressures, as they are given to a controller."""
 
 from __future__ import annotations
 
 import itertools
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from stiffopt.errors import InputError
 from stiffopt.optimise.target import Target
 from stiffopt.schema import Items, Schema
-from stiffopt.units import Duration
+from stiffopt.units import Duration, Pressure
 
 MAX_WAYPOINTS = 2_000
 """Of a trajectory; its splines are made between two ticks of the control loop."""
 _LONGEST = 86_400.0  # s, of a trajectory
-_CLOSEST = 1e-3  # s, between waypoints
+CLOSEST = 1e-3
+"""Between waypoints, in s."""
 _ROUNDING = 1e-6  # of that
 
 
@@ -26,19 +29,25 @@ class Waypoint(Schema):
     ----------
     time : since the beginning of the trajectory, in s; at most a day.
     target : the pose.
+    pressures : the posture in which it is to be there, one for each channel, in Pa; None: the
+        stiffest.
     """
 
     time: Annotated[Duration, Field(ge=0, le=_LONGEST)]
     target: Target
+    pressures: Items[Pressure] | None = None
 
 
 class Trajectory(Schema):
-    """Waypoints through which the tip passes smoothly.
+    """Waypoints through which the tip passes.
+
+    Without pressures it passes them smoothly, and the controller chooses the posture. With
+    pressures the posture goes on straight lines from one waypoint's to the next.
 
     Attributes
     ----------
     waypoints : in order of time, at least 1 ms apart, the first at 0 or 1 ms later; all
-        prescribe the same components of the pose.
+        prescribe the same components of the pose, and all have pressures or none has.
     """
 
     waypoints: Items[Waypoint]
@@ -53,12 +62,20 @@ class Trajectory(Schema):
         kinds = {_kind(w.target) for w in self.waypoints}
         if len(kinds) > 1:
             raise ValueError("all waypoints must ask for the same axes of the pose")
+        _check_counts([w.pressures for w in self.waypoints])
         return self
 
     @property
     def duration(self) -> float:
         """Time of the last waypoint, in s."""
         return self.waypoints[-1].time
+
+    @property
+    def pressures(self) -> NDArray[np.float64] | None:
+        """Those of all waypoints (k, n), in Pa; None where they have none."""
+        if self.waypoints[0].pressures is None:
+            return None
+        return np.array([waypoint.pressures for waypoint in self.waypoints])
 
 
 def check_times(times: list[float]) -> None:
@@ -75,11 +92,53 @@ def check_times(times: list[float]) -> None:
             )
     begun = times if times[0] == 0 else [0.0, *times]  # the trajectory begins where the tip is
     for before, after in itertools.pairwise(begun):
-        if after - before < _CLOSEST * (1 - _ROUNDING):
+        if after - before < CLOSEST * (1 - _ROUNDING):
             raise InputError(
-                f"waypoints must be at least {_CLOSEST:g} s apart, and the first at 0 s or as "
+                f"waypoints must be at least {CLOSEST:g} s apart, and the first at 0 s or as "
                 f"much later; {after:g} s follows {before:g} s"
             )
+
+
+def without_straight(
+    times: NDArray[np.float64], values: NDArray[np.float64], tolerance: float
+) -> NDArray[np.intp]:
+    """Indices (k,) of those of N points that make up the same line in time, to a tolerance.
+
+    The first and the last are among them; the others are those farthest from the line through the
+    ones before (Ramer, Douglas and Peucker), in any of the values (N, n), which are interpolated
+    in time (N,).
+    """
+    kept, open_ = {0, len(times) - 1}, [(0, len(times) - 1)]
+    while open_:
+        first, last = open_.pop()
+        if last - first < 2:
+            continue
+        inner = slice(first + 1, last)
+        share = ((times[inner] - times[first]) / (times[last] - times[first]))[:, None]
+        line = values[first] + share * (values[last] - values[first])
+        away = np.abs(values[inner] - line).max(axis=1)
+        farthest = int(np.argmax(away))
+        if away[farthest] > tolerance:
+            index = first + 1 + farthest
+            kept.add(index)
+            open_ += [(first, index), (index, last)]
+    return np.array(sorted(kept))
+
+
+def _check_counts(pressures: list[tuple[float, ...] | None]) -> None:
+    """Refuse waypoints of which some have pressures, or have more of them than others."""
+    counts = [None if each is None else len(each) for each in pressures]
+    for number, count in enumerate(counts, start=1):
+        if count == counts[0]:
+            continue
+        if count is None or counts[0] is None:
+            have, lack = (1, number) if count is None else (number, 1)
+            raise ValueError(
+                f"waypoint {have} has pressures and waypoint {lack} has none; all have, or none has"
+            )
+        raise ValueError(
+            f"waypoint {number} has {count} pressures, waypoint 1 has {counts[0]}; expected as many"
+        )
 
 
 def _kind(target: Target) -> tuple[object, ...]:

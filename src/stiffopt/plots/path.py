@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import degrees
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
+from stiffopt.model.scene import Scene
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution
@@ -17,6 +20,8 @@ from stiffopt.plots.wording import BAR, MM, figures, unit_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Vector = NDArray[np.float64]
 
 _POSES = 5  # of the arm
 _FULL = 0.99  # share of a rate from which a pressure counts as changing at it
@@ -39,6 +44,52 @@ def plot_path(path: Path, solution: PathSolution, *, title: str | None = None) -
     MissingExtraError
         If matplotlib is not installed.
     """
+    source = path.source
+    drawn = _Drawn(
+        solution, path.scene, path.pressure_bounds(solution.robot.description),
+        path.points().positions if len(solution.times) else None,
+    )  # fmt: skip
+    name = solution.robot.description.name if source is None else source.stem
+    return _figure(drawn, title or name, lambda: _key_numbers(path, solution))
+
+
+def plot_motion(
+    solution: PathSolution, scene: Scene | None = None, *, title: str | None = None
+) -> Figure:
+    """Draw a motion of `stiffopt.plan_motion` as `plot_path` draws a path.
+
+    Parameters
+    ----------
+    solution : PathSolution
+    scene : Scene, optional
+        That was kept clear of.
+    title : str, optional
+        By default the name of the robot.
+
+    Raises
+    ------
+    InputError
+        If the solution has no points.
+    MissingExtraError
+        If matplotlib is not installed.
+    """
+    robot = solution.robot
+    drawn = _Drawn(solution, scene, (robot.pressure_min, robot.pressure_max), None)
+    name = title or robot.description.name
+    return _figure(drawn, name, lambda: _duration(solution))
+
+
+class _Drawn(NamedTuple):
+    """What is drawn: with the scene, limits of the pressures and the positions asked for."""
+
+    solution: PathSolution
+    scene: Scene | None
+    limits: tuple[Vector, Vector]
+    asked: Vector | None
+
+
+def _figure(drawn: _Drawn, title: str, key_numbers: Callable[[], str]) -> Figure:
+    solution = drawn.solution
     style.require_matplotlib()
     if not len(solution.times):
         raise InputError("there is nothing to draw: the solution has no points")
@@ -50,9 +101,7 @@ def plot_path(path: Path, solution: PathSolution, *, title: str | None = None) -
         len(heights), 2, width_ratios=(1.15, 1), height_ratios=heights, left=0.03, right=0.975,
         top=1 - 1.25 / height, bottom=0.55 / height, wspace=0.14, hspace=0.2,
     )  # fmt: skip
-    _draw_arm(
-        figure.add_subplot(grid[:, 0], projection="3d", computed_zorder=False), path, solution
-    )
+    _draw_arm(figure.add_subplot(grid[:, 0], projection="3d", computed_zorder=False), drawn)
     panels: list[Any] = []
     for row in range(len(heights)):
         panels.append(figure.add_subplot(grid[row, 1], sharex=panels[0] if panels else None))
@@ -63,18 +112,18 @@ def plot_path(path: Path, solution: PathSolution, *, title: str | None = None) -
     if solution.stiffness is not None:
         _draw_stiffness(next(left), solution)
     if solution.clearance is not None:
-        _draw_clearance(next(left), path, solution)
-    _draw_pressures(list(left), path, solution)
-    source = path.source
-    name = solution.robot.description.name if source is None else source.stem
-    style.draw_outcome(
-        figure, title or name, _key_numbers(path, solution), solution.status, solution.message
-    )
+        _draw_clearance(next(left), drawn)
+    _draw_pressures(list(left), drawn)
+    style.draw_outcome(figure, title, key_numbers(), solution.status, solution.message)
     return figure
 
 
+def _duration(solution: PathSolution) -> str:
+    return f"{len(solution.times)} points in {solution.times[-1]:.4g} s"
+
+
 def _key_numbers(path: Path, solution: PathSolution) -> str:
-    parts = [f"{len(solution.times)} points in {solution.times[-1]:.4g} s"]
+    parts = [_duration(solution)]
     if solution.position_errors is not None:
         parts.append(
             f"tip error at most {solution.position_errors.max() * MM:.3g} mm "
@@ -91,20 +140,23 @@ def _key_numbers(path: Path, solution: PathSolution) -> str:
     return "      ".join(parts)
 
 
-def _draw_arm(axes: Any, path: Path, solution: PathSolution) -> None:
+def _draw_arm(axes: Any, drawn: _Drawn) -> None:
     """The arm at some of the points, the path that was asked for and the one that is followed."""
+    solution = drawn.solution
     drawing = ArmDrawing(axes, solution.robot)
     drawing.draw_base()
     last = len(solution.times) - 1
     for index in np.unique(np.linspace(0, last, _POSES).astype(int)):
         drawing.draw_tube(solution.pressures[index], 0.3 if index in (0, last) else 0.1)
     drawing.explain_segments()
-    asked, tips = path.points().positions.T * MM, solution.tip_poses[:, :3, 3].T * MM
-    axes.plot(*asked, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
-    drawing.add_line(style.TARGET, "path that is asked for", ":")
+    tips = solution.tip_poses[:, :3, 3].T * MM
+    if drawn.asked is not None:
+        axes.plot(*drawn.asked.T * MM, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
+        drawing.add_line(style.TARGET, "path that is asked for", ":")
+        drawing.corners.append(drawn.asked * MM)
     axes.plot(*tips, color=style.DARK, linewidth=2.2, zorder=8)
     drawing.add_line(style.DARK, "tip")
-    drawing.corners += [asked.T, tips.T]
+    drawing.corners.append(tips.T)
     marks = [(0, "o", style.DARK, "start", 10), (last, "s", style.DARK, "end", 9)]
     if solution.worst_index is not None:
         marks.append((solution.worst_index, "D", style.AT_LIMIT, "least stiff", 7))
@@ -114,8 +166,8 @@ def _draw_arm(axes: Any, path: Path, solution: PathSolution) -> None:
         look = {"marker": marker, "markersize": size, "markeredgecolor": "white"}
         axes.plot(*tips[:, index, None], color=colour, linestyle="none", zorder=11, **look)
         drawing.add_line(colour, label, "none", **look)
-    if path.scene is not None:
-        drawing.draw_objects(path.scene)
+    if drawn.scene is not None:
+        drawing.draw_objects(drawn.scene)
     drawing.finish(tips.mean(axis=1))
 
 
@@ -142,26 +194,27 @@ def _draw_stiffness(axes: Any, solution: PathSolution) -> None:
     _legend(axes)
 
 
-def _draw_clearance(axes: Any, path: Path, solution: PathSolution) -> None:
+def _draw_clearance(axes: Any, drawn: _Drawn) -> None:
     """Clearance over time against what is required."""
+    solution = drawn.solution
     if solution.clearance is None:
         return
     axes.plot(solution.times, solution.clearance * MM, color=style.OBSTACLE, linewidth=2)
-    if path.scene is not None:
-        axes.axhline(
-            path.scene.clearance * MM, color=style.BOUND, linestyle=":", label="required"
-        )  # fmt: skip
+    if drawn.scene is not None:
+        required = drawn.scene.clearance * MM
+        axes.axhline(required, color=style.BOUND, linestyle=":", label="required")
         _legend(axes)
     axes.set_ylim(bottom=min(0.0, solution.clearance.min() * MM))
     axes.set_ylabel("clearance\n(mm)")
 
 
-def _draw_pressures(panels: list[Any], path: Path, solution: PathSolution) -> None:
+def _draw_pressures(panels: list[Any], drawn: _Drawn) -> None:
     """Pressures over time, a panel for each segment; steps at the full rate stand out."""
     from matplotlib.collections import LineCollection
 
+    solution = drawn.solution
     description = solution.robot.description
-    limits = [bound * BAR for bound in path.pressure_bounds(description)]
+    limits = [bound * BAR for bound in drawn.limits]
     values, fast = solution.pressures * BAR, _fast_steps(solution)
     start, is_any = 0, False
     for number, (axes, segment) in enumerate(zip(panels, description.segments, strict=True)):

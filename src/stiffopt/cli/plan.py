@@ -1,0 +1,88 @@
+"""The command `stiffopt plan`: its options and its help."""
+
+from typing import Annotated
+
+import typer
+
+from stiffopt.cli.exits import with_exit_code
+from stiffopt.cli.options import Json, Quiet
+
+PLAN_HELP = """\
+Find a motion from one configuration to another with the whole body clear of a scene all the way.
+
+The ends are pressures, proximal segment first, or task files; a task as a goal means any
+configuration that solves it. Of several goals one is reached. The pressures change no faster than
+the rates allow. A way that is not straight needs the extra 'plan'.
+"""
+
+PLAN_EPILOG = """\
+\b
+Examples:
+  stiffopt plan --robot stiff-flop-2 --from '1, 0, 0, 1, 0, 0 bar' --to task.yaml --scene scene.yaml
+  stiffopt plan --from here.yaml --to there.yaml --to elsewhere.yaml --slew '2 bar/s' --json
+
+\b
+Exit codes:
+  0    a motion was found
+  2    bad input: a file or an option is wrong
+  3    no clear way was found, or an end of it cannot be had
+  4    the planner failed
+  130  interrupted (Ctrl-C)
+"""
+
+
+@with_exit_code
+def plan(
+    start: Annotated[
+        str,
+        typer.Option("--from", metavar="A", help="Pressures such as '0.2, 0, 0.3 bar', or a task."),
+    ],
+    goals: Annotated[
+        list[str],
+        typer.Option("--to", metavar="B", help="The same; may be given several times."),
+    ],
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROBOT", help="A built-in robot or a robot file; by default that of the tasks."
+        ),
+    ] = None,
+    scene: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.yaml", help="A scene file, instead of the scene of the tasks."),
+    ] = None,
+    clearance: Annotated[
+        str | None,
+        typer.Option(metavar="LENGTH", help="Asked of the body, instead of the scene's: '2 mm'."),
+    ] = None,
+    slew: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RATES",
+            help="One rate or one per channel, such as '2 bar/s'; the robot's hold too.",
+        ),
+    ] = None,
+    as_json: Json = False,
+    out: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FILE.yaml|FILE.csv",
+            help="Write the motion to a result file or as CSV; may be given several times.",
+        ),
+    ] = None,
+    plot: Annotated[
+        str | None,
+        typer.Option(metavar="FILE.png", help="Draw the arm on its way, and its pressures."),
+    ] = None,
+    seed: Annotated[
+        int,
+        typer.Option(metavar="N", min=0, help="Of the search: the same seed, the same motion."),
+    ] = 0,
+    timeout: Annotated[str, typer.Option(metavar="TIME", help="After which to give up.")] = "10 s",
+    quiet: Quiet = False,
+) -> int:
+    """Plan a motion."""
+    from stiffopt.cli.plan_run import PlanCommand  # here, so that --help waits for no numerics
+
+    command = PlanCommand(robot, start, tuple(goals), scene, clearance, slew, seed, timeout)
+    return command.run(as_json=as_json, out=tuple(out or ()), plot=plot, quiet=quiet)

@@ -1,0 +1,179 @@
+"""What `stiffopt plan` does: plan a motion; print, write and draw it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from stiffopt.cli import exits
+from stiffopt.cli.console import report_error, show, write_json
+from stiffopt.cli.exits import interruptible_work
+from stiffopt.cli.outputs import check_picture
+from stiffopt.cli.path_records import csv_text, solution_quantities, solution_values
+from stiffopt.cli.path_run import RESULT_FORMAT, check_csv, is_csv
+from stiffopt.cli.quantities import listed, quantity
+from stiffopt.cli.solve_files import check_result_file
+from stiffopt.documents import write_file, write_whole
+from stiffopt.errors import InputError, StiffoptError, printable
+from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.scene import Scene, load_scene
+from stiffopt.optimise.task import Task, load_task
+from stiffopt.paths.motion import plan_motion
+from stiffopt.paths.solution import PathSolution, Vector
+from stiffopt.plots.wording import MM
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+
+@dataclass(frozen=True)
+class PlanCommand:
+    """The options of `stiffopt plan` that say what is planned."""
+
+    robot: str | None
+    start: str
+    goals: tuple[str, ...]
+    scene: str | None
+    clearance: str | None
+    slew: str | None
+    seed: int
+    timeout: str
+
+    def run(self, *, as_json: bool, out: tuple[str, ...], plot: str | None, quiet: bool) -> int:
+        """Plan, print, write and draw; return the exit code."""
+        ends = [self.start, *self.goals]
+        for file in out:
+            if is_csv(file):
+                check_csv(file, [file])
+            else:
+                check_result_file(file, [each for each in ends if _is_file(each)], RESULT_FORMAT)
+        check_picture(plot)
+        with interruptible_work(quiet=quiet) as progress:
+            progress(0, 0, "planning")
+            scene, solution = self._plan()
+        if as_json:
+            write_json({"from": self.start, "to": self.goals, **solution_values(solution)})
+        elif not quiet:
+            show(self._report(scene, solution))
+        return self._write(scene, solution, out, plot) or exits.OF_STATUS[solution.status]
+
+    def _plan(self) -> tuple[Scene | None, PathSolution]:
+        """The scene that is kept clear of, and the motion."""
+        given = [load_task(text) if _is_file(text) else text for text in (self.start, *self.goals)]
+        tasks = [each for each in given if isinstance(each, Task)]
+        robot = self._robot(tasks)
+        ends = [
+            each if isinstance(each, Task) else _pressures(option, each)
+            for option, each in zip(["--from"] + ["--to"] * len(self.goals), given, strict=True)
+        ]
+        own = [each.scene for each in (*ends[1:], ends[0]) if isinstance(each, Task)]
+        scene = next((each for each in own if each is not None), None)
+        if self.scene is not None:
+            scene = load_scene(self.scene)
+        clearance = None
+        if self.clearance is not None:
+            clearance = quantity("--clearance", self.clearance, "m", "length")
+        solution = plan_motion(
+            robot, ends[0], ends[1:], scene=scene, clearance=clearance, slew=self._slew(),
+            seed=self.seed, timeout=quantity("--timeout", self.timeout, "s", "time"),
+        )  # fmt: skip
+        if scene is not None and clearance is not None:
+            scene = scene.model_copy(update={"clearance": clearance})
+        return scene, solution
+
+    def _robot(self, tasks: list[Task]) -> Manipulator:
+        if self.robot is not None:
+            return load_robot(self.robot)
+        if not tasks:
+            raise InputError("--robot: name a robot; pressures alone do not say which one")
+        descriptions = [task.resolve_robot() for task in tasks]
+        if any(each != descriptions[0] for each in descriptions):
+            raise InputError("--robot: the tasks name different robots; say which one is meant")
+        return load_robot(descriptions[0])
+
+    def _slew(self) -> float | tuple[float, ...] | None:
+        if self.slew is None:
+            return None
+        rates = listed("--slew", self.slew, "Pa/s", "rate of pressure")
+        return rates[0] if len(rates) == 1 else rates
+
+    def _write(
+        self, scene: Scene | None, solution: PathSolution, out: tuple[str, ...], plot: str | None
+    ) -> int:
+        """Write files, and draw; return an exit code if that fails."""
+        code = exits.SOLVED
+        for file in out:
+            if is_csv(file):
+                write_whole(FilePath(file), csv_text(solution).encode())
+                continue
+            record = {"from": self.start, "to": list(self.goals), **solution_quantities(solution)}
+            write_file(file, {"format": RESULT_FORMAT, "results": [record]})
+        if plot is not None and len(solution.times):
+            from stiffopt.plots import plot_motion, save_figure
+
+            try:
+                save_figure(plot_motion(solution, scene), plot)
+            except StiffoptError as error:
+                report_error(f"no picture: {error}")
+                code = exits.BAD_INPUT
+        return code
+
+    def _report(self, scene: Scene | None, solution: PathSolution) -> RenderableType:
+        """The motion as text."""
+        from rich.console import Group
+        from rich.text import Text
+
+        from stiffopt.cli.path_report import points_table
+        from stiffopt.cli.tables import STATUS_COLOURS, labelled
+
+        robot = solution.robot.description
+        heading = Text.assemble(
+            (f"motion of {printable(robot.name)}", "bold"),
+            "  ",
+            (solution.status, f"bold {STATUS_COLOURS[solution.status]}"),
+            f"  {solution.timings.get('total', 0.0):.2f} s",
+        )
+        parts: list[RenderableType] = [heading, labelled(self._lines(scene, solution))]
+        if len(solution.times):
+            parts += ["", points_table(solution)]
+        return Group(*parts, "")
+
+    def _lines(
+        self, scene: Scene | None, solution: PathSolution
+    ) -> Iterable[tuple[str, RenderableType]]:
+        from rich.text import Text
+
+        from stiffopt.cli.path_report import rate_lines
+
+        if solution.message:
+            yield "note", Text(solution.message)
+        yield "from", Text(printable(self.start))
+        yield "to", Text(printable("\n".join(self.goals)))
+        if not len(solution.times):
+            return
+        yield "time", Text(f"{solution.times[-1]:.4g} s, {len(solution.times)} points")
+        yield from rate_lines(solution)
+        if solution.clearance is not None and scene is not None:
+            index = int(np.argmin(solution.clearance))
+            yield (
+                "clearance",
+                Text.assemble(
+                    (f"{solution.clearance[index] * MM:.3f} mm", "bold"),
+                    f" at point {index + 1}, required: at least {scene.clearance * MM:g} mm",
+                ),
+            )
+        if solution.confidence:
+            yield "search", Text(solution.confidence)
+
+
+def _is_file(text: str) -> bool:
+    """Whether an end of a motion is a task file; else it is pressures."""
+    return text.lower().endswith((".yaml", ".yml")) or FilePath(text).is_file()
+
+
+def _pressures(option: str, text: str) -> Vector:
+    return np.array(listed(option, text, "Pa", "pressure"))

@@ -1,0 +1,152 @@
+"""Whether an arm's body keeps clear of the rig's scene: on a way before it goes there, and now.
+
+A way is a line of straight pieces in the space of pressures. All is by the model: pressures are
+effective ones, and an arm that differs from its model is as much nearer or farther.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import StiffoptError
+from stiffopt.model.body import COMPILED_FREE_FROM
+from stiffopt.model.compiled import compiling_at_once
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.scene import Scene
+
+Array = NDArray[np.float64]
+
+_PIECE = 1e4  # Pa, of the longest piece of a way, over which each point of the body goes straight
+_CURVED = 1.1  # how much longer the way of a point is than the one straight between two states
+_FORGIVEN = 1e-4  # m, by which a state may be nearer than the clearance
+_UNSEEN = 2e-4  # m, by which the body may be nearer between two states
+_EXACT = 5e-4  # m, to which a shortfall is found
+_STATIONS = 13  # along the body, whose ways are measured
+_SAMPLES = 64  # pressures at which the body's speed is measured
+_FASTER = 1.5  # than there, it may be elsewhere
+
+
+class Ways:
+    """Checks ways of an arm through a scene."""
+
+    def __init__(self, robot: Manipulator, scene: Scene) -> None:
+        self._robot, self._scene = robot, scene
+
+    def blocked(self, way: Array, *, waypoints: bool = False) -> str:
+        """Why the body does not keep its clearance on a way (k, n), in Pa; empty if it does.
+
+        An arm that is nearer to the scene already where the way begins must not come nearer still.
+        The way is divided until the body cannot come nearer unseen: it is nowhere nearer by more
+        than 0.2 mm than what is accepted.
+
+        Parameters
+        ----------
+        way :
+            Its corners.
+        waypoints :
+            Whether the corners but the first are waypoints, which the reason names.
+        """
+        robot = self._robot
+        states, legs = _divided(np.clip(way, robot.pressure_min, robot.pressure_max))
+        try:
+            clearance, lines = self._clearance(states), self._lines(states)
+            least = min(self._scene.clearance, float(clearance[0]))
+            while True:
+                worst = int(np.argmin(clearance))
+                is_clear = clearance[worst] >= least - _FORGIVEN
+                limit = least - _UNSEEN if is_clear else clearance[worst] - _EXACT
+                motion = np.linalg.norm(np.diff(lines, axis=0), axis=-1).max(axis=1)
+                between = (clearance[:-1] + clearance[1:] - _CURVED * motion) / 2
+                open_ = np.flatnonzero(between < limit)
+                if not len(open_):
+                    break
+                middle = (states[open_] + states[open_ + 1]) / 2
+                found = self._clearance(middle), self._lines(middle)
+                states = np.insert(states, open_ + 1, middle, axis=0)
+                legs = np.insert(legs, open_ + 1, legs[open_ + 1])
+                clearance = np.insert(clearance, open_ + 1, found[0])
+                lines = np.insert(lines, open_ + 1, found[1], axis=0)
+            if is_clear:
+                return ""
+            where = f"to waypoint {legs[worst]}" if waypoints else "there"
+            return f"on the way {where} {shortfall(robot, self._scene, states[worst])}"
+        except StiffoptError as error:
+            return f"the model has no answer on the way: {error}"
+
+    def _clearance(self, states: Array) -> Array:
+        return np.asarray(self._robot.clearance(states, self._scene))
+
+    def _lines(self, states: Array) -> Array:
+        """Positions (N, stations, 3) along the body."""
+        return np.asarray(self._robot.backbone(states, n=_STATIONS)[..., :3, 3])
+
+
+class ClearanceWatch:
+    """Watches, tick by tick, that commands keep half of the clearance that the scene asks for."""
+
+    def __init__(self, robot: Manipulator, scene: Scene) -> None:
+        self._robot, self._scene = robot, scene
+        self._least = scene.clearance / 2
+        self._speed = np.full(robot.n_pressures, np.inf)  # of the body per pressure, in m/Pa
+        self.begin()
+
+    def prepare(self) -> None:
+        """Compile the model's clearance, and measure how fast pressures move the body."""
+        robot = self._robot
+        with compiling_at_once():
+            robot._body.machine_code(COMPILED_FREE_FROM)
+        low, high = robot.pressure_min, robot.pressure_max
+        samples = np.random.default_rng(0).uniform(low, high, (_SAMPLES, len(low)))
+        at = np.linspace(0.0, robot.length, _STATIONS)
+        jacobians = robot.body_jacobian(samples, at)[:, :, :3]  # (N, stations, 3, n)
+        self._speed = _FASTER * np.linalg.norm(jacobians, axis=2).max(axis=(0, 1))
+
+    def begin(self) -> None:
+        """Start anew: nothing is known of where the body is."""
+        self._at = np.zeros(self._robot.n_pressures)
+        self._clearance = -np.inf
+
+    def too_near(self, pressures: Array) -> str:
+        """Why the body must not go to effective pressures (n,) in Pa; empty if it may.
+
+        It may go where it has half of the clearance, or no less than it has now: so it gets away
+        from where it should not be. The clearance is not computed where the body cannot have
+        come near enough since it was.
+        """
+        robot = self._robot
+        moved = float(np.abs(pressures - self._at) @ self._speed)
+        if moved <= self._clearance - self._least:
+            return ""
+        within = np.clip(pressures, robot.pressure_min, robot.pressure_max)
+        try:
+            clearance = float(robot.clearance(within, self._scene))
+        except StiffoptError as error:
+            return f"the model has no answer at the next pressures: {error}"
+        if not clearance >= min(self._least, self._clearance):
+            return shortfall(robot, self._scene, within)
+        self._at, self._clearance = pressures.copy(), clearance
+        return ""
+
+
+def shortfall(robot: Manipulator, scene: Scene, pressures: Array) -> str:
+    """What an arm at pressures (n,) is too near to, and by how much."""
+    found = robot.clearances(pressures, scene)
+    distance, asked = 1e3 * float(found.distances.min()), 1e3 * scene.clearance
+    near = f"be {distance:.1f} mm from" if distance >= 0 else f"go {-distance:.1f} mm into"
+    return (
+        f"the body would {near} '{found.nearest}', {asked - distance:.1f} mm short of the "
+        f"{asked:g} mm that the rig's scene asks for"
+    )
+
+
+def _divided(way: Array) -> tuple[Array, NDArray[np.intp]]:
+    """States (N, n) on a way (k, n), and the number of the piece to which each belongs, from 1."""
+    states, legs = [way[:1]], [np.ones(1, dtype=np.intp)]
+    for number, (start, end) in enumerate(pairwise(way), start=1):
+        count = max(1, int(np.ceil(np.abs(end - start).max() / _PIECE)))
+        states.append(start + np.arange(1, count + 1)[:, None] / count * (end - start))
+        legs.append(np.full(count, number))
+    return np.concatenate(states), np.concatenate(legs)
