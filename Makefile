@@ -10,6 +10,9 @@ PEERS := scipy pin-pink soromox
 PIP := $(BIN)/python -m pip --quiet --quiet --disable-pip-version-check
 PICTURE := docs/images/two_segment_stiff_x.png
 
+# Tests start many processes, and each imports what the others have compiled.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help demo test mutate lint types format picture bench clean
 

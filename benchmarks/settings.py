@@ -66,3 +66,6 @@ CLEARANCE_BATCH_US = 5.0
 WARM_ABOVE_HOT_US, WARM_ABOVE_COLD_US = 20.0, 250.0  # CPU of a lean call above that of C
 UNREACHABLE_MS = 60.0  # CPU, under gravity or a load
 BATCH_POSES, BATCH_STIFFNESSES = 1.5e6, 0.5e6  # per second, two segments
+MOTION_MS, MOTION_LOADED_MS = 100.0, 1000.0  # p95, to a timed motion
+MOTIONS_SOLVED = 0.98
+MOTION_BELOW_MM = 0.05

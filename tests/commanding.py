@@ -245,7 +245,7 @@ def simulated(limits: Limits) -> Iterator[Bench]:
     from stiffopt.rig.config import RigDescription
 
     high = min(x for x in (limits.safety, limits.channel, limits.register, ROBOT_HIGH) if x)
-    coarse = {"bending_degree": 1, "shear_degree": 0, "sub_intervals": 3, "step": 0.002}
+    coarse = {"bending_degree": 1, "shear_degree": 0, "sub_intervals": 3, "step": PERIOD}
     description = RigDescription(
         robot="stiff-flop-1",
         supply={"driver": "simulated", "resolution": 0.0},

@@ -8,6 +8,7 @@ import signal
 import socket
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,17 @@ def code_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder = folder.parent  # each of them has its own below
     cache = folder / "code"
     cache.mkdir(exist_ok=True)
+    _link_simulator(cache)
     return cache
+
+
+def _link_simulator(cache: Path) -> None:
+    """Let a cache of compiled code have what is kept of the simulator, which takes longest."""
+    root = os.environ.get("STIFFOPT_CACHE_DIR") or Path.home() / ".cache" / "stiffopt"
+    kept = Path(root) / "simulator"
+    kept.mkdir(parents=True, exist_ok=True)
+    with suppress(FileExistsError):  # another process of this run was first
+        (cache / "simulator").symlink_to(kept)
 
 
 @pytest.fixture

@@ -462,6 +462,13 @@ def rod_tip(
     The unknown reaction (6,) at the base is found by Newton's method so that the tip is free,
     by continuation in `steps` from no load; integrated with rotation matrices by DOP853.
     """
+    return _reaction(arm, p, loads, steps, at)[1]
+
+
+def _reaction(
+    arm: Arm, p: ArrayLike, loads: Sequence[Load], steps: int, at: float | None
+) -> tuple[Vector, Vector]:
+    """Wrench (6,) at the base that leaves the tip free, and the pose that `rod_tip` returns."""
     p = np.asarray(p, dtype=float)
     scale = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
     reaction = np.zeros(6)
@@ -477,7 +484,32 @@ def rod_tip(
             reaction = reaction - scale * step
         else:
             raise AssertionError(f"no equilibrium found at {share:.0%} of the loads")
-    return T[0]
+    return reaction, T[0]
+
+
+def centre_line(arm: Arm, p: ArrayLike, count: int, steps: int = 6) -> Vector:
+    """Positions (about count, 3) along the arm from base to tip, evenly spaced in each segment.
+
+    Without weight products of exponentials; under weight the rod of `rod_tip`.
+    """
+    weighs = np.any(arm.gravity) and (arm.tip_mass or any(tube.density for tube in arm.tubes))
+    base = _reaction(arm, p, (), steps, None)[0] if weighs else np.zeros(6)
+    T, n, m = np.eye(4)[np.newaxis], base[np.newaxis, :3], base[np.newaxis, 3:]
+    found = [T[0, :3, 3]]
+    for tube, own in zip(arm.tubes, arm.split(p), strict=True):
+        law = rod_section(tube, own, arm.gravity)
+        pieces = max(1, round(count * tube.length / arm.length))
+        step = expm(hat6(law.strain * tube.length / pieces))
+        for _ in range(pieces):
+            if weighs:
+                T, n, m = _integrate(law, tube.length / pieces, T, n, m)
+            else:
+                T = T @ step
+            found.append(T[0, :3, 3])
+        if tube.connector:
+            T, n, m = _carry(law, tube.connector, T, n, m)
+            found.append(T[0, :3, 3])
+    return np.array(found)
 
 
 def _shoot(

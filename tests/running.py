@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -44,16 +43,6 @@ def patient_rig(folder: Path, name: str = "sim", **blocks: Any) -> Path:
     path = folder / f"{name}-patient.yaml"
     path.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     return path
-
-
-def with_simulator(cache: Path) -> Path:
-    """Let a cache of compiled code have what is kept of the simulator, which takes longest."""
-    root = os.environ.get("STIFFOPT_CACHE_DIR") or Path.home() / ".cache" / "stiffopt"
-    kept, link = Path(root) / "simulator", cache / "simulator"
-    if not link.exists() and Path(root) != cache:
-        kept.mkdir(parents=True, exist_ok=True)
-        link.symlink_to(kept)
-    return cache
 
 
 def wait_for(condition: Callable[[], Any], timeout: float = 20.0) -> Any:

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -30,8 +31,14 @@ def _machine_code(compiled):
     """Truth and controllers are too slow without."""
 
 
+@cache
+def drawn():
+    """A case of one target, for all tests that only read it."""
+    return draw_case(3, targets=1)
+
+
 def test_a_case_is_what_the_bars_say_and_its_truth_is_that_of_the_arm():
-    case = draw_case(3, targets=1)
+    case = drawn()
     m = case.description.plant.mismatch
     assert np.linalg.norm(m.base.position) == pytest.approx(2e-3)
     assert np.abs(np.array(m.gain) - 1).max() <= 0.05
@@ -56,7 +63,7 @@ def test_a_case_is_what_the_bars_say_and_its_truth_is_that_of_the_arm():
 
 
 def test_feedback_beats_the_model_alone_and_the_table_says_so():
-    case = draw_case(3, targets=1)
+    case = drawn()
 
     def slow(rig, robot, dynamics):
         return IntegralFeedback(rig, robot, Gains(1.0, 2e5))
@@ -73,7 +80,7 @@ def test_feedback_beats_the_model_alone_and_the_table_says_so():
 
 
 def test_a_path_has_the_right_speed():
-    case = draw_case(3, targets=1)
+    case = drawn()
     path = draw_path(case)
     lengths = np.linalg.norm(np.diff(path.positions, axis=0), axis=1)
     assert (lengths / np.diff(path.times)).max() == pytest.approx(0.010, rel=0.03)
@@ -84,7 +91,7 @@ def test_a_path_has_the_right_speed():
 
 
 def test_a_robot_file_with_another_base_gets_targets_and_poses_in_that_base():
-    nominal = draw_case(3, targets=1)
+    nominal = drawn()
     case = with_true_file(nominal)
     place, axis = case.aims[0].position, DIRECTIONS["lateral"]
     base = case.description.plant.mismatch.base.transform()
@@ -106,7 +113,7 @@ def test_a_robot_file_with_another_base_gets_targets_and_poses_in_that_base():
 
 
 def test_what_a_file_calls_the_tip_is_what_goes_to_the_target():
-    nominal = draw_case(3, targets=1)
+    nominal = drawn()
     off = Placement(position=(4e-3, 0.0, 0.0))
     recordings = Recordings(registration=Registration(tip_in_sensor=off))
     case = replace(nominal, believed=nominal.robot.model_copy(update={"recordings": recordings}))

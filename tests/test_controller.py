@@ -28,6 +28,7 @@ from stiffopt.rig.settings import ControlSettings
 
 BAR = 1e5
 HANGING, ONE, FREE = "stiff-flop-2-hanging", "stiff-flop-1", "stiff-flop-2"
+COARSE = {"bending_degree": 2, "shear_degree": 1, "sub_intervals": 3, "step": 0.002}
 LATERAL = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
 
 pytestmark = pytest.mark.usefixtures("compiled")
@@ -58,6 +59,7 @@ class Bench:
             "base": {"position": [1e-3 * spread, -1e-3 * spread, 0.0]},
         }
         plant = {"dynamics": dynamics, "seed": seed, "mismatch": mismatch, "faults": True}
+        plant["discretisation"] = COARSE
         self.description = RigDescription(
             robot=robot,
             supply={"driver": "simulated", "ripple": 100.0, "noise": 150.0}

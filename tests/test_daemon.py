@@ -27,7 +27,7 @@ import pytest
 
 from examples import blocks
 from fake_loop import FakeLoop, ManualClock
-from running import ONE, TWO, patient_rig, wait_for, with_simulator
+from running import ONE, TWO, patient_rig, wait_for
 from stiffopt.control.lifecycle import EventBuffer
 from stiffopt.control.state import Severity, Snapshot, State
 from stiffopt.daemon import daemon as daemon_module
@@ -52,7 +52,7 @@ def daemon(
         pytest.skip("there is no C compiler")
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("STIFFOPT_COMPILER", raising=False)
-        patch.setenv("STIFFOPT_CACHE_DIR", str(with_simulator(code_cache)))
+        patch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
         folder = tmp_path_factory.mktemp("daemon")
         rig = patient_rig(folder, plant={"dynamics": "quasi-static"})
         with Daemon(rig) as made:

@@ -192,8 +192,8 @@ def check_coverage(results: list[tuple[Array, Fit]]) -> None:
 
 
 def test_true_values_lie_inside_the_intervals() -> None:
-    white = [recovered(seed, "lag", 0.0) for seed in range(20)]
-    red = [recovered(seed, "lag", 0.9) for seed in range(20, 40)]
+    white = [recovered(seed, "lag", 0.0) for seed in range(10)]
+    red = [recovered(seed, "lag", 0.9) for seed in range(20, 30)]
     check_coverage(white + red)
     assert np.mean([found.independent for _, found in white]) < 1.2
     assert np.mean([found.independent for _, found in red]) > 5

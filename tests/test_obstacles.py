@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from stiffopt import (
     Manipulator,
+    PressureSolution,
     PressureSolver,
     Scene,
     StiffnessGoal,
@@ -265,6 +266,70 @@ def test_a_scene_that_leaves_no_way(compiled: Path) -> None:
     assert found.clearance < CLEARANCE
 
 
+@pytest.fixture
+def no_general_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have what takes seconds among obstacles fail."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("the general method was called")
+
+    monkeypatch.setattr(PressureSolver, "_solve_generally", refuse)
+
+
+@pytest.mark.usefixtures("compiled", "no_general_method")
+def test_a_stiffness_that_cannot_be_had_is_told_by_compiled_code() -> None:
+    robot = load_robot("stiff-flop-2")
+    task = task_with(scene_of(POST))
+    best = solve_pressure(robot, task).stiffness
+    assert best is not None
+    floor = {"direction": (1, 0, 0), "value": 1.5 * best}
+    goal = StiffnessGoal(maximise=[{"direction": (0, 1, 0)}], at_least=[floor])
+    found = solve_pressure(robot, task.model_copy(update={"stiffness": goal}))
+    assert found.status == "unreachable"
+    assert "not this stiffness there" in found.message
+    assert found.stiffnesses[1] == pytest.approx(best, rel=1e-3)
+    assert clearance(robot, found.pressures, task.scene) > CLEARANCE - EXACT
+
+
+@pytest.mark.usefixtures("compiled", "no_general_method")
+def test_an_arm_boxed_in_is_told_by_compiled_code() -> None:
+    """That clear configurations exist, which no start comes to, makes it no slower."""
+    robot = load_robot("stiff-flop-2")
+    p = np.array([0.2, 1.1, 0.4, 0.9, 0.1, 0.3]) * 1e5
+    points = robot.backbone(p, 8)[:, :3, 3].tolist()
+    lumen = {"name": "lumen", "inside_tube": {"points": points, "radius": 0.0215}}
+    scene = scene_of(lumen)
+    assert robot.clearance(p, scene) > CLEARANCE
+    found = solve_pressure(robot, task_with(scene, (0.05, -0.03, 0.18)))
+    assert found.status == "unreachable"
+    assert "no configuration was found" in found.message
+    assert "mm too far out of 'lumen'" in found.message
+
+
+def test_a_coarse_mesh_says_so(compiled: Path, tmp_path: Path) -> None:
+    trimesh = pytest.importorskip("trimesh")
+    pytest.importorskip("igl")
+    trimesh.creation.box((0.06, 0.06, 0.02)).export(tmp_path / "wall.stl")
+    robot = load_robot("stiff-flop-2")
+
+    def solved(resolution: float) -> PressureSolution:
+        mesh = {"file": str(tmp_path / "wall.stl"), "scale": 1.0, "resolution": resolution,
+                "centre": (-0.03, 0.0, 0.24)}  # fmt: skip
+        task = task_with(scene_of({"name": "wall", "mesh": mesh}), (-0.03, 0.01, 0.22))
+        return solve_pressure(robot, task)
+
+    coarse, fine = solved(8e-3), solved(3e-3)
+    assert coarse.status == "unreachable"
+    assert coarse.nearest_object == "wall"
+    assert coarse.mesh_error == pytest.approx(6.511e-3, abs=1e-6)
+    assert (
+        "distances from 'wall' are up to 6.5 mm too small: a finer 'resolution'" in coarse.message
+    )
+    assert fine.mesh_error is None
+    assert "resolution" not in fine.message
+    assert fine.position_error < coarse.position_error
+
+
 def test_a_cloud_of_points(compiled: Path) -> None:
     """As many objects as there may be: more rows than fit on a stack as square matrices."""
     robot = load_robot("stiff-flop-2")
@@ -353,6 +418,20 @@ def test_derivatives_of_an_answer_that_an_object_holds_back(
 
 def test_derivatives_of_an_answer_that_two_objects_hold_back(compiled: Path) -> None:
     check_derivatives(load_robot("stiff-flop-2"), task_with(scene_of(POST, RIB)))
+
+
+def test_descents_that_a_quick_look_misleads_are_made_with_a_closer_one(compiled: Path) -> None:
+    """Next to the joint of two segments none of 64 descents converged."""
+    centre = (0.02550724, -0.01340549, 0.11061152)
+    scene = scene_of({"name": "post", "sphere": {"centre": centre, "radius": 0.006}})
+    task = task_with(scene).model_copy(
+        update={"target": Target(position=(0.1187035, -1.673e-5, 0.1548174))}
+    )
+    robot = load_robot("stiff-flop-2")
+    at_once = PressureSolver(robot, task).solve_at_once()
+    assert at_once is not None
+    assert at_once.clearance >= task.scene.clearance - 1e-5
+    assert at_once.confidence.reached > 0
 
 
 def test_no_derivatives_where_a_distance_has_an_edge(compiled: Path) -> None:

@@ -273,6 +273,21 @@ def test_cancelling_by_an_event_or_a_function(code):
         assert solver.solve(far, cancel=cancel).message == "cancelled before there was an answer"
 
 
+def test_a_warm_call_gives_up(code):
+    solver = solver_of(so.load_robot("stiff-flop-2"))
+    p = solver.solve().pressures
+    plain = solver.warm(PLACE, p)
+    again = solver.warm(PLACE, p, timeout=10.0, cancel=threading.Event())
+    np.testing.assert_array_equal(again.pressures, plain.pressures)
+    for options in ({"timeout": 1e-9}, {"cancel": lambda: True}):
+        away = solver.warm((0, 0, 1), p, **options)
+        assert not away.found
+        assert away.pressures is None
+    assert solver.warm(PLACE, p).found  # nothing of it stays
+    with pytest.raises(so.InputError, match="timeout must be"):
+        solver.warm(PLACE, p, timeout=0)
+
+
 def test_what_a_cancel_function_raises_is_raised(compiled):
     solver = solver_of(so.load_robot("stiff-flop-2"))
     solver.solve()

@@ -33,7 +33,6 @@ from running import (
     patient_rig,
     running,
     wait_for,
-    with_simulator,
 )
 from stiffopt.cli import run_daemon
 from stiffopt.cli.main import main
@@ -47,11 +46,6 @@ from stiffopt.daemon.daemon import TIMES
 
 ROOT = Path(__file__).resolve().parent.parent
 EDGES, COUNTS = (1e-4, 1e-3, 1e-2), (90, 8, 2, 0)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _simulator(code_cache: Path) -> None:
-    with_simulator(code_cache)
 
 
 @pytest.fixture

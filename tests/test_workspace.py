@@ -24,7 +24,13 @@ from hypothesis import strategies as st
 
 import stiffopt
 from stiffopt.cli.main import main
-from stiffopt.errors import FileError, InputError, MissingExtraError
+from stiffopt.errors import (
+    CancelledError,
+    FileError,
+    InputError,
+    MissingExtraError,
+    OutOfTimeError,
+)
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.scene import Scene
 from stiffopt.workspace import (
@@ -306,6 +312,17 @@ def test_a_run_goes_on_where_it_stopped(
     assert_same(found, whole)
 
 
+def test_a_run_that_is_given_up_goes_on(
+    robot: Manipulator, whole: WorkspaceMap, tmp_path: Path
+) -> None:
+    path = tmp_path / "map.zarr"
+    with pytest.raises(OutOfTimeError):
+        map_workspace(robot, path, samples=SAMPLES, cell=0.004, timeout=1e-9)
+    with pytest.raises(CancelledError):
+        map_workspace(robot, path, samples=SAMPLES, cell=0.004, cancel=lambda: True)
+    assert_same(map_workspace(robot, path, samples=SAMPLES, cell=0.004), whole)
+
+
 def test_a_run_survives_being_killed(
     robot: Manipulator, whole: WorkspaceMap, tmp_path: Path
 ) -> None:
@@ -462,7 +479,7 @@ def test_what_a_scene_forbids_is_left_out(tmp_path: Path) -> None:
 def test_a_cluster_makes_no_difference_even_if_it_loses_a_worker(
     robot: Manipulator, tmp_path: Path
 ) -> None:
-    samples = 600_000
+    samples = 300_000
     script = tmp_path / "cluster.py"
     script.write_text(textwrap.dedent(CLUSTER), encoding="utf-8")
     done = subprocess.run(

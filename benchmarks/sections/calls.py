@@ -73,8 +73,8 @@ def _calls(
     """What is timed, by name."""
     calls = solver._warm_calls
     assert calls is not None
-    block, search = calls._spare[0]
-    block[calls.fast.targets], block[calls.fast.guess] = place, p
+    block, _, start, search, _ = calls._spare[0]
+    block[calls.fast.targets], start[...] = place, p
     return {
         "nothing": calls.fast._library.cdll.stiffopt_setup_size,
         "machine code": search,

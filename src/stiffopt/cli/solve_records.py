@@ -79,7 +79,13 @@ def json_record(solved: SolvedTask) -> Record:
 def _clearance(solution: PressureSolution) -> Record:
     if solution.task.scene is None:
         return {}
-    return {"clearance_m": solution.clearance, "nearest_object": solution.nearest_object}
+    record: Record = {
+        "clearance_m": solution.clearance,
+        "nearest_object": solution.nearest_object,
+    }
+    if solution.mesh_error is not None:
+        record["mesh_error_m"] = solution.mesh_error
+    return record
 
 
 def _json_sensitivities(solution: PressureSolution) -> Record | None:
@@ -136,6 +142,7 @@ def result_record(solved: SolvedTask) -> Record:
         },
         "clearance": _quantity(solution.clearance, "m", "mm"),
         "nearest_object": solution.nearest_object,
+        "mesh_error": _quantity(solution.mesh_error, "m", "mm"),
         "stiffness": _stiffnesses(solved),
         "matrix_distance": solution.matrix_distance,
         "compliance": _compliance(solution),
@@ -211,6 +218,10 @@ def _worth(solution: PressureSolution) -> Record | None:
             _relaxed(term): _quantity(given.per_tolerance.get(term.name), f"{gained}/{term.unit}")
             for term in solution.task.target.terms
         },
+        "clearance": {
+            name: _quantity(value, f"{gained}/m") for name, value in given.per_clearance.items()
+        }
+        or None,
     }
 
 

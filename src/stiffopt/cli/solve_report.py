@@ -122,6 +122,9 @@ def _clearance(solution: PressureSolution) -> Iterable[Line]:
             f"{scene.clearance * MM:g} mm",
         ),
     )
+    if solution.mesh_error is not None:
+        note = f"up to {solution.mesh_error * MM:.2g} mm too small: the grid of its mesh is coarse"
+        yield "", f"{note}, see 'resolution'"
 
 
 def _error(term: Term, value: float) -> Text:

@@ -55,6 +55,12 @@ class Surface:
         return np.asarray(np.where(inside, -far, far))
 
 
+@lru_cache(maxsize=256)
+def distance_of(surface: Surface, point: tuple[float, ...]) -> float:
+    """Signed distance of one point (3,), for which igl looks at all triangles first."""
+    return float(surface.distances(np.array([point]))[0])
+
+
 @dataclass(frozen=True)
 class DistanceGrid:
     """Signed distances at the corners of cubes.

@@ -173,15 +173,10 @@ class MeasuredObject:
 
     def in_c(self, code: Library) -> SceneObjectInC:
         """The object as a structure for C, which points into this object's memory."""
-
-        def address(what: str) -> int | None:
-            function = getattr(code.cdll, f"{what}_{self.key}")
-            return ctypes.cast(function, _pointer).value
-
         return SceneObjectInC(
-            distance=address("distance"),
-            cell=address("cell") if self.is_interpolated else None,
-            passage=address("passage") if self.is_ring else None,
+            distance=_address(code, f"distance_{self.key}"),
+            cell=_address(code, f"cell_{self.key}") if self.is_interpolated else None,
+            passage=_address(code, f"passage_{self.key}") if self.is_ring else None,
             course=_COURSES[self.along],
             pieces=len(self._parameters),
             size=self._parameters.shape[1],
@@ -189,3 +184,8 @@ class MeasuredObject:
             grids=self._addresses.ctypes.data,
             shapes=self._shapes.ctypes.data,
         )
+
+
+@lru_cache(maxsize=64)
+def _address(code: Library, function: str) -> int | None:
+    return ctypes.cast(getattr(code.cdll, function), _pointer).value

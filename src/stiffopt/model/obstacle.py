@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
+from stiffopt.model.batch import InterpretedFunction
 from stiffopt.schema import BadKeyError, Schema, Vector
 from stiffopt.units import Length, within
 
@@ -85,6 +86,10 @@ class Obstacle(Schema, ABC):
         """Grids of distances, one for each piece, or none."""
         return ()
 
+    def error_at(self, distance: float) -> float:
+        """By how much a distance in m is too small at most, since it is interpolated."""
+        return 0.0
+
     @abstractmethod
     def outline(self, size: float) -> list[Array]:
         """Surfaces (3, rows, columns) in m that show it, cut off at a size where it has no end."""
@@ -116,13 +121,13 @@ class Obstacle(Schema, ABC):
     def distance_of(self, point: Any) -> float:
         """Signed distance of one point (3,), from the formula itself, in m."""
         formula = _function(type(self))
-        return float(formula(point, np.array(self.pieces).T).full().max())
+        return max(float(formula(point, piece)[0][0, 0]) for piece in self.pieces)
 
 
 @cache
-def _function(kind: type[Obstacle]) -> ca.Function:
+def _function(kind: type[Obstacle]) -> InterpretedFunction:
     point, q = ca.SX.sym("point", 3), ca.SX.sym("parameters", kind.n_parameters)
-    return ca.Function("distance", [point, q], [kind.formula(point, q)])
+    return InterpretedFunction(ca.Function("distance", [point, q], [kind.formula(point, q)]))
 
 
 class BetweenEnds(Obstacle):

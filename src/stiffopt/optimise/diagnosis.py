@@ -127,6 +127,30 @@ def in_the_way(robot: Manipulator, scene: Scene, pressures: Vector) -> str:
     return f"; without its scene the task is solved, with the body {' and '.join(words)}"
 
 
+def mesh_error(robot: Manipulator, scene: Scene, name: str | None) -> float | None:
+    """By how much (m) the clearance of an object that the body touches may be too small.
+
+    None where that does not matter: it is no mesh, or less than a tenth of the clearance asked.
+    """
+    shape = next((item.shape for item in scene.objects if item.name == name), None)
+    if shape is None:
+        return None
+    radius = max(segment.outer_radius for segment in robot.description.segments)
+    error = shape.error_at(radius + scene.clearance)
+    return error if error > max(scene.clearance / 10, OBSTACLES.allowed) else None
+
+
+def coarse_meshes(robot: Manipulator, scene: Scene | None, names: Iterable[str]) -> str:
+    """Say which of the objects that hold an arm back may do so since their grids are coarse."""
+    errors = {name: mesh_error(robot, scene, name) for name in names} if scene is not None else {}
+    return "".join(
+        f"; distances from '{name}' are up to {error * 1e3:.2g} mm too small: a finer 'resolution' "
+        "of its mesh would leave more room"
+        for name, error in errors.items()
+        if error
+    )
+
+
 def _intrusions(scene: Scene, missing: dict[str, float]) -> list[str]:
     """Say by how much (m) the body lacks the clearance of each object that it is too near."""
     shapes = {item.name: item.shape for item in scene.objects}

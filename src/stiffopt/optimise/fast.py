@@ -8,6 +8,7 @@ method.
 
 import ctypes
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import asdict
 from functools import partial
 from itertools import pairwise
@@ -20,7 +21,7 @@ from stiffopt.model.batch import in_parallel
 from stiffopt.model.compiled import Library
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import stop_flag
-from stiffopt.optimise.obstacles import ObstaclesInC
+from stiffopt.optimise.obstacles import Obstacles, ObstaclesInC
 from stiffopt.optimise.program import Program, pressure_ranges
 from stiffopt.optimise.samples import SampleTable
 from stiffopt.optimise.search import effort
@@ -31,8 +32,9 @@ Vector = NDArray[np.float64]
 
 _NEAR = 18  # numbers of a term's `Nearness`
 _COUNTS = 14  # numbers of an answer before its pressures
-_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _COME, _CLOSEST = range(6)  # as solver.c has them
-_UNSOLVED, ANSWERED, _GLOBAL, _JUDGED, _CAME, _NEAREST, _NOT_FINITE = range(7)
+# as solver.c has them
+_SEARCH, _GUESS_FIRST, _GUESS_ALONE, _JUDGE, _COME, _CLOSEST, _CLOSEST_FROM = range(7)
+_UNSOLVED, ANSWERED, _GLOBAL, _JUDGED, _CAME, _NEAREST, _NOT_FINITE, _TOO_SOFT = range(8)
 
 _integer, _double, _pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 
@@ -78,6 +80,12 @@ class _Setup(ctypes.Structure):
     ]  # fmt: skip
 
 
+class _OneTask(ctypes.Structure):
+    """`OneTask` of native/solver.c."""
+
+    _fields_ = [(name, _pointer) for name in ("setup", "task", "answer", "stop")]
+
+
 class CompiledAnswer(NamedTuple):
     """What the compiled solver found.
 
@@ -111,12 +119,14 @@ class FastSolver:
         Functions of the structure, with the compiled solver.
     robot : Manipulator
     program : Program
-        Any of that structure.
+        Any of that structure; of one with obstacles see `among`.
     table : SampleTable
         Where searches start; that of a loaded arm has the arm in machine code.
 
     Attributes
     ----------
+    table : SampleTable
+        Where searches start.
     targets, guess : slice
         Where the target's parameters and a guess are in a row.
     """
@@ -124,7 +134,7 @@ class FastSolver:
     def __init__(
         self, library: Library, robot: Manipulator, program: Program, table: SampleTable
     ) -> None:
-        self._library, self._table = library, table  # what pointers below lead to
+        self._library, self.table = library, table  # what pointers below lead to
         arm = table.arm
         size = library.cdll.stiffopt_setup_size
         size.restype = _integer
@@ -185,9 +195,7 @@ class FastSolver:
             setup.state = arm.state_size
             setup.sample_states = table.states.ctypes.data
             setup.rod = arm.address
-        if program.obstacles is not None:
-            self._obstacles = ObstaclesInC(program.obstacles, robot, arm)
-            setup.obstacles = self._obstacles.address
+        self._obstacles: ObstaclesInC | None = None
         self._setup = setup
         self._address = ctypes.addressof(setup)
         self._numbers = robot.numbers
@@ -203,6 +211,15 @@ class FastSolver:
         self._answer_width = ends[-1]
         self.guess = slice(self._asked + 1, self._width)
         self._pressures = slice(self._width + _COUNTS, self._width + _COUNTS + n)
+
+    def among(self, obstacles: Obstacles, robot: Manipulator) -> "FastSolver":
+        """The same solver around which is another scene, of as many rows."""
+        other = copy(self)
+        other._obstacles = in_c = ObstaclesInC(obstacles, robot, self.table.arm)
+        other._setup = type(self._setup).from_buffer_copy(self._setup)
+        other._setup.obstacles = in_c.address
+        other._address = ctypes.addressof(other._setup)
+        return other
 
     def row(self, program: Program, lower: Vector, upper: Vector, floors: Vector) -> Vector:
         """Numbers of a task, its target and guess left out."""
@@ -257,12 +274,21 @@ class FastSolver:
         return numbers[:, _COUNTS : _COUNTS + n], values
 
     def solve(self, row: Vector) -> CompiledAnswer | None:
-        """Answer to one task; None if the general method is needed."""
+        """Answer to one task; None if the general method is needed.
+
+        Of a stiffness that is demanded and was not found, the nearest to it: judge the answer.
+        """
         return self.answer(self._run_one(row))
 
-    def closest(self, row: Vector) -> CompiledAnswer | None:
-        """Configuration closest to a target out of reach; None if the general method is needed."""
-        return self.answer(self._run_one(row, _CLOSEST))
+    def closest(self, row: Vector, start: Vector | None = None) -> CompiledAnswer | None:
+        """Configuration closest to a target out of reach; None if the general method is needed.
+
+        It is sought from samples and, first of all, from a start (n,) in Pa, if there is one.
+        """
+        if start is None:
+            return self.answer(self._run_one(row, _CLOSEST))
+        row[self.guess] = start
+        return self.answer(self._run_one(row, _CLOSEST_FROM))
 
     def comes(self, row: Vector) -> bool:
         """Whether one of the configurations nearest to the target is brought to it."""
@@ -274,13 +300,17 @@ class FastSolver:
         block[self._asked] = _GUESS_ALONE
         return block
 
-    def call(self, block: Vector) -> Callable[[], int]:
-        """What fills in the numbers of a block, which stays where it is; they are not judged."""
+    def call(self, block: Vector) -> tuple[Callable[[], int], ctypes.Structure]:
+        """What fills in the numbers of a block, which stays where it is, and says what came of it.
+
+        They are not judged.  A single argument, as each takes longer to convert than to use; its
+        field `stop` may be set to the address of a `StopFlag`.
+        """
         row = block.ctypes.data
-        return partial(
-            self._solve, self._address, row, self._width, row + block.itemsize * self._width,
-            self._answer_width, 0, 1, 0,
-        )  # fmt: skip
+        task = _OneTask(self._address, row, row + block.itemsize * self._width, None)
+        solve_one = self._library.cdll.stiffopt_solve_one
+        solve_one.argtypes = [_pointer]
+        return partial(solve_one, ctypes.addressof(task)), task
 
     def judged(self, block: Vector) -> CompiledAnswer | None:
         """The answer in a block, judged by the model."""
@@ -347,7 +377,7 @@ class FastSolver:
 
     def answer(self, numbers: Vector) -> CompiledAnswer | None:
         """Answer from the numbers of a call, which become its own; None if there is none."""
-        if numbers[0] not in (ANSWERED, _GLOBAL, _JUDGED, _NEAREST):
+        if numbers[0] not in (ANSWERED, _GLOBAL, _JUDGED, _NEAREST, _TOO_SOFT):
             return None
         slope, residuals, pose, compliance, values = self._parts
         _, _, _, _, tried, reached, descents, agreeing, optima, complete, *work = map(

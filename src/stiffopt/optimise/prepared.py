@@ -75,10 +75,23 @@ class Prepared:
         if not self.robot.is_loaded:
             return _recent(
                 self.robot, "fast solvers", (program.structure, self._key, self._scene),
-                lambda: FastSolver(library, self.robot, program, self.samples),
+                lambda: self._among(library, program),
             )  # fmt: skip
         table = _recent(self.robot, "loaded arms", self._key, lambda: self._loaded_samples(library))
-        return None if table is None else FastSolver(library, self.robot, program, table)
+        if table is None:
+            return None
+        solver = FastSolver(library, self.robot, program, table)
+        return solver.among(program.obstacles, self.robot) if program.obstacles else solver
+
+    def _among(self, library: Library, program: Program) -> FastSolver:
+        """Compiled solver of a free arm: all scenes of as many rows share what they can."""
+        obstacles = program.obstacles
+        rows = 0 if obstacles is None else len(obstacles.row_objects)
+        solver = _recent(
+            self.robot, "fast solvers of all scenes", (program.structure, self._key, rows),
+            lambda: FastSolver(library, self.robot, program, self.samples),
+        )  # fmt: skip
+        return solver if obstacles is None else solver.among(obstacles, self.robot)
 
     def _loaded_samples(self, library: Library) -> SampleTable | None:
         """Samples of the arm under its load in machine code; None if it does not stand at rest."""

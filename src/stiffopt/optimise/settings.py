@@ -141,7 +141,8 @@ class ObstacleSettings:
     cutoff : distance beyond the clearance, in m, from which an object has no part in a step.
     touching : how near to the clearance an object counts as one that holds the arm back, in m.
     turns, closer : without machine code, how often it is looked closer, and at how many stations.
-    clearest : samples of which the one with most clearance is shown where nothing keeps clear.
+    clearest : samples of which a clear one is sought to start from, where none near the target
+        comes clear, and of which the clearest is shown where nothing is.
     allowed : by how much an answer may be nearer than the clearance, in m: the precision of least
         distances.
     """
@@ -152,7 +153,7 @@ class ObstacleSettings:
     touching: float = 2e-5
     turns: int = 5
     closer: int = 9
-    clearest: int = 512
+    clearest: int = 2048
     allowed: float = 1e-5
 
 

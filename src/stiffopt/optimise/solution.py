@@ -316,6 +316,18 @@ class PressureSolution:
         near = self._clearances
         return None if near is None else near.nearest
 
+    @property
+    def mesh_error(self) -> float | None:
+        """By how much the clearance may be too small, in m, since the nearest object is a mesh.
+
+        None where that does not matter: less than a tenth of the clearance asked, or no mesh.
+        """
+        from stiffopt.optimise.diagnosis import mesh_error  # which needs this module
+
+        if self.robot is None or self.task.scene is None:
+            return None
+        return mesh_error(self.robot, self.task.scene, self.nearest_object)
+
     @cached_property
     def _clearances(self) -> Clearances | None:
         if self.robot is None or self.pressures is None or self.task.scene is None:

@@ -19,7 +19,7 @@ from stiffopt.model.compiled import (
     until_ready,
 )
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.model.stopping import Cancel, checkpoint, giving_up
+from stiffopt.model.stopping import Cancel, checkpoint, giving_up, stop_flag
 from stiffopt.optimise import diagnosis
 from stiffopt.optimise.fast import CompiledAnswer, FastSolver
 from stiffopt.optimise.local import LocalResult, descend
@@ -119,6 +119,8 @@ class PressureSolver:
         pointing: ArrayLike | None = None,
         orientation: ArrayLike | None = None,
         limits: tuple[ArrayLike, ArrayLike] | None = None,
+        timeout: float | None = None,
+        cancel: Cancel | None = None,
     ) -> WarmAnswer:
         """The answer next to a guess, with as little as possible around the search for it.
 
@@ -134,15 +136,27 @@ class PressureSolver:
             Instead of the unit quaternion (w, x, y, z) in the task's target.
         limits : two (n,), optional
             Lowest and highest pressures in Pa, where they are narrower than the task's.
+        timeout, cancel : optional
+            When to give up, see `solve`; what is not `found` by then has no pressures, or some
+            that do not hold.
 
         Raises
         ------
         InputError
             If an argument is wrong, or not a part of the task's target.
         """
+        if timeout is not None or cancel is not None:
+            with giving_up(timeout, cancel), stop_flag() as stop:
+                return self._warm(position, guess, pointing, orientation, limits, stop)
+        return self._warm(position, guess, pointing, orientation, limits)
+
+    def _warm(
+        self, position: Any, guess: Any, pointing: Any, orientation: Any, limits: Any, stop: int = 0
+    ) -> WarmAnswer:
+        """See `warm`; `stop` is the address of a `StopFlag`."""
         calls = self._warm_calls or self._prepare_warm_calls()
         if calls is not None and limits is None:
-            block = calls.next_to(guess, position, pointing, orientation)
+            block = calls.next_to(guess, position, pointing, orientation, stop)
             if block is not None:
                 return WarmAnswer(calls.fast.pressures(block), self, block)
         task = asked_task(self.task, position, pointing, orientation)
@@ -331,38 +345,46 @@ class PressureSolver:
         """Answer where the compiled search has none."""
         try:
             checkpoint()
-            nearest = self._nearest(task)
-            if nearest is None and task.scene is not None and not self.reachable(task.target):
-                nearest = self._clearest(task)
-            return nearest or self._general(task, guess)
+            found = self._nearest(task)
+            if found is None and task.scene is not None:
+                found = self._among_obstacles(task)
+            return found or self._general(task, guess)
         except StoppedError as error:
             return PressureSolution("failed", str(error), task)
 
-    def _nearest(self, task: Task) -> PressureSolution | None:
-        """Closest configuration by compiled code; None if the pose can be had, or for no code."""
+    def _nearest(self, task: Task, start: Vector | None = None) -> PressureSolution | None:
+        """Closest configuration by compiled code; None if the pose can be had, or for no code.
+
+        Among obstacles the answer from there, if the pose can be had.  A start (n,) is in Pa.
+        """
         fast = self._fast(task, None)
-        answer = None if fast is None else fast[0].closest(fast[1])
+        answer = None if fast is None else fast[0].closest(fast[1], start)
         checkpoint()  # a search that was cut short proves nothing
         if fast is None or answer is None or answer.slope is None:
             return None
         p = answer.pressures
         within = are_within(p, self._prepared.lower, self._prepared.upper)
         judgement = Judgement.of(fast[2], answer.judged, within)
+        if judgement.pose_holds and task.scene is not None:
+            return self._compiled(task, p)
         if judgement.pose_holds or not within:
             return None
         active = active_bounds(self.robot, task, p)
         holding = [*map(repr, judgement.touched), *_pressed(active, -answer.slope)]
+        message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(
+            task, judgement.touched
+        )
 
         def explain() -> Explanation:
             problem = PressureProblem(self.robot, task)
             last = diagnosis.last_stage(problem, judgement.errors)
             result = LocalResult.at(last, last.pose(p / problem.unit))
-            return self._explanation(problem, result, judgement, p)
+            return self._explanation(problem, result, judgement, p, message)
 
         fields = self._quantities(task, judgement)
         fields.update(
             status="unreachable",
-            message=diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task),
+            message=message,
             active_bounds=tuple(active),
             pressures=p,
             confidence=replace(answer.confidence, reached=0),  # none came to the pose
@@ -371,17 +393,49 @@ class PressureSolver:
         )
         return PressureSolution.explained_later(explain, fields)
 
-    def _clearest(self, task: Task) -> PressureSolution | None:
-        """Of sampled configurations the one with most clearance, if none keeps enough of it.
+    def _among_obstacles(self, task: Task) -> PressureSolution | None:
+        """Answer of compiled code where neither search nor descents to the target had one.
 
-        None where one does, or without compiled code to look at many.
+        The pose can be had, but no stiffness that is demanded; or descents start from the clear
+        sample nearest to the target, or from the clearest; or nothing is clear.
         """
-        if task.scene is None or self._fast(task, None) is None:
+        fast = self._fast(task, None)
+        if fast is None or task.scene is None:
             return None
-        samples = self._prepared.samples.pressures[: OBSTACLES.clearest]
+        solver, row, program = fast
+        answer = solver.solve(row)
+        checkpoint()
+        if answer is not None:
+            within = are_within(answer.pressures, self._prepared.lower, self._prepared.upper)
+            judgement = Judgement.of(program, answer.judged, within)
+            if judgement.pose_holds and judgement.is_clear and within and judgement.shortfalls:
+                return self._too_soft(task, judgement, answer)
+        samples = solver.table.pressures[: OBSTACLES.clearest]
         distances = self.robot.clearance(samples, task.scene)
-        if distances.max() >= task.scene.clearance:
-            return None
+        clear = distances >= task.scene.clearance
+        far = solver.table.distances(program.terms, self.robot.length)[: len(samples)]
+        start = np.where(clear, far, np.inf).argmin() if clear.any() else distances.argmax()
+        found = self._nearest(task, samples[int(start)])
+        if found is None and not clear.any():
+            return self._clearest(task, samples, distances)
+        return found
+
+    def _too_soft(
+        self, task: Task, judgement: Judgement, answer: CompiledAnswer
+    ) -> PressureSolution:
+        """The stiffest that was found, where more is demanded."""
+        return PressureSolution(
+            status="unreachable",
+            message=diagnosis.demands_message(judgement),
+            active_bounds=tuple(active_bounds(self.robot, task, answer.pressures)),
+            **self._quantities(task, judgement),
+            pressures=answer.pressures,
+            confidence=answer.confidence,
+            counts=answer.counts,
+        )
+
+    def _clearest(self, task: Task, samples: Vector, distances: Vector) -> PressureSolution:
+        """Of configurations none of which keeps enough clearance the one with most of it."""
         p = samples[int(distances.argmax())]
         judgement = judge(self.robot, task, p)
         return PressureSolution(
@@ -547,32 +601,39 @@ class PressureSolver:
         }
 
     def _explanation(
-        self, problem: PressureProblem, result: LocalResult, judgement: Judgement, pressures: Vector
+        self,
+        problem: PressureProblem,
+        result: LocalResult,
+        judgement: Judgement,
+        pressures: Vector,
+        message: str = "",
     ) -> Explanation:
-        """Put a judged result into words."""
+        """Put a judged result into words, unless there are some already."""
         task = problem.task
         active = active_bounds(self.robot, task, pressures)
         sensitivities = self._sensitivities(problem, result, judgement, pressures, active)
         freedom = diagnosis.freedom(problem, pressures / problem.unit)
-        message = ""
-        if not judgement.pose_holds:
+        if not message and not judgement.pose_holds:
             holding = [*map(repr, judgement.touched), *self._holding(result, active)]
-            message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(task)
-        elif not judgement.holds:
+            message = diagnosis.unreachable_message(judgement, task, holding) + self._blocked(
+                task, judgement.touched
+            )
+        elif not message and not judgement.holds:
             message = diagnosis.demands_message(judgement)
-        elif freedom == 0 and task.stiffness is not None:
+        elif not message and freedom == 0 and task.stiffness is not None:
             message = diagnosis.no_freedom_message(task, self.robot.n_pressures, sensitivities)
         return Explanation(message, tuple(active), freedom, sensitivities)
 
-    def _blocked(self, task: Task) -> str:
+    def _blocked(self, task: Task, touched: Iterable[str]) -> str:
         """What a scene keeps the arm from, if the task is solved without it."""
         if task.scene is None:
             return ""
+        coarse = diagnosis.coarse_meshes(self.robot, task.scene, touched)
         plain = task.model_copy(update={"scene": None})
         found = PressureSolver(self._given, plain, seed=self.seed).solve_at_once()
         if found is None or not found.found or found.pressures is None:
-            return ""
-        return diagnosis.in_the_way(self.robot, task.scene, found.pressures)
+            return coarse
+        return diagnosis.in_the_way(self.robot, task.scene, found.pressures) + coarse
 
     @staticmethod
     def _holding(result: LocalResult, active: dict[str, tuple[int, int]]) -> list[str]:

@@ -6,7 +6,7 @@ call whose memory is no longer in the processor's caches pays for each line of P
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -105,6 +105,16 @@ class WarmAnswer:
         return f"WarmAnswer({self.solution!r})" if self.found else "WarmAnswer(nothing was found)"
 
 
+class _WarmMemory(NamedTuple):
+    """A block of numbers, its parts for a position and a guess, and the call that answers it."""
+
+    block: Vector
+    place: Vector | None
+    start: Vector
+    call: Callable[[], int]
+    task: Any
+
+
 class WarmCalls:
     """Warm calls for one task, whose memory is used again and again.
 
@@ -120,8 +130,6 @@ class WarmCalls:
     def __init__(self, fast: FastSolver, row: Vector, program: Program) -> None:
         self.fast, self.program = fast, program
         self.like = fast.block(fast.with_target(row, program, None))
-        self._spare = [self._memory()]
-        self._guess, self._outcome = fast.guess, len(row)
         self._n = fast.guess.stop - fast.guess.start
         self._parts: dict[str, tuple[slice, Term]] = {}
         start = fast.targets.start
@@ -132,39 +140,48 @@ class WarmCalls:
         self._place = None if place is None else place[0]
         axes: tuple[int, ...] = () if place is None else getattr(place[1], "axes", ())
         self._axes = None if len(axes) == 3 else list(axes)
+        self._spare = [self._memory()]
 
-    def _memory(self) -> tuple[Vector, Callable[[], int]]:
+    def _memory(self) -> _WarmMemory:
         """A block of numbers and the call that answers it."""
         block = self.like.copy()
-        return block, self.fast.call(block)
+        place = None if self._place is None else block[self._place]
+        return _WarmMemory(block, place, block[self.fast.guess], *self.fast.call(block))
 
-    def next_to(self, guess: Any, position: Any, pointing: Any, orientation: Any) -> Vector | None:
-        """Block with the answer next to a guess; None if there is none, or an argument is wrong."""
+    def next_to(
+        self, guess: Any, position: Any, pointing: Any, orientation: Any, stop: int = 0
+    ) -> Vector | None:
+        """Block with the answer next to a guess; None if there is none, or an argument is wrong.
+
+        `stop` is the address of a `StopFlag`.
+        """
         if not self._spare:  # other threads have them all
             self._spare.append(self._memory())
         memory = self._spare.pop()
-        block, call = memory
+        block, place, start, call, task = memory
+        if stop:
+            task.stop = stop
         others = pointing is not None or orientation is not None
         found = None
         try:
             if position is None:
                 block[self.fast.targets] = self.like[self.fast.targets]
-            elif len(position) == 3 and self._place is not None:
-                own = position if self._axes is None else np.asarray(position)[self._axes]
-                block[self._place] = own
+            elif len(position) == 3 and place is not None:
+                place[...] = position if self._axes is None else np.asarray(position)[self._axes]
             else:
                 raise ValueError
             if others:
                 self._turn(block, pointing, orientation)
             if len(guess) == self._n:
-                block[self._guess] = guess
-                call()
-                if block.item(self._outcome) == ANSWERED:
+                start[...] = guess
+                if call() == ANSWERED:
                     found = block.copy()
         except (KeyError, TypeError, ValueError):
             pass
         if others:
             block[self.fast.targets] = self.like[self.fast.targets]
+        if stop:
+            task.stop = None
         self._spare.append(memory)
         return found
 

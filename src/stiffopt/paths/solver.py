@@ -109,6 +109,8 @@ class _PathSolver:
 
     def solve(self) -> PathSolution:
         """Answer; see `solve_path`."""
+        if len(self._tasks) > RATES.few_points:  # so many that waiting for machine code pays
+            PressureSolver(self._robot, self._tasks[0], seed=self._seed).compile()
         tasks = PathTasks(self._robot, self._tasks, self._seed)
         self._check_ends(tasks)
         try:

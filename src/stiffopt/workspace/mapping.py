@@ -16,6 +16,7 @@ from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
+from stiffopt.model.stopping import Cancel, checkpoint, giving_up
 from stiffopt.workspace.map import WorkspaceMap
 from stiffopt.workspace.plan import TUNING, MapPlan
 from stiffopt.workspace.store import MapStore, is_vacant
@@ -43,6 +44,8 @@ def map_workspace(
     threads: int | None = None,
     overwrite: bool = False,
     progress: Report | None = None,
+    timeout: float | None = None,
+    cancel: Cancel | None = None,
 ) -> WorkspaceMap:
     """Map where an arm's tip can be, and the range of its stiffness there, by sampling pressures.
 
@@ -79,6 +82,8 @@ def map_workspace(
     progress : callable, optional
         Called now and then with the number of samples done and of all samples. What it raises
         stops the run, which can then be resumed.
+    timeout, cancel : optional
+        When to stop, as of `PressureSolver.solve`; a run with a path can then be resumed.
 
     Returns
     -------
@@ -94,6 +99,8 @@ def map_workspace(
         Zarr (extra ``map``) or distributed (extra ``dask``) is needed and not installed.
     ClusterError
         The cluster cannot be reached, or failed.
+    OutOfTimeError, CancelledError
+        Where `timeout` or `cancel` stopped it.
     """
     plan = MapPlan.of(
         robot, directions=directions, kind=kind, boundary=boundary, frame=frame, samples=samples,
@@ -103,13 +110,19 @@ def map_workspace(
         checked_integer("threads", threads, 1)
         if scheduler is not None:
             raise InputError("give threads or a scheduler, not both")
-    with ExitStack() as stack:
+
+    def report(done: int, total: int) -> None:
+        checkpoint()
+        if progress is not None:
+            progress(done, total)
+
+    with giving_up(timeout, cancel), ExitStack() as stack:
         store = None if path is None else _opened(path, plan, overwrite, stack)
         if store is not None and store.is_complete:
             store.tidy()
             return _as_map(plan, store.read(), store.path, evaluated=0)
         begun = None if store is None else store.load()
-        run = _MapRun(plan, store, begun, progress or (lambda done, total: None))
+        run = _MapRun(plan, store, begun, report)
         workers: Threads | Cluster = (
             stack.enter_context(Threads(plan, threads))
             if scheduler is None

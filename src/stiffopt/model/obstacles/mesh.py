@@ -18,6 +18,7 @@ from stiffopt.model.description import RobotDescription
 from stiffopt.model.distance_grid import (
     DistanceGrid,
     Surface,
+    distance_of,
     grids_about,
     read_surface,
     usual_spacing,
@@ -92,6 +93,10 @@ class Mesh(Obstacle):
         """By how much the interpolated distance may differ from the true one, in m."""
         return _share_of_cube * self.spacing
 
+    def error_at(self, distance: float) -> float:
+        """See `Obstacle.error_at`: what is subtracted from what is interpolated."""
+        return float(_most_too_large(ca.DM(distance), self.spacing))
+
     @cached_property
     def grids(self) -> tuple[DistanceGrid, ...]:
         """The distances, a grid for each piece; made and kept in the cache folder."""
@@ -133,7 +138,7 @@ class Mesh(Obstacle):
         """Signed distance of one point (3,) from the triangles themselves, in m."""
         axes = np.asarray(lie.rotation_from_quaternion(np.array(self.orientation)))
         seen = (np.asarray(point, dtype=float) - np.array(self.centre)) @ axes
-        return float(self.surface.distances(seen[None])[0])
+        return distance_of(self.surface, tuple(seen.tolist()))
 
     def check_against(self, robot: RobotDescription, clearance: float) -> None:
         """Its size is one that things about this arm have; see `Obstacle.check_against`."""

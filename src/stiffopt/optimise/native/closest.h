@@ -60,9 +60,11 @@ static int stands(Program *P, const double *x, Point *p) {
 }
 
 /* Pressures x (n) that come nearest to the target, their slope of the Lagrangian; 0 if none do or
- * they are not to be trusted, 1 otherwise. */
-static int closest(Program *P, double *x, double *slope, Found *found) {
+ * they are not to be trusted, 1 otherwise.  A first start (n), in Pa, is taken unless it is NULL. */
+static int closest(Program *P, const double *from, double *x, double *slope, Found *found) {
     const Setup *s = P->setup;
+    for (int64_t i = 0; from && i < s->n; i++)
+        x[i] = clip(from[i] / s->unit[i], P->lower[i], P->upper[i]);
     const ClosestSettings *set = &s->closest;
     Setup own = *s;
     const double *asked = P->radius;
@@ -83,7 +85,7 @@ static int closest(Program *P, double *x, double *slope, Found *found) {
     NEW_POINT(p, &own);
     for (; stage.number < stages; stage.number++) {
         Known known = {0, ends, optima};
-        closest_optima(P, stage.number ? x : NULL, nearest, count, set, &known, found);
+        closest_optima(P, stage.number || from ? x : NULL, nearest, count, set, &known, found);
         for (int64_t k = good = 0; !good && k < known.count; k++)
             good = stands(P, optima + k * n, &p) && p.f[0] < ends[k].value + set->same;
         if (!good) break;

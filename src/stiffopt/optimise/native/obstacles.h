@@ -188,7 +188,7 @@ static int obstacle_row(const Program *P, const SceneObject *object, int64_t beg
     const Obstacles *o = s->obstacles;
     Surroundings *around = P->around;
     Nearest nearest;
-    double near = o->clearance + QUICK_NEAR;
+    double near = P->sight == ROUGH ? -INFINITY : o->clearance + QUICK_NEAR;
     int found;
     if (P->sight == EXACT)
         found = object_nearest(&around->line, object, around->ranges + begin, end - begin,
@@ -218,10 +218,10 @@ static int put_obstacles(const Program *P, const double *pressures, const double
                          double *r, double *J) {
     const Obstacles *o = P->setup->obstacles;
     int64_t count = P->setup->rows - P->setup->own_rows;
-    if (P->sight == BLIND) {
-        for (int64_t i = 0; i < count; i++) r[i] = 0;
-        if (J) memset(J, 0, (size_t)(count * P->setup->n) * sizeof(double));
-        return 1;
+    if (!o || P->sight == KNOWN) return 1;
+    if (J && P->sight == ROUGH) {
+        memset(J, 0, (size_t)(count * P->setup->n) * sizeof(double));
+        J = NULL;
     }
     if (!move_body(P, pressures, state, J != NULL)) return 0;
     for (int64_t i = 0; i < o->count; i++) {

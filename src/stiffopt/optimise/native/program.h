@@ -75,8 +75,9 @@ typedef struct {
     const double *radius; /* (balls) of the target */
 } Stage;
 
-/* How obstacles are seen: not at all, by a few stations, or by the least distance for certain. */
-enum { BLIND, QUICK, EXACT };
+/* How obstacles are seen: as they were at the same pressures a moment ago, by coarse stations and
+ * without slopes, by a few more stations, or by the least distance for certain. */
+enum { KNOWN, ROUGH, QUICK, EXACT };
 
 typedef struct {
     const Setup *setup;

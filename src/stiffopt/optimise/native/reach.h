@@ -141,13 +141,30 @@ static int approach(Program *P, Point *p, int64_t most) {
     return p->reached;
 }
 
-/* The same without a look at obstacles. */
+/* The same without a look at obstacles, whose rows are not evaluated. */
 static int reach_blindly(Program *P, Point *p, int64_t most) {
-    int sight = P->sight;
-    P->sight = BLIND;
-    int come = approach(P, p, most);
-    P->sight = sight;
+    const Setup *s = P->setup;
+    if (!s->obstacles) return approach(P, p, most);
+    Setup own = *s;
+    own.rows = s->own_rows, own.balls -= s->rows - s->own_rows, own.obstacles = NULL;
+    P->setup = &own;
+    NEW_POINT(alone, &own);
+    memcpy(alone.x, p->x, (size_t)s->n * sizeof(double));
+    inherit_state(s, p, &alone);
+    int come = approach(P, &alone, most);
+    memcpy(p->x, alone.x, (size_t)s->n * sizeof(double));
+    inherit_state(s, &alone, p);
+    P->setup = s;
     return come;
+}
+
+/* Evaluate in full what obstacles are seen of by a sight. */
+static int evaluate_by_sight(Program *P, Point *p, int sight) {
+    int before = P->sight;
+    P->sight = sight;
+    int good = evaluate(P, p, 1);
+    P->sight = before;
+    return good;
 }
 
 /* The same past obstacles, at which it looks when the target is reached. */
@@ -166,7 +183,7 @@ static int pulled_back(Program *P, const Point *from, const double *d, const dou
     inherit_state(s, from, to);
     for (int tries = 0; tries < 8; tries++) {
         if (!evaluate(P, to, 0)) return 0;
-        if (to->reached) return evaluate(P, to, 1) && to->reached;
+        if (to->reached) return evaluate_by_sight(P, to, KNOWN) && to->reached;
         double wanted[s->rows], low[s->n], high[s->n], back[s->n], memory[s->rows * s->n];
         const double *J = lacking(P, to, wanted, memory);
         for (int64_t k = 0, i = 0; k < s->balls; k++) {

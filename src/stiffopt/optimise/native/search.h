@@ -137,7 +137,8 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
         Point p = point_in(s, memory + ranked * size);
         start_from_sample(P, nearest[i].index, &p);
         found->tried++;
-        if (!reach_blindly(P, &p, s->reach.iterations_of_many) || !evaluate(P, &p, 1)) continue;
+        if (!reach_blindly(P, &p, s->reach.iterations_of_many)) continue;
+        if (!evaluate_by_sight(P, &p, ROUGH)) continue;
         double value = objective(s, &p) + s->price_of_floors * violation(P, &p);
         screened[ranked] = (Ranked){value + s->price_of_obstacles * intrusion(P, &p), ranked};
         ranked++;
@@ -173,6 +174,7 @@ static int search(Program *P, Point *best, Descent *end, Found *found) {
     for (int64_t i = 0; i < given && i < effort.most_descents && !(i && stopped(P)); i++) {
         Point from = point_in(s, memory + screened[order[i]].index * size);
         copy_point(s, &from, &p);
+        if (s->obstacles && !evaluate(P, &p, 1)) continue; /* which was but roughly seen */
         measure_balls(P, &p);
         if (!p.reached && !(reach(P, &p, s->reach.iterations_of_many) && evaluate(P, &p, 1))) continue;
         Descent now = descend(P, &p, &known);

@@ -2,15 +2,24 @@
  *
  * A task is a row of numbers: parameters of its functions, radii of the balls, lower and upper
  * pressure limits (Pa), floors, the `Nearness` of each term, what is asked for and a guess (Pa).
- * An answer is a row of numbers too, see `solve_row`.
+ * An answer is a row of numbers too, see `solve_by_sight`.
  */
 #include "functions.h"
 
 #include "closest.h"
 
+#ifndef STIFFOPT_LOADED
+void point_rows(void); /* follows the code of `point` */
+#endif
+
+#define CACHE_LINE 64    /* bytes */
+#define MOST_CODE 400000 /* bytes */
+
 /* What is asked for, and what came of it; as fast.py has them. */
-enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, COME, CLOSEST };
-enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL, JUDGED, CAME, NEAREST, NOT_FINITE };
+enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, COME, CLOSEST, CLOSEST_FROM };
+enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL, JUDGED, CAME, NEAREST, NOT_FINITE, TOO_SOFT };
+
+enum { FOUND_AT = 4, PRESSURES_AT = 14 }; /* in an answer, see solve_by_sight */
 
 /* From a guess (n) in Pa; whether the descent from there ended at an optimum, or was stopped. */
 static int from_guess(Program *P, const double *guess, Point *p, Descent *end, Found *found) {
@@ -27,7 +36,8 @@ static int from_guess(Program *P, const double *guess, Point *p, Descent *end, F
 /* Row of an answer: outcome, value, violation, converged, the seven numbers of Found, three
  * counts of evaluations, pressures (n) in Pa, slope (n) per unit of x of the error of the closest
  * configuration, then what judge_at writes: not of a guess alone, which is judged when it is
- * looked at, but where there are obstacles.  Returns whether a body among obstacles keeps clear.
+ * looked at, but where there are obstacles.  Returns 0 where obstacles need
+ * a closer look.
  */
 static int solve_by_sight(Program *P, const double *task, double *answer, int sight) {
     const Setup *s = P->setup;
@@ -54,13 +64,13 @@ static int solve_by_sight(Program *P, const double *task, double *answer, int si
         outcome = JUDGED;
     else if (asked == COME)
         outcome = can_come(P, &p, s->least_effort.screened) ? CAME : NEEDS_GENERAL_METHOD;
-    else if (asked == CLOSEST)
-        outcome = closest(P, p.x, slope, &found) ? NEAREST : NEEDS_GENERAL_METHOD;
+    else if (asked == CLOSEST || asked == CLOSEST_FROM)
+        outcome = closest(P, asked == CLOSEST ? NULL : task, p.x, slope, &found)
+            ? NEAREST : NEEDS_GENERAL_METHOD;
     else if (asked != SEARCH && from_guess(P, task, &p, &end, &found))
         outcome = LOCAL;
-    else if (asked != GUESS_ALONE && search(P, &p, &end, &found) &&
-             end.violation < 0.5 * s->descent.floor_margin)
-        outcome = GLOBAL;
+    else if (asked != GUESS_ALONE && search(P, &p, &end, &found))
+        outcome = end.violation < 0.5 * s->descent.floor_margin ? GLOBAL : TOO_SOFT;
     double *out = answer;
     *out++ = (double)outcome, *out++ = end.value, *out++ = end.violation, *out++ = end.converged;
     *out++ = (double)found.tried, *out++ = (double)found.reached, *out++ = (double)found.descents;
@@ -71,16 +81,42 @@ static int solve_by_sight(Program *P, const double *task, double *answer, int si
     for (int64_t i = 0; i < s->n; i++)
         *out++ = outcome == JUDGED ? task[i] : clip(p.x[i] * s->unit[i], least[i], most[i]);
     memcpy(out, slope, sizeof slope), out += s->n;
-    int judged = outcome == GLOBAL || outcome == NEAREST || outcome == JUDGED ||
+    int judged = outcome == GLOBAL || outcome == NEAREST || outcome == JUDGED || outcome == TOO_SOFT ||
                  (outcome == LOCAL && (asked != GUESS_ALONE || P->around));
-    if (!judged) return 1;
+    if (!judged) /* a descent may have failed for what a quick look misses */
+        return !(P->around && outcome == NEEDS_GENERAL_METHOD && found.reached);
     if (!judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
     return outcome == JUDGED || is_clear(P, out + s->own_rows);
 }
 
+/* Go on from an answer (n), with a closer look at obstacles; whether the body keeps clear then. */
+static int go_on(Program *P, const double *task, double *answer) {
+    const Setup *s = P->setup;
+    int64_t before = s->parameters + s->balls + 2 * s->n + s->floors + 18 * s->near;
+    double next[before + 1 + s->n], searched[PRESSURES_AT], *asked = next + before;
+    memcpy(next, task, sizeof next), memcpy(searched, answer, sizeof searched);
+    *asked = GUESS_ALONE;
+    memcpy(asked + 1, answer + PRESSURES_AT, (size_t)s->n * sizeof(double));
+    int clear = solve_by_sight(P, next, answer, EXACT) && answer[0] == LOCAL;
+    answer[0] = searched[0]; /* what was asked for, and how hard it was searched */
+    memcpy(answer + FOUND_AT, searched + FOUND_AT, (PRESSURES_AT - FOUND_AT) * sizeof(double));
+    return clear;
+}
+
 /* A row of an answer, with a closer look at obstacles where a quick one has not been enough. */
 static void solve_row(Program *P, const double *task, double *answer) {
-    if (!solve_by_sight(P, task, answer, QUICK)) solve_by_sight(P, task, answer, EXACT);
+    if (solve_by_sight(P, task, answer, QUICK)) return;
+    if ((answer[0] == LOCAL || answer[0] == GLOBAL) && go_on(P, task, answer)) return;
+    solve_by_sight(P, task, answer, EXACT);
+}
+
+/* Fetch code ahead, many lines of the cache at once; a processor that follows code which is not in
+ * its caches, since much else was done, waits for it line by line.  Functions are linked in the
+ * order of their files; were they not, this would be of no use, and no harm. */
+static void fetch(uintptr_t begin, uintptr_t end) {
+    for (uintptr_t at = begin; at < end && at < begin + MOST_CODE; at += CACHE_LINE)
+        __builtin_prefetch((const void *)at, 0, 2);
+    __asm__ volatile(""); /* or a function without effects is left out */
 }
 
 /* For the caller to check that it has the same idea of a Setup. */
@@ -95,8 +131,26 @@ int stiffopt_solve(const Setup *setup, const double *tasks, int64_t task_width, 
     Program program = {.setup = setup, .arg = arg, .res = res, .iw = iw, .w = w};
     program.stop = stop, program.deadline = stop ? now() + stop->seconds : 0;
     if (!add_memory(&program)) return 1;
+#ifndef STIFFOPT_LOADED
+    fetch((uintptr_t)&pose, (uintptr_t)&point_rows); /* the model */
+    fetch((uintptr_t)&dot, (uintptr_t)&stiffopt_solve);
+#endif
     for (int64_t i = begin; i < end; i++)
         solve_row(&program, tasks + i * task_width, answers + i * answer_width);
     free_memory(&program);
     return 0;
+}
+
+/* A task of its own; mirrors `_OneTask` in fast.py. */
+typedef struct {
+    const Setup *setup;
+    const double *task;
+    double *answer;
+    const Stop *stop;
+} OneTask;
+
+/* Solve it: what came of it, -1 if memory is short. */
+int stiffopt_solve_one(const OneTask *one) {
+    if (stiffopt_solve(one->setup, one->task, 0, one->answer, 0, 0, 1, one->stop)) return -1;
+    return (int)one->answer[0];
 }

@@ -1,0 +1,1 @@
+"""Tasks among obstacles: random ones, an independent judge, a reference by IPOPT."""
