@@ -25,8 +25,8 @@ from stiffopt.rig.config import load_rig_description
 
 BAR, MM = 1e5, 1e-3
 RIG = Path(__file__).resolve().parent.parent / "rig" / "sim.yaml"
-CENTRE, SIZE, CLEARANCE = (0.041, 0.0, 0.085), (0.02, 0.02, 0.05), 0.006
-ONE_SIDE, OTHER_SIDE = np.array([0.6, 0.0, 0.9]) * BAR, np.array([0.9, 0.6, 0.0]) * BAR
+CENTRE, SIZE, CLEARANCE = (-0.021, -0.036, 0.09), (0.02, 0.02, 0.05), 0.006
+ONE_SIDE, OTHER_SIDE = np.array([1.2, 0.0, 0.0]) * BAR, np.array([0.0, 1.2, 0.0]) * BAR
 RATE = 0.5 * BAR  # Pa/s, slower than the arm may be
 
 
@@ -74,7 +74,7 @@ def draw(path: str, scene: Scene, played: list[dict[str, np.ndarray]], true: np.
     draw_objects(space, scene, 100.0, bodies[0])
     space.set(xlabel="x (mm)", ylabel="y (mm)", zlabel="z (mm)")
     space.set_aspect("equal")
-    space.view_init(elev=25, azim=-60)
+    space.view_init(elev=25, azim=60)
     space.set_title("arm around the box, from dark to light")
     times = np.concatenate([each["times"] for each in played])
     times -= times[0]
