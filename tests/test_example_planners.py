@@ -1,4 +1,4 @@
-"""The planners in `examples`: they find a way, the simulated rig plays it, and its body is clear."""
+"""The planners in `examples`: they find a way, the rig plays it, and the true body is clear."""
 
 from __future__ import annotations
 

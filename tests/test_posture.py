@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import stiffopt as so
-from running import patient_rig, wait_for, with_simulator
+from running import patient_rig, wait_for
 from simulated_loop import Lab
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.posture import PostureCourse, difference
@@ -500,7 +500,6 @@ def test_points_on_straight_lines_are_left_out_where_there_are_too_many() -> Non
 
 def test_over_the_daemon_a_way_is_refused_or_followed(tmp_path: Path, compiled: Path) -> None:
     """Plans and ways are made in processes of their own there, and the loop runs in real time."""
-    with_simulator(compiled)
     model, way = so.load_robot(ONE), sideways(3)
     ball = beside(model, way, 1e-3).objects[0].sphere
     centre = [f"{1e3 * each:.2f} mm" for each in ball.centre]
