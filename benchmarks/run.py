@@ -22,7 +22,18 @@ import environment
 import plots
 import report
 from report import Section
-from sections import body, calls, full_task, kinds, kinematics, motions, pose, processes, rates
+from sections import (
+    body,
+    calls,
+    full_task,
+    kinds,
+    kinematics,
+    motions,
+    paths,
+    pose,
+    processes,
+    rates,
+)
 from settings import Settings, quick
 
 HERE = Path(__file__).resolve().parent
@@ -41,6 +52,7 @@ SECTIONS: dict[str, Callable[[Settings], Section]] = {
     "evaluations": kinematics.section,
     "body": body.section,
     "pose": pose.section,
+    "paths": paths.section,
     "motions": motions.section,
     "simulator": rates.simulated_arm,
 }

@@ -20,6 +20,10 @@ class Settings:
     most_seconds : per solver and table; a solver that needs more is timed on fewer tasks.
     batch : rows of the batched evaluations.
     batch_tasks : tasks of `solve_batch`.
+    paths, scene_paths : random paths per arm, without and with objects.
+    reference_paths : of these with references.
+    lattice : configurations per point of the dynamic programme.
+    path_starts : random starts of IPOPT for a whole path.
     """
 
     seed: int = 1
@@ -33,6 +37,11 @@ class Settings:
     most_seconds: float = 3.0
     batch: int = 60_000
     batch_tasks: int = 2000
+    paths: int = 12
+    scene_paths: int = 10
+    reference_paths: int = 3
+    lattice: int = 2500
+    path_starts: int = 20
 
     @property
     def few_segments(self) -> tuple[int, ...]:
@@ -45,6 +54,7 @@ def quick(seed: int) -> Settings:
     return Settings(
         seed=seed, quick=True, segments=(1, 2), tasks=3, warm_tasks=2, kind_tasks=1,
         repetitions=2, reference_starts=1, most_seconds=0.5, batch=2000, batch_tasks=10,
+        paths=1, scene_paths=1, reference_paths=0, lattice=300, path_starts=2,
     )  # fmt: skip
 
 
@@ -66,6 +76,8 @@ CLEARANCE_BATCH_US = 5.0
 WARM_ABOVE_HOT_US, WARM_ABOVE_COLD_US = 20.0, 250.0  # CPU of a lean call above that of C
 UNREACHABLE_MS = 60.0  # CPU, under gravity or a load
 BATCH_POSES, BATCH_STIFFNESSES = 1.5e6, 0.5e6  # per second, two segments
+PATH_SECONDS = {2: 0.5, 3: 1.5}  # CPU, 250 points
+PATH_SHARE = 0.99  # of the stiffness that a reference finds
 MOTION_MS, MOTION_LOADED_MS = 100.0, 1000.0  # p95, to a timed motion
 MOTIONS_SOLVED = 0.98
 MOTION_BELOW_MM = 0.05

@@ -6,6 +6,7 @@ measured is the distance of its own body, not of the model's.
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,16 +16,19 @@ import numpy as np
 import pytest
 
 import stiffopt as so
+from running import patient_rig, wait_for
 from simulated_loop import Lab
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.posture import PostureCourse, difference
 from stiffopt.control.state import State
 from stiffopt.control.ways import ClearanceWatch, Ways
+from stiffopt.daemon.daemon import Daemon
 from stiffopt.errors import InputError
 from stiffopt.model.description import Corrections
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.target import Target
-from stiffopt.paths.trajectory import Trajectory, Waypoint
+from stiffopt.paths.solution import PathSolution
+from stiffopt.paths.trajectory import MAX_WAYPOINTS, Trajectory, Waypoint, without_straight
 from stiffopt.rig.config import RigDescription
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "examples"))
@@ -65,7 +69,7 @@ def dense(way: np.ndarray, count: int = 1001) -> np.ndarray:
     return np.array([np.interp(times, np.arange(len(way)), row) for row in way.T]).T
 
 
-def beside(robot: so.Manipulator, way: np.ndarray, gap: float, asked: float = ASKED) -> Scene:
+def beside(robot: so.Manipulator, way: np.ndarray, gap: float) -> Scene:
     """A ball beside the distal part of an arm, a gap from where it comes nearest on a way."""
     middle = (way[-2] + way[-1]) / 2 if len(way) > 1 else way[0]
     point = robot.backbone(middle, n=20)[15, :3, 3]
@@ -74,7 +78,7 @@ def beside(robot: so.Manipulator, way: np.ndarray, gap: float, asked: float = AS
     for _ in range(4):
         centre = tuple(map(float, point + outwards * away))
         ball = {"name": "post", "sphere": {"centre": centre, "radius": 0.005}}
-        scene = Scene(clearance=asked, objects=[ball])
+        scene = Scene(clearance=ASKED, objects=[ball])
         away += gap - float(robot.clearance(dense(way) if len(way) > 1 else way, scene).min())
     return scene
 
@@ -322,8 +326,6 @@ def calibrated(robot: str, found: float = 0.8) -> so.Manipulator:
     [
         (ONE, "full", False),
         (ONE, "full", True),
-        (TWO, "quasi-static", False),
-        (TWO, "quasi-static", True),
         (HANGING, "full", False),
         (HANGING, "full", True),
     ],
@@ -333,12 +335,11 @@ def test_a_played_path_stays_within_the_clearance_that_was_checked(
 ) -> None:
     model = calibrated(robot) if is_calibrated else so.load_robot(robot)
     way = sideways(model.n_pressures)
-    asked = 2 * ASKED if robot == TWO else ASKED  # the longer arm, the farther from its model
-    scene = beside(model, way, asked + 5e-4, asked)
+    scene = beside(model, way, ASKED + 5e-4)
     arm = playing(robot, dynamics, scene=scene, model=model)
     played = arm.play(trajectory(model, way))
     assert set(played["states"]) == {"active"}
-    assert on_the_plant(arm, played["bodies"]) > 0.8 * asked
+    assert on_the_plant(arm, played["bodies"]) > 0.8 * ASKED
     on_the_way = dense(way, 2001)
     away = np.abs(played["pressures"][:, None] - on_the_way[None]).max(axis=2).min(axis=1)
     assert away.max() < 0.2 * BAR
@@ -349,3 +350,184 @@ def test_a_played_path_stays_within_the_clearance_that_was_checked(
     # what the loop goes through is what was checked, but for the smoothing at its corners
     steps = np.abs(played["plan"][:, None] - on_the_way[None]).max(axis=2).min(axis=1)
     assert np.nanmax(steps) < 0.01 * BAR
+
+
+# -- refused, held, gone on with ------------------------------------------------------------------
+
+
+REFUSED = (
+    r"refused: on the way {} the body would (be|go) \d+\.\d mm (from|into) 'post', \d+\.\d mm "
+    "short of the 6 mm that the rig's scene asks for"
+)
+
+
+def test_what_would_come_too_near_is_refused_and_changes_nothing(playing: Any) -> None:
+    model, way = so.load_robot(ONE), sideways(3)
+    arm = playing(ONE, scene=beside(model, way, 1e-3), model=model)
+    loop = arm.loop
+    with pytest.raises(InputError, match=f"^{REFUSED.format('to waypoint 3')}$"):
+        loop.follow_trajectory(trajectory(model, way))
+    assert not arm.run(0.1)["commanded"].any()
+    arm.play(trajectory(model, way[:2], TIMES[:2]))
+    here, there = (tuple(map(float, model.tip_pose(p)[:3, 3])) for p in way[1:])
+    for ask in (
+        lambda: loop.set_target(Target(position=there)),
+        lambda: loop.set_task(so.Task(robot=ONE, target=Target(position=there))),
+    ):
+        with pytest.raises(InputError, match=f"^{REFUSED.format('there')}$"):
+            ask()
+    points = [Waypoint(time=t, target=Target(position=p)) for t, p in ((0, here), (2, there))]
+    with pytest.raises(InputError, match=f"^{REFUSED.format('there')}$"):
+        loop.follow_trajectory(Trajectory(waypoints=points))
+    assert arm.run(0.2)["plan"] == pytest.approx(np.tile(way[1], (20, 1)))  # it stays there
+    back = Target(position=tuple(map(float, model.tip_pose(way[1] / 2)[:3, 3])))
+    loop.set_target(back)
+    assert arm.run(1.5)["errors"][-1] < 1e-3
+    loop.follow_trajectory(Trajectory(waypoints=[Waypoint(time=1, target=Target(position=here))]))
+    assert arm.run(2.0)["errors"][-1] < 1e-3
+    assert set(arm.run(0.1)["states"]) == {"active"}
+
+
+def test_a_plan_whose_way_is_blocked_is_not_taken(playing: Any) -> None:
+    """As where the offset has changed what is planned, after the request was accepted."""
+    model, way = so.load_robot(ONE), sideways(3)
+    arm = playing(ONE, scene=beside(model, way, 1e-3), model=model)
+    arm.play(trajectory(model, way[:2], TIMES[:2]))
+    there = tuple(map(float, model.tip_pose(way[2])[:3, 3]))
+    arm.controller.check_ahead = lambda request: None
+    arm.loop.set_target(Target(position=there))
+    played = arm.run(1.0)
+    assert np.abs(played["commanded"][-1] - way[1]).max() < 0.1 * BAR
+    (alarm,) = (each for each in arm.loop.snapshot().alarms if each.kind == "blocked")
+    assert "'post'" in alarm.text
+    with pytest.raises(InputError, match="has not been checked"):
+        arm.loop.follow_trajectory(trajectory(model, way[1:], (0.0, 1.0)))
+
+
+def test_a_trajectory_waits_while_the_arm_is_held_and_goes_on_where_it_was(playing: Any) -> None:
+    model, way = so.load_robot(ONE), sideways(3)
+    arm = playing(ONE, scene=beside(model, way, ASKED + 1e-3), model=model)
+    arm.loop.follow_trajectory(trajectory(model, way))
+    before = arm.run(1.3)["plan"][-1]
+    arm.rig.world.inject("tracker", "missing")
+    held = arm.run(0.3)
+    assert held["states"][-1] == "holding"
+    arm.rig.world.inject("tracker", "ok")
+    rest = arm.run(3.0)
+    active = rest["plan"][rest["states"] == "active"]
+    assert np.abs(active[0] - before).max() < 0.1 * BAR
+    on_the_way = dense(way, 2001)
+    away = np.abs(rest["pressures"][:, None] - on_the_way[None]).max(axis=2).min(axis=1)
+    assert away.max() < 0.2 * BAR
+    assert rest["plan"][-1] == pytest.approx(way[-1], abs=1.0)
+
+
+def test_held_or_vented_in_the_middle_it_begins_anew_from_where_it_is(playing: Any) -> None:
+    model, way = so.load_robot(ONE), sideways(3)
+    arm = playing(ONE, scene=beside(model, way, ASKED + 1e-3), model=model)
+    arm.loop.follow_trajectory(trajectory(model, way))
+    arm.run(1.5)
+    arm.loop.hold()
+    held = arm.run(0.5)
+    assert set(held["states"]) == {"holding"}
+    assert np.ptp(held["commanded"], axis=0).max() == 0
+    now = held["commanded"][-1]
+    with pytest.raises(
+        InputError, match=r"waypoint 1 is at 0 s and has 0\.9 bar in channel 1, which"
+    ):
+        arm.loop.follow_trajectory(trajectory(model, way[1:], (0.0, 1.0)))
+    with pytest.raises(InputError, match=r"on the way to waypoint 1, channel \d would change by"):
+        arm.loop.follow_trajectory(trajectory(model, way[1:], (0.01, 1.0)))
+    played = arm.play(trajectory(model, np.stack([now, way[2]]), (0.0, 1.0)))
+    assert played["plan"][-1] == pytest.approx(way[2], abs=1.0)
+    arm.loop.follow_trajectory(trajectory(model, way[::-1]))
+    arm.run(0.5)
+    arm.loop.vent()
+    assert arm.run(1.0)["pressures"][-1] == pytest.approx(0, abs=1e3)
+    arm.loop.arm()
+    assert arm.play(trajectory(model, way))["plan"][-1] == pytest.approx(way[2], abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("pressures", "words"),
+    [
+        (((0, 0), (0, 0)), r"waypoints\[0\]\.pressures: expected 3, one for each channel, not 2"),
+        (
+            ((0, 0, 0), (0, 1.6e5, 0)),
+            r"waypoints\[1\]\.pressures: 1\.6 bar is beyond the limits of channel 2, 0 to 1\.5 bar",
+        ),
+        (
+            ((0, 0, 0), (0, 0, 1e5), (0, 0, 0.2e5)),
+            "from waypoint 1 to 2, channel 3 would change by 10 bar/s; at most 5 bar/s",
+        ),
+    ],
+)
+def test_pressures_that_do_not_fit_the_arm_are_refused(pressures: Any, words: str) -> None:
+    lab = Lab(safety={"max_slew": 5e5})
+    given = [each.model_copy(update={"time": 0.1 * each.time}) for each in waypoints(*pressures)]
+    with pytest.raises(InputError, match=words):
+        lab.loop.follow_trajectory(Trajectory(waypoints=given))
+    assert "follow" not in lab.controller.calls
+
+
+# -- of a solution --------------------------------------------------------------------------------
+
+
+def solution(robot: so.Manipulator, times: np.ndarray, pressures: np.ndarray) -> PathSolution:
+    return PathSolution("solved", "", robot, times, pressures, robot.tip_pose(pressures))
+
+
+def test_a_solution_s_trajectory_has_its_pressures_and_tips() -> None:
+    robot = so.load_robot(ONE)
+    found = solution(robot, np.array(TIMES), sideways(3)).trajectory(begin=0.5)
+    assert found.waypoints == trajectory(robot, sideways(3), (0.5, 1.5, 2.5)).waypoints
+    assert found.pressures == pytest.approx(sideways(3))
+    with pytest.raises(InputError, match="nothing to follow"):
+        solution(robot, np.zeros(0), np.zeros((0, 3))).trajectory()
+
+
+def test_points_on_straight_lines_are_left_out_where_there_are_too_many() -> None:
+    robot = so.load_robot(ONE)
+    times = np.linspace(0, 3, 2 * MAX_WAYPOINTS)
+    pressures = np.abs(np.sin(times[:, None] + [0, 1, 2])) * BAR
+    found = solution(robot, times, pressures).trajectory()
+    assert 20 < len(found.waypoints) < 300
+    at = [each.time for each in found.waypoints]
+    thinned = np.array([np.interp(times, at, row) for row in found.pressures.T]).T
+    assert np.abs(thinned - pressures).max() <= 1.5e-3 * BAR
+    assert list(without_straight(times, 0 * pressures, 1e-3)) == [0, len(times) - 1]
+
+
+def test_over_the_daemon_a_way_is_refused_or_followed(tmp_path: Path, compiled: Path) -> None:
+    """Plans and ways are made in processes of their own there, and the loop runs in real time."""
+    model, way = so.load_robot(ONE), sideways(3)
+    ball = beside(model, way, 1e-3).objects[0].sphere
+    centre = [f"{1e3 * each:.2f} mm" for each in ball.centre]
+    scene = {
+        "clearance": "6 mm",
+        "objects": [{"name": "post", "sphere": {"centre": centre, "radius": "5 mm"}}],
+    }
+    path = patient_rig(tmp_path, plant={"dynamics": "quasi-static"}, scene=scene)
+    with Daemon(path) as daemon:
+        daemon.arm()
+        with so.Client(daemon.url, daemon.token) as client:
+            client.take_control()
+            with pytest.raises(InputError, match=REFUSED.format("to waypoint 3")) as caught:
+                client.follow_trajectory(trajectory(model, way))
+            assert "5.0 mm short" in str(caught.value)
+            found = solution(model, np.array([0.0, 1.0]), way[:2])
+            client.follow_trajectory(found.trajectory())
+            wait_for(lambda: np.abs(client.state().plan - way[1]).max() < 1.0)
+            there = model.tip_pose(way[2])[:3, 3]
+
+            def refusal() -> str:
+                with pytest.raises(InputError) as caught:
+                    client.set_target(position=there.tolist())
+                return "" if "ask again" in str(caught.value) else str(caught.value)
+
+            assert re.fullmatch(REFUSED.format("there"), wait_for(refusal, 200.0))
+            with pytest.raises(InputError, match="expected 3, one for each channel, not 2"):
+                client.follow_trajectory(Trajectory(waypoints=waypoints((0, 0), (0, 0))))
+            assert client.state().state is State.ACTIVE
+            client.hold()
+            client.vent()

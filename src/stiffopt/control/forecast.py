@@ -140,8 +140,8 @@ class Forecast:
                 raise CommandError(f"the way could not be checked: {reason}")
             if requester.gone or time.monotonic() > self._deadline:
                 raise CommandError(
-                    f"the way could not be checked within {self._tuning.patience:g} s; ask again, "
-                    "or give the pressures of all waypoints"
+                    f"the way could not be checked within {self._tuning.patience:g} s; the first "
+                    "task of a kind takes longer, so ask again"
                 )
             time.sleep(self._tuning.look)
 

@@ -121,14 +121,18 @@ class RouteSearch:
         none, nothing = np.zeros(0, dtype=np.intp), np.zeros(0)
         self._crossings = _Crossings(none, none, none, none, nothing, nothing)
 
-    def best(self, rounds: int = ROUTE.rounds) -> Route | None:
-        """The best sequence; None if there is none.
+    def best(self, rounds: int = ROUTE.rounds, *, any_will_do: bool = False) -> Route | None:
+        """The best sequence, or any; None if there is none.
 
         Crossings are computed in so many rounds; without any, only steps from candidate to
         candidate count.
         """
         direct = self._sequence()
-        if not rounds or (direct is not None and self._is_about(direct, self._hope())):
+        if (
+            not rounds
+            or (direct is not None and any_will_do)
+            or (direct is not None and self._is_about(direct, self._hope()))
+        ):
             return None if direct is None else self._route(direct)
         self._crossings = self._all_crossings()
         for _ in range(rounds):
@@ -139,8 +143,9 @@ class RouteSearch:
             unknown = [each for each in used if not self._crossings.known[each]]
             if not unknown:
                 return self._route(hoped)
-            known = self._sequence(computed=True)
-            if known is not None and self._is_about(known, hoped):
+            enough = -np.inf if any_will_do else hoped.worst - ROUTE.hardly
+            known = self._sequence(enough, computed=True)
+            if known is not None and (any_will_do or self._is_about(known, hoped)):
                 return self._route(known)
             for number in unknown:
                 checkpoint()
@@ -176,14 +181,16 @@ class RouteSearch:
 
     # -- dynamic programming ------------------------------------------------------------------
 
-    def _sequence(self, *, computed: bool = False) -> _Sequence | None:
-        """The best sequence, maybe of computed crossings alone."""
+    def _sequence(self, enough: float = -np.inf, *, computed: bool = False) -> _Sequence | None:
+        """The best sequence, maybe of computed crossings alone; None where the worst is less."""
         least = worst = -np.inf
         if self._over == "worst":
             best = self._best(least, bottleneck=True, computed=computed)
             if not np.isfinite(best.values[-1]).any():
                 return None
             worst = float(best.values[-1].max())
+            if worst < enough:
+                return None
             least = worst - 1e-9
         best = self._best(least, bottleneck=False, computed=computed)
         if not np.isfinite(best.values[-1]).any():

@@ -232,7 +232,12 @@ class _PathSolver:
         return step_limits(times, self._slew)
 
     def _best_route(
-        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
+        self,
+        tasks: PathTasks,
+        layers: list[list[PathCandidate]],
+        steps: Vector,
+        *,
+        any_will_do: bool = False,
     ) -> Route | None:
         """The best sequence, over further configurations where the local optima are not enough."""
         if not all(layers):
@@ -243,10 +248,10 @@ class _PathSolver:
             if with_lanes and tasks.robot.is_loaded:
                 break
             some = self._with_lanes(tasks, layers) if with_lanes else layers
-            route = self._best_of(tasks, some, steps, rounds)
+            route = self._best_of(tasks, some, steps, rounds, any_will_do)
             found = [each for each in (best, route) if each is not None]
             best = max(found, key=lambda each: each.value(self._over), default=None)
-            if hope.comes_up_to(best, LANES.enough):
+            if hope.comes_up_to(best, LANES.enough) or (any_will_do and best is not None):
                 break
         return best
 
@@ -263,15 +268,24 @@ class _PathSolver:
         ]
 
     def _best_of(
-        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector, rounds: int
+        self,
+        tasks: PathTasks,
+        layers: list[list[PathCandidate]],
+        steps: Vector,
+        rounds: int,
+        any_will_do: bool,
     ) -> Route | None:
         """The best sequence of candidates; that of a closed path ends where it begins."""
+
+        def best(layers: list[list[PathCandidate]]) -> Route | None:
+            search = RouteSearch(tasks, layers, steps, self._over)
+            return search.best(rounds, any_will_do=any_will_do)
+
         if not self._path.closed:
-            return RouteSearch(tasks, layers, steps, self._over).best(rounds)
+            return best(layers)
         found: list[Route] = []
         for first in layers[0][: CANDIDATES.kept]:
-            closed = [[first], *layers[1:-1], [first]]
-            route = RouteSearch(tasks, closed, steps, self._over).best(rounds)
+            route = best([[first], *layers[1:-1], [first]])
             if route is not None:
                 found.append(route)
         return max(found, key=lambda each: each.value(self._over), default=None)
@@ -283,15 +297,17 @@ class _PathSolver:
         factor, route = 1.0, None
         while route is None and factor < RATES.slowest:
             factor *= 2
-            route = self._best_route(tasks, layers, steps * factor)
+            route = self._best_route(tasks, layers, steps * factor, any_will_do=True)
         low = factor / 2
         while route is not None and factor / low > 1.05:
             middle = (low * factor) ** 0.5
-            quicker = self._best_route(tasks, layers, steps * middle)
+            quicker = self._best_route(tasks, layers, steps * middle, any_will_do=True)
             if quicker is None:
                 low = middle
             else:
                 factor, route = middle, quicker
+        if route is not None:
+            route = self._best_route(tasks, layers, steps * factor) or route
         return factor, route
 
     def _fastest(self, pressures: Vector) -> Vector:
