@@ -195,7 +195,7 @@ def test_differences_of_directions_are_turns(kind: str) -> None:
 
 
 @pytest.mark.usefixtures("compiled")
-@pytest.mark.parametrize("robot", [ONE, TWO])
+@pytest.mark.parametrize("robot", [ONE, pytest.param(TWO, marks=pytest.mark.long)])
 def test_ways_are_checked_between_their_corners(robot: str) -> None:
     arm = so.load_robot(robot)
     way = sideways(arm.n_pressures)
@@ -234,8 +234,8 @@ def test_a_body_that_is_too_near_may_get_away_and_not_come_nearer() -> None:
 
 @pytest.mark.usefixtures("compiled")
 def test_the_watch_misses_nothing_where_it_does_not_look() -> None:
-    arm = so.load_robot(TWO)
-    way = sideways(6)
+    arm = so.load_robot(ONE)
+    way = sideways(3)
     scene = beside(arm, (way[1] + way[2])[None] / 2, ASKED / 4)
     watch = ClearanceWatch(arm, scene)
     watch.prepare()
@@ -326,7 +326,7 @@ def calibrated(robot: str, found: float = 0.8) -> so.Manipulator:
     [
         (ONE, "full", False),
         (ONE, "full", True),
-        (HANGING, "full", False),
+        pytest.param(HANGING, "full", False, marks=pytest.mark.long),
         (HANGING, "full", True),
     ],
 )

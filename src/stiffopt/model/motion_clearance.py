@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError, PressureError
-from stiffopt.model.arm_clearance import ArmClearance
+from stiffopt.model.arm_clearance import ArmClearance, Ranges
+from stiffopt.model.clearance import range_ends
 from stiffopt.model.distances import scene_library
 from stiffopt.model.scene import Scene
 from stiffopt.model.stations import Pieces
@@ -37,6 +38,8 @@ _ALLOWED = 2e-5  # m, by which poses that are looked at may be too near
 _SAG, _MOST_POSES, _STEEPEST = 1e-5, 512, 1.5  # as motion.h has them, but for the poses
 _CLEAR, _BLOCKED, _NO_SHAPE = range(3)  # as motion.h has them
 _SAMPLES = {False: 256, True: 64}  # of the bounds, by whether the arm is loaded
+_STATIONS = 4  # of each part of the body, at which bounds are sampled
+_INTERVALS = 2  # between coarse stations, of each part
 _CORNERS = 512  # of the pressures' range, at most
 _SPEED_MARGIN, _BEND_MARGIN = 1.1, 1.5
 _EXPECTED = 500  # poses for each motion, while there is no machine code
@@ -50,13 +53,16 @@ class MotionBounds(NamedTuple):
 
     Attributes
     ----------
-    speeds : (pieces,), way of any point per change (Euclidean) of a piece's pressures, in m/Pa.
-    bend : in m; along a straight way in pressures, second derivatives of positions are at most
-        the square of the speed, by `speeds`, over this.
+    ranges : parts of the body, to which these belong.
+    speeds : (ranges, pieces), way of any point of a range per change (Euclidean) of a piece's
+        pressures, in m/Pa.
+    bends : (ranges,), in m; along a straight way in pressures, second derivatives of positions are
+        at most the square of the speed, by `speeds`, over this.
     """
 
+    ranges: Ranges
     speeds: Array
-    bend: float
+    bends: Array
 
 
 @dataclass(frozen=True)
@@ -117,7 +123,7 @@ class ClearMotions:
         code = scene_library() if body is not None else None
         if body is None or code is None:
             return None
-        ranges, objects = self._clearance.ranges, self._clearance.scene.in_c(code)
+        ranges, objects = self.bounds.ranges, self._clearance.scene.in_c(code)
         motions = _Motions(
             model=body.address,
             objects=ctypes.addressof(objects),
@@ -126,7 +132,7 @@ class ClearMotions:
             counts=ranges.counts.ctypes.data,
             n_ranges=len(ranges.ends),
             speeds=self.bounds.speeds.ctypes.data,
-            bend=self.bounds.bend,
+            bends=self.bounds.bends.ctypes.data,
         )
         self._given, self._results = ctypes.addressof(motions), self._found.ctypes.data
         size = body.code.cdll.stiffopt_motion_memory
@@ -155,8 +161,8 @@ class ClearMotions:
         steep = (
             _STEEPEST if any(item.is_interpolated for item in self._clearance.scene.items) else 1
         )
-        change = np.bincount(self.piece_of, (b - a) ** 2, len(self.bounds.speeds))
-        way = steep * float(self.bounds.speeds @ np.sqrt(change))
+        change = np.bincount(self.piece_of, (b - a) ** 2, self.bounds.speeds.shape[1])
+        way = steep * float((self.bounds.speeds @ np.sqrt(change)).max())
         shares, spare, least = np.empty(0), np.empty(0), np.inf
         new = np.array([0.0, 1.0])
         while len(new):
@@ -197,7 +203,7 @@ class _Motions(ctypes.Structure):
         *((name, _pointer) for name in ("ends", "counts")),
         ("n_ranges", _integer),
         ("speeds", _pointer),
-        ("bend", _double),
+        ("bends", _pointer),
         ("memory", _pointer),
     ]
 
@@ -207,15 +213,28 @@ class _Motions(ctypes.Structure):
 
 def motion_bounds(arm: Manipulator) -> MotionBounds:
     """The bounds of an arm, sampled at corners of its pressures' range and within it."""
-    pieces = Pieces(arm)
-    at = np.linspace(0.0, arm.length, 4 * arm.n_segments + 1)[1:]
+    pieces, ranges = Pieces(arm), _parts(arm)
+    low, high = ranges.bounds.T
+    at = np.linspace(low, high, _STATIONS, axis=1).ravel()  # of one part after the other
     p = _that_settle(arm, _spread(arm))
     moves = _moves(arm, p, at)  # (N, k, 4, n)
-    speeds = np.zeros(len(pieces.ends))
+    speeds = np.zeros((len(at), len(pieces.ends)))
     for piece in np.unique(pieces.piece_of):
         block = moves[..., pieces.piece_of == piece]
-        speeds[piece] = _SPEED_MARGIN * np.linalg.svd(block, compute_uv=False)[..., 0].max()
-    return MotionBounds(speeds, _bend(arm, p, at, speeds, pieces.piece_of))
+        speeds[:, piece] = np.linalg.svd(block, compute_uv=False)[..., 0].max(axis=0)
+    speeds = _SPEED_MARGIN * speeds.reshape(-1, _STATIONS, len(pieces.ends)).max(axis=1)
+    return MotionBounds(ranges, speeds, _bends(arm, p, at, speeds, pieces.piece_of))
+
+
+def _parts(arm: Manipulator) -> Ranges:
+    """The ranges of an arm's body, divided: what is near to the base moves less."""
+    parts: list[tuple[float, float, int]] = []
+    for start, end, count in range_ends(arm.description):
+        number = -(-(count - 1) // _INTERVALS)
+        marks = np.linspace(start, end, number + 1).tolist()
+        coarse = 1 + -(-(count - 1) // number)
+        parts += [(low, high, coarse) for low, high in pairwise(marks)]
+    return Ranges.of(tuple(parts))
 
 
 def _spread(arm: Manipulator) -> Array:
@@ -259,9 +278,9 @@ def _moves(arm: Manipulator, p: Array, at: Array) -> Array:
     return np.concatenate([moves, np.stack(slopes, axis=-1)[:, :, None]], axis=2)
 
 
-def _bend(
+def _bends(
     arm: Manipulator, p: Array, at: Array, speeds: Array, piece_of: NDArray[np.int64]
-) -> float:
+) -> Array:
     """The square of speeds over second derivatives, at least, from second differences."""
     rng = np.random.default_rng(1)
     low, high = arm.pressure_min, arm.pressure_max
@@ -274,8 +293,12 @@ def _bend(
             arm._body.line(q, at)[..., :3] for q in (middle - step, middle, middle + step)
         )
     except EquilibriumError:  # near where it buckles
-        return float(arm.length) / 10
-    second = np.linalg.norm(before - 2 * here + after, axis=-1).max(axis=1)
-    squares = [step[:, piece_of == piece] ** 2 for piece in range(len(speeds))]
+        return np.full(len(speeds), arm.length / 10)
+    second = np.linalg.norm(before - 2 * here + after, axis=-1)
+    second = second.reshape(len(p), -1, _STATIONS).max(axis=2)  # (N, ranges)
+    squares = [step[:, piece_of == piece] ** 2 for piece in range(speeds.shape[1])]
     change = np.sqrt(np.stack([each.sum(axis=1) for each in squares], axis=-1))
-    return float(((change @ speeds) ** 2 / second).min()) / _BEND_MARGIN
+    ways = change @ speeds.T
+    moving = ways > 1e-9  # a part may not move at all
+    bends = np.where(moving, ways**2 / np.maximum(second, 1e-12), np.inf).min(axis=0)
+    return np.asarray(bends / _BEND_MARGIN)

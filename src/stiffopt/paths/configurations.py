@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stiffopt.errors import InputError
+from stiffopt.errors import InputError, StoppedError
 from stiffopt.model.arguments import checked_vector
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.optimise.goal import StiffnessMeasure
@@ -89,12 +89,17 @@ class TaskConfigurations:
     Raises
     ------
     Unsolved
+        There are none.
+    StoppedError
+        The solver failed, or the time is over.
     """
 
     def __init__(self, name: str, robot: Manipulator, task: Task, seed: int) -> None:
         self._solver, self._seed = PressureSolver(robot, task, seed=seed), seed
         self.limits = task.pressure_bounds(robot.description)
         solution = self._solver.solve()
+        if solution.status == "failed":
+            raise StoppedError(f"{name}: {solution.message}")
         if not solution.found or solution.pressures is None:
             raise Unsolved(f"{name}: {solution.status}: {solution.message}")
         self.best = Configuration(solution.pressures)

@@ -232,7 +232,7 @@ class _Planner:
         """A way around; see `plan_motion` for which goal."""
         begin = perf_counter()
         assert self.motions is not None  # or the straight way was clear
-        weights = self.motions.bounds.speeds[self.motions.piece_of]
+        weights = self.motions.bounds.speeds.max(axis=0)[self.motions.piece_of]
         limits = self._limits(start, goals, tasks)
         search = TreeSearch(self.is_still_clear, *limits, weights, self.request.seed)
         way, end = self._straight(start, goals)
