@@ -39,7 +39,7 @@ class LaneSettings:
     enough : share of what the points alone could have from which on none are looked for.
     """
 
-    knots: int = 4
+    knots: int = 8
     starts: int = 256
     kept: int = 16
     apart: float = 0.1
