@@ -257,3 +257,17 @@ def test_steps_that_are_asked_of_a_crossing_are_kept(robot, compiled):
         if (np.abs(np.diff([each.pressures for each in some], axis=0)) <= 1.5e5).all()
     ]
     assert route.value("mean") >= max(values) - 2e-3
+
+
+def test_a_body_that_is_too_near_between_two_points_is_told(robot, compiled):
+    """Both points are clear of a post that the body passes half-way."""
+    options = {"points": 2, "timing": {"times": [0, 4.0]}}
+    free = solve_path(robot, path_of(**options))
+    half = robot.pose(free.pressures.mean(axis=0), 0.165)
+    outer = robot.description.segments[0].outer_radius
+    centre = half[:3, 3] + half[:3, 0] * (outer + 0.0045)
+    post = {"name": "post", "sphere": {"centre": tuple(centre), "radius": 0.004}}
+    solution = solve_path(robot, path_of(**options, scene={"clearance": 0.001, "objects": [post]}))
+    assert solution.found
+    assert solution.clearance.min() > 0.001
+    assert "Between points 1 and 2 the body is only 0.5 mm clear of the scene" in solution.message

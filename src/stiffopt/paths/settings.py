@@ -115,6 +115,8 @@ class RateSettings:
     largest_step : of a channel between two points, as a share of its range, where no rate or no
         time says more.
     slowest : times slower that a path is tried that is too fast.
+    clearance_between : by how much the body may be nearer between two points before the message
+        says so, in m.
     few_points : up to which a path does not wait for machine code.
     least_time : between two points, in s.
     """
@@ -122,6 +124,7 @@ class RateSettings:
     rounding: float = 1e-9
     largest_step: float = 0.1
     slowest: float = 64.0
+    clearance_between: float = 5e-5
     few_points: int = 5
     least_time: float = 1e-3
 

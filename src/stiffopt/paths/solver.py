@@ -218,7 +218,7 @@ class _PathSolver:
         branches = max(map(len, layers))
         confidence = (
             f"{starts} starts found at most {branches} local optima at a point; "
-            f"the best sequence changes {route.crossings} times between branches"
+            f"the best sequence crosses between branches at full rate {route.crossings} times"
         )
         solution = replace(solution, confidence=confidence)
         if stuck is not None:
@@ -383,6 +383,16 @@ class _PathSolver:
                     f"Between points {index + 1} and {index + 2} the tip is up to "
                     f"{1e3 * off[index]:.2g} mm off the path; with more points, or lower rates, "
                     "it stays nearer."
+                )
+        scene = self._path.scene
+        if len(middle) and scene is not None:
+            clear = solution.robot.clearance(middle, scene)
+            index = int(clear.argmin())
+            if clear[index] < scene.clearance - RATES.clearance_between:
+                notes.append(
+                    f"Between points {index + 1} and {index + 2} the body is only "
+                    f"{1e3 * clear[index]:.3g} mm clear of the scene; with more points, or lower "
+                    "rates, it keeps further away."
                 )
         return " ".join(notes)
 
