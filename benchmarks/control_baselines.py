@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stiffopt.control.trajectory import Trajectory
 
 from stiffopt import PressureSolver, RobotDescription, Target, Task, load_robot
 from stiffopt.control.controller import TipController
 from stiffopt.control.interface import Controller, ControlOutput, SampleCounts
 from stiffopt.control.state import ControllerStatus
 from stiffopt.optimise.tip import TipModel
+from stiffopt.paths.trajectory import Trajectory
 from stiffopt.rig.interface import PoseSample, PressureReading, Rig
 
 Array = NDArray[np.float64]

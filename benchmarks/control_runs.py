@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from stiffopt.control.trajectory import Trajectory, Waypoint
 
 from control_baselines import PERIOD, MakeController
 from control_cases import DIRECTIONS, Case, Path8, settling_time
@@ -18,6 +17,7 @@ from stiffopt import Task
 from stiffopt.control.interface import Controller
 from stiffopt.control.loop import ControlLoop
 from stiffopt.control.state import State
+from stiffopt.paths.trajectory import Trajectory, Waypoint
 from stiffopt.plant.devices import SimulatedRig
 from stiffopt.safety.gate import SafetyGate
 

@@ -249,6 +249,9 @@ class Whim:
     def _want(self) -> None:
         self.base = HIGH * [self.chance.random() for _ in range(N)]
 
+    def check_ahead(self, request: Task | Target | Trajectory) -> None:
+        self._fail()
+
     def resume(self, now: float) -> None:
         self._fail()
 
