@@ -1,7 +1,7 @@
 """`solve_path`: the stiffest pressures with which the tip follows a path within the rates."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -68,27 +68,6 @@ def solve_path(
         solution = _PathSolver(robot, path, seed).solve()
     solution.timings["total"] = perf_counter() - begin
     return solution
-
-
-@dataclass
-class _Attempt:
-    """What was found for tasks with given steps.
-
-    Attributes
-    ----------
-    tasks : PathTasks
-    route : Route or None
-    alone : (N,) array
-        Best value of each point alone.
-    starts : local optimisations that looked for branches.
-    branches : most candidates that a point has.
-    """
-
-    tasks: PathTasks
-    route: Route | None
-    alone: Vector
-    starts: int
-    branches: int
 
 
 class _PathSolver:
