@@ -27,6 +27,7 @@ from stiffopt.cli.plan import PLAN_EPILOG, PLAN_HELP, plan
 from stiffopt.cli.robots import robots
 from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
 from stiffopt.cli.solve import EXAMPLES, HELP, solve
+from stiffopt.cli.studio import STUDIO_EPILOG, STUDIO_HELP, studio
 from stiffopt.cli.vent import VENT_EPILOG, VENT_HELP, vent
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
@@ -35,6 +36,7 @@ app = command_group(context_settings=_SETTINGS)
 app.command("solve", help=HELP, epilog=EXAMPLES.format(command="stiffopt solve"))(solve)
 app.command("path", help=PATH_HELP, epilog=PATH_EPILOG)(path)
 app.command("plan", help=PLAN_HELP, epilog=PLAN_EPILOG)(plan)
+app.command("studio", help=STUDIO_HELP, epilog=STUDIO_EPILOG)(studio)
 app.command("robots")(robots)
 app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
 app.command("vent", help=VENT_HELP, epilog=VENT_EPILOG)(vent)
