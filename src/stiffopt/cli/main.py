@@ -15,9 +15,11 @@ from stiffopt.cli.calibrate import (
     calibrate,
     validate,
 )
+from stiffopt.cli.check import CHECK_EPILOG, CHECK_HELP, check
 from stiffopt.cli.console import Closed, report_error
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
 from stiffopt.cli.experiment import experiment_app
+from stiffopt.cli.init import init_app
 from stiffopt.cli.lab import LAB_EPILOG, LAB_HELP, lab
 from stiffopt.cli.log import log_app
 from stiffopt.cli.map import map_app
@@ -31,10 +33,12 @@ from stiffopt.cli.vent import VENT_EPILOG, VENT_HELP, vent
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 
-app = command_group(context_settings=_SETTINGS)
+app = command_group(context_settings=_SETTINGS, add_completion=True)
 app.command("solve", help=HELP, epilog=EXAMPLES.format(command="stiffopt solve"))(solve)
 app.command("path", help=PATH_HELP, epilog=PATH_EPILOG)(path)
 app.command("plan", help=PLAN_HELP, epilog=PLAN_EPILOG)(plan)
+app.add_typer(init_app, name="init")
+app.command("check", help=CHECK_HELP, epilog=CHECK_EPILOG)(check)
 app.command("robots")(robots)
 app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
 app.command("vent", help=VENT_HELP, epilog=VENT_EPILOG)(vent)
