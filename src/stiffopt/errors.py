@@ -51,28 +51,30 @@ class FileError(InputError):
     ) -> None:
         super().__init__(path, reason, line, key)
         self.path = os.fspath(path)
-        self.reason = reason
         self.line = line
         self.key = key
         self.others = tuple(others)
+        self.own_reason = reason
+        for other in self.others[: MAX_MISTAKES - 1]:
+            reason += f"; also line {other.line or 0}: {other.key or ''}: {other.own_reason}"
+        more = len(self.others) + 1 - MAX_MISTAKES
+        self.reason = f"{reason}; and {more} more" if more > 0 else reason
 
     def __str__(self) -> str:
-        """Return the first mistake, and after it the next ones."""
-        text = self.first
-        for other in self.others[: MAX_MISTAKES - 1]:
-            text += f"; also line {other.line or 0}: {other.key or ''}: {other.reason}"
-        more = len(self.others) + 1 - MAX_MISTAKES
-        return f"{text}; and {more} more" if more > 0 else text
+        return self._placed(self.reason)
 
     @property
-    def first(self) -> str:
-        """The first mistake alone, with its place."""
+    def alone(self) -> str:
+        """The text without the file's other mistakes."""
+        return self._placed(self.own_reason)
+
+    def _placed(self, reason: str) -> str:
         where = self.path if self.line is None else f"{self.path}:{self.line}"
-        return f"{where}: {self.key}: {self.reason}" if self.key else f"{where}: {self.reason}"
+        return f"{where}: {self.key}: {reason}" if self.key else f"{where}: {reason}"
 
     def __reduce__(self) -> tuple[object, ...]:
         """Support pickling, so that the error crosses process boundaries whole."""
-        return _rebuild_file_error, (self.path, self.reason, self.line, self.key, self.others)
+        return _rebuild_file_error, (self.path, self.own_reason, self.line, self.key, self.others)
 
 
 def _rebuild_file_error(

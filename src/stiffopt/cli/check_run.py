@@ -27,7 +27,7 @@ def check_files(paths: Sequence[str], *, as_json: bool, quiet: bool) -> int:
             write_json({"file": path, "kind": kind, "mistakes": [_record(m) for m in mistakes]})
             continue
         for mistake in mistakes:
-            write_line(mistake.first)
+            write_line(mistake.alone)
         if not mistakes and not quiet:
             article = "an" if kind[:1] in "aeiou" else "a"
             write_line(f"{path}: {article} {kind} file without mistakes")
@@ -39,7 +39,7 @@ def _record(mistake: FileError) -> dict[str, Any]:
         "file": mistake.path,
         "line": mistake.line,
         "key": mistake.key,
-        "reason": mistake.reason,
+        "reason": mistake.own_reason,
     }
 
 

@@ -40,7 +40,9 @@ def _file(kind: str) -> Any:
 
 def _write(kind: str, path: str, answers: dict[str, Any], yes: bool, force: bool) -> int:
     """Ask for what was not given, and write the file."""
-    from stiffopt.cli.init_files import write_first_file  # here, so that --help waits for no numerics
+    from stiffopt.cli.init_files import (
+        write_first_file,
+    )  # here, so that --help waits for no numerics
 
     asks = not yes and sys.stdin is not None and sys.stdin.isatty()
 

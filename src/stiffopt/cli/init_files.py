@@ -13,7 +13,7 @@ import numpy as np
 from stiffopt.cli.check_run import check_file
 from stiffopt.cli.console import write_line
 from stiffopt.cli.outputs import check_ending, check_writable
-from stiffopt.cli.quantities import choice, listed, quantity
+from stiffopt.cli.quantities import choice, quantity
 from stiffopt.documents import write_whole
 from stiffopt.errors import FileError, InputError
 from stiffopt.files import format_of
@@ -136,7 +136,7 @@ def _option(name: str) -> str:
 
 
 def _write_checked(path: str, text: str) -> None:
-    """Write a file after a check of what it will say; a file that was there stays if it is wrong."""
+    """Write a file after a check of its text; what was there stays if that is wrong."""
     draft = Path(path).with_name(f".{Path(path).stem}.draft.yaml")
     try:
         write_whole(draft, text.encode())
@@ -145,7 +145,7 @@ def _write_checked(path: str, text: str) -> None:
         draft.unlink(missing_ok=True)
     if mistakes:
         first = mistakes[0]
-        raise InputError(f"{first.key or path}: {first.reason}; nothing was written")
+        raise InputError(f"{first.key or path}: {first.own_reason}; nothing was written")
     write_whole(path, text.encode())
 
 
@@ -213,14 +213,12 @@ def _robot(answers: _Answers, path: str) -> tuple[str, list[str]]:
             f"[0 m/s^2, 0 m/s^2, {along} m/s^2]" if along else "[-9.81 m/s^2, 0 m/s^2, 0 m/s^2]"
         )
         text += f"gravity: {vector}    # {words}\n# tip_mass: 20 g\n"
-    text += (
-        f"pressure: {{min: 0 bar, max: {highest}, slew: 5 bar/s}}    # gauge; the arm's own limits\n"
-    )
+    text += f"pressure: {{min: 0 bar, max: {highest}, slew: 5 bar/s}}    # gauge; of the arm\n"
     return text, [
         f"stiffopt init task --robot {path}     # a task for this arm",
         f"stiffopt map arm {path}               # its stiffness along the arm",
-        "measure lengths and radii of your arm and correct them here; `stiffopt calibrate` finds the",
-        "moduli from a recording (docs/calibration.md)",
+        "measure lengths and radii of your arm and correct them in the file;",
+        "`stiffopt calibrate` finds the moduli from a recording (docs/calibration.md)",
     ]
 
 
@@ -277,8 +275,9 @@ def _scene(answers: _Answers, path: str) -> tuple[str, list[str]]:
         sphere:
           centre: [0 mm, {_mm(away)}, {_mm(robot.length / 2)}]
           radius: 5 mm
-      # or capsule, cylinder {{from, to, radius}}, box {{centre, size}}, half_space {{point, normal}},
-      # mesh {{file}}, inside_tube {{points, radius}}, trocar {{centre, axis, radius}}
+      # or capsule, cylinder {{from, to, radius}}, box {{centre, size}}, mesh {{file}},
+      # half_space {{point, normal}}, inside_tube {{points, radius}},
+      # trocar {{centre, axis, radius}}
     """
     return text, [f"name it in a task, path or rig file:  scene: {path}"]
 
@@ -295,7 +294,8 @@ def _rig(answers: _Answers, path: str) -> tuple[str, list[str]]:
     text += "safety: {tracker_timeout: 0.5 s}    # what may happen, and what counts as a fault\n"
     text += "log: {folder: runs}\n"
     if supply == "simulated":
-        text += "plant: {seed: 1, spread: {gain: 3 %, modulus: 5 %}}    # how it differs from the robot\n"
+        text += "# how the simulated arm differs from its robot file\n"
+        text += "plant: {seed: 1, spread: {gain: 3 %, modulus: 5 %}}\n"
         return text, [f"stiffopt run {path} --task my-task.yaml"]
     return text, [
         "put in the addresses and ranges of your devices; rig/ has examples with their wiring",
@@ -308,7 +308,8 @@ def _modbus(n: int) -> str:
     return (
         "  driver: modbus\n"
         "  tcp: {host: 192.168.1.10, port: 502}\n"
-        "  scale: {counts: [0, 32767], pressure: [0 bar, 10 bar]}    # two points of the regulators\n"
+        "  # counts and pressures of the regulators, at two points\n"
+        "  scale: {counts: [0, 32767], pressure: [0 bar, 10 bar]}\n"
         "  table: holding\n"
         f"  channels:                            # register addresses, counted from 0\n{lines}"
         "  dump_valve: {coil: 0, energised: closed}    # empties the arm without power\n"
@@ -324,7 +325,8 @@ def _nidaq(n: int) -> str:
     )
     return (
         f"  driver: nidaq\n  channels:\n{lines}"
-        "  dump_valve: {line: Dev1/port0/line0, closed_when: high}    # empties the arm without power\n"
+        "  # empties the arm without power\n"
+        "  dump_valve: {line: Dev1/port0/line0, closed_when: high}\n"
     )
 
 

@@ -70,7 +70,9 @@ class _DeviceJsonSchema:
 
     def __get_pydantic_json_schema__(self, _: Any, handler: Any) -> dict[str, Any]:
         names = built_in_drivers(self.kind)
-        schemas = (handler(driver_class(self.kind, name).__pydantic_core_schema__) for name in names)
+        schemas = (
+            handler(driver_class(self.kind, name).__pydantic_core_schema__) for name in names
+        )
         own = [
             {"allOf": [schema, {"properties": {"driver": {"const": name}}}]}
             for name, schema in zip(names, schemas, strict=True)
@@ -131,16 +133,26 @@ class RigDescription(Schema):
     name: Annotated[str, Field(min_length=1)] = "rig"
     robot: Annotated[str, Field(min_length=1)]
     rate: Annotated[Frequency, Field(gt=0, le=1000)] = 100.0
-    supply: Annotated[SerializeAsAny[SupplySettings], _device("supply"), _DeviceJsonSchema("supply")]
-    tracker: Annotated[SerializeAsAny[TrackerSettings] | None, _device("tracker"), _DeviceJsonSchema("tracker")] = None
-    probe: Annotated[SerializeAsAny[ProbeSettings] | None, _device("probe"), _DeviceJsonSchema("probe")] = None
+    supply: Annotated[
+        SerializeAsAny[SupplySettings], _device("supply"), _DeviceJsonSchema("supply")
+    ]
+    tracker: Annotated[
+        SerializeAsAny[TrackerSettings] | None, _device("tracker"), _DeviceJsonSchema("tracker")
+    ] = None
+    probe: Annotated[
+        SerializeAsAny[ProbeSettings] | None, _device("probe"), _DeviceJsonSchema("probe")
+    ] = None
     safety: Safety = Safety()
     control: ControlSettings = ControlSettings()
     service: ServiceSettings = ServiceSettings()
     log: LogSettings = LogSettings()
     scene: SceneOrFile | None = None
-    plant: Annotated[SerializeAsAny[RigSection] | None, _section("plant"), _SectionJsonSchema("plant")] = None
-    lab: Annotated[SerializeAsAny[RigSection] | None, _section("lab"), _SectionJsonSchema("lab")] = None
+    plant: Annotated[
+        SerializeAsAny[RigSection] | None, _section("plant"), _SectionJsonSchema("plant")
+    ] = None
+    lab: Annotated[
+        SerializeAsAny[RigSection] | None, _section("lab"), _SectionJsonSchema("lab")
+    ] = None
 
 
 def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
