@@ -105,6 +105,11 @@ class ArmTube:
             if mesh.visible != visible:
                 mesh.visible = visible
 
+    @property
+    def end(self) -> Vector:
+        """Middle of the lid of its tip (3,), in m."""
+        return np.asarray(self._meshes[-1].vertices[-1], dtype=np.float64)
+
     def remove(self) -> None:
         """Take it away for good."""
         for mesh in self._meshes:

@@ -74,6 +74,16 @@ class TaskView:
         """End the thread that searches."""
         self.worker.close()
 
+    @property
+    def target_position(self) -> Vector:
+        """Where the handle of the target is (3,), in m."""
+        return np.asarray(self._target.position)
+
+    @property
+    def arm_end(self) -> Vector:
+        """Where the arm that is drawn ends (3,), in m."""
+        return self._arm.end
+
     # -- what is there ------------------------------------------------------------------------
 
     def _add_scene(self) -> None:
@@ -302,7 +312,8 @@ class TaskView:
         self._answer(self.bench.answer_quickly, cancel)
 
     def _fully(self, cancel: Cancel) -> None:
-        self.bench.end_step()
+        if self._dragged is None:
+            self.bench.end_step()
         self._answer(self.bench.answer_best, cancel)
 
     def _answer(self, search: Callable[[Cancel], bool], cancel: Cancel) -> None:
