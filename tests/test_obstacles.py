@@ -459,15 +459,14 @@ def test_descents_next_to_a_joint_of_segments_converge(compiled: Path) -> None:
 def test_descents_in_a_bent_tube_are_as_short_as_without_it(compiled: Path) -> None:
     """The body leans on the joints of the tube's pieces: its least distances have kinks there."""
     points = [(0, 0, 0), (0, 0, 0.09), (-0.006, -0.003, 0.14), (-0.03, 0.01, 0.2)]
-    tube = {"name": "tube", "inside_tube": {"points": points, "radius": 0.018}}
-    robot = load_robot("stiff-flop-2")
-    free = solve_pressure(robot, task_with(None))
-    within = solve_pressure(robot, task_with(scene_of(tube)))
+    tube = {"name": "tube", "inside_tube": {"points": points, "radius": 0.021}}
+    robot, position = load_robot("stiff-flop-2"), (-0.03, 0.01, 0.195)
+    free = solve_pressure(robot, task_with(None, position))
+    within = solve_pressure(robot, task_with(scene_of(tube), position))
     assert within.found
-    assert within.stiffness < 0.99 * free.stiffness
-    descents = within.confidence.reached
-    assert within.counts["iterations"] / descents < 20
+    assert within.stiffness < 0.997 * free.stiffness
     assert within.confidence.complete
+    assert within.counts["iterations"] <= free.counts["iterations"]
 
 
 def test_no_derivatives_where_a_distance_has_an_edge(compiled: Path) -> None:
