@@ -7,7 +7,6 @@ import fcntl
 import logging
 import os
 import re
-import shutil
 import signal
 import socket
 import stat
@@ -25,6 +24,7 @@ from typing import Any
 
 import pytest
 
+from conftest import use_compiler
 from examples import blocks
 from fake_loop import FakeLoop, ManualClock
 from running import ONE, TWO, patient_rig, wait_for
@@ -48,11 +48,8 @@ def daemon(
     tmp_path_factory: pytest.TempPathFactory, code_cache: Path
 ) -> Iterator[tuple[Daemon, Client]]:
     """A running daemon of a simulated arm without inertia, and a client that has control."""
-    if not any(shutil.which(name) for name in ("cc", "gcc", "clang")):
-        pytest.skip("there is no C compiler")
     with pytest.MonkeyPatch.context() as patch:
-        patch.delenv("STIFFOPT_COMPILER", raising=False)
-        patch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
+        use_compiler(patch, code_cache)
         folder = tmp_path_factory.mktemp("daemon")
         rig = patient_rig(folder, plant={"dynamics": "quasi-static"})
         with Daemon(rig) as made:
