@@ -148,44 +148,50 @@ class RouteSearch:
         self._set_links(self._all_steps())
 
     def best(
-        self, rounds: int = ROUTE.rounds, *, share: float = 1.0, any_will_do: bool = False
+        self, rounds: int = ROUTE.rounds, *, share: float | None = None, any_will_do: bool = False
     ) -> Route | None:
         """The best sequence, or any; None if there is none.
 
-        Crossings are computed in so many rounds, but where steps alone lead to about this share of
-        what the points alone could have.
+        Crossings are computed in so many rounds, until one is about as good as can be, or has this
+        share of what the points alone could have.
         """
-        best = self._best_of_ends(0, any_will_do)
-        if best is None or not (any_will_do or self._is_about(best, self._hope(share))):
+        hope = self._hope()
+        best = self._best_of_ends(0, hope, share, any_will_do)
+        if best is None or not (any_will_do or self._is_enough(best, hope, share)):
             self._add_crossings()
-            best = self._best_of_ends(rounds, any_will_do)
+            best = self._best_of_ends(rounds, hope, share, any_will_do)
         return None if best is None else self._route(best)
 
-    def _best_of_ends(self, rounds: int, any_will_do: bool) -> _Sequence | None:
+    def _best_of_ends(
+        self, rounds: int, hope: _Sequence, share: float | None, any_will_do: bool
+    ) -> _Sequence | None:
         found: list[_Sequence] = []
         for end in self._ends:
             self._hold(end)
-            one = self._best(rounds, any_will_do)
+            one = self._best(rounds, hope, share, any_will_do)
             found += [] if one is None else [one]
         self._hold(None)
         return max(found, key=lambda each: (each.worst, each.mean), default=None)
 
-    def _best(self, rounds: int, any_will_do: bool) -> _Sequence | None:
+    def _best(
+        self, rounds: int, hope: _Sequence, share: float | None, any_will_do: bool
+    ) -> _Sequence | None:
+        known = self._sequence(computed=True)
         for _ in range(rounds):
+            if known is not None and (any_will_do or self._is_enough(known, hope, share)):
+                return known
             hoped = self._sequence()
             if hoped is None:
                 return None
             unknown = [each for each in hoped.links if not self._links.known[each]]
-            if not unknown:
-                return hoped
-            enough = -np.inf if any_will_do else hoped.worst - ROUTE.hardly
-            known = self._sequence(enough, computed=True)
-            if known is not None and (any_will_do or self._is_about(known, hoped)):
+            if not unknown or (known is not None and self._is_enough(known, hoped, None)):
                 return known
             for number in unknown:
                 checkpoint()
                 self._compute(number)
-        return self._sequence(computed=True)
+            if any(number in self._links.between for number in unknown):
+                known = self._sequence(computed=True)
+        return known
 
     def _hold(self, end: int | None) -> None:
         """Have sequences begin and end with one candidate of the first point, or with any."""
@@ -196,25 +202,25 @@ class RouteSearch:
                 self._usable[first:last] = -np.inf
                 self._usable[first + end] = self._values[first + end]
 
-    def _is_about(self, known: _Sequence, hoped: _Sequence) -> bool:
-        """Whether a sequence is hardly worse than what is hoped for."""
-        if self._over == "worst":
-            return (
-                known.worst > hoped.worst - ROUTE.hardly
-                and known.mean > hoped.mean - ROUTE.hardly_on_average
-            )
-        return known.mean > hoped.mean - ROUTE.hardly
+    def _is_enough(self, known: _Sequence, hoped: _Sequence, share: float | None) -> bool:
+        """Whether a sequence has a share of what is hoped for; without any, almost all of it."""
+        over = self._over == "worst"
+        gain = hoped.worst - known.worst if over else hoped.mean - known.mean
+        if share is not None:
+            return gain < -np.log(share)
+        on_average = hoped.mean - known.mean
+        return gain < ROUTE.hardly and (not over or on_average < ROUTE.hardly_on_average)
 
-    def _hope(self, share: float) -> _Sequence:
-        """What no sequence can be better than, or a share of it."""
-        best = np.maximum.reduceat(self._values, self._first[:-1]) + np.log(share)
+    def _hope(self) -> _Sequence:
+        """What no sequence can be better than."""
+        best = np.maximum.reduceat(self._values, self._first[:-1])
         return _Sequence(0, [], float(best.min()), float(best.mean()))
 
     def comes_up_to(self, route: Route | None, share: float) -> bool:
         """Whether a sequence has this share of what the points alone could have."""
-        hope = self._hope(share)
+        hope = self._hope()
         best = hope.worst if self._over == "worst" else hope.mean
-        return route is not None and route.value(self._over) > best
+        return route is not None and route.value(self._over) > best + np.log(share)
 
     @property
     def furthest(self) -> int:
@@ -229,13 +235,13 @@ class RouteSearch:
         self._by_point = links.sorted_by_point(self._first)
         self._starts = np.searchsorted(links.goal, np.arange(len(self._values) + 1))
 
-    def _sequence(self, enough: float = -np.inf, *, computed: bool = False) -> _Sequence | None:
-        """The best sequence, maybe of computed links alone; None where the worst is less."""
+    def _sequence(self, *, computed: bool = False) -> _Sequence | None:
+        """The best sequence, maybe of computed links alone; None without any."""
         if self._over == "mean":
             return self._traced(-np.inf, computed=computed)
         worst = self._reached(-np.inf, bottleneck=True, computed=computed)
         best = float(worst[self._first[-2] :].max(initial=-np.inf))
-        if not np.isfinite(best) or best < enough:
+        if not np.isfinite(best):
             return None
         found = self._traced(best - 1e-9, computed=computed)
         return found and found._replace(worst=best)

@@ -72,7 +72,7 @@ class RouteSettings:
     ends: int = 40
     lengths: tuple[float, ...] = (1.0, 1.5, 2.5)
     nearest: int = 6
-    rounds: int = 40
+    rounds: int = 100
     first_rounds: int = 8
     price: float = 1e-3
     within: float = 0.98
@@ -104,7 +104,7 @@ class RefinementSettings:
     margin: int = 8
     iterations: int = 12
     radius: float = 0.1
-    last_radius: float = 1e-5
+    last_radius: float = 1e-3
     last_gain: float = 1e-4
     price: float = 100.0
     aside: float = 1e-6
