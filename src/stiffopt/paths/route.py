@@ -6,6 +6,7 @@ stays on the path.  How stiff the arm is on a crossing is computed only for thos
 sequence would use; until then a crossing counts as good as its ends.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -207,7 +208,7 @@ class RouteSearch:
         over = self._over == "worst"
         gain = hoped.worst - known.worst if over else hoped.mean - known.mean
         if share is not None:
-            return gain < -np.log(share)
+            return gain < -math.log(share)
         on_average = hoped.mean - known.mean
         return gain < ROUTE.hardly and (not over or on_average < ROUTE.hardly_on_average)
 
