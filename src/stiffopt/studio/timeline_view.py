@@ -63,8 +63,8 @@ class TimelineView:
             for number, item in enumerate(timeline.scene.objects):
                 vertices, faces = objects.surface_mesh(item.shape, self._length)
                 scene.add_mesh_simple(
-                    f"/scene/{number}", vertices, faces, color=rgb(style.OBSTACLE), opacity=0.5, cast_shadow=False,
-                    side="double",
+                    f"/scene/{number}", vertices, faces, color=rgb(style.OBSTACLE), opacity=0.5,
+                    side="double", cast_shadow=False,
                 )  # fmt: skip
 
     def _add_line(self, name: str, points: Any, colour: str) -> None:
