@@ -42,7 +42,7 @@ Line = tuple[str, RenderableType]
 def block(solved: SolvedTask) -> RenderableType:
     """Return the full report of one task, about 80 columns wide."""
     solution = solved.solution
-    title = block_title(printable(solved.file), solution.status, solution.timings.get("total", 0.0))
+    title = block_title(printable(solved.file), solution.status, solution.timings)
     return Group(title, labelled(_lines(solved)), "")
 
 
