@@ -1,0 +1,118 @@
+"""How the documentation site is made: `make docs`."""
+
+import os
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from latex2mathml.converter import convert
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).resolve().parent
+
+project = "stiffopt"
+author = "The stiffopt authors"
+copyright = author
+extensions = [
+    "myst_nb",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["gallery/*", "auto_gallery/*.ipynb", "**sg_execution_times.rst"]
+
+# -- Pages ----------------------------------------------------------------------------------------
+
+source_suffix = {".md": "myst-nb", ".rst": "restructuredtext"}
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_heading_anchors = 4
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", r".*")]  # types in docstrings are words for people
+
+# -- Notebooks: executed at each build, away from the checkout ------------------------------------
+
+nb_execution_mode = "force"
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_execution_in_temp = True
+nb_merge_streams = True
+os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+os.environ |= {
+    "COLUMNS": "96",
+    "NO_COLOR": "1",
+    "MPLBACKEND": "Agg",
+    "STIFFOPT_CHECKOUT": str(HERE.parent),
+    "STIFFOPT_COMPILE": "wait",
+}
+
+# -- Gallery --------------------------------------------------------------------------------------
+
+sphinx_gallery_conf = {
+    "examples_dirs": "gallery",
+    "gallery_dirs": "auto_gallery",
+    "filename_pattern": r"\.py$",
+    "download_all_examples": False,
+    "show_memory": False,
+    "show_signature": False,
+    "within_subsection_order": "FileNameSortKey",
+    "abort_on_example_error": True,
+}
+
+# -- Python ---------------------------------------------------------------------------------------
+
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+numpydoc_show_class_members = False
+numpydoc_xref_param_type = False
+
+# -- HTML -----------------------------------------------------------------------------------------
+
+html_theme = "furo"
+html_title = "stiffopt"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_math_renderer = "mathml"
+html_copy_source = False
+html_show_sphinx = False
+
+
+def _inline_mathml(translator: Any, node: Any) -> None:
+    translator.body.append(convert(_tex(node.astext())))
+    _skip()
+
+
+def _display_mathml(translator: Any, node: Any) -> None:
+    translator.body.append(translator.starttag(node, "div", CLASS="math"))
+    translator.body.append(convert(_tex(node.astext()), display="block"))
+    translator.body.append("</div>\n")
+    _skip()
+
+
+def _skip() -> None:
+    from docutils.nodes import SkipNode
+
+    raise SkipNode
+
+
+def _tex(text: str) -> str:
+    """TeX that the converter knows in place of what it does not."""
+    return text.replace(r"\tfrac", r"\frac").strip()
+
+
+def _links_out_of_docs(app: Sphinx, page: str, source: list[str]) -> None:
+    """Files of the checkout that a page links to are downloads; folders are only named."""
+    folder = (HERE / page).parent
+
+    def link(found: re.Match[str]) -> str:
+        text, target = found.groups()
+        return f"[{text}](path:{target})" if (folder / target).is_file() else text
+
+    source[0] = re.sub(r"\[([^]]+)\]\((\.\./[^)#]+)\)", link, source[0])
+
+
+def setup(app: Sphinx) -> None:
+    """Formulas are MathML, which needs neither the internet nor a script."""
+    app.add_html_math_renderer("mathml", (_inline_mathml, None), (_display_mathml, None))
+    app.connect("source-read", _links_out_of_docs)

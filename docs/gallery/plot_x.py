@@ -1,0 +1,5 @@
+"""
+X
+=
+"""
+import stiffopt
