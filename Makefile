@@ -14,7 +14,7 @@ PICTURE := docs/images/two_segment_stiff_x.png
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test mutate lint types format picture bench clean
+.PHONY: help demo test schemas mutate lint types format picture bench clean
 
 help:  ## say what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -26,6 +26,9 @@ demo: $(VENV)/.installed-plot  ## solve a task and plot the arm
 
 test: $(VENV)/.installed-dev  ## run the tests (make test ARGS=--long for the long ones too)
 	$(BIN)/python -m pytest $(PARALLEL) $(ARGS)
+
+schemas: $(VENV)/.installed-dev  ## make the JSON Schemas anew from the models
+	$(BIN)/python -c "from stiffopt.json_schemas import write_schema_files as w; w()"
 
 mutate: $(VENV)/.installed-dev  ## try mutants of the safety package (make mutate ARGS=--short: some)
 	$(BIN)/python tests/mutation.py $(ARGS)

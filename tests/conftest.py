@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
@@ -48,6 +49,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(skip)
 
 
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector all that was imported: it would be looked through for ever."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
+
+
 def _is_sampled(item: pytest.Item) -> bool:
     """Say whether the ordinary form runs this case of a test that is marked `one_in(n, *names)`.
 
@@ -83,17 +91,22 @@ def _link_simulator(cache: Path) -> None:
         (cache / "simulator").symlink_to(kept)
 
 
-@pytest.fixture
-def compiled(code_cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Machine code instead of the CasADi VM; not optimised but in the long form, to save time."""
+def use_compiler(patch: pytest.MonkeyPatch, code_cache: Path) -> None:
+    """Use machine code, not optimised but in the long form; skip where there is no compiler."""
     found = next((name for name in ("cc", "gcc", "clang") if shutil.which(name)), None)
     if found is None:
         pytest.skip("there is no C compiler")
     if is_long():
-        monkeypatch.delenv("STIFFOPT_COMPILER")
+        patch.delenv("STIFFOPT_COMPILER", raising=False)
     else:
-        monkeypatch.setenv("STIFFOPT_COMPILER", f"{found} -O0")
-    monkeypatch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
+        patch.setenv("STIFFOPT_COMPILER", f"{found} -O0")
+    patch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
+
+
+@pytest.fixture
+def compiled(code_cache: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Machine code instead of the CasADi VM; not optimised but in the long form, to save time."""
+    use_compiler(monkeypatch, code_cache)
     return code_cache
 
 

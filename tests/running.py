@@ -29,7 +29,15 @@ stiffness: {{maximise: {{direction: [1, 0, 0]}}}}
 """
 ONE = TASK.format(robot="stiff-flop-1", position="[-20 mm, 5 mm, free]")
 TWO = TASK.format(robot="stiff-flop-2-hanging", position="[-20 mm, 10 mm, 186 mm]")
-_PATIENT = {"guard_timeout": "0.5 s", "max_overruns": 200, "heartbeat": "5 s"}
+_PATIENT = {
+    "command_timeout": "5 s",
+    "guard_timeout": "2 s",
+    "max_overruns": 200,
+    "heartbeat": "5 s",
+    "tracker_frames": 100,
+    "tracker_timeout": "5 s",
+    "pressure_error_time": "3 s",
+}
 
 
 def patient_rig(folder: Path, name: str = "sim", **blocks: Any) -> Path:
@@ -38,6 +46,8 @@ def patient_rig(folder: Path, name: str = "sim", **blocks: Any) -> Path:
     content["safety"] = {**content.get("safety", {}), **_PATIENT}
     content["service"] = {"port": 0, "foxglove_port": 0}
     content["log"] = {"folder": str(folder / "runs")}
+    if "plant" in content:  # without inertia, which takes most of the simulator's time
+        content["plant"] = {**content["plant"], "dynamics": "quasi-static"}
     for key, block in blocks.items():
         content[key] = {**(content.get(key) or {}), **block}
     path = folder / f"{name}-patient.yaml"
@@ -45,7 +55,7 @@ def patient_rig(folder: Path, name: str = "sim", **blocks: Any) -> Path:
     return path
 
 
-def wait_for(condition: Callable[[], Any], timeout: float = 20.0) -> Any:
+def wait_for(condition: Callable[[], Any], timeout: float = 60.0) -> Any:
     """Return what is so at last."""
     end = time.monotonic() + timeout
     while not (value := condition()):
@@ -83,7 +93,7 @@ class Process:
         """The JSON lines so far; each must be one."""
         return [json.loads(line) for line in tuple(self.out)]
 
-    def line(self, kind: str, timeout: float = 60.0, **fields: Any) -> dict[str, Any]:
+    def line(self, kind: str, timeout: float = 120.0, **fields: Any) -> dict[str, Any]:
         """Wait for a JSON line of a kind."""
 
         def found() -> dict[str, Any] | None:

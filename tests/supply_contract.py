@@ -100,13 +100,6 @@ def bad_commands(supply: PressureSupply) -> dict[str, Any]:
     }
 
 
-BAD = (
-    *("nan", "inf", "minus inf", "too high", "far too high", "too low", "too few", "too many"),
-    *("one number", "a matrix", "empty", "text", "quantities", "none", "ragged"),
-    *("expired", "of the future", "bad in a command"),
-)
-
-
 class SupplyContract:
     """The tests; the fixture `case` yields a `Case`."""
 
@@ -125,17 +118,17 @@ class SupplyContract:
         with case.supply:
             assert not case.told().any()
 
-    @pytest.mark.parametrize("what", BAD)
     @pytest.mark.parametrize("method", ["command", "exchange"])
-    def test_refuses(self, ready: Case, what: str, method: str) -> None:
+    def test_refuses(self, ready: Case, method: str) -> None:
         supply = ready.supply
-        supply.command(ready.some())
-        before, commanded = ready.told(), supply.commanded.copy()
-        assert before.any()
-        with pytest.raises(CommandError):
-            getattr(supply, method)(bad_commands(supply)[what])
-        np.testing.assert_array_equal(ready.told(), before)
-        np.testing.assert_array_equal(supply.commanded, commanded)
+        for what in bad_commands(supply):
+            supply.command(ready.some())
+            before, commanded = ready.told(), supply.commanded.copy()
+            assert before.any()
+            with pytest.raises(CommandError):
+                pytest.fail(f"{what}: {getattr(supply, method)(bad_commands(supply)[what])}")
+            np.testing.assert_array_equal(ready.told(), before, err_msg=what)
+            np.testing.assert_array_equal(supply.commanded, commanded, err_msg=what)
 
     @pytest.mark.parametrize("method", ["command", "exchange"])
     def test_carries_out(self, ready: Case, method: str) -> None:

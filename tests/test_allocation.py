@@ -79,6 +79,7 @@ class Case:
         )
 
 
+@pytest.mark.one_in(2)
 @SOLVER
 @pytest.mark.parametrize("kind", ["full", "tall", "none", "zero", "rank 1", "huge", "tiny"])
 @pytest.mark.parametrize("n", [1, 3, 6, 9])

@@ -143,6 +143,7 @@ def somewhere(problem: CalibrationProblem, seed: int = 5) -> Array:
     return np.asarray(np.clip(x, problem.low + 0.02, problem.high - 0.02))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", CASES)
 def test_slopes_are_the_derivatives(name: str) -> None:
     problem = problem_of(CASES[name])

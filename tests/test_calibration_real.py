@@ -35,7 +35,7 @@ def ucl_log(name: str) -> Log:
 
 @cache
 def ucl_result(structure: str) -> CalibrationResult:
-    told = CalibrationSettings(structure=structure, rows=600, trial_rows=200, strain_law="keep")
+    told = CalibrationSettings(structure=structure, rows=600, trial_rows=100, strain_law="keep")
     if structure == "auto":
         told = CalibrationSettings()
     robot = load_description("ucl-stiff-flop")
@@ -100,7 +100,7 @@ def test_beyond_what_was_recorded_predictions_stay_physical(structure: str) -> N
 def asu_result(short: bool) -> CalibrationResult:
     told = CalibrationSettings(structure="channel-hysteresis", sequence=True, strain_law="keep")
     if short:
-        told = told.model_copy(update={"rows": 200, "trial_rows": 100})
+        told = told.model_copy(update={"rows": 100, "trial_rows": 50})
     logs = [(path.name, read_log(path)) for path in ASU]
     return calibrate(load_description("asu-two-segment"), logs, settings=told)
 

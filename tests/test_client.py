@@ -95,7 +95,7 @@ def test_connections_that_idle_or_dribble_keep_nobody_away_and_use_up_nothing(
             late.vent()
         ends_of_ours = 3 * MAX_CONNECTIONS + 2
         eventually(lambda: open_files() - before <= ends_of_ours + 2 * MAX_CONNECTIONS + 2)
-        assert loop.names[-1] == "vent"
+        assert "vent" in loop.names
         other.sendall(b"       }")
         last = other.recv(100)
         assert last.startswith(b"HTTP/1.1 200")  # the newest were not dropped

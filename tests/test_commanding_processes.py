@@ -274,7 +274,16 @@ _NAMES = ("SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGALRM", "SIGABRT", "SIGX
 _SIGNALS = {name: getattr(signal, name) for name in _NAMES} | {"SIGRTMIN+3": signal.SIGRTMIN + 3}
 
 
-@pytest.mark.parametrize("name", [*_SIGNALS, "SIGKILL", "SIGSEGV"])
+_MANY = [name for name in _SIGNALS if name not in ("SIGTERM", "SIGHUP", "SIGRTMIN+3")]
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("SIGTERM", "SIGHUP", "SIGRTMIN+3", "SIGKILL", "SIGSEGV"),
+        *(pytest.param(name, marks=pytest.mark.long) for name in _MANY),
+    ],
+)
 def test_a_lost_guard_leaves_nothing_under_pressure(wire: Wire, name: str) -> None:
     """The supply has neither watchdog nor valve: the guard vents, or else its client does."""
     with wire.rig() as rig:

@@ -7,7 +7,6 @@ import fcntl
 import logging
 import os
 import re
-import shutil
 import signal
 import socket
 import stat
@@ -25,6 +24,7 @@ from typing import Any
 
 import pytest
 
+from conftest import use_compiler
 from examples import blocks
 from fake_loop import FakeLoop, ManualClock
 from running import ONE, TWO, patient_rig, wait_for
@@ -48,11 +48,8 @@ def daemon(
     tmp_path_factory: pytest.TempPathFactory, code_cache: Path
 ) -> Iterator[tuple[Daemon, Client]]:
     """A running daemon of a simulated arm without inertia, and a client that has control."""
-    if not any(shutil.which(name) for name in ("cc", "gcc", "clang")):
-        pytest.skip("there is no C compiler")
     with pytest.MonkeyPatch.context() as patch:
-        patch.delenv("STIFFOPT_COMPILER", raising=False)
-        patch.setenv("STIFFOPT_CACHE_DIR", str(code_cache))
+        use_compiler(patch, code_cache)
         folder = tmp_path_factory.mktemp("daemon")
         rig = patient_rig(folder, plant={"dynamics": "quasi-static"})
         with Daemon(rig) as made:
@@ -219,7 +216,9 @@ def test_it_is_started_once(daemon: tuple[Daemon, Client]) -> None:
         daemon[0].start()
 
 
-def test_a_rig_that_does_not_answer_is_told_and_nothing_stays(tmp_path: Path) -> None:
+def test_a_rig_that_does_not_answer_is_told_and_nothing_stays(
+    tmp_path: Path, compiled: Path
+) -> None:
     """Nobody listens where the Modbus coupler should be."""
     rig = patient_rig(
         tmp_path,
@@ -637,7 +636,7 @@ class Standstill:
 
 
 @pytest.fixture
-def idle(tmp_path: Path) -> Iterator[Daemon]:
+def idle(tmp_path: Path, compiled: Path) -> Iterator[Daemon]:
     """A daemon that is not started, of devices that are not there."""
     made = Daemon(patient_rig(tmp_path, "modbus-aurora", safety={"ramp_time": "0.1 s"}))
     end_planner = made._controller.close
@@ -775,7 +774,7 @@ def _warnings(made: Daemon) -> dict[str, str]:
 
 
 def test_a_daemon_that_others_can_reach_warns_or_does_not_start(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiled: Path
 ) -> None:
     made = _starting(tmp_path, monkeypatch, "x", {"host": "0.0.0.0"})
     assert "too few for the host 0.0.0.0" in made.error  # type: ignore[attr-defined]

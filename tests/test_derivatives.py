@@ -51,6 +51,7 @@ def test_second_derivative_of_the_pose(arm, where):
         assert H[half] == pytest.approx(expected[half], abs=1e-5 * np.abs(expected[half]).max())
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.one_in(3, "arm", "where", "kind")
 @pytest.mark.parametrize("where", ["in general", "equal pressures"])
 @pytest.mark.parametrize("arm", list(robots()))

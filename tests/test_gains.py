@@ -74,6 +74,7 @@ def test_damping_increases(omega):
     assert with_ > 3 * without
 
 
+@pytest.mark.one_in(3)
 @pytest.mark.parametrize(("period", "dead_steps"), [(0.01, 1), (0.002, 5)])
 @pytest.mark.parametrize("omega", HANGING)
 @pytest.mark.parametrize("off", [0.8, 1.0, 1.2])

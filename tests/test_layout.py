@@ -130,6 +130,7 @@ def cached(folder):
     return sorted(path.name for path in Path(folder).glob("*.so"))
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", ["stiff-flop-2", "stiff-flop-2-hanging"])
 def test_one_library_serves_all_arms_of_a_layout(compiled, tmp_path, monkeypatch, name):
     """Its answers are those of the general method; nothing is compiled for the second arm."""

@@ -186,7 +186,7 @@ def test_what_cannot_be_reached_is_left_to_the_general_method():
     assert solution.position_error > 0.1
 
 
-def test_a_load_that_buckles_the_arm_is_said():
+def test_a_load_that_buckles_the_arm_is_said(compiled):
     model = so.load_robot("stiff-flop-1")
     load = so.Load(force=(0.0, 0.0, -6.0))
     target = so.Target(position=(0.0, 0.0, 0.09))

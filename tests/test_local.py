@@ -143,6 +143,7 @@ def test_search_for_what_cannot_be_reached_says_where_it_ended(without_compiler)
     assert len(found.nearest) == len(x)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["position", "pose-5", "guided", "several", "limited", "floor"])
 def test_agrees_with_compiled_code(kind, compiled, monkeypatch):
     """Next to an answer of compiled code the other implementation finds the same optimum."""

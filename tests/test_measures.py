@@ -105,6 +105,7 @@ def test_survives_its_file(kind, tmp_path):
     assert so.load_task(path).stiffness == goal
 
 
+@pytest.mark.one_in(2)
 @each
 @pytest.mark.parametrize("name", ["stiff-flop-2", "stiff-flop-2-hanging"])
 def test_gradients_are_those_of_finite_differences(kind, name):

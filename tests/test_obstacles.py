@@ -429,6 +429,7 @@ def mesh_of_a_ball(folder: Path, centre: tuple[float, float, float]) -> dict[str
     return {"file": folder / "ball.stl", "scale": 1.0, "centre": centre, "resolution": 0.002}
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("kind", ["sphere", "box", "half_space", "inside_tube", "mesh"])
 def test_derivatives_of_an_answer_that_an_object_holds_back(
     kind: str, compiled: Path, tmp_path: Path

@@ -370,6 +370,7 @@ def test_stretching_in_time():
 
 
 @pytest.mark.one_in(2)
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("damping", [0.02, 0.1])
 @pytest.mark.parametrize("step", [1e-3, 5e-4])
 def test_free_decay(damping, step):
@@ -383,6 +384,7 @@ def test_free_decay(damping, step):
     assert decrement / np.hypot(2 * np.pi, decrement) == pytest.approx(damping, rel=0.01)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.one_in(2)
 @pytest.mark.parametrize("step", [2e-3, 1e-3])
 @pytest.mark.parametrize("size", [0.01, 1.0])
@@ -414,6 +416,7 @@ def disbalance(silicone: Silicone, step: float, arm: Arm) -> tuple[float, float]
 BALANCED = Arm((CONSTANT, CONSTANT)).under(DOWN, 0.02)
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("law", ["linear", "yeoh"])
 def test_energy_balance_improves_with_the_square_of_the_step(law):
     rubber = material(law=law, damping=0.1, creep=(SiliconeCreep(share=0.1, time=0.5),))

@@ -325,7 +325,7 @@ def calibrated(robot: str, found: float = 0.8) -> so.Manipulator:
     ("robot", "dynamics", "is_calibrated"),
     [
         (ONE, "full", False),
-        (ONE, "full", True),
+        pytest.param(ONE, "full", True, marks=pytest.mark.long),
         pytest.param(HANGING, "full", False, marks=pytest.mark.long),
         (HANGING, "full", True),
     ],

@@ -67,6 +67,7 @@ def test_ball_jacobians(name):
         assert ball.jacobian == pytest.approx(expected, abs=1e-6 * np.abs(expected).max())
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("robot", ["stiff-flop-2", "stiff-flop-2-hanging"])
 @pytest.mark.parametrize("name", GOALS)
 def test_gradients_of_terms_and_floors(name, robot):

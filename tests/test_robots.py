@@ -18,6 +18,7 @@ from stiffopt.model.robot_files import builtin_robots
 PSI = 6894.757  # Pa
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("name", builtin_robots())
 def test_solve_pressure_finds_back_where_pressures_have_the_tip(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

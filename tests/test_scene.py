@@ -299,6 +299,7 @@ def by_brute_force(item: MeasuredObject, positions: np.ndarray, radii: np.ndarra
     return float((found.values[worst] if inside else -found.values[worst]) - radii[worst])
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize("key", sorted(OBSTACLES))
 def test_the_minimum_along_a_body_is_that_of_very_many_stations(key, organ):
     rng = np.random.default_rng(7)

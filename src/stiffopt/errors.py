@@ -6,6 +6,8 @@ import os
 from collections.abc import Sequence
 from importlib.util import find_spec
 
+MAX_MISTAKES = 10
+"""How many mistakes of a file one message tells."""
 Loc = tuple[str | int, ...]
 """The place of a value in nested data: keys, and indices of items counted from 0."""
 
@@ -34,6 +36,8 @@ class FileError(InputError):
         Line number, counted from 1, if one line is to blame.
     key :
         Dotted key such as ``target.position[0]``, if one key is to blame.
+    others :
+        The file's further mistakes.
     """
 
     def __init__(
@@ -43,24 +47,40 @@ class FileError(InputError):
         *,
         line: int | None = None,
         key: str | None = None,
+        others: Sequence[FileError] = (),
     ) -> None:
         super().__init__(path, reason, line, key)
         self.path = os.fspath(path)
-        self.reason = reason
         self.line = line
         self.key = key
+        self.others = tuple(others)
+        self.own_reason = reason
+        for other in self.others[: MAX_MISTAKES - 1]:
+            reason += f"; also line {other.line or 0}: {other.key or ''}: {other.own_reason}"
+        more = len(self.others) + 1 - MAX_MISTAKES
+        self.reason = f"{reason}; and {more} more" if more > 0 else reason
 
     def __str__(self) -> str:
+        return self._placed(self.reason)
+
+    @property
+    def alone(self) -> str:
+        """The text without the file's other mistakes."""
+        return self._placed(self.own_reason)
+
+    def _placed(self, reason: str) -> str:
         where = self.path if self.line is None else f"{self.path}:{self.line}"
-        return f"{where}: {self.key}: {self.reason}" if self.key else f"{where}: {self.reason}"
+        return f"{where}: {self.key}: {reason}" if self.key else f"{where}: {reason}"
 
     def __reduce__(self) -> tuple[object, ...]:
         """Support pickling, so that the error crosses process boundaries whole."""
-        return _rebuild_file_error, (self.path, self.reason, self.line, self.key)
+        return _rebuild_file_error, (self.path, self.own_reason, self.line, self.key, self.others)
 
 
-def _rebuild_file_error(path: str, reason: str, line: int | None, key: str | None) -> FileError:
-    return FileError(path, reason, line=line, key=key)
+def _rebuild_file_error(
+    path: str, reason: str, line: int | None, key: str | None, others: Sequence[FileError]
+) -> FileError:
+    return FileError(path, reason, line=line, key=key, others=others)
 
 
 class PressureError(InputError):

@@ -22,7 +22,6 @@ from stiffopt.errors import FileError, Loc, dotted, shown
 from stiffopt.schema import Schema, explain
 from stiffopt.units import FROM_FILE, read_from_file
 
-MAX_MISTAKES = 10  # told at once
 VERSIONS = {"robot": 1, "task": 1, "rig": 1}
 """The version of each kind of file that is read; a kind not listed is at version 1."""
 
@@ -97,15 +96,20 @@ def file_text(kind: str, schema: Schema) -> str:
     return to_yaml(_as_file(kind, schema))
 
 
+def format_of(kind: str) -> str:
+    """Return what a file of a kind says under the key ``format``."""
+    return f"stiffopt-{kind}/{VERSIONS.get(kind, 1)}"
+
+
 def _as_file(kind: str, schema: Schema) -> dict[str, Any]:
     data = _without_empty_lists(schema.model_dump(mode="json", exclude_none=True, by_alias=True))
-    return {"format": f"stiffopt-{kind}/{VERSIONS.get(kind, 1)}", **data}
+    return {"format": format_of(kind), **data}
 
 
 def _check_format(document: Document, kind: str) -> None:
     """Refuse a file that does not say it is of this kind and of the version that is read."""
     version = VERSIONS.get(kind, 1)
-    wanted = f"stiffopt-{kind}/{version}"
+    wanted = format_of(kind)
     if "format" not in document.data:
         near = difflib.get_close_matches("format", document.data, n=1)
         hint = f" (is '{near[0]}' meant to be that?)" if near else ""
@@ -142,11 +146,8 @@ def _file_error(document: Document, model: type[BaseModel], error: ValidationErr
         found.append((line, dotted(loc), reason))
     found.sort(key=lambda mistake: mistake[0])
     line, key, reason = found[0]
-    for other_line, other_key, other in found[1:MAX_MISTAKES]:
-        reason += f"; also line {other_line}: {other_key}: {other}"
-    if len(found) > MAX_MISTAKES:
-        reason += f"; and {len(found) - MAX_MISTAKES} more"
-    return FileError(document.path, reason, line=line or None, key=key or None)
+    others = [FileError(document.path, r, line=n or None, key=k or None) for n, k, r in found[1:]]
+    return FileError(document.path, reason, line=line or None, key=key or None, others=others)
 
 
 def _without_empty_lists(value: Any) -> Any:

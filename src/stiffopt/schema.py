@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar, get_args
 
 import numpy as np
@@ -15,7 +16,16 @@ from pydantic_core import ErrorDetails
 
 from stiffopt.errors import InputError, Loc, dotted, shown
 
-__all__ = ["BadKeyError", "Items", "Pair", "Schema", "Vector", "explain", "items_of"]
+__all__ = [
+    "BadKeyError",
+    "Items",
+    "JsonSchemaOfFile",
+    "Pair",
+    "Schema",
+    "Vector",
+    "explain",
+    "items_of",
+]
 
 ItemT = TypeVar("ItemT")
 
@@ -45,6 +55,22 @@ class Schema(BaseModel):
 
     # pydantic then keeps building nested models itself, so that errors know where they are.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True)
+class JsonSchemaOfFile:
+    """Part of a type whose values are written in a file in other ways than the type tells.
+
+    Parameters
+    ----------
+    change :
+        Makes of the JSON Schema of the type that of what stands in the file.
+    """
+
+    change: Callable[[dict[str, Any]], dict[str, Any]]
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return self.change(handler(schema))
 
 
 def _as_tuple(value: Any) -> Any:

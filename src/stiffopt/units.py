@@ -49,6 +49,7 @@ __all__ = [
     "format_quantity",
     "get_ready",
     "parse_quantity",
+    "quantity_schema",
     "read_from_file",
     "unit_suffix",
     "within",
@@ -58,6 +59,7 @@ FROM_FILE = {"from_file": True}
 """The pydantic validation context of data that come from a file: quantities must have units."""
 
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
+_QUANTITY = r"^ *[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]{1,4})? *[A-Za-zµμ°%(].*$"
 _UNIT = re.compile(r"(?=[A-Za-zµμ°%(])(?:[A-Za-zµμ°%²³·*/^() ]|-?[0-9](?![0-9]))+")
 _TOKEN = re.compile(
     r"""\ *(?:
@@ -83,6 +85,10 @@ class QuantityKind:
     what: str
     example: str
     written: str
+
+    def __get_pydantic_json_schema__(self, *_: Any) -> dict[str, Any]:
+        """Return the JSON Schema of such a quantity in a file."""
+        return quantity_schema(self.what, self.example)
 
 
 _LENGTH = QuantityKind("m", "length", "90 mm", "mm")
@@ -206,6 +212,16 @@ def format_quantity(value: float, unit: str, written: str | None = None) -> str:
                 return text
     number = f"{value:.15g}"
     return f"{number if float(number) == value else repr(float(value))} {unit}".rstrip()
+
+
+def quantity_schema(what: str, *examples: str) -> dict[str, Any]:
+    """Return the JSON Schema of a quantity in a file."""
+    return {
+        "type": "string",
+        "pattern": _QUANTITY,
+        "description": f"{what} with its unit, such as {' or '.join(examples)}",
+        "examples": list(examples),
+    }
 
 
 def unit_suffix(unit: str) -> str:
@@ -341,7 +357,7 @@ _FINITE = Field(allow_inf_nan=False)
 
 Number = Annotated[float, BeforeValidator(finite_number), _FINITE]
 """A finite number that has no unit."""
-Ratio = Annotated[float, BeforeValidator(_ratio), _FINITE]
+Ratio = Annotated[float, BeforeValidator(_ratio, json_schema_input_type=float | str), _FINITE]
 """A finite number that has no unit and may be written in per cent."""
 Length = Annotated[float, _LENGTH, _reader(_LENGTH), _writer(_LENGTH), _FINITE]
 """In m."""

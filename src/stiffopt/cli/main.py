@@ -15,9 +15,11 @@ from stiffopt.cli.calibrate import (
     calibrate,
     validate,
 )
+from stiffopt.cli.check import CHECK_EPILOG, CHECK_HELP, check
 from stiffopt.cli.console import Closed, report_error
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
 from stiffopt.cli.experiment import experiment_app
+from stiffopt.cli.init import init_app
 from stiffopt.cli.lab import LAB_EPILOG, LAB_HELP, lab
 from stiffopt.cli.log import log_app
 from stiffopt.cli.map import map_app
@@ -31,19 +33,63 @@ from stiffopt.cli.vent import VENT_EPILOG, VENT_HELP, vent
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 
-app = command_group(context_settings=_SETTINGS)
-app.command("solve", help=HELP, epilog=EXAMPLES.format(command="stiffopt solve"))(solve)
-app.command("path", help=PATH_HELP, epilog=PATH_EPILOG)(path)
-app.command("plan", help=PLAN_HELP, epilog=PLAN_EPILOG)(plan)
+app = command_group(context_settings=_SETTINGS, add_completion=True)
+app.command(
+    "solve",
+    short_help="Find the stiffest chamber pressures for tasks.",
+    help=HELP,
+    epilog=EXAMPLES.format(command="stiffopt solve"),
+)(solve)
+app.command(
+    "path",
+    short_help="Find pressures with which the tip follows a path.",
+    help=PATH_HELP,
+    epilog=PATH_EPILOG,
+)(path)
+app.command(
+    "plan",
+    short_help="Find a motion that keeps the body clear of a scene.",
+    help=PLAN_HELP,
+    epilog=PLAN_EPILOG,
+)(plan)
+app.add_typer(init_app, name="init")
+app.command(
+    "check",
+    short_help="Check files: all their mistakes at once.",
+    help=CHECK_HELP,
+    epilog=CHECK_EPILOG,
+)(check)
 app.command("robots")(robots)
-app.command("run", help=RUN_HELP, epilog=RUN_EPILOG)(run)
-app.command("vent", help=VENT_HELP, epilog=VENT_EPILOG)(vent)
+app.command(
+    "run",
+    short_help="Hold an arm at its task: run the daemon of a rig.",
+    help=RUN_HELP,
+    epilog=RUN_EPILOG,
+)(run)
+app.command(
+    "vent", short_help="Let all pressure out of an arm at once.", help=VENT_HELP, epilog=VENT_EPILOG
+)(vent)
 app.add_typer(map_app, name="map")
 app.add_typer(experiment_app, name="experiment")
 app.add_typer(log_app, name="log")
-app.command("calibrate", help=CALIBRATE_HELP, epilog=CALIBRATE_EPILOG)(calibrate)
-app.command("validate", help=VALIDATE_HELP, epilog=VALIDATE_EPILOG)(validate)
-app.command("lab", help=LAB_HELP, epilog=LAB_EPILOG)(lab)
+app.command(
+    "calibrate",
+    short_help="Fit a robot file to recordings of the arm.",
+    help=CALIBRATE_HELP,
+    epilog=CALIBRATE_EPILOG,
+)(calibrate)
+app.command(
+    "validate",
+    short_help="Say how well a robot file predicts recordings.",
+    help=VALIDATE_HELP,
+    epilog=VALIDATE_EPILOG,
+)(validate)
+app.command(
+    "lab",
+    short_help="Start a simulated arm behind real protocols.",
+    help=LAB_HELP,
+    epilog=LAB_EPILOG,
+)(lab)
 
 solve_pressure_app = command_group(context_settings=_SETTINGS)
 solve_pressure_app.command(

@@ -10,9 +10,8 @@ def command_group(**settings: Any) -> typer.Typer:
 
     Its help has no rich markup: a path may hold brackets, and help is read in pipes too.
     """
-    return typer.Typer(
-        add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None, **settings
-    )
+    always = {"pretty_exceptions_enable": False, "rich_markup_mode": None}
+    return typer.Typer(**{"add_completion": False, **always, **settings})
 
 
 def print_version(wanted: bool) -> None:

@@ -430,16 +430,15 @@ class ClientStream:
         url = "ws" + self._client.url.removeprefix("http") + f"/v1/stream?rate={self._rate:g}"
         self._lease = self._client._lease
         try:
-            self._socket = self._open.enter_context(
-                connect(
-                    url,
-                    additional_headers=self._client._headers,
-                    compression=None,
-                    proxy=None,  # it would see the token
-                    open_timeout=5,
-                    close_timeout=2,
-                )
+            self._socket = connect(
+                url,
+                additional_headers=self._client._headers,
+                compression=None,
+                proxy=None,  # it would see the token
+                open_timeout=5,
+                close_timeout=2,
             )
+            self._open.enter_context(self._socket)
         except (OSError, WebSocketException) as error:
             raise ServiceError(f"no stream from {self._client.url}: {error}") from None
         threading.Thread(

@@ -6,6 +6,7 @@ with derivatives by lag, dead time, shares and the state in which the log begins
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import casadi as ca
@@ -13,15 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.identify.settings import FIT
-from stiffopt.model.batch import CompiledFunction
+from stiffopt.model.batch import CompiledFunction, InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import compiling_at_once, library
 from stiffopt.model.history import NO_HISTORY, History
 
 Array = NDArray[np.float64]
 
-_CHUNKS = (1, 32, 128, 512, 2048)  # rows that may be run at once; fewer are filled up
-_WORTH_COMPILING = 50  # runs of the longest kind; compiling takes a second
+_CHUNKS = (1, 8, 32, 128, 512, 2048)  # rows that may be run at once; fewer are filled up
+_MOST_FILLED = 0.25  # share of a chunk; rather than more, a smaller one is run
+_WORTH_FILLING = 128  # rows; machine code is quicker with them, though it always runs the most
+_WORTH_COMPILING = 100_000  # rows; compiling takes a second
 _CARRIED = 5  # values and four derivatives
 
 
@@ -121,14 +124,13 @@ class Past:
         run, lags = self._run(history), (history.lag, history.lag_falling)
         state = _carried(start)
         kept = np.empty((len(wanted), *state.shape))
-        for begin in range(0, len(time), _CHUNKS[-1]):
-            block = slice(begin, min(begin + _CHUNKS[-1], len(time)))
+        for block in run.blocks(len(time)):
             found = run(
                 state, before[block], delayed[block], changes[0][block], changes[1][block],
                 steps[block], lags,
             )  # fmt: skip
             inside = (wanted >= block.start) & (wanted < block.stop)
-            kept[inside] = found[wanted[inside] - begin]
+            kept[inside] = found[wanted[inside] - block.start]
             state = found[-1]
         shares = np.array([part.share for part in history.parts])
         memory = np.array([history.memory_of(channel) for channel in range(self._channels)])
@@ -197,11 +199,28 @@ class _HistoryRun:
     def __init__(self, history: History, channels: int, lags: bool, falls: bool) -> None:
         self._shape = (history.n_states, _CARRIED * channels)
         self._step = _steps(history, channels, lags, falls)
-        self._functions = {rows: self._step.mapaccum("run", rows) for rows in _CHUNKS}
+        self._interpreted: dict[int, InterpretedFunction] = {}
         operators = [part.model_dump(exclude={"share"}) for part in history.parts]
         self._content = ("past", operators, channels, lags, falls, _CHUNKS[-1])
         self._compiled: CompiledFunction | None = None
-        self._runs = 0  # of the longest kind
+        self._interpreted_rows = 0
+
+    def blocks(self, count: int) -> Iterator[slice]:
+        """Blocks of the rows of a log, each to be run at once."""
+        begin = 0
+        while begin < count:
+            end = min(begin + self._at_once(count - begin), count)
+            yield slice(begin, end)
+            begin = end
+
+    def _at_once(self, count: int) -> int:
+        """How many of the rows that are left to run at once, or more to run them all."""
+        if self._compiled is not None and count >= _WORTH_FILLING:
+            return _CHUNKS[-1]
+        enough = next((rows for rows in _CHUNKS if rows >= count), _CHUNKS[-1])
+        if count >= (1 - _MOST_FILLED) * enough:
+            return enough
+        return next(rows for rows in reversed(_CHUNKS) if rows <= count)
 
     def __call__(
         self,
@@ -215,35 +234,47 @@ class _HistoryRun:
     ) -> Array:
         """States (N, m, 5 c) after each of N steps; the pressures and their changes are (N, c)."""
         count = len(steps)
-        size = next(rows for rows in _CHUNKS if rows >= count)
-        fill = size - count
-
-        def columns(values: Array) -> Array:
-            return np.pad(values.reshape(count, -1), ((0, fill), (0, 0)), mode="edge").T
-
+        size = self._at_once(count)
+        given = np.broadcast_to(np.array(lags), (count, 2))
         arguments = (
             state,
-            *(columns(each) for each in (before, now, before_change, now_change, steps)),
-            np.tile(np.array(lags)[:, np.newaxis], size),
+            *(
+                _columns(each, size)
+                for each in (before, now, before_change, now_change, steps, given)
+            ),
         )
         rows, width = self._shape
-        fast = self._fast() if size == _CHUNKS[-1] else None
-        found = fast(*arguments)[0] if fast else self._functions[size](*arguments).full()
-        states = np.asarray(found).reshape(rows, size, width)
-        return np.asarray(np.swapaxes(states[:, :count], 0, 1))
+        found = self._function(size)(*arguments)[0].reshape(rows, size, width)
+        return np.asarray(np.swapaxes(found[:, :count], 0, 1))
 
-    def _fast(self) -> CompiledFunction | None:
-        """The longest run in machine code, once it pays to compile it."""
-        self._runs += 1
-        if self._runs == _WORTH_COMPILING:
+    def _function(self, rows: int) -> CompiledFunction | InterpretedFunction:
+        """A run of so many rows; the longest in machine code, once it pays to compile it."""
+        if rows == _CHUNKS[-1] and self._compiled is not None:
+            return self._compiled
+        before = self._interpreted_rows
+        self._interpreted_rows += rows
+        if before < _WORTH_COMPILING <= self._interpreted_rows:
+            self._compile()
+        if rows not in self._interpreted:
+            self._interpreted[rows] = InterpretedFunction(dense(self._step.mapaccum("run", rows)))
+        return self._interpreted[rows]
 
-            def make() -> list[ca.Function]:
-                return [dense(self._step.mapaccum("past_run", _CHUNKS[-1]))]
+    def _compile(self) -> None:
+        def make() -> list[ca.Function]:
+            return [dense(self._step.mapaccum("past_run", _CHUNKS[-1]))]
 
-            with compiling_at_once():
-                code = library(self._content, make)
-            self._compiled = code.function("past_run") if code else None
-        return self._compiled
+        with compiling_at_once():
+            code = library(self._content, make)
+        self._compiled = code.function("past_run") if code else None
+
+
+def _columns(values: Array, count: int) -> Array:
+    """Rows (N, c) or (N,) as columns (c, count), the last one again and again to fill them up."""
+    rows = values.reshape(len(values), -1)
+    filled = np.empty((count, rows.shape[1]))
+    filled[: len(rows)] = rows
+    filled[len(rows) :] = rows[-1]
+    return filled[0] if count == 1 else filled.T
 
 
 def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Function:

@@ -12,6 +12,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -122,7 +123,7 @@ class Parameter:
 
     key: str
 
-    @property
+    @cached_property
     def _path(self) -> _Path:
         steps: list[str | int] = []
         place = 0

@@ -207,5 +207,5 @@ def _from_file(value: Any, info: ValidationInfo) -> Any:
     return value
 
 
-SceneOrFile = Annotated[Scene, BeforeValidator(_from_file)]
+SceneOrFile = Annotated[Scene, BeforeValidator(_from_file, json_schema_input_type=Scene | str)]
 """A scene, or the path of a scene file: in a file relative to its folder."""

@@ -17,7 +17,7 @@ from stiffopt.optimise.measure import Measure, Role
 from stiffopt.optimise.measures import measures_of
 from stiffopt.optimise.measures.directional import AtLeast, MatchValue, StiffnessMeasure
 from stiffopt.optimise.measures.matrix import MatchMatrix
-from stiffopt.schema import BadKeyError, Items, Schema
+from stiffopt.schema import BadKeyError, Items, JsonSchemaOfFile, Schema
 from stiffopt.units import read_from_file
 
 __all__ = ["AtLeast", "MatchMatrix", "MatchValue", "StiffnessGoal", "StiffnessMeasure"]
@@ -57,7 +57,11 @@ if TYPE_CHECKING:
     _Match: TypeAlias = MatchValue | MatchMatrix
 else:
     _Maximised, _Floor, _Match = map(_either, ("maximise", "at_least", "match"))
-OneOrMore = Annotated[Items[MeasureT], BeforeValidator(_as_items)]
+OneOrMore = Annotated[
+    Items[MeasureT],
+    BeforeValidator(_as_items),
+    JsonSchemaOfFile(lambda listed: {"anyOf": [listed["items"], listed]}),
+]
 """A list; in a file one mapping stands for a list of one."""
 
 

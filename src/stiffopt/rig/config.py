@@ -22,7 +22,7 @@ from stiffopt.rig.device import DeviceSettings, MisfitError, RigSection
 from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.pressure import SupplySettings
 from stiffopt.rig.probing import ProbeSettings
-from stiffopt.rig.registry import driver_class, driver_names, load, one_of
+from stiffopt.rig.registry import built_in_drivers, driver_class, driver_names, load, one_of
 from stiffopt.rig.settings import ControlSettings, LogSettings, Safety, ServiceSettings
 from stiffopt.rig.tracking import TrackerSettings
 from stiffopt.schema import BadKeyError, Schema, explain
@@ -62,6 +62,25 @@ def _reader(class_of: Callable[[dict[str, Any]], type[Schema]]) -> BeforeValidat
     return BeforeValidator(read)
 
 
+class _DeviceJsonSchema:
+    """The JSON Schema of a device: that of a driver of stiffopt, or of a driver from elsewhere."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+
+    def __get_pydantic_json_schema__(self, _: Any, handler: Any) -> dict[str, Any]:
+        names = built_in_drivers(self.kind)
+        schemas = (
+            handler(driver_class(self.kind, name).__pydantic_core_schema__) for name in names
+        )
+        own = [
+            {"allOf": [schema, {"properties": {"driver": {"const": name}}}]}
+            for name, schema in zip(names, schemas, strict=True)
+        ]
+        other = {"driver": {"type": "string", "not": {"enum": list(names)}}}
+        return {"anyOf": [*own, {"type": "object", "properties": other, "required": ["driver"]}]}
+
+
 def _device(kind: str) -> BeforeValidator:
     """Return the validator of a device, whose class is that of its driver."""
 
@@ -75,6 +94,16 @@ def _device(kind: str) -> BeforeValidator:
             raise BadKeyError("driver", str(error)) from None
 
     return _reader(class_of)
+
+
+class _SectionJsonSchema:
+    """The JSON Schema of a part whose class is that of another package."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __get_pydantic_json_schema__(self, _: Any, handler: Any) -> Any:
+        return handler(load(_SECTIONS[self.name]).__pydantic_core_schema__)
 
 
 def _section(name: str) -> BeforeValidator:
@@ -104,16 +133,26 @@ class RigDescription(Schema):
     name: Annotated[str, Field(min_length=1)] = "rig"
     robot: Annotated[str, Field(min_length=1)]
     rate: Annotated[Frequency, Field(gt=0, le=1000)] = 100.0
-    supply: Annotated[SerializeAsAny[SupplySettings], _device("supply")]
-    tracker: Annotated[SerializeAsAny[TrackerSettings] | None, _device("tracker")] = None
-    probe: Annotated[SerializeAsAny[ProbeSettings] | None, _device("probe")] = None
+    supply: Annotated[
+        SerializeAsAny[SupplySettings], _device("supply"), _DeviceJsonSchema("supply")
+    ]
+    tracker: Annotated[
+        SerializeAsAny[TrackerSettings] | None, _device("tracker"), _DeviceJsonSchema("tracker")
+    ] = None
+    probe: Annotated[
+        SerializeAsAny[ProbeSettings] | None, _device("probe"), _DeviceJsonSchema("probe")
+    ] = None
     safety: Safety = Safety()
     control: ControlSettings = ControlSettings()
     service: ServiceSettings = ServiceSettings()
     log: LogSettings = LogSettings()
     scene: SceneOrFile | None = None
-    plant: Annotated[SerializeAsAny[RigSection] | None, _section("plant")] = None
-    lab: Annotated[SerializeAsAny[RigSection] | None, _section("lab")] = None
+    plant: Annotated[
+        SerializeAsAny[RigSection] | None, _section("plant"), _SectionJsonSchema("plant")
+    ] = None
+    lab: Annotated[
+        SerializeAsAny[RigSection] | None, _section("lab"), _SectionJsonSchema("lab")
+    ] = None
 
 
 def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:

@@ -49,6 +49,11 @@ _BUILT_IN = {
 }
 
 
+def built_in_drivers(kind: str) -> tuple[str, ...]:
+    """Return the names of the drivers of a kind of device that come with stiffopt."""
+    return tuple(_BUILT_IN[kind])
+
+
 def driver_names(kind: str) -> tuple[str, ...]:
     """Return the names of all drivers of a kind of device, those of stiffopt first."""
     announced = {entry.name for entry, _ in _announced(kind)}

@@ -17,7 +17,9 @@ def _none(value: Any) -> Any:
 
 
 _Port = Annotated[int, Field(ge=0, le=65535, strict=True)]
-_PortOrNone = Annotated[_Port | None, BeforeValidator(_none)]
+_PortOrNone = Annotated[
+    _Port | None, BeforeValidator(_none, json_schema_input_type=_Port | Literal["none"])
+]
 
 
 class Safety(Schema):

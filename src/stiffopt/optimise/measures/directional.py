@@ -13,7 +13,15 @@ from stiffopt.directions import Direction, Frame
 from stiffopt.model.compliance import held_stiffness
 from stiffopt.model.shape import FreeShape, stiffness_along
 from stiffopt.optimise.measure import Measure, Role, Vector
-from stiffopt.units import Ratio, finite_number, format_quantity, parse_quantity, read_from_file
+from stiffopt.schema import JsonSchemaOfFile
+from stiffopt.units import (
+    Ratio,
+    finite_number,
+    format_quantity,
+    parse_quantity,
+    quantity_schema,
+    read_from_file,
+)
 
 Kind = Literal["translation", "rotation"]
 Boundary = Literal["free", "guided", "clamped"]
@@ -96,7 +104,11 @@ class StiffnessMeasure(Measure):
 
 
 class _ValuedMeasure(StiffnessMeasure):
-    value: Annotated[float, Field(gt=0)]
+    value: Annotated[
+        float,
+        Field(gt=0),
+        JsonSchemaOfFile(lambda _: quantity_schema("stiffness", "1.3 N/m", "0.2 N*m/rad")),
+    ]
 
     @field_validator("value", mode="before")
     @classmethod

@@ -13,7 +13,7 @@ from stiffopt.directions import Frame
 from stiffopt.errors import InputError
 from stiffopt.model.compliance import stiffness_block
 from stiffopt.optimise.measure import Measure, Role
-from stiffopt.schema import BadKeyError, Vector
+from stiffopt.schema import BadKeyError, JsonSchemaOfFile, Vector
 from stiffopt.units import Number, Ratio, parse_quantity, read_from_file
 
 
@@ -32,7 +32,7 @@ class MatchMatrix(Measure):
     key: ClassVar[str] = "matrix"
     role: ClassVar[Role] = "match"
 
-    unit: Literal["N/m"] = "N/m"
+    unit: Annotated[Literal["N/m"], JsonSchemaOfFile(lambda _: {"type": "string"})] = "N/m"
     matrix: Vector[Vector[Number]]
     frame: Frame = "base"
     boundary: Literal["guided", "clamped"] = "guided"

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, BeforeValidator, PlainSerializer
 
 from stiffopt.optimise.term import Nearness, Term, Tolerance, numbers_shown
 from stiffopt.optimise.term import Vector as Numbers
-from stiffopt.schema import Vector
+from stiffopt.schema import JsonSchemaOfFile, Vector
 from stiffopt.units import Length, format_quantity, within
 
 
@@ -27,6 +27,7 @@ def _write_coordinate(value: float | None) -> str:
 Coordinate = Annotated[
     Annotated[Length, within(1e3, "m")] | None,
     BeforeValidator(_coordinate),
+    JsonSchemaOfFile(lambda length: {"anyOf": [length, {"const": "free"}]}),
     PlainSerializer(_write_coordinate, return_type=str, when_used="json"),
 ]
 

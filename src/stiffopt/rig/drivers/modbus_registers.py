@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationInfo, model_validator
 
 from stiffopt.errors import InputError
-from stiffopt.schema import BadKeyError, Items, Pair, Schema
+from stiffopt.schema import BadKeyError, Items, JsonSchemaOfFile, Pair, Schema
 from stiffopt.units import Duration, Number, Pressure, finite_number, parse_quantity, read_from_file
 
 Address = Annotated[int, Field(ge=0, le=0xFFFF)]
@@ -120,6 +120,9 @@ class ReadingRegister(Register):
     table: RegisterTable | None = None
 
 
+_OR_ADDRESS = JsonSchemaOfFile(lambda made: {"anyOf": [made, {"type": "integer"}]})
+
+
 class ModbusChannel(Schema):
     """One regulator.
 
@@ -130,8 +133,8 @@ class ModbusChannel(Schema):
     min, max : limits that hold where they are tighter than those of the rig, in Pa.
     """
 
-    setpoint: SetPointRegister
-    reading: ReadingRegister | None = None
+    setpoint: Annotated[SetPointRegister, _OR_ADDRESS]
+    reading: Annotated[ReadingRegister, _OR_ADDRESS] | None = None
     min: Pressure | None = None
     max: Pressure | None = None
 

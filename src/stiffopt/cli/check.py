@@ -1,0 +1,42 @@
+"""The command `stiffopt check`: its options and its help."""
+
+from typing import Annotated
+
+import typer
+
+from stiffopt.cli.exits import with_exit_code
+from stiffopt.cli.options import Quiet
+
+CHECK_HELP = """\
+Check files without using them: all mistakes at once, one a line, with file, line and key.
+
+Robot, task, path, scene and rig files are checked together with the files that they name; logs
+(.csv, .mcap) are read. Nothing is solved and no device is touched.
+"""
+
+CHECK_EPILOG = """\
+\b
+Examples:
+  stiffopt check my-arm.yaml my-task.yaml
+  stiffopt check problems/*.yaml --quiet
+
+\b
+Exit codes:
+  0    no mistake
+  2    a mistake, or a file that cannot be read
+"""
+
+
+@with_exit_code
+def check(
+    files: Annotated[list[str], typer.Argument(metavar="FILE...", help="Any files of stiffopt.")],
+    as_json: Annotated[
+        bool,
+        typer.Option("--json", help="Print one JSON object a file: file, kind, mistakes."),
+    ] = False,
+    quiet: Quiet = False,
+) -> int:
+    """Check files."""
+    from stiffopt.cli.check_run import check_files  # here, so that --help waits for no numerics
+
+    return check_files(files, as_json=as_json, quiet=quiet)

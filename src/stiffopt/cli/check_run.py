@@ -1,0 +1,144 @@
+"""What `stiffopt check` does with each kind of file."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from stiffopt.cli.console import write_json, write_line
+from stiffopt.cli.exits import BAD_INPUT, SOLVED
+from stiffopt.documents import read_document
+from stiffopt.errors import FileError, InputError, StiffoptError, shown
+
+_FORMAT = re.compile(r"stiffopt-([a-z]+)/\d+")
+
+
+def check_files(paths: Sequence[str], *, as_json: bool, quiet: bool) -> int:
+    """Check files, print their mistakes and return the exit code."""
+    code = SOLVED
+    for path in paths:
+        kind, mistakes = check_file(path)
+        if mistakes:
+            code = BAD_INPUT
+        if as_json:
+            write_json({"file": path, "kind": kind, "mistakes": [_record(m) for m in mistakes]})
+            continue
+        for mistake in mistakes:
+            write_line(mistake.alone)
+        if not mistakes and not quiet:
+            article = "an" if kind[:1] in "aeiou" else "a"
+            write_line(f"{path}: {article} {kind} file without mistakes")
+    return code
+
+
+def _record(mistake: FileError) -> dict[str, Any]:
+    return {
+        "file": mistake.path,
+        "line": mistake.line,
+        "key": mistake.key,
+        "reason": mistake.own_reason,
+    }
+
+
+def check_file(path: str) -> tuple[str, list[FileError]]:
+    """Return the kind of a file, empty if nobody knows, and its mistakes."""
+    kind = ""
+    try:
+        kind = _kind_of(path)
+        _CHECKS[kind](path)
+    except FileError as error:
+        return kind, [error, *error.others]
+    except StiffoptError as error:
+        return kind, [FileError(path, str(error))]
+    return kind, []
+
+
+def _kind_of(path: str) -> str:
+    """Return the kind of a file by its ending, and of a YAML file by its format."""
+    ending = Path(path).suffix.lower()
+    if ending in (".csv", ".mcap"):
+        return "log"
+    given = read_document(path).data.get("format")
+    match = _FORMAT.fullmatch(given) if isinstance(given, str) else None
+    if match is not None and match[1] in _CHECKS:
+        return match[1]
+    kinds = [kind for kind in _CHECKS if kind != "log"]
+    expected = f"expected one of {', '.join(f'stiffopt-{kind}/1' for kind in kinds)}"
+    if given is None:
+        raise FileError(path, f"has no 'format'; {expected}")
+    near = difflib.get_close_matches(str(given), [f"stiffopt-{kind}/1" for kind in kinds], n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else f"; {expected}"
+    line = read_document(path).lines.get(("format",))
+    raise FileError(
+        path, f"{shown(given)} is no format of a file that people write{hint}",
+        line=line, key="format",
+    )  # fmt: skip
+
+
+def _check_robot(path: str) -> None:
+    from stiffopt.model.robot_files import load_description
+
+    load_description(Path(path))
+
+
+def _check_scene(path: str) -> None:
+    from stiffopt.model.scene import load_scene
+
+    load_scene(path)
+
+
+def _check_task(path: str) -> None:
+    from stiffopt.optimise.task import load_task
+
+    _check_with_robot(load_task(path))
+
+
+def _check_path(path: str) -> None:
+    from stiffopt.paths.path import load_path
+
+    found = load_path(path)
+    _check_with_robot(found)
+    found.end_pressures(found.resolve_robot())
+
+
+def _check_with_robot(wanted: Any) -> None:
+    """Check what a task and a path ask for against their robot."""
+    robot = wanted.resolve_robot()
+    wanted.pressure_bounds(robot)
+    wanted.check_scene(robot)
+
+
+def _check_rig(path: str) -> None:
+    from stiffopt.rig.config import load_rig_description
+
+    load_rig_description(path)
+
+
+def _check_log(path: str) -> None:
+    if path.lower().endswith(".mcap"):
+        from stiffopt.logs import read_mcap_log
+
+        read_mcap_log(path)
+        return
+    from stiffopt.logs import read_log, read_stiffness_table
+
+    try:
+        read_log(path)
+    except InputError as error:
+        try:
+            read_stiffness_table(path)
+        except InputError:
+            raise error from None
+
+
+_CHECKS: dict[str, Callable[[str], None]] = {
+    "robot": _check_robot,
+    "task": _check_task,
+    "path": _check_path,
+    "scene": _check_scene,
+    "rig": _check_rig,
+    "log": _check_log,
+}

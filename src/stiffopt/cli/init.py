@@ -1,0 +1,192 @@
+"""The commands `stiffopt init ...`: their options, their questions and their help."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Any
+
+import typer
+
+from stiffopt.cli.exits import with_exit_code
+from stiffopt.cli.options import command_group
+
+init_app = command_group(
+    help="Write a minimal file to begin with, with comments: it asks a few questions.",
+    no_args_is_help=True,
+)
+
+_EPILOG = """\
+\b
+On a terminal each option that is not given is asked for; elsewhere, and with --yes, it has its
+default. The file is checked before it is written. An existing file is left alone without --force.
+
+\b
+Exit codes:
+  0    the file was written
+  2    an answer is wrong, or there is such a file
+  130  interrupted (Ctrl-C)
+"""
+
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Ask nothing; take the defaults.")]
+Force = Annotated[bool, typer.Option("--force", help="Write in the place of a file that is there.")]
+Robot = Annotated[
+    str | None, typer.Option(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml).")
+]
+
+
+def _file(kind: str) -> Any:
+    return typer.Argument(metavar="FILE", help=f"The {kind} file to write.")
+
+
+def _write(kind: str, path: str, answers: dict[str, Any], yes: bool, force: bool) -> int:
+    """Ask for what was not given, and write the file."""
+    from stiffopt.cli.init_files import (
+        write_first_file,
+    )  # here, so that --help waits for no numerics
+
+    asks = not yes and sys.stdin is not None and sys.stdin.isatty()
+
+    def ask(question: str, default: str) -> str:
+        return str(typer.prompt(question, default=default, err=True)) if asks else default
+
+    write_first_file(kind, path, answers, ask, force=force)
+    return 0
+
+
+@init_app.command("robot", epilog=_EPILOG)
+@with_exit_code
+def init_robot(
+    file: Annotated[str, _file("robot")] = "my-arm.yaml",
+    segments: Annotated[
+        int | None, typer.Option(metavar="N", min=1, max=6, help="Segments in series, all alike.")
+    ] = None,
+    length: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="Of a segment at rest.")
+    ] = None,
+    outer_radius: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="Of the silicone cylinder.")
+    ] = None,
+    inner_radius: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="Of its central channel; 0 mm for none.")
+    ] = None,
+    chambers: Annotated[
+        int | None, typer.Option(metavar="N", min=3, help="Chambers around a segment.")
+    ] = None,
+    channels: Annotated[
+        int | None, typer.Option(metavar="N", min=3, help="Regulators that feed a segment.")
+    ] = None,
+    chamber_radius: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="Of a chamber's round section.")
+    ] = None,
+    chamber_offset: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="From the arm's axis to a chamber's.")
+    ] = None,
+    modulus: Annotated[
+        str | None, typer.Option(metavar="PRESSURE", help="Young's modulus of the silicone.")
+    ] = None,
+    max_pressure: Annotated[
+        str | None, typer.Option(metavar="PRESSURE", help="That the arm bears, gauge.")
+    ] = None,
+    mounting: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOW", help="hanging, standing, horizontal, or weightless as in the paper."
+        ),
+    ] = None,
+    yes: Yes = False,
+    force: Force = False,
+) -> int:
+    """Write a robot file: what your arm is made of."""
+    answers = {
+        "segments": segments,
+        "length": length,
+        "outer_radius": outer_radius,
+        "inner_radius": inner_radius,
+        "chambers": chambers,
+        "channels": channels,
+        "chamber_radius": chamber_radius,
+        "chamber_offset": chamber_offset,
+        "modulus": modulus,
+        "max_pressure": max_pressure,
+        "mounting": mounting,
+    }
+    return _write("robot", file, answers, yes, force)
+
+
+@init_app.command("task", epilog=_EPILOG)
+@with_exit_code
+def init_task(
+    file: Annotated[str, _file("task")] = "my-task.yaml",
+    robot: Robot = None,
+    position: Annotated[
+        str | None,
+        typer.Option(metavar="'X, Y, Z'", help="Where the tip shall be; an axis may be free."),
+    ] = None,
+    direction: Annotated[
+        str | None, typer.Option(metavar="'X, Y, Z'", help="In which it shall be stiff.")
+    ] = None,
+    yes: Yes = False,
+    force: Force = False,
+) -> int:
+    """Write a task file: where the tip shall be, and in which direction it shall be stiff."""
+    answers = {"robot": robot, "position": position, "direction": direction}
+    return _write("task", file, answers, yes, force)
+
+
+@init_app.command("path", epilog=_EPILOG)
+@with_exit_code
+def init_path(
+    file: Annotated[str, _file("path")] = "my-path.yaml",
+    robot: Robot = None,
+    begin: Annotated[
+        str | None, typer.Option("--from", metavar="'X, Y, Z'", help="Begin of the line.")
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", metavar="'X, Y, Z'", help="End of the line.")
+    ] = None,
+    speed: Annotated[
+        str | None, typer.Option(metavar="SPEED", help="At which the tip follows it.")
+    ] = None,
+    direction: Annotated[
+        str | None, typer.Option(metavar="'X, Y, Z'", help="In which it shall be stiff.")
+    ] = None,
+    yes: Yes = False,
+    force: Force = False,
+) -> int:
+    """Write a path file: a line that the tip follows."""
+    answers = {"robot": robot, "from": begin, "to": end, "speed": speed, "direction": direction}
+    return _write("path", file, answers, yes, force)
+
+
+@init_app.command("scene", epilog=_EPILOG)
+@with_exit_code
+def init_scene(
+    file: Annotated[str, _file("scene")] = "my-scene.yaml",
+    robot: Robot = None,
+    clearance: Annotated[
+        str | None, typer.Option(metavar="LENGTH", help="That the whole arm keeps from objects.")
+    ] = None,
+    yes: Yes = False,
+    force: Force = False,
+) -> int:
+    """Write a scene file: what stands around the arm."""
+    return _write("scene", file, {"robot": robot, "clearance": clearance}, yes, force)
+
+
+@init_app.command("rig", epilog=_EPILOG)
+@with_exit_code
+def init_rig(
+    file: Annotated[str, _file("rig")] = "my-rig.yaml",
+    robot: Robot = None,
+    supply: Annotated[
+        str | None, typer.Option(metavar="DRIVER", help="simulated, modbus or nidaq.")
+    ] = None,
+    tracker: Annotated[
+        str | None,
+        typer.Option(metavar="DRIVER", help="simulated, aurora, openigtlink, or none."),
+    ] = None,
+    yes: Yes = False,
+    force: Force = False,
+) -> int:
+    """Write a rig file: the arm's regulators and tracker."""
+    return _write("rig", file, {"robot": robot, "supply": supply, "tracker": tracker}, yes, force)

@@ -1,0 +1,244 @@
+"""`stiffopt init` and `stiffopt check`: first files, and what is wrong with files."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import select
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+import stiffopt
+from stiffopt.cli import main as entry
+from stiffopt.documents import read_document
+
+ROOT = Path(__file__).parent.parent
+KINDS = ("robot", "task", "path", "scene", "rig")
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(entry.app, arguments)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_first_file_is_right_and_says_what_comes_next(kind: str) -> None:
+    name = f"a {kind}.yaml"
+    made = run("init", kind, name)
+    assert made.exit_code == 0, made.output
+    assert made.stdout.startswith(f"{name}: written. Next:")
+    text = Path(name).read_text(encoding="utf-8")
+    schema = text.splitlines()[0].removeprefix("# yaml-language-server: $schema=file://")
+    assert json.loads(Path(schema).read_text(encoding="utf-8"))["title"] == f"stiffopt {kind} file"
+    found = run("check", name)
+    assert (found.exit_code, found.stdout) == (0, f"{name}: a {kind} file without mistakes\n")
+
+
+def test_first_files_lead_to_an_answer() -> None:
+    """The way of a new user: one's own arm of three segments, a task, a path, a scene, a rig."""
+    assert run("init", "robot", "arm.yaml", "--segments", "3", "--length", "60 mm").exit_code == 0
+    robot = stiffopt.load_robot("arm.yaml")
+    assert (robot.n_pressures, robot.length) == (9, pytest.approx(0.18))
+    os.mkdir("tasks")
+    assert run("init", "task", "tasks/task.yaml", "--robot", "arm.yaml").exit_code == 0
+    task = stiffopt.load_task("tasks/task.yaml")
+    assert task.robot == f"..{os.sep}arm.yaml"
+    assert stiffopt.solve_pressure(robot, task).found
+    assert run("init", "path", "--robot", "arm.yaml", "--direction", "0 1 0").exit_code == 0
+    path = stiffopt.load_path("my-path.yaml")
+    targets = path.points().targets
+    assert len(targets) > 10
+    solver = stiffopt.PressureSolver(robot, task)
+    assert all(solver.reachable(targets[k]) for k in (0, -1))
+    assert run("init", "scene", "--robot", "arm.yaml", "--clearance", "1 mm").exit_code == 0
+    assert robot.clearance([0.0] * 9, stiffopt.load_scene("my-scene.yaml")) > 1e-3
+    assert run("init", "rig", "--robot", "arm.yaml").exit_code == 0
+    with stiffopt.open_rig("my-rig.yaml") as rig:
+        assert rig.supply.limits.n == 9
+
+
+@pytest.mark.parametrize("segments", ["1", "2"])
+def test_the_default_arm_is_the_papers(segments: str) -> None:
+    """Without its compensation, which nobody knows of an arm of one's own."""
+    assert run("init", "robot", "--segments", segments).exit_code == 0
+    data = read_document("my-arm.yaml").data
+    paper = read_document(ROOT / f"src/stiffopt/robots/stiff-flop-{segments}.yaml").data
+    for one in paper["segments"]:
+        del one["compensation"], one["connector"]
+    assert data["segments"] == paper["segments"]
+    assert data["pressure"] == paper["pressure"]
+
+
+@pytest.mark.parametrize(
+    ("mounting", "gravity"),
+    [("hanging", (0, 0, 9.81)), ("standing", (0, 0, -9.81)), ("horizontal", (-9.81, 0, 0))],
+)
+def test_gravity_is_that_of_the_mounting(mounting: str, gravity: tuple[float, ...]) -> None:
+    assert run("init", "robot", "--mounting", mounting, "--segments", "1").exit_code == 0
+    assert stiffopt.load_robot("my-arm.yaml").description.gravity == gravity
+
+
+@pytest.mark.parametrize("supply", ["modbus", "nidaq"])
+@pytest.mark.parametrize("tracker", ["aurora", "openigtlink", "none"])
+def test_rigs_with_devices(supply: str, tracker: str) -> None:
+    options = ("--robot", "stiff-flop-2", "--supply", supply, "--tracker", tracker)
+    made = run("init", "rig", *options)
+    assert made.exit_code == 0, made.output
+    data = read_document("my-rig.yaml").data
+    assert len(data["supply"]["channels"]) == 6
+    assert data.get("tracker", {"driver": "none"})["driver"] == tracker
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("robot", "--length", "90"), "--length: '90' has no unit"),
+        (("robot", "--length", "-90 mm"), "segments[0].length: "),
+        (("robot", "--chambers", "7"), "--channels: 3 regulators cannot feed 7 chambers alike"),
+        (("robot", "--chamber-offset", "14 mm"), "nothing was written"),
+        (("robot", "--mounting", "upside"), "--mounting: expected weightless or hanging"),
+        (("task", "--robot", "stiff-flop-9"), "there is no robot 'stiff-flop-9'"),
+        (("task", "--position", "1 mm, 2 mm"), "--position: expected a position such as"),
+        (("task", "--direction", "0 0 0"), "--direction: expected a direction such as"),
+        (("path", "--from", "0 mm, free, 1 mm"), "--from: "),
+        (("rig", "--supply", "steam"), "--supply: expected simulated or modbus or nidaq"),
+        (("rig", "--supply", "modbus", "--tracker", "simulated"), "--tracker: expected aurora"),
+        (("scene", "x.txt"), "x.txt"),
+    ],
+)
+def test_wrong_answers_write_nothing(arguments: tuple[str, ...], message: str) -> None:
+    made = run("init", *arguments)
+    assert made.exit_code == 2, made.output
+    assert message in made.stderr.replace("\n", " ")
+    assert os.listdir() == []
+
+
+def test_a_file_that_is_there_stays() -> None:
+    Path("my-task.yaml").write_text("mine", encoding="utf-8")
+    made = run("init", "task")
+    assert made.exit_code == 2
+    assert "exists" in made.stderr
+    assert Path("my-task.yaml").read_text(encoding="utf-8") == "mine"
+    assert run("init", "task", "--force", "--direction", "x y z").exit_code == 2
+    assert Path("my-task.yaml").read_text(encoding="utf-8") == "mine"
+    assert run("init", "task", "--force").exit_code == 0
+    assert stiffopt.load_task("my-task.yaml").robot == "stiff-flop-2"
+
+
+def test_on_a_terminal_it_asks() -> None:
+    """Answers are typed on a pseudo-terminal; return alone takes the default."""
+    mine, theirs = pty.openpty()
+    command = [sys.executable, "-m", "stiffopt", "init", "scene", "--clearance", "3 mm"]
+    with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs) as process:
+        os.close(theirs)
+        seen = _until(mine, "stiff-flop-2]: ")
+        os.write(mine, b"stiff-flop-1\n")
+        seen += _until(mine, "scene: my-scene.yaml")
+        assert process.wait(timeout=60) == 0
+    os.close(mine)
+    assert "Robot (built-in, or a robot file)" in seen
+    assert "Distance" not in seen  # it was given
+    sphere = read_document("my-scene.yaml").data["objects"][0]["sphere"]
+    assert sphere["centre"][2] == "45 mm"
+
+
+def _until(terminal: int, text: str) -> str:
+    seen = ""
+    while text not in seen:
+        assert select.select([terminal], [], [], 60.0)[0], f"nothing more came after: {seen}"
+        seen += os.read(terminal, 4096).decode()
+    return seen
+
+
+TASK = "format: stiffopt-task/1\ntarget: {position: [0 mm, 0 mm, 1 mm]}\n"
+RIG = "format: stiffopt-rig/1\nsupply: {driver: simulated}\n"
+BAD = """\
+format: stiffopt-task/1
+robot: stiff-flop-2
+targt: 1
+target: {position: [1, 2 mm, 3 kg]}
+stiffness: {maximise: {directon: [1, 0, 0]}}
+"""
+
+
+def test_all_mistakes_are_told_one_a_line() -> None:
+    Path("bad.yaml").write_text(BAD, encoding="utf-8")
+    found = run("check", "bad.yaml", "missing.yaml", str(ROOT / "rig/sim.yaml"))
+    assert found.exit_code == 2
+    lines = found.stdout.splitlines()
+    assert [line.partition(": ")[0] for line in lines] == [
+        "bad.yaml:3",
+        *(["bad.yaml:4"] * 2),
+        *(["bad.yaml:5"] * 2),
+        "missing.yaml",
+        str(ROOT / "rig/sim.yaml"),
+    ]
+    assert "targt: unknown key; did you mean 'target'?" in lines[0]
+    assert lines[-1].endswith("a rig file without mistakes")
+    assert run("check", "--quiet", str(ROOT / "rig/sim.yaml")).stdout == ""
+
+
+def test_more_mistakes_than_one_message_tells() -> None:
+    rows = "".join(f"  wrong_{k}: 1\n" for k in range(14))
+    Path("bad.yaml").write_text(f"format: stiffopt-task/1\ntarget:\n{rows}", encoding="utf-8")
+    assert len(run("check", "bad.yaml").stdout.splitlines()) == 15  # and the missing robot
+
+
+def test_mistakes_for_programs() -> None:
+    Path("bad.yaml").write_text(BAD, encoding="utf-8")
+    record = json.loads(run("check", "--json", "bad.yaml").stdout)
+    assert (record["file"], record["kind"], len(record["mistakes"])) == ("bad.yaml", "task", 5)
+    assert record["mistakes"][0]["line"] == 3
+    assert record["mistakes"][0]["key"] == "targt"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.yaml", "robot: x\n", "has no 'format'; expected one of stiffopt-robot/1"),
+        ("a.yaml", "format: stiffopt-tsk/1\n", "did you mean 'stiffopt-task/1'?"),
+        ("a.yaml", "format: [1]\n", "is no format of a file that people write"),
+        ("a.csv", "time_s,p1_pa\nx,y\n", "a.csv"),
+        ("a.yaml", f"{TASK}robot: none.yaml\n", "there is no file"),
+        ("a.yaml", f"{TASK}robot: stiff-flop-1\npressure: {{max: [1 bar]}}\n", "pressure.max"),
+        ("a.yaml", f"{RIG}robot: stiff-flop-9\n", "there is no robot"),
+    ],
+)
+def test_each_kind_of_mistake(name: str, text: str, message: str) -> None:
+    Path(name).write_text(text, encoding="utf-8")
+    found = run("check", name)
+    assert found.exit_code == 2
+    assert message in found.stdout
+
+
+def test_every_shipped_file_is_without_mistakes() -> None:
+    files = [
+        str(path)
+        for folder in ("problems", "rig", "src/stiffopt/robots")
+        for path in sorted((ROOT / folder).rglob("*.yaml"))
+        if "golden" not in path.parts
+    ]
+    found = run("check", "--quiet", *files)
+    assert (found.exit_code, found.stdout) == (0, "")
+
+
+def test_completion_and_python_m() -> None:
+    environment = os.environ | {
+        "_STIFFOPT_COMPLETE": "complete_bash",
+        "COMP_WORDS": "stiffopt ini",
+        "COMP_CWORD": "1",
+    }
+    command = [sys.executable, "-m", "stiffopt"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    assert done.stdout.split() == ["init"]
+    done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == f"stiffopt {stiffopt.__version__}"
