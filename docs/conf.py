@@ -6,8 +6,11 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from docutils.nodes import SkipNode, literal_block
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+
+import stiffopt
 
 HERE = Path(__file__).resolve().parent
 
@@ -38,11 +41,13 @@ nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_execution_in_temp = True
 nb_merge_streams = True
+nb_render_markdown_format = "gfm"
 os.environ["PATH"] = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+os.environ.pop("MPLBACKEND", None)  # notebooks show figures in place
 os.environ |= {
-    "COLUMNS": "96",
+    "COLUMNS": "84",
     "NO_COLOR": "1",
-    "MPLBACKEND": "Agg",
+    "PYTHONPATH": os.pathsep.join(filter(None, (str(HERE), os.environ.get("PYTHONPATH")))),
     "STIFFOPT_CHECKOUT": str(HERE.parent),
     "STIFFOPT_COMPILE": "wait",
 }
@@ -64,6 +69,8 @@ sphinx_gallery_conf = {
 
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
+for _name in stiffopt.__all__:  # as users do: autodoc would import with typing.TYPE_CHECKING set
+    getattr(stiffopt, _name)
 numpydoc_show_class_members = False
 numpydoc_xref_param_type = False
 
@@ -91,8 +98,6 @@ def _display_mathml(translator: Any, node: Any) -> None:
 
 
 def _skip() -> None:
-    from docutils.nodes import SkipNode
-
     raise SkipNode
 
 
@@ -101,8 +106,17 @@ def _tex(text: str) -> str:
     return text.replace(r"\tfrac", r"\frac").strip()
 
 
+def _shell_cells(app: Sphinx, tree: Any) -> None:
+    """Cells that the shell runs look like a terminal."""
+    for block in tree.findall(literal_block):
+        if block.astext().startswith("%%sh\n"):
+            lines = block.astext().splitlines()[1:]
+            shown = "\n".join(f"$ {line}" for line in lines)
+            block.replace_self(literal_block(shown, shown, language="console"))
+
+
 def _links_out_of_docs(app: Sphinx, page: str, source: list[str]) -> None:
-    """Files of the checkout that a page links to are downloads; folders are only named."""
+    """Files of the checkout that a page links to are downloads; other folders are only named."""
     folder = (HERE / page).parent
 
     def link(found: re.Match[str]) -> str:
@@ -110,9 +124,11 @@ def _links_out_of_docs(app: Sphinx, page: str, source: list[str]) -> None:
         return f"[{text}](path:{target})" if (folder / target).is_file() else text
 
     source[0] = re.sub(r"\[([^]]+)\]\((\.\./[^)#]+)\)", link, source[0])
+    source[0] = source[0].replace("](gallery/)", "](auto_gallery/index.rst)")
 
 
 def setup(app: Sphinx) -> None:
     """Formulas are MathML, which needs neither the internet nor a script."""
     app.add_html_math_renderer("mathml", (_inline_mathml, None), (_display_mathml, None))
     app.connect("source-read", _links_out_of_docs)
+    app.connect("doctree-read", _shell_cells)

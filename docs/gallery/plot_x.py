@@ -1,5 +1,0 @@
-"""
-X
-=
-"""
-import stiffopt
