@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +15,12 @@ import pytest
 
 import stiffopt
 from recordings import UCL, needs_ucl
-from stiffopt.cli import calibrate_run
+from stiffopt.cli import calibrate_run, exits
 from stiffopt.cli.calibrate_run import fixed_keys, log_names
 from stiffopt.cli.main import main
 from stiffopt.errors import FileError
 from stiffopt.files import save_file
+from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.logs import (
     Body,
@@ -534,6 +536,46 @@ def test_an_interrupt_leaves_nothing_behind(
     )  # fmt: skip
     assert (code, out) == (130, "")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("models", [0, 1])
+def test_ctrl_c_keeps_the_best_model_so_far(
+    models: int, folder: Path, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    """While the second model is fitted; before the first is, there is nothing to keep."""
+    fitted: list[str] = []
+
+    def report(self: object, done: float, total: float, text: str) -> None:
+        begins = text.startswith("fitting") and text not in fitted
+        if begins:
+            fitted.append(text)
+        if begins and len(fitted) == models + 1:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(exits.ProgressBar, "report", report)
+    out = tmp_path / "fitted.yaml"
+    command = ["calibrate", "--robot", "stiff-flop-1", folder / "monday.csv", "--out", out]
+    code, text, err = run(capsys, *command, "--rows", "60")
+    assert (code, err.splitlines()[-1]) == (130, "interrupted")
+    assert out.exists() == bool(models)
+    if models:
+        assert "the calibration was interrupted" in " ".join(text.split())
+        assert "# Interrupted: not all models were compared" in out.read_text(encoding="utf-8")
+        assert load_description(out).calibration is not None
+
+
+def test_quick_fits_one_model_to_few_rows() -> None:
+    quick = CalibrationSettings().quick()
+    assert (quick.structure, quick.strain_law, quick.rows) == ("hysteresis", "keep", 400)
+    chosen = CalibrationSettings(structure="lag", rows=100, trial_rows=80).quick()
+    assert (chosen.structure, chosen.rows, chosen.trial_rows) == ("lag", 100, 80)
+
+
+def test_the_command_is_quick(folder: Path, tmp_path: Path, capsys: Any) -> None:
+    command = ["calibrate", "--robot", "stiff-flop-1", folder / "monday.csv"]
+    options = ["--out", tmp_path / "q.yaml", "--quick", "--model", "lag", "--rows", "60", "--json"]
+    code, text, _ = run(capsys, *command, *options)
+    assert (code, len(json.loads(text)["models"])) == (0, 1)
 
 
 # -- a real arm -----------------------------------------------------------------------------------

@@ -175,7 +175,7 @@ def wait_for(condition, seconds=120):
 
 def test_the_first_answer_does_not_wait_for_the_compiler(empty_cache):
     solver = so.PressureSolver(so.load_robot("stiff-flop-1"), one_segment_task())
-    with pytest.warns(so.SlowWarning, match="made in the background"):
+    with pytest.warns(so.SlowWarning, match="compiling once"):
         first = solver.solve()
     assert first.found
     wait_for(lambda: solver.is_compiled)
@@ -188,7 +188,7 @@ def test_one_process_is_started_however_often_code_is_asked_for(empty_cache, mon
     started = []
     monkeypatch.setattr(compiler, "start_background", lambda *request: started.append(request))
     solver = so.PressureSolver(so.load_robot("stiff-flop-1"), one_segment_task())
-    with pytest.warns(so.SlowWarning, match="made in the background"):
+    with pytest.warns(so.SlowWarning, match="compiling once"):
         assert not solver.is_compiled
     for _ in range(3):
         time.sleep(0.25)  # longer than it takes until the cache is looked at again

@@ -753,6 +753,8 @@ def test_quiet_hanging_and_rotation(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["stiff-flop-1", "--boundary", "loose"], "unknown boundary 'loose'"),
         (["stiff-flop-1", "--samples", "0"], "--samples"),
         (["stiff-flop-1", "--samples", "10", "--levels", "3"], "not both"),
+        (["stiff-flop-1", "--timeout", "5"], "--timeout: '5' has no unit"),
+        (["stiff-flop-1", "--timeout", "0 s"], "timeout must be"),
         (["stiff-flop-1", "--plot", "map.txt"], "expected a name that ends in .png"),
         (["stiff-flop-1", "--out", "no/such/map.zarr"], "there is no folder"),
     ],
@@ -771,6 +773,20 @@ def test_bad_input(
     assert not printed.out
     assert message in " ".join(printed.err.split())
     assert not list(tmp_path.iterdir())
+
+
+def test_out_of_time_stops_and_the_same_command_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "map.zarr"
+    options = ("stiff-flop-1", "--samples", 3000, "--out", path)
+    assert command(*options, "--timeout", "1 us") == 130
+    printed = capsys.readouterr()
+    assert not printed.out
+    said = " ".join(printed.err.split())
+    assert "out of time; stopped after 0 of 3,000 samples; the same command goes on" in said
+    assert command(*options, "--timeout", "1 h", "--quiet") == 0
+    assert open_workspace_map(path).table.count.sum() == 3000
 
 
 def interrupted(path: Path, wait_for: str = "") -> str:

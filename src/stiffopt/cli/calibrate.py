@@ -28,7 +28,6 @@ _CODES = """
 Exit codes:
   0    done
   2    bad input, or a file cannot be written; nothing is written
-  130  interrupted (Ctrl-C); nothing is written
 """
 
 CALIBRATE_EPILOG = f"""\
@@ -37,14 +36,18 @@ Examples:
   stiffopt calibrate --robot my-arm.yaml run/*.csv --out my-arm-calibrated.yaml
   stiffopt calibrate --robot my-arm.yaml monday.csv --stiffness run/stiffness.csv --out fitted.yaml
   stiffopt calibrate --robot asu-two-segment apr4_*.csv --sequence --out asu.yaml --report fit
-{_CODES}"""
+{_CODES}\
+  130  interrupted (Ctrl-C): the best model so far is written, if there is one; twice: nothing is
+"""
 
 VALIDATE_EPILOG = f"""\
 \b
 Examples:
   stiffopt validate --robot my-arm-calibrated.yaml tuesday.csv
   stiffopt validate --robot my-arm-calibrated.yaml tuesday_*.csv --sequence --report tuesday
-{_CODES}"""
+{_CODES}\
+  130  interrupted (Ctrl-C); nothing is written
+"""
 
 Robot = Annotated[
     str,
@@ -133,6 +136,14 @@ def calibrate(
             "alone, such as corrections.gain, for all segments and channels; may be repeated.",
         ),
     ] = None,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick",
+            help="A first answer within about a minute: one model, with hysteresis unless --model "
+            "says another, fitted to few rows; no models and strain laws are compared.",
+        ),
+    ] = False,
     sequence: Sequence = False,
     rezero: Rezero = False,
     pressures: Pressures = "commanded",
@@ -147,16 +158,16 @@ def calibrate(
     report: Report = None,
     as_json: Json = False,
     quiet: Quiet = False,
-) -> None:
+) -> int:
     """Fit a robot file."""
     from stiffopt.cli import calibrate_run  # here, so that --help waits for no numerics
 
     recordings = calibrate_run.RecordingOptions(
         robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame
     )
-    calibrate_run.run_calibrate(
+    return calibrate_run.run_calibrate(
         recordings, out, tables=stiffness or (), model=model, strain_law=strain_law, fix=fix or (),
-        rows=rows, report=report, as_json=as_json, quiet=quiet,
+        rows=rows, quick=quick, report=report, as_json=as_json, quiet=quiet,
     )  # fmt: skip
 
 

@@ -15,9 +15,15 @@ from typing import Any
 import stiffopt
 from stiffopt.cli import quantities
 from stiffopt.cli.console import show, write_json
-from stiffopt.cli.exits import Progress, interruptible_work
+from stiffopt.cli.exits import (
+    INTERRUPTED,
+    SOLVED,
+    Progress,
+    interruptible_work,
+    stoppable_work,
+)
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
-from stiffopt.errors import FileError, InputError, require_package, shown
+from stiffopt.errors import CancelledError, FileError, InputError, require_package, shown
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
@@ -50,12 +56,14 @@ def run_calibrate(
     strain_law: str,
     fix: Sequence[str],
     rows: int | None,
+    quick: bool,
     report: str | None,
     as_json: bool,
     quiet: bool,
-) -> None:
-    """Fit a robot; write, report and draw it."""
-    with interruptible_work(quiet=quiet) as progress:
+) -> int:
+    """Fit a robot; write, report and draw it; return the exit code."""
+    code = SOLVED
+    with stoppable_work(quiet=quiet) as progress:
         check_new_file(out, _ENDINGS)
         _check_report(report)
         if report and Path(report).resolve() == Path(out).resolve():
@@ -77,24 +85,32 @@ def run_calibrate(
         settings = recordings.settings(
             structure=model, strain_law=strain_law, fixed=fixed_keys(fix, robot), **counts
         )
+        if quick:
+            settings = settings.quick()
         stiffnesses = read_tables(tables, robot)
         logs = recordings.read(robot, progress)
-        result = fit_robot(robot, logs, stiffnesses, settings, progress)
-        progress(1, 1, "writing")
+        try:
+            result = fit_robot(robot, logs, stiffnesses, settings, progress)
+        except CancelledError as stop:
+            if not isinstance(stop.found, CalibrationResult):
+                raise KeyboardInterrupt from None
+            result, code = stop.found, INTERRUPTED
         with new_folder(report) as folder:
             if folder is not None:
                 from stiffopt.cli.calibration_report import write_calibration
 
                 write_calibration(folder, result, out)
-            save_file(out, "robot", result.robot, _origin(result, recordings, tables, fix))
+            origin = _origin(result, recordings, tables, fix, is_interrupted=code == INTERRUPTED)
+            save_file(out, "robot", result.robot, origin)
     if quiet and not as_json:
-        return
+        return code
     from stiffopt.cli.calibration_report import calibration, calibration_record
 
     if as_json:
         write_json(calibration_record(result, out, report))
     else:
         show(calibration(result, out, report))
+    return code
 
 
 def run_validate(
@@ -291,6 +307,8 @@ def _origin(
     recordings: RecordingOptions,
     tables: Sequence[str],
     fix: Sequence[str],
+    *,
+    is_interrupted: bool,
 ) -> list[str]:
     """The comment at the top of the robot file: the data and options that it came from."""
     lines = [f"Calibrated by stiffopt {stiffopt.__version__} from {Path(recordings.robot).name}."]
@@ -301,6 +319,8 @@ def _origin(
         files = ", ".join(os.path.basename(path) for path in tables)
         lines.append(f"Tables of stiffness: {files}.")
     lines.append(f"Model: {result.structure.name}, {result.structure.words}.")
+    if is_interrupted:
+        lines.append("Interrupted: not all models were compared, and few rows were fitted.")
     if names:
         errors = together(result.calibrated)
         lines.append(

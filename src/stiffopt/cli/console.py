@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 
 _REFRESH = 0.1  # s, between two changes of a progress bar
+_FIRST_LINE, _LONGEST_SILENCE = 2.0, 30.0  # s, of progress without a terminal
 
 
 class Closed(Exception):  # noqa: N818 - no error: `head`, for example, reads a few lines
@@ -118,11 +119,17 @@ def warnings_as_notes(*, quiet: bool) -> AbstractContextManager[None]:
 class ProgressBar:
     """Says what is being done, how much of it is done and how long the rest takes.
 
-    It is a context: from the first report to its end it is shown on stderr, on a terminal only.
+    It is a context: from the first report to its end a bar is shown on stderr. Where that is no
+    terminal, lines are printed: the first after two seconds, then ever more seldom.
     """
 
-    def __init__(self, *, quiet: bool) -> None:
-        self._wanted = not quiet and sys.stderr is not None and sys.stderr.isatty()
+    def __init__(self, *, quiet: bool, clock: Callable[[], float] = monotonic) -> None:
+        self._wanted = (
+            not quiet
+            and sys.stderr is not None
+            and os.environ.get("STIFFOPT_PROGRESS", "") != "none"
+        )
+        self._lines = None if self._wanted and sys.stderr.isatty() else _ProgressLines(clock)
         self._progress: Progress | None = None
         self._is_shown = False
         self._shown_at = 0.0
@@ -136,6 +143,9 @@ class ProgressBar:
     def report(self, done: float, total: float | None, text: str) -> None:
         """Show how far the work is; `total` is None where nobody knows."""
         if not self._wanted:
+            return
+        if self._lines is not None:
+            self._lines.report(done, total, text)
             return
         now = monotonic()
         if self._is_shown and now - self._shown_at < _REFRESH and done != total:
@@ -156,6 +166,29 @@ class ProgressBar:
         if self._progress is not None:
             self._progress.stop()
         self._is_shown = False
+
+
+class _ProgressLines:
+    """Progress where there is no terminal: lines with an estimate, ever more seldom."""
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self._clock = clock
+        self._begin = clock()
+        self._next = _FIRST_LINE
+
+    def report(self, done: float, total: float | None, text: str) -> None:
+        """Print a line if it is time for one."""
+        gone = self._clock() - self._begin
+        if gone < self._next:
+            return
+        self._next = gone + min(max(gone, _FIRST_LINE), _LONGEST_SILENCE)
+        share = done / total if total else 0.0
+        line = f"{printable(text)}: " if text else ""
+        if share > 0.0:
+            line += f"{share:.0%}, {gone:.0f} s gone, about {gone * (1 / share - 1):.0f} s to go"
+        else:
+            line += f"{gone:.0f} s gone"
+        print(line, file=sys.stderr, flush=True)
 
 
 def _progress(*, is_counted: bool) -> Progress:

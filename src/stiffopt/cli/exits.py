@@ -14,7 +14,7 @@ from typing import Any, ParamSpec
 import typer
 
 from stiffopt.cli.console import ProgressBar, report_error, warnings_as_notes
-from stiffopt.errors import StiffoptError
+from stiffopt.errors import CancelledError, StiffoptError
 
 SOLVED = 0
 BAD_INPUT = 2
@@ -140,6 +140,26 @@ def interruptible_work(*, quiet: bool) -> Iterator[Progress]:
         yield progress
 
 
+@contextmanager
+def stoppable_work(*, quiet: bool) -> Iterator[Progress]:
+    """Context of work that keeps what it has at the first Ctrl-C, and that a second one ends.
+
+    The function for progress raises `CancelledError` once after the first.
+    """
+    interrupt, is_told = InterruptBetweenSteps(), False
+    with interrupt.handled(), ProgressBar(quiet=quiet) as bar, warnings_as_notes(quiet=quiet):
+
+        def progress(done: float, total: float, text: str) -> None:
+            nonlocal is_told
+            if interrupt.pressed and not is_told:
+                is_told = True
+                bar.report(done, total, "interrupted: keeping the best so far")
+                raise CancelledError("interrupted")
+            bar.report(done, total, text)
+
+        yield progress
+
+
 class InterruptBetweenSteps:
     """Turns signals into one KeyboardInterrupt between two steps of the work.
 
@@ -156,6 +176,11 @@ class InterruptBetweenSteps:
     def handled(self) -> AbstractContextManager[None]:
         """Context in which the signals are handled."""
         return handled(dict.fromkeys(self._signals, self._handle))
+
+    @property
+    def pressed(self) -> bool:
+        """Whether a signal has come."""
+        return self._pressed
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a signal has come."""

@@ -29,6 +29,7 @@ from stiffopt.cli.plan import PLAN_EPILOG, PLAN_HELP, plan
 from stiffopt.cli.robots import robots
 from stiffopt.cli.run import RUN_EPILOG, RUN_HELP, run
 from stiffopt.cli.solve import EXAMPLES, HELP, solve
+from stiffopt.cli.studio import STUDIO_EPILOG, STUDIO_HELP, studio
 from stiffopt.cli.vent import VENT_EPILOG, VENT_HELP, vent
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
@@ -59,6 +60,12 @@ app.command(
     help=CHECK_HELP,
     epilog=CHECK_EPILOG,
 )(check)
+app.command(
+    "studio",
+    short_help="See a robot and a task in the browser, and drag them.",
+    help=STUDIO_HELP,
+    epilog=STUDIO_EPILOG,
+)(studio)
 app.command("robots")(robots)
 app.command(
     "run",

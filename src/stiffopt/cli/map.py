@@ -7,7 +7,12 @@ from typing import Annotated, Any
 import typer
 
 from stiffopt.cli.console import ProgressBar, report_note, show, warnings_as_notes, write_json
-from stiffopt.cli.exits import InterruptBetweenSteps, interruptible_work, with_exit_code
+from stiffopt.cli.exits import (
+    INTERRUPTED,
+    InterruptBetweenSteps,
+    interruptible_work,
+    with_exit_code,
+)
 from stiffopt.cli.options import (
     BoundaryOption,
     FrameOption,
@@ -17,7 +22,7 @@ from stiffopt.cli.options import (
     command_group,
 )
 from stiffopt.cli.outputs import check_ending, check_picture, check_writable
-from stiffopt.errors import InputError
+from stiffopt.errors import InputError, OutOfTimeError
 
 map_app = command_group(
     help="Map an arm: where its tip can be, how stiff it is there, and how stiff along its length."
@@ -28,7 +33,7 @@ _CODES = """
 Exit codes:
   0    the map is complete
   2    bad input, or the map cannot be made or written
-  130  interrupted (Ctrl-C)
+  130  interrupted (Ctrl-C{or_late})
 """
 
 HELP = """\
@@ -37,7 +42,7 @@ Sample the pressures of an arm and map its workspace.
 Space is divided into cells. For each cell that the tip reaches the map holds how many samples did,
 and for each direction the greatest and the least stiffness that they have, with the pressures.
 ROBOT is the name of a built-in robot or a robot file. With --out, the map is kept as a Zarr group;
-the same command continues a run that was interrupted.
+the same command continues a run that was interrupted, or ended by --timeout.
 """
 
 _EPILOG = f"""\
@@ -46,7 +51,7 @@ Examples:
   stiffopt map workspace stiff-flop-2 --out map.zarr --samples 10000000 --plot map.png
   stiffopt map workspace my-arm.yaml --levels 6 --cell '5 mm' --direction x --direction 0,1,1
   stiffopt map workspace stiff-flop-3 --out map.zarr --scheduler tcp://10.0.0.5:8786
-{_CODES}"""
+{_CODES.format(or_late=", or --timeout is over")}"""
 
 
 @map_app.command("workspace", help=HELP, epilog=_EPILOG)
@@ -95,6 +100,9 @@ def workspace(
         str | None,
         typer.Option(metavar="ADDRESS", help="Have the workers of this Dask scheduler do it."),
     ] = None,
+    timeout: Annotated[
+        str | None, typer.Option(metavar="TIME", help="After which to stop, as by Ctrl-C.")
+    ] = None,
     plot: Annotated[
         str | None,
         typer.Option(metavar="FILE.png", help="Draw sections through the workspace."),
@@ -104,7 +112,7 @@ def workspace(
         bool, typer.Option("--overwrite", help="Replace a map that is in the folder of --out.")
     ] = False,
     quiet: Quiet = False,
-) -> None:
+) -> int:
     """Make a map of a workspace, or continue one; print and draw it."""
     check_picture(plot)
     from stiffopt.cli import map_report, quantities  # here, so that --help waits for no numerics
@@ -118,6 +126,7 @@ def workspace(
         directions = [quantities.direction("--direction", text) for text in direction]
     choices: dict[str, Any] = {"kind": kind, "boundary": boundary, "frame": frame}
     size = quantities.quantity("--cell", cell, "m", "length")
+    seconds = None if timeout is None else quantities.quantity("--timeout", timeout, "s", "time")
     mapped = load_robot(robot)
     around = None if scene is None else load_scene(scene)
     interrupt = InterruptBetweenSteps([signal.SIGINT])
@@ -136,29 +145,31 @@ def workspace(
             found = map_workspace(
                 mapped, out, directions=directions, samples=samples, levels=levels, cell=size,
                 seed=seed, scene=around, scheduler=scheduler, overwrite=overwrite,
-                progress=progress, **choices,
+                progress=progress, timeout=seconds, **choices,
             )  # fmt: skip
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, OutOfTimeError) as ended:
         if so_far is not None and not quiet:
             how = (
                 f"the same command goes on with {out}"
                 if out
                 else "nothing was kept: with --out a run can be resumed"
             )
-            report_note("stopped after {:,} of {:,} samples; ".format(*so_far) + how)
-        raise
-    seconds = perf_counter() - begin
+            why = "out of time; " if isinstance(ended, OutOfTimeError) else ""
+            report_note(why + "stopped after {:,} of {:,} samples; ".format(*so_far) + how)
+        return INTERRUPTED
+    took = perf_counter() - begin
     if out is not None and not found.evaluated and not quiet:
         report_note(f"{out} is complete; there was nothing left to sample")
     if as_json:
-        write_json(map_report.workspace_record(found, out, seconds))
+        write_json(map_report.workspace_record(found, out, took))
     elif not quiet:
-        show(map_report.workspace_summary(found, out, seconds))
+        show(map_report.workspace_summary(found, out, took))
     if plot is not None:
         from stiffopt.plots import save_figure
         from stiffopt.plots.maps import plot_workspace
 
         save_figure(plot_workspace(found), plot)
+    return 0
 
 
 ARM_HELP = """\
@@ -175,7 +186,7 @@ Examples:
   stiffopt map arm stiff-flop-1 --plot arm.png
   stiffopt map arm stiff-flop-2 --channels 1 --channels 4 --pressures '0:1.5:0.5 bar'
   stiffopt map arm stiff-flop-1 --over 1,2 --plot tip.png --csv tip.csv
-{_CODES}"""
+{_CODES.format(or_late="")}"""
 
 
 @map_app.command("arm", help=ARM_HELP, epilog=_ARM_EPILOG)

@@ -11,8 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from stiffopt.cli.path_records import SolvedPath, rate_margins
-from stiffopt.cli.tables import STATUS_COLOURS, labelled, number_table
+from stiffopt.cli.tables import STATUS_COLOURS, block_title, labelled, number_table
 from stiffopt.errors import printable
+from stiffopt.model.scene import Scene
 from stiffopt.paths.solution import PathSolution
 from stiffopt.plots.wording import BAR, MM, figures, unit_text
 
@@ -22,13 +23,8 @@ _ROWS = 10  # of the table, about
 def block(solved: SolvedPath) -> RenderableType:
     """Return the full report of one path, about 80 columns wide."""
     solution = solved.solution
-    heading = Text.assemble(
-        (printable(solved.file), "bold"),
-        "  ",
-        (solution.status, f"bold {STATUS_COLOURS[solution.status]}"),
-        f"  {solution.timings.get('total', 0.0):.2f} s",
-    )
-    parts: list[RenderableType] = [heading, labelled(_lines(solved))]
+    title = block_title(printable(solved.file), solution.status, solution.timings.get("total", 0.0))
+    parts: list[RenderableType] = [title, labelled(_lines(solved))]
     if len(solution.times):
         parts += ["", points_table(solution)]
     return Group(*parts, "")
@@ -63,15 +59,7 @@ def _lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]:
     )
     yield from _stiffness_lines(solved)
     yield from rate_lines(solution)
-    if solution.clearance is not None and path.scene is not None:
-        index = int(np.argmin(solution.clearance))
-        yield (
-            "clearance",
-            Text.assemble(
-                (f"{solution.clearance[index] * MM:.3f} mm", "bold"),
-                f" at point {index + 1}, required: at least {path.scene.clearance * MM:g} mm",
-            ),
-        )
+    yield from clearance_lines(solution, path.scene)
     if solution.confidence:
         yield "search", Text(solution.confidence)
 
@@ -116,6 +104,22 @@ def rate_lines(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
         Text.assemble(
             (f"{rate * BAR:.3g} of {solution.slew[channel] * BAR:.3g} bar/s", "bold"),
             f" at most, by {name} on the way to point {index + 1}",
+        ),
+    )
+
+
+def clearance_lines(
+    solution: PathSolution, scene: Scene | None
+) -> Iterable[tuple[str, RenderableType]]:
+    """Where the body is nearest to the scene."""
+    if solution.clearance is None or scene is None:
+        return
+    index = int(np.argmin(solution.clearance))
+    yield (
+        "clearance",
+        Text.assemble(
+            (f"{solution.clearance[index] * MM:.3f} mm", "bold"),
+            f" at point {index + 1}, required: at least {scene.clearance * MM:g} mm",
         ),
     )
 

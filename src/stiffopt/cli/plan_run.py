@@ -24,7 +24,6 @@ from stiffopt.model.scene import Scene, load_scene
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.paths.motion import plan_motion
 from stiffopt.paths.solution import PathSolution, Vector
-from stiffopt.plots.wording import MM
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -125,19 +124,14 @@ class PlanCommand:
     def _report(self, scene: Scene | None, solution: PathSolution) -> RenderableType:
         """The motion as text."""
         from rich.console import Group
-        from rich.text import Text
 
         from stiffopt.cli.path_report import points_table
-        from stiffopt.cli.tables import STATUS_COLOURS, labelled
+        from stiffopt.cli.tables import block_title, labelled
 
         robot = solution.robot.description
-        heading = Text.assemble(
-            (f"motion of {printable(robot.name)}", "bold"),
-            "  ",
-            (solution.status, f"bold {STATUS_COLOURS[solution.status]}"),
-            f"  {solution.timings.get('total', 0.0):.2f} s",
-        )
-        parts: list[RenderableType] = [heading, labelled(self._lines(scene, solution))]
+        seconds = solution.timings.get("total", 0.0)
+        title = block_title(f"motion of {printable(robot.name)}", solution.status, seconds)
+        parts: list[RenderableType] = [title, labelled(self._lines(scene, solution))]
         if len(solution.times):
             parts += ["", points_table(solution)]
         return Group(*parts, "")
@@ -147,7 +141,7 @@ class PlanCommand:
     ) -> Iterable[tuple[str, RenderableType]]:
         from rich.text import Text
 
-        from stiffopt.cli.path_report import rate_lines
+        from stiffopt.cli.path_report import clearance_lines, rate_lines
 
         if solution.message:
             yield "note", Text(solution.message)
@@ -157,15 +151,7 @@ class PlanCommand:
             return
         yield "time", Text(f"{solution.times[-1]:.4g} s, {len(solution.times)} points")
         yield from rate_lines(solution)
-        if solution.clearance is not None and scene is not None:
-            index = int(np.argmin(solution.clearance))
-            yield (
-                "clearance",
-                Text.assemble(
-                    (f"{solution.clearance[index] * MM:.3f} mm", "bold"),
-                    f" at point {index + 1}, required: at least {scene.clearance * MM:g} mm",
-                ),
-            )
+        yield from clearance_lines(solution, scene)
         if solution.confidence:
             yield "search", Text(solution.confidence)
 

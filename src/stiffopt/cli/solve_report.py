@@ -11,7 +11,7 @@ from rich.text import Text
 
 from stiffopt.cli.solve_records import priced
 from stiffopt.cli.solved_task import SolvedTask
-from stiffopt.cli.tables import STATUS_COLOURS, labelled
+from stiffopt.cli.tables import STATUS_COLOURS, block_title, labelled
 from stiffopt.errors import printable
 from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
 from stiffopt.optimise.measure import Measure
@@ -45,13 +45,8 @@ Line = tuple[str, RenderableType]
 def block(solved: SolvedTask) -> RenderableType:
     """Return the full report of one task, about 80 columns wide."""
     solution = solved.solution
-    heading = Text.assemble(
-        (printable(solved.file), "bold"),
-        "  ",
-        (solution.status, f"bold {STATUS_COLOURS[solution.status]}"),
-        f"  {solution.timings.get('total', 0.0):.2f} s",
-    )
-    return Group(heading, labelled(_lines(solved)), "")
+    title = block_title(printable(solved.file), solution.status, solution.timings.get("total", 0.0))
+    return Group(title, labelled(_lines(solved)), "")
 
 
 def _lines(solved: SolvedTask) -> Iterable[Line]:

@@ -152,3 +152,10 @@ def _escaped(text: str) -> str:
 
 def _cell(text: str) -> str:
     return _escaped(text).replace("|", r"\|")
+
+
+def block_title(name: str, status: str, seconds: float) -> Text:
+    """Return the first line of a report: what was solved, how that ended, and the time it took."""
+    return Text.assemble(
+        (name, "bold"), "  ", (status, f"bold {STATUS_COLOURS[status]}"), f"  {seconds:.2f} s"
+    )

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import hmac
 from collections.abc import Iterable
-from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from stiffopt.daemon.place import check_place
 from stiffopt.daemon.reports import RefusalError
-from stiffopt.daemon.secret import is_address
 from stiffopt.errors import InputError
 
 MAX_BODY = 1_000_000
@@ -57,9 +56,7 @@ class Token:
 class Access:
     """ASGI middleware that refuses requests without the token and those of foreign web pages.
 
-    - A web page in a browser on this machine can send requests here. So the header Host must be an
-      IP address or a known name, which no foreign name server can resolve to this machine (DNS
-      rebinding), and the header Origin, if there is one, must be the daemon's own.
+    - The headers Host and Origin must be those of a page of the daemon, see `check_place`.
     - Any other method than GET and HEAD needs the token.
     - A body that is too long is refused before it is read whole.
 
@@ -69,7 +66,7 @@ class Access:
     def __init__(self, app: ASGIApp, *, token: Token, hosts: Iterable[str] = ()) -> None:
         self._app = app
         self._token = token
-        self._hosts = {"localhost", *(host.lower().rstrip(".") for host in hosts)} - {""}
+        self._hosts = tuple(hosts)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it."""
@@ -78,7 +75,7 @@ class Access:
             return
         headers = Headers(scope=scope)
         try:
-            self._check_place(headers)
+            check_place(headers.getlist("host"), headers.getlist("origin"), self._hosts)
             if scope["type"] == "http":
                 if scope["method"] not in _READING:
                     self._token.check_headers(headers)
@@ -93,30 +90,6 @@ class Access:
             await JSONResponse(refusal.body, refusal.status, challenge)(scope, receive, send)
             return
         await self._app(scope, receive, send)
-
-    def _check_place(self, headers: Headers) -> None:
-        hosts = headers.getlist("host")
-        name = _host_name(hosts[0]) if len(hosts) == 1 else ""
-        if name not in self._hosts and not is_address(name):
-            raise RefusalError(
-                403,
-                "host",
-                "the header Host names no address of this daemon; use its IP address, localhost, "
-                "or the host of the rig file's service",
-            )
-        for origin in headers.getlist("origin"):
-            scheme, _, place = origin.partition("://")
-            if scheme not in ("http", "https") or place.lower() != hosts[0].lower():
-                raise RefusalError(
-                    403, "origin", "pages of other sites may not speak to this daemon"
-                )
-
-
-def _host_name(host: str) -> str:
-    try:
-        return (urlsplit(f"//{host}").hostname or "").rstrip(".")
-    except ValueError:
-        return ""
 
 
 async def _collected(receive: Receive, headers: Headers) -> Receive:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
-from stiffopt.errors import InputError, PressureError
+from stiffopt.errors import CancelledError, InputError, PressureError
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.results import (
     Comparison,
@@ -45,6 +45,7 @@ from stiffopt.identify.structures import (
 from stiffopt.identify.unknowns import BASE
 from stiffopt.identify.validation import compare
 from stiffopt.logs import StiffnessTable
+from stiffopt.model.actuation import StrainLaw
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.description import Recordings, RobotDescription
 from stiffopt.model.manipulator import Manipulator
@@ -110,7 +111,8 @@ def calibrate(
         Measured stiffness, fitted together with the logs.
     settings : CalibrationSettings, optional
     progress : callable, optional
-        Is told what is done, of how much, and in words.
+        Is told what is done, of how much, and in words. If it raises `CancelledError`, the best
+        model so far becomes the error's `found`.
 
     Returns
     -------
@@ -125,6 +127,9 @@ def calibrate(
         A file cannot be read or is wrong.
     EquilibriumError
         An arm under gravity buckles on the way.
+    CancelledError
+        From `progress`. Its `found` is the result with the best of the models that were fitted by
+        then, to `trial_rows` rows; None if there was none yet.
     """
     description, settings = description_of(robot), settings or CalibrationSettings()
     if not logs and not tables:
@@ -143,8 +148,36 @@ def calibrate(
             "stiffness", "stiffness alone", ("compensation.stiffness",), as_given=True
         )
         return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
-    first = near = _screened(setup, teller)
     candidates: list[Candidate] = []
+    try:
+        chosen = _chosen(setup, structures, laws, candidates, teller)
+        teller.begin(f"final fit: {chosen.structure.words}")
+        near = chosen.fit.problem.named(chosen.fit.x)
+        final = _final(setup, chosen.structure, near, teller)
+        return _result(setup, final, chosen.structure, candidates, teller)
+    except CancelledError as stop:
+        if candidates:
+            leader = best(candidates)
+            silent = _Teller(None, 0)
+            found = _result(setup, leader.fit, leader.structure, candidates, silent)
+            remark = (
+                f"the calibration was interrupted: '{leader.structure.words}' is the best of the "
+                f"models that were compared by then, fitted to {settings.trial_rows} rows"
+            )
+            stop.found = replace(found, remarks=(remark, *found.remarks))
+        raise
+
+
+def _chosen(
+    setup: Setup,
+    structures: Sequence[ModelStructure],
+    laws: Sequence[type[StrainLaw]],
+    candidates: list[Candidate],
+    teller: _Teller,
+) -> Candidate:
+    """Fit structures, then the best of them under other laws; list them all, return the best."""
+    description, recordings = setup.description, setup.recordings
+    first = near = _screened(setup, teller)
     for structure in structures:
         if len(structures) > 1 and not (
             structure.is_possible(description)
@@ -167,12 +200,9 @@ def calibrate(
                 words=f"{chosen.structure.words}; {law.words}",
             )
             others.append(_candidate(setup, structure, (near,), teller))
-        candidates += others[1:]
+            candidates.append(others[-1])
         chosen = best(others)
-    teller.begin(f"final fit: {chosen.structure.words}")
-    near = chosen.fit.problem.named(chosen.fit.x)
-    final = _final(setup, chosen.structure, near, teller)
-    return _result(setup, final, chosen.structure, candidates, teller)
+    return chosen
 
 
 def _candidate(

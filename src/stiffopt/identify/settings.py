@@ -43,6 +43,12 @@ class CalibrationSettings(Schema):
     rows: Annotated[int, Field(ge=50, le=100_000)] = 2000
     trial_rows: Annotated[int, Field(ge=50, le=100_000)] = 600
 
+    def quick(self) -> CalibrationSettings:
+        """These settings for an answer within a minute: one model, its law kept, few rows."""
+        structure = "hysteresis" if self.structure == "auto" else self.structure
+        rows = {"rows": min(self.rows, 400), "trial_rows": min(self.trial_rows, 200)}
+        return self.model_copy(update={"structure": structure, "strain_law": "keep", **rows})
+
 
 @dataclass(frozen=True)
 class TrackerFaultSettings:

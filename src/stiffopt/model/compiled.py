@@ -365,8 +365,8 @@ def _notify(error: build.BuildError) -> None:
 
 def _notify_of_waiting() -> None:
     _warn_once(
-        "machine code for this kind of arm and task is being made in the background; until it is "
-        "there, answers take longer"
+        "compiling once for this kind of arm and task, in the background (about 10 s); until then "
+        "answers take longer"
     )
 
 

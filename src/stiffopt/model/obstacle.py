@@ -8,7 +8,7 @@ object compiles nothing.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from functools import cache
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import casadi as ca
@@ -119,7 +119,7 @@ class Obstacle(Schema, ABC):
                 f"counts from {begin * 1e3:.4g} mm up the arm; expected less than half the first "
                 f"segment, {500 * length:g} mm",
             )
-        left = self.distance_of((0.0, 0.0, 0.0)) - radius
+        left = self.from_base - radius
         if begin > 0 or left >= clearance:
             return
         has = f"has {left * 1e3:.4g} mm of the clearance of {clearance * 1e3:g} mm asked for"
@@ -148,15 +148,20 @@ class Obstacle(Schema, ABC):
         clearance :
             That is asked for, in m.
         """
-        missing = base_radius + clearance - self.distance_of((0.0, 0.0, 0.0))
+        missing = base_radius + clearance - self.from_base
         return _RISEN * missing if missing > 0 and self._is_behind_base else 0.0
 
     @property
     def _is_behind_base(self) -> bool:
-        if self.along != "convex" or self.distance_of((0.0, 0.0, 0.0)) < -_FLUSH:
+        if self.along != "convex" or self.from_base < -_FLUSH:
             return False
         rise = self.distance_of((0.0, 0.0, 2 * _ABOVE)) - self.distance_of((0.0, 0.0, _ABOVE))
         return rise > (1 - _STRAIGHT) * _ABOVE
+
+    @cached_property
+    def from_base(self) -> float:
+        """Signed distance of the origin, the middle of an arm's base, in m."""
+        return self.distance_of((0.0, 0.0, 0.0))
 
     def distance_of(self, point: Any) -> float:
         """Signed distance of one point (3,), from the formula itself, in m."""

@@ -2,8 +2,9 @@
 
 After the rows of the terms there is one for each object and segment (with its connector), of a
 ring one for the whole arm: ``margin - (distance - clearance) <= margin``, with the derivatives of
-the nearest point.  Steps of a search find that point by a few stations; an answer is judged by the
-exact minimum along the body (`stiffopt.model.clearance`).
+the nearest point.  In machine code that is the exact minimum along the body wherever it is near;
+without, steps of a search find it by a few stations, and an answer is judged by the exact one
+(`stiffopt.model.clearance`).
 Scenes are data of these rows, so that no object compiles anything.
 """
 
@@ -50,7 +51,7 @@ class _Obstacles(ctypes.Structure):
         ("count", _integer),
         ("segments", _integer),
         *((name, _pointer) for name in ("ends", "bounds", "stations")),
-        *((name, _double) for name in ("clearance", "margin", "cutoff", "allowed")),
+        *((name, _double) for name in ("clearance", "margin", "cutoff")),
     ]
 
 
@@ -104,7 +105,6 @@ class ObstaclesInC:
             clearance=obstacles.scene.clearance,
             margin=OBSTACLES.margin,
             cutoff=obstacles.scene.clearance + OBSTACLES.cutoff,
-            allowed=OBSTACLES.allowed,
         )
         self.address = ctypes.addressof(self._structure)
 

@@ -124,9 +124,9 @@ class ForRobot(Schema):
         except FileError as error:
             if Path(error.path).exists():
                 raise
-            raise self._error("robot", f"there is no file '{error.path}'") from None
+            raise self.error_at("robot", f"there is no file '{error.path}'") from None
         except InputError as error:
-            raise self._error("robot", str(error)) from None
+            raise self.error_at("robot", str(error)) from None
 
     def check_scene(self, description: RobotDescription) -> None:
         """Refuse a scene that makes no sense for a robot.
@@ -165,12 +165,12 @@ class ForRobot(Schema):
             for key, value in self.pressure:
                 description.check_per_channel(key, value)
         except BadKeyError as error:
-            raise self._error(f"pressure.{error.loc[0]}", str(error)) from None
+            raise self.error_at(f"pressure.{error.loc[0]}", str(error)) from None
         lower = np.fmax(lower, np.array(self.pressure.min, dtype=float))  # None is nan: no limit
         upper = np.fmin(upper, np.array(self.pressure.max, dtype=float))
         for index in np.flatnonzero(lower > upper):
             key = "max" if self.pressure.max is not None else "min"
-            raise self._error(
+            raise self.error_at(
                 f"pressure.{key}",
                 f"leaves {description.channel_name(int(index))} no pressure, as its min is "
                 f"{lower[index] * 1e-5:g} bar and its max {upper[index] * 1e-5:g} bar "
@@ -178,7 +178,7 @@ class ForRobot(Schema):
             )
         return lower, upper
 
-    def _error(self, key: str, reason: str) -> InputError:
+    def error_at(self, key: str, reason: str) -> InputError:
         """Return the error that blames a key, in the file if this was read from one."""
         if self.source is None:
             return InputError(f"{type(self).__name__}.{key}: {reason}")

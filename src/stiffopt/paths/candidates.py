@@ -5,14 +5,13 @@ from point to point, forwards and backwards.  A branch ends where its optimum va
 next to it then leads to another branch, or to none.
 """
 
+import itertools
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.model.stopping import checkpoint
-from stiffopt.optimise.problem import PressureProblem
-from stiffopt.optimise.reach import reach_all
 from stiffopt.paths.points import Local, PathCandidate, PathTasks
 from stiffopt.paths.settings import CANDIDATES, LANES
 
@@ -60,50 +59,57 @@ def lanes(tasks: PathTasks) -> list[list[PathCandidate]]:
     """Further candidates at each point of a free arm: any pressures that solve the task there.
 
     Some are spread over all that reach the target at a few points, and follow the path from there
-    with as little change as possible.  A way from branch to branch leads over them where the
-    direct one does not stay on the path.
+    with as little change as possible, from one mark to the next.  A way from branch to branch
+    leads over them where the direct one does not stay on the path.
     """
-    count, n = len(tasks), len(tasks.unit)
+    count = len(tasks)
     if tasks.robot.is_loaded:
         return [[] for _ in range(count)]
-    problems = [tasks.problem(index) for index in range(count)]
-    knots = np.unique(np.linspace(0, count - 1, LANES.knots).round().astype(int)).tolist()
-    spread = {
-        knot: _spread(tasks, _come(problems[knot], tasks.near(knot, LANES.starts)))
-        for knot in knots
+    marks = np.unique(np.linspace(0, count - 1, min(count, LANES.marks)).round().astype(int))
+    knots = marks[np.unique(np.linspace(0, len(marks) - 1, LANES.knots).round().astype(int))]
+    born = {
+        knot: tasks.brought(np.full(LANES.starts, knot), tasks.near(knot, LANES.starts))[0]
+        for knot in knots.tolist()
     }
-    followed: list[list[Vector]] = [[] for _ in range(count)]
-    for order in (range(count), range(count - 1, -1, -1)):
-        live = np.zeros((0, n))
-        for index in order:
+    points: list[NDArray[np.intp]] = []
+    guesses: list[Vector] = []
+    for order in (marks.tolist(), marks[::-1].tolist()):
+        live = _spread(tasks, np.zeros((0, len(tasks.unit))), born[order[0]])
+        points.append(np.full(len(live), order[0]))
+        guesses.append(live)
+        for here, there in itertools.pairwise(order):
             checkpoint()
-            live = _come(problems[index], np.vstack([live, spread.get(index, live[:0])]))
-            followed[index].append(live)
-    return [
-        tasks.assessed(index, _spread(tasks, np.vstack(some), len(tasks.unit) * LANES.kept))
-        for index, some in enumerate(followed)
-    ]
+            came, arrived = tasks.brought(np.full(len(live), there), live)
+            live = live[arrived]
+            for point in range(here, there, 1 if there > here else -1)[1:]:
+                share = (point - here) / (there - here)
+                points.append(np.full(len(live), point))
+                guesses.append(live + share * (came - live))
+            live = _spread(tasks, came, born[there]) if there in born else came
+            points.append(np.full(len(live), there))
+            guesses.append(live)
+    where = np.concatenate(points)
+    pressures, arrived = tasks.brought(where, np.concatenate(guesses))
+    return tasks.assessed(where[arrived], pressures)
 
 
-def _come(problem: PressureProblem, pressures: Vector) -> Vector:
-    """Those of some pressures (k, n) that come to the target, there."""
-    if not len(pressures):
-        return pressures
-    x, excess = reach_all(problem, pressures / problem.unit)
-    return np.clip(x[excess <= 1], problem.lower, problem.upper) * problem.unit
+def _spread(tasks: PathTasks, live: Vector, new: Vector) -> Vector:
+    """Pressures (k, n) that differ, and new ones that are far from all of them, the furthest first.
 
-
-def _spread(tasks: PathTasks, pressures: Vector, most: int = LANES.kept) -> Vector:
-    """Some of these pressures (k, n), far from each other: each the furthest from those before."""
-    if not len(pressures):
-        return pressures
-    x = pressures / tasks.unit
-    chosen = [0]
-    distance = np.abs(x - x[0]).max(axis=1)
-    while len(chosen) < most and distance.max() > LANES.apart:
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, np.abs(x - x[chosen[-1]]).max(axis=1))
-    return pressures[chosen]
+    There are at most `LANES.kept` then.
+    """
+    x = np.vstack([live, new]) / tasks.unit
+    distance = np.full(len(x), np.inf)
+    chosen: list[int] = []
+    for some, apart in (
+        (slice(0, len(live)), LANES.alike),
+        (slice(len(live), len(x)), LANES.apart),
+    ):
+        own = distance[some]
+        while len(own) and len(chosen) < LANES.kept and own.max() > apart:
+            chosen.append(some.start + int(own.argmax()))
+            np.minimum(distance, np.abs(x - x[chosen[-1]]).max(axis=1), out=distance)
+    return x[chosen] * tasks.unit
 
 
 def _at_knots(tasks: PathTasks, knots: Sequence[int]) -> tuple[dict[int, list[PathCandidate]], int]:

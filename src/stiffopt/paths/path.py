@@ -250,13 +250,13 @@ class Path(ForRobot):
                 continue
             pressures = np.array(given.pressures, dtype=float)
             if len(pressures) != len(lower):
-                raise self._error(
+                raise self.error_at(
                     f"{key}.pressures",
                     f"has {len(pressures)} values; expected {len(lower)}, one for each channel of "
                     "the robot, proximal segment first",
                 )
             for index in np.flatnonzero((pressures < lower) | (pressures > upper)):
-                raise self._error(
+                raise self.error_at(
                     f"{key}.pressures",
                     f"{description.channel_name(int(index))} is at {pressures[index] * 1e-5:g} "
                     f"bar; expected {lower[index] * 1e-5:g} bar to {upper[index] * 1e-5:g} bar",

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -15,11 +16,14 @@ from stiffopt.optimise.local import descend
 from stiffopt.optimise.prepared import prepared
 from stiffopt.optimise.problem import PressureProblem
 from stiffopt.optimise.program import Program, pressure_ranges
-from stiffopt.optimise.reach import reach
+from stiffopt.optimise.reach import bounded_steps, reach
+from stiffopt.optimise.settings import REACH
 from stiffopt.optimise.solution import Judgement, are_within, judge
 from stiffopt.optimise.task import Task
+from stiffopt.paths.settings import LANES
 
 Vector = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 
 class PathCandidate(NamedTuple):
@@ -96,7 +100,13 @@ class PathTasks:
         ]
         self._fast = self._prepared.fast(first)
         self.is_compiled = self._fast is not None
+        self._functions = functions(self.robot, self.programs[0])
         self._rows: dict[int, Vector] = {}
+
+    @cached_property
+    def _parameters(self) -> Vector:
+        """Of the functions at each point."""
+        return np.array([self.robot.parameters(each.parameters) for each in self.programs])
 
     def __len__(self) -> int:
         return len(self.tasks)
@@ -175,22 +185,46 @@ class PathTasks:
 
     # -- evaluation -------------------------------------------------------------------------
 
-    def problem(self, index: int) -> PressureProblem:
-        """The general optimiser's view of a point."""
-        return PressureProblem(self.robot, self._without_load[index])
+    def brought(self, indices: NDArray[np.intp], pressures: Vector) -> tuple[Vector, Mask]:
+        """Pressures (k, n) of a free arm brought to targets near by, each to that of a point.
 
-    def assessed(self, index: int, pressures: Vector) -> list[PathCandidate]:
-        """Candidates that pressures (k, n) at the target of a point are, if the body is clear."""
-        scene = self.tasks[index].scene
+        Those that arrive, and which (k,) these are.
+        """
+        lower, upper = self.lower / self.unit, self.upper / self.unit
+        bounding = PressureProblem(self.robot, self._without_load[0]).terms_bounding
+        x, is_at = np.clip(pressures / self.unit, lower, upper), np.zeros(len(pressures), bool)
+        parameters = self._parameters[indices]
+        going = np.arange(len(x))
+        for left in range(LANES.iterations, -1, -1):
+            r, J = self._functions["pose"].many(x[going] * self.unit, parameters[going], threads=1)
+            r, J = r[:, bounding.rows, 0], J.swapaxes(1, 2)[:, bounding.rows] * self.unit
+            arrived = bounding.errors(r) <= 1
+            is_at[going[arrived]] = True
+            going, r, J = going[~arrived], r[~arrived], J[~arrived]
+            if not left or not len(going):
+                break
+            r, J = bounding.missing(r, J)
+            D = np.broadcast_to(
+                REACH.least_damping * bounding.far_damping, (len(r), r.shape[1], r.shape[1])
+            )
+            step = REACH.longest_step
+            low, high = np.maximum(lower - x[going], -step), np.minimum(upper - x[going], step)
+            x[going] = np.clip(x[going] + bounded_steps(J, -r, D, low, high), lower, upper)
+        return x[is_at] * self.unit, is_at
+
+    def assessed(self, indices: NDArray[np.intp], pressures: Vector) -> list[list[PathCandidate]]:
+        """Candidates at each point, of pressures (k, n) at targets, where the body is clear."""
+        found: list[list[PathCandidate]] = [[] for _ in range(len(self))]
+        scene = self.tasks[0].scene
         if scene is not None and len(pressures):
-            pressures = pressures[self.robot.clearance(pressures, scene) >= scene.clearance]
-        if not len(pressures):
-            return []
-        slopes = self.slopes([index] * len(pressures), pressures)
-        if slopes is None:
-            return []
-        pairs = zip(pressures, slopes.costs.max(axis=1).tolist(), strict=True)
-        return [PathCandidate(p, -cost) for p, cost in pairs]
+            clear = self.robot.clearance(pressures, scene) >= scene.clearance
+            indices, pressures = indices[clear], pressures[clear]
+        slopes = self.slopes(indices.tolist(), pressures) if len(pressures) else None
+        if slopes is not None:
+            values = (-slopes.costs.max(axis=1)).tolist()
+            for index, p, value in zip(indices.tolist(), pressures, values, strict=True):
+                found[index].append(PathCandidate(p, value))
+        return found
 
     def judged(self, pressures: Vector) -> list[Judgement | None]:
         """Judgement by the model of pressures (N, n), one of each point; None: no equilibrium."""
@@ -227,9 +261,9 @@ class PathTasks:
             if len(known) < len(parts):
                 return None
             return Slopes(*(np.stack(each) for each in zip(*known, strict=True)))
-        parameters = [self.robot.parameters(self.programs[i].parameters) for i in indices]
-        point = functions(self.robot, self.programs[0])["point"]
-        residuals, jacobians, costs, gradients = point.many(pressures, np.stack(parameters))[:4]
+        point = self._functions["point"]
+        parameters = self._parameters[np.asarray(indices)]
+        residuals, jacobians, costs, gradients = point.many(pressures, parameters)[:4]
         return Slopes(
             residuals[..., 0],
             jacobians.swapaxes(1, 2) * self.unit,

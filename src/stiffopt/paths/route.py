@@ -6,6 +6,8 @@ stays on the path.  How stiff the arm is on a crossing is computed only for thos
 sequence would use; until then a crossing counts as good as its ends.
 """
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -18,30 +20,7 @@ from stiffopt.paths.settings import RATES, ROUTE
 
 Vector = NDArray[np.float64]
 Indices = NDArray[np.intp]
-
-
-@dataclass
-class _Crossings:
-    """Crossings in the order of the points where they end; arrays have a value for each.
-
-    Attributes
-    ----------
-    begin, a : from which candidate of which point.
-    end, b : to which.
-    worst, total : values on the way; until a crossing is computed they are guessed.
-    between : the candidates at the points between, of those that are computed.
-    """
-
-    begin: Indices
-    a: Indices
-    end: Indices
-    b: Indices
-    worst: Vector
-    total: Vector
-    between: dict[int, list[PathCandidate]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.known = np.zeros(len(self.begin), dtype=bool)
+_NONE = np.zeros(0, dtype=np.intp)
 
 
 @dataclass
@@ -64,27 +43,62 @@ class Route:
 
 
 class _Sequence(NamedTuple):
-    """Candidates (point, number) and numbers of crossings in order; worst value and mean."""
+    """The first candidate, numbers of links in order, worst value (where it counts) and mean."""
 
-    steps: list[tuple[int, int] | int]
+    first: int
+    links: list[int]
     worst: float
     mean: float
 
 
 @dataclass
-class _Best:
-    """Of the best sequences to each candidate: value, and where it came from.
+class _Links:
+    """Ways from a candidate to one of a later point, in the order of where they end.
 
-    `before` counts candidates of the point before, and crossings as ``-1 - number``.
+    Candidates are counted through all points.  A link is a step to the next point or a crossing.
+
+    Attributes
+    ----------
+    origin, goal : candidates at both ends.
+    worst, total : values between; until a crossing is computed they are guessed.
+    known : whether they are computed.
+    between : the candidates between, of crossings that were computed.
     """
 
-    values: list[Vector] = field(default_factory=list)
-    before: list[Indices] = field(default_factory=list)
+    origin: Indices
+    goal: Indices
+    worst: Vector
+    total: Vector
+    known: NDArray[np.bool_]
+    between: dict[int, list[PathCandidate]] = field(default_factory=dict)
 
+    @classmethod
+    def steps(cls, origin: Indices, goal: Indices) -> "_Links":
+        """Steps, with nothing between."""
+        count = len(goal)
+        return cls(origin, goal, np.full(count, np.inf), np.zeros(count), np.ones(count, bool))
 
-def steps_are_kept(pressures: Vector, steps: Vector) -> bool:
-    """Whether pressures (N, n) change by no more than steps (N - 1, n) from point to point."""
-    return bool((np.abs(np.diff(pressures, axis=0)) <= steps * (1 + RATES.rounding) + 1e-9).all())
+    def with_crossings(self, others: "_Links") -> "_Links":
+        """These steps, and crossings that are not computed yet."""
+        order = np.argsort(np.concatenate([self.goal, others.goal]), kind="stable")
+        return _Links(
+            np.concatenate([self.origin, others.origin])[order],
+            np.concatenate([self.goal, others.goal])[order],
+            np.concatenate([self.worst, others.worst])[order],
+            np.concatenate([self.total, others.total])[order],
+            np.concatenate([self.known, others.known])[order],
+        )
+
+    def sorted_by_point(self, first: Indices) -> list[tuple[slice, Indices, Indices]]:
+        """For each point: its links, where each goal's begin among them, and the goals."""
+        bounds = np.searchsorted(self.goal, first)
+        heads = np.flatnonzero(np.diff(self.goal, prepend=-1))
+        runs = np.searchsorted(heads, bounds)
+        return [
+            (slice(a, b), heads[c:d] - a, self.goal[heads[c:d]])
+            for a, b, c, d in zip(bounds[:-1], bounds[1:], runs[:-1], runs[1:], strict=True)
+            if b > a
+        ]
 
 
 class RouteSearch:
@@ -94,78 +108,114 @@ class RouteSearch:
     ----------
     tasks : PathTasks
     layers : list of list of PathCandidate
-        At each of N points.
+        Local optima at each of N points.
     steps : (N - 1, n)
         Largest changes of pressure from point to point, in Pa.
     over : "worst" or "mean"
         Which value along the path counts.
+    lanes : list of list of PathCandidate, optional
+        Further candidates at each point.
+    is_closed : whether sequences end with the pressures with which they begin.
     """
 
     def __init__(
-        self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector, over: str
+        self,
+        tasks: PathTasks,
+        layers: Sequence[Sequence[PathCandidate]],
+        steps: Vector,
+        over: str,
+        lanes: Sequence[Sequence[PathCandidate]] | None = None,
+        is_closed: bool = False,
     ) -> None:
-        self._tasks, self._layers, self._steps, self._over = tasks, layers, steps, over
-        self._values = [np.array([each.value for each in layer]) for layer in layers]
-        self._pressures = [
-            np.array([each.pressures for each in layer]).reshape(len(layer), len(tasks.unit))
-            for layer in layers
-        ]
-        # from each candidate (columns) to each of the next point (rows): 0, or -inf
-        self._bars = [
-            _bars(before, after, step * (1 + RATES.rounding) + 1e-9)
-            for before, after, step in zip(
-                self._pressures[:-1], self._pressures[1:], steps, strict=True
-            )
-        ]
-        self._first = np.cumsum([0, *map(len, layers)])  # candidate of each point, of all
-        none, nothing = np.zeros(0, dtype=np.intp), np.zeros(0)
-        self._crossings = _Crossings(none, none, none, none, nothing, nothing)
+        self._tasks, self._steps, self._over = tasks, steps, over
+        count = len(layers)
+        if is_closed:
+            layers = [*layers[:-1], layers[0]]
+        further = lanes or [[] for _ in layers]
+        pairs = list(zip(layers, further, strict=True))
+        sizes = [len(own) + len(more) for own, more in pairs]
+        self._candidates = [each for own, more in pairs for each in (*own, *more)]
+        self._is_lane = np.array(
+            [lane for pair in pairs for lane in (False, True) for _ in pair[lane]], dtype=bool
+        )
+        self._first = np.cumsum([0, *sizes])  # candidate of each point, of all
+        self._point = np.repeat(np.arange(count), sizes)
+        self._values = np.array([each.value for each in self._candidates])
+        self._pressures = np.array([each.pressures for each in self._candidates]).reshape(
+            len(self._candidates), len(tasks.unit)
+        )
+        self._ends: Sequence[int | None] = range(len(layers[0])) if is_closed else [None]
+        self._usable = self._values
+        self._set_links(self._all_steps())
 
-    def best(self, rounds: int = ROUTE.rounds, *, any_will_do: bool = False) -> Route | None:
+    def best(
+        self, rounds: int = ROUTE.rounds, *, share: float | None = None, any_will_do: bool = False
+    ) -> Route | None:
         """The best sequence, or any; None if there is none.
 
-        Crossings are computed in so many rounds; without any, only steps from candidate to
-        candidate count.
+        Crossings are computed in so many rounds, until one is about as good as can be, or has this
+        share of what the points alone could have.
         """
-        direct = self._sequence()
-        if (
-            not rounds
-            or (direct is not None and any_will_do)
-            or (direct is not None and self._is_about(direct, self._hope()))
-        ):
-            return None if direct is None else self._route(direct)
-        self._crossings = self._all_crossings()
+        hope = self._hope()
+        best = self._best_of_ends(0, hope, share, any_will_do)
+        if best is None or not (any_will_do or self._is_enough(best, hope, share)):
+            self._add_crossings()
+            best = self._best_of_ends(rounds, hope, share, any_will_do)
+        return None if best is None else self._route(best)
+
+    def _best_of_ends(
+        self, rounds: int, hope: _Sequence, share: float | None, any_will_do: bool
+    ) -> _Sequence | None:
+        found: list[_Sequence] = []
+        for end in self._ends:
+            self._hold(end)
+            one = self._best(rounds, hope, share, any_will_do)
+            found += [] if one is None else [one]
+        self._hold(None)
+        return max(found, key=lambda each: (each.worst, each.mean), default=None)
+
+    def _best(
+        self, rounds: int, hope: _Sequence, share: float | None, any_will_do: bool
+    ) -> _Sequence | None:
+        known = self._sequence(computed=True)
         for _ in range(rounds):
+            if known is not None and (any_will_do or self._is_enough(known, hope, share)):
+                return known
             hoped = self._sequence()
             if hoped is None:
                 return None
-            used = [each for each in hoped.steps if isinstance(each, int)]
-            unknown = [each for each in used if not self._crossings.known[each]]
-            if not unknown:
-                return self._route(hoped)
-            enough = -np.inf if any_will_do else hoped.worst - ROUTE.hardly
-            known = self._sequence(enough, computed=True)
-            if known is not None and (any_will_do or self._is_about(known, hoped)):
-                return self._route(known)
+            unknown = [each for each in hoped.links if not self._links.known[each]]
+            if not unknown or (known is not None and self._is_enough(known, hoped, None)):
+                return known
             for number in unknown:
                 checkpoint()
                 self._compute(number)
-        known = self._sequence(computed=True)
-        return None if known is None else self._route(known)
+            if any(number in self._links.between for number in unknown):
+                known = self._sequence(computed=True)
+        return known
 
-    def _is_about(self, known: _Sequence, hoped: _Sequence) -> bool:
-        """Whether a sequence is hardly worse than what is hoped for."""
-        if self._over == "worst":
-            return (
-                known.worst > hoped.worst - ROUTE.hardly
-                and known.mean > hoped.mean - ROUTE.hardly_on_average
-            )
-        return known.mean > hoped.mean - ROUTE.hardly
+    def _hold(self, end: int | None) -> None:
+        """Have sequences begin and end with one candidate of the first point, or with any."""
+        self._usable = self._values
+        if end is not None:
+            self._usable = self._values.copy()
+            for first, last in (self._first[:2], self._first[-2:]):
+                self._usable[first:last] = -np.inf
+                self._usable[first + end] = self._values[first + end]
+
+    def _is_enough(self, known: _Sequence, hoped: _Sequence, share: float | None) -> bool:
+        """Whether a sequence has a share of what is hoped for; without any, almost all of it."""
+        over = self._over == "worst"
+        gain = hoped.worst - known.worst if over else hoped.mean - known.mean
+        if share is not None:
+            return gain < -math.log(share)
+        on_average = hoped.mean - known.mean
+        return gain < ROUTE.hardly and (not over or on_average < ROUTE.hardly_on_average)
 
     def _hope(self) -> _Sequence:
         """What no sequence can be better than."""
-        best = [values.max(initial=-np.inf) for values in self._values]
-        return _Sequence([], float(min(best)), float(np.mean(best)))
+        best = np.maximum.reduceat(self._values, self._first[:-1])
+        return _Sequence(0, [], float(best.min()), float(best.mean()))
 
     def comes_up_to(self, route: Route | None, share: float) -> bool:
         """Whether a sequence has this share of what the points alone could have."""
@@ -176,151 +226,156 @@ class RouteSearch:
     @property
     def furthest(self) -> int:
         """The last point that a sequence comes to."""
-        values = self._best(-np.inf, bottleneck=True, computed=True).values
-        return max((i for i, each in enumerate(values) if np.isfinite(each).any()), default=0)
+        reached = np.isfinite(self._reached(-np.inf, bottleneck=True, computed=True))
+        return int(self._point[reached].max(initial=0))
 
     # -- dynamic programming ------------------------------------------------------------------
 
-    def _sequence(self, enough: float = -np.inf, *, computed: bool = False) -> _Sequence | None:
-        """The best sequence, maybe of computed crossings alone; None where the worst is less."""
-        least = worst = -np.inf
-        if self._over == "worst":
-            best = self._best(least, bottleneck=True, computed=computed)
-            if not np.isfinite(best.values[-1]).any():
-                return None
-            worst = float(best.values[-1].max())
-            if worst < enough:
-                return None
-            least = worst - 1e-9
-        best = self._best(least, bottleneck=False, computed=computed)
-        if not np.isfinite(best.values[-1]).any():
-            return None
-        point, number = len(self._layers) - 1, int(np.argmax(best.values[-1]))
-        mean = float(best.values[-1][number]) / len(self._layers)
-        found: list[tuple[int, int] | int] = [(point, number)]
-        while point:
-            came = int(best.before[point][number])
-            if came >= 0:
-                point, number = point - 1, came
-            else:
-                found.append(-1 - came)
-                point = int(self._crossings.begin[-1 - came])
-                number = int(self._crossings.a[-1 - came])
-            found.append((point, number))
-        return _Sequence(found[::-1], worst, mean)
+    def _set_links(self, links: _Links) -> None:
+        self._links = links
+        self._by_point = links.sorted_by_point(self._first)
+        self._starts = np.searchsorted(links.goal, np.arange(len(self._values) + 1))
 
-    def _best(self, least: float, *, bottleneck: bool, computed: bool = False) -> _Best:
-        """Best worst value (`bottleneck`), or sum of values that are all at least `least`."""
-        best, every = _Best(), np.full(self._first[-1], -np.inf)
-        crossings = self._crossings
-        usable = np.flatnonzero((crossings.worst >= least) & (crossings.known | (not computed)))
-        starts = np.searchsorted(crossings.end[usable], np.arange(len(self._values) + 1))
-        origin = self._first[crossings.begin] + crossings.a
-        price = crossings.worst if bottleneck else crossings.total
-        for point, own in enumerate(self._values):
-            values = np.full(len(own), -np.inf if point else np.inf if bottleneck else 0.0)
-            before = np.zeros(len(own), dtype=np.intp)
-            if point and len(own) and len(best.values[-1]):
-                reached = self._bars[point - 1] + best.values[-1]
-                before = reached.argmax(axis=1)
-                values = reached[np.arange(len(own)), before]
-            some = usable[starts[point] : starts[point + 1]]
-            if len(some):
-                came, passed = every[origin[some]], price[some]
-                came = np.minimum(came, passed) if bottleneck else came + passed
-                order = np.argsort(came, kind="stable")  # so that the best stays
-                over, number = np.full(len(own), -np.inf), np.zeros(len(own), dtype=np.intp)
-                goals = crossings.b[some[order]]
-                over[goals] = came[order]
-                number[goals] = some[order]
-                before = np.where(over > values, -1 - number, before)
-                values = np.maximum(values, over)
-            values = np.minimum(values, own) if bottleneck else values + own
-            values = np.where(own >= least, values, -np.inf)
-            every[self._first[point] : self._first[point + 1]] = values
-            best.values.append(values)
-            best.before.append(before)
-        return best
+    def _sequence(self, *, computed: bool = False) -> _Sequence | None:
+        """The best sequence, maybe of computed links alone; None without any."""
+        if self._over == "mean":
+            return self._traced(-np.inf, computed=computed)
+        worst = self._reached(-np.inf, bottleneck=True, computed=computed)
+        best = float(worst[self._first[-2] :].max(initial=-np.inf))
+        if not np.isfinite(best):
+            return None
+        found = self._traced(best - 1e-9, computed=computed)
+        return found and found._replace(worst=best)
+
+    def _prices(self, least: float, *, bottleneck: bool, computed: bool) -> Vector:
+        links = self._links
+        usable = links.worst >= least
+        if computed:
+            usable &= links.known
+        return np.where(usable, links.worst if bottleneck else links.total, -np.inf)
+
+    def _reached(self, least: float, *, bottleneck: bool, computed: bool = False) -> Vector:
+        """To each candidate the best worst value, or sum of values that are at least `least`."""
+        price = self._prices(least, bottleneck=bottleneck, computed=computed)
+        join = np.minimum if bottleneck else np.add
+        own = np.where(self._usable >= least, self._usable, -np.inf)
+        found = np.full(len(own), -np.inf)
+        found[: self._first[1]] = own[: self._first[1]]
+        origin = self._links.origin
+        for some, runs, goals in self._by_point:
+            came = join(found[origin[some]], price[some])
+            found[goals] = join(np.maximum.reduceat(came, runs), own[goals])
+        return found
+
+    def _traced(self, least: float, *, computed: bool = False) -> _Sequence | None:
+        """The sequence with the best sum of values, all at least `least`."""
+        price = self._prices(least, bottleneck=False, computed=computed)
+        reached = self._reached(least, bottleneck=False, computed=computed)
+        at = int(self._first[-2] + reached[self._first[-2] :].argmax())
+        if not np.isfinite(reached[at]):
+            return None
+        mean = float(reached[at]) / (len(self._first) - 1)
+        links: list[int] = []
+        while self._point[at]:
+            some = slice(self._starts[at], self._starts[at + 1])
+            came = reached[self._links.origin[some]] + price[some]
+            links.append(int(some.start + came.argmax()))
+            at = int(self._links.origin[links[-1]])
+        return _Sequence(at, links[::-1], -np.inf, mean)
 
     def _route(self, found: _Sequence) -> Route:
-        candidates: list[PathCandidate] = []
+        candidates = [self._candidates[found.first]]
         crossings = 0
-        for each in found.steps:
-            if isinstance(each, int):
-                candidates += self._crossings.between[each]
-                crossings += 1
-            else:
-                candidates.append(self._layers[each[0]][each[1]])
+        for each in found.links:
+            between = self._links.between.get(each, [])
+            candidates += [*between, self._candidates[self._links.goal[each]]]
+            crossings += bool(between)
         return Route(candidates, crossings)
 
-    # -- crossings ------------------------------------------------------------------------------
+    # -- steps and crossings ----------------------------------------------------------------------
 
-    def _all_crossings(self) -> _Crossings:
+    def _all_steps(self) -> _Links:
+        """Steps from point to point that keep the rates."""
+        origins, goals = [_NONE], [_NONE]
+        first = self._first.tolist()
+        for a, b, c, step in zip(first[:-2], first[1:-1], first[2:], self._steps, strict=True):
+            apart = np.abs(self._pressures[b:c, np.newaxis] - self._pressures[a:b])
+            after, before = (apart <= step * (1 + RATES.rounding) + 1e-9).all(axis=2).nonzero()
+            origins.append(a + before)
+            goals.append(b + after)
+        return _Links.steps(np.concatenate(origins), np.concatenate(goals))
+
+    def _add_crossings(self) -> None:
         """Crossings from some points, where candidates are too far apart for a step."""
-        count = len(self._layers)
-        point = np.repeat(np.arange(count), [len(layer) for layer in self._layers])
-        pressures = np.concatenate(self._pressures)
+        count = len(self._first) - 1
         reach = np.concatenate([np.zeros((1, len(self._tasks.unit))), self._steps.cumsum(axis=0)])
-        widest = np.ptp(pressures, axis=0)
-        none = np.zeros(0, dtype=np.intp)
-        origins, goals = [none], [none]
+        widest = np.ptp(self._pressures, axis=0)
+        origins, goals = [_NONE], [_NONE]
         for begin in range(0, count - 2, max(1, count // ROUTE.crossings)):
+            checkpoint()
             lengths = np.arange(2, count - begin)
             limits = np.maximum((reach[begin + 2 :] - reach[begin]) * ROUTE.within, 1e-9)
-            needed = (widest / limits).max(axis=1) * lengths  # steps, by the widest apart
-            longest = lengths[np.ceil(max(ROUTE.lengths) * np.maximum(needed, 1.0)) >= lengths]
-            last = begin + longest.max(initial=1)
-            later = np.arange(self._first[begin + 2], self._first[last + 1])
-            length = point[later] - begin
-            for origin in range(self._first[begin], self._first[begin + 1]):
-                apart = np.abs(pressures[later] - pressures[origin])
-                # steps, if all of them are as large
-                needed = np.max(apart / limits[length - 2], axis=1) * length
-                for more in ROUTE.lengths:
-                    fits = (np.ceil(more * np.maximum(needed, 1.0)) == length) & (needed > 1)
-                    nearest = np.flatnonzero(fits)
-                    nearest = nearest[np.argsort(needed[nearest], kind="stable")[: ROUTE.nearest]]
-                    origins.append(np.full(len(nearest), origin))
-                    goals.append(later[nearest])
-        return self._guessed(np.concatenate(origins), np.concatenate(goals), point)
+            most = (widest / limits).max(axis=1) * lengths  # steps, by the widest apart
+            longest = lengths[np.ceil(max(ROUTE.lengths) * np.maximum(most, 1.0)) >= lengths]
+            every = 1 + longest.max(initial=2) // ROUTE.ends
+            some = slice(0, longest.max(initial=1) - 1, every)
+            origin = np.arange(self._first[begin], self._first[begin + 1])
+            before, after = self._pairs(begin, origin, lengths[some], limits[some], every)
+            origins.append(before)
+            goals.append(after)
+        new = self._guessed(np.concatenate(origins), np.concatenate(goals))
+        self._set_links(self._links.with_crossings(new))
 
-    def _guessed(self, origin: Indices, goal: Indices, point: Indices) -> _Crossings:
-        """Crossings from candidates to candidates, of all those of all points."""
-        order = np.argsort(goal, kind="stable")
-        origin, goal = origin[order], goal[order]
-        begin, end = point[origin], point[goal]
-        values = np.concatenate(self._values)
-        mean = (values[origin] + values[goal]) / 2 - ROUTE.price
-        return _Crossings(
-            begin=begin,
-            a=origin - self._first[begin],
-            end=end,
-            b=goal - self._first[end],
-            worst=np.minimum(values[origin], values[goal]) - ROUTE.price,
-            total=(end - begin - 1) * mean,
-        )
+    def _pairs(
+        self, begin: int, origin: Indices, lengths: Indices, limits: Vector, every: int
+    ) -> tuple[Indices, Indices]:
+        """Ends of crossings of some lengths, which come every so many points, and limits."""
+        goal = np.flatnonzero(np.isin(self._point, begin + lengths))
+        at = (self._point[goal] - begin - 2) // every
+        length, limit = lengths[at], limits[at]
+        before, after = [_NONE], [_NONE]
+        for is_lane in (False, True):
+            own = origin[self._is_lane[origin] == is_lane]
+            # an end is a local optimum, but where every point counts
+            others = np.flatnonzero(~self._is_lane[goal] | (not is_lane or self._over == "mean"))
+            if not len(own) or not len(others):
+                continue
+            apart = np.abs(self._pressures[own][:, np.newaxis] - self._pressures[goal[others]])
+            # steps, if all of them are as large
+            needed = (apart / limit[others]).max(axis=2) * length[others]
+            for more in ROUTE.lengths:
+                wanted = np.ceil(more * np.maximum(needed, 1.0))
+                fits = (wanted <= length[others]) & (wanted > length[others] - every)
+                rank = np.where(fits & (needed > 1), needed, np.inf)
+                few = min(ROUTE.nearest, rank.shape[1]) - 1
+                nearest = np.argpartition(rank, few, axis=1)[:, : few + 1]
+                row, column = np.isfinite(np.take_along_axis(rank, nearest, 1)).nonzero()
+                before.append(own[row])
+                after.append(goal[others[nearest[row, column]]])
+        return np.concatenate(before), np.concatenate(after)
+
+    def _guessed(self, origin: Indices, goal: Indices) -> _Links:
+        """Crossings from candidates to candidates, as good as their ends."""
+        values = self._values
+        between = self._point[goal] - self._point[origin] - 1
+        worst = np.minimum(values[origin], values[goal]) - ROUTE.price
+        total = between * ((values[origin] + values[goal]) / 2 - ROUTE.price)
+        return _Links(origin, goal, worst, total, np.zeros(len(goal), dtype=bool))
 
     def _compute(self, number: int) -> None:
         """Follow a crossing; it counts as impossible where that fails."""
-        every = self._crossings
-        begin, end = int(every.begin[number]), int(every.end[number])
-        start, goal = self._pressures[begin][every.a[number]], self._pressures[end][every.b[number]]
-        between = crossed(self._tasks, begin, start, goal, self._steps[begin:end])
-        every.known[number] = True
-        every.between[number] = between or []
-        every.worst[number] = every.total[number] = -np.inf
+        links = self._links
+        origin, goal = links.origin[number], links.goal[number]
+        begin, end = int(self._point[origin]), int(self._point[goal])
+        start, last = self._pressures[origin], self._pressures[goal]
+        between = crossed(self._tasks, begin, start, last, self._steps[begin:end])
+        links.known[number] = True
+        links.worst[number] = links.total[number] = -np.inf
         if between is not None:
             values = [each.value for each in between]
-            every.worst[number] = min(values) - ROUTE.price
-            every.total[number] = sum(values) - ROUTE.price * len(values)
-
-
-def _bars(before: Vector, after: Vector, step: Vector) -> Vector:
-    """0 where candidates after (rows) may follow those before (columns), -inf elsewhere."""
-    may = np.ones((len(after), len(before)), dtype=bool)
-    for own, other, most in zip(after.T, before.T, step, strict=True):
-        may &= np.abs(own[:, np.newaxis] - other) <= most
-    return np.where(may, 0.0, -np.inf)
+            links.between[number] = between
+            links.worst[number] = min(values) - ROUTE.price
+            links.total[number] = sum(values) - ROUTE.price * len(values)
 
 
 def crossed(

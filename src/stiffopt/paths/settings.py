@@ -34,16 +34,20 @@ class LaneSettings:
     ----------
     knots : points at which they are spread over all that reach the target.
     starts : samples that are brought to the target at each of them.
-    kept : most of them that are followed from each.
-    apart : least distance between two, as a share of a channel's range.
-    enough : share of what the points alone could have from which on none are looked for.
+    kept : most of them that are followed, in either direction.
+    marks : points from one to the next of which they are followed.
+    iterations : to bring them to a target.
+    apart : least distance of a new one from the others, as a share of a channel's range.
+    alike : where they are nearer to each other than this, one is enough.
     """
 
     knots: int = 8
-    starts: int = 256
-    kept: int = 16
+    starts: int = 128
+    kept: int = 40
     apart: float = 0.1
-    enough: float = 0.99
+    alike: float = 0.02
+    marks: int = 48
+    iterations: int = 4
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,7 @@ class RouteSettings:
     Attributes
     ----------
     crossings : points of a path at which a crossing to another branch may begin.
+    ends : points at which crossings from one of them may end, about.
     lengths : of a crossing, times the least number of steps that the rates allow.
     nearest : candidates to which crossings lead from another, for each length.
     rounds, first_rounds : in which crossings are computed; and before anything else is tried.
@@ -60,17 +65,20 @@ class RouteSettings:
     within : share of a rate that crossings use.
     hardly : gain of the logarithm of stiffness for which no crossing is computed; and of its mean
     hardly_on_average : where the worst is maximised.
+    enough : share of what the points alone could have, from which on nothing else is tried.
     """
 
     crossings: int = 40
+    ends: int = 40
     lengths: tuple[float, ...] = (1.0, 1.5, 2.5)
     nearest: int = 6
-    rounds: int = 40
+    rounds: int = 100
     first_rounds: int = 8
     price: float = 1e-3
     within: float = 0.98
     hardly: float = 2e-3
     hardly_on_average: float = 2e-2
+    enough: float = 0.99
 
 
 @dataclass(frozen=True)
@@ -94,10 +102,10 @@ class RefinementSettings:
 
     near: float = 0.9
     margin: int = 8
-    iterations: int = 25
+    iterations: int = 12
     radius: float = 0.1
-    last_radius: float = 1e-5
-    last_gain: float = 1e-5
+    last_radius: float = 1e-3
+    last_gain: float = 1e-4
     price: float = 100.0
     aside: float = 1e-6
     mean: float = 1e-2

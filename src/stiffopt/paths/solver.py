@@ -19,13 +19,10 @@ from stiffopt.paths.points import PathCandidate, PathTasks
 from stiffopt.paths.rates import least_times, slew_limits, step_limits
 from stiffopt.paths.refinement import refined
 from stiffopt.paths.route import Route, RouteSearch
-from stiffopt.paths.settings import CANDIDATES, LANES, RATES, ROUTE
+from stiffopt.paths.settings import RATES, ROUTE
 from stiffopt.paths.solution import PathSolution
 
 Vector = NDArray[np.float64]
-
-# what is tried until it is good enough: whether with lanes, and rounds of crossings
-_STAGES = ((False, ROUTE.first_rounds), (True, 0), (True, ROUTE.rounds))
 
 
 def solve_path(
@@ -131,7 +128,7 @@ class _PathSolver:
                 where = f"the tip is {' and '.join(off)} off that point"
             elif judgement is not None:
                 where = f"the body is too near to '{next(iter(judgement.intruders))}'"
-            raise self._path._error(
+            raise self._path.error_at(
                 f"{key}.pressures",
                 f"are not at the {'first' if index == 0 else 'last'} point of the path: {where}; "
                 "give pressures that are, or none, and plan a motion there (stiffopt plan)",
@@ -193,7 +190,7 @@ class _PathSolver:
         if times is None:
             times = self._fastest(pressures)
         alone = np.array([max((c.value for c in layer), default=np.nan) for layer in layers])
-        solution = self._judged(tasks, pressures, times, alone)
+        solution = self._judged(pressures, times, alone)
         branches = max(map(len, layers))
         confidence = (
             f"{starts} starts found at most {branches} local optima at a point; "
@@ -221,53 +218,26 @@ class _PathSolver:
         """The best sequence, over further configurations where the local optima are not enough."""
         if not all(layers):
             return None
-        hope = RouteSearch(tasks, layers, steps, self._over)
-        best: Route | None = None
-        for with_lanes, rounds in _STAGES:
-            if with_lanes and tasks.robot.is_loaded:
-                break
-            some = self._with_lanes(tasks, layers) if with_lanes else layers
-            route = self._best_of(tasks, some, steps, rounds, any_will_do)
-            found = [each for each in (best, route) if each is not None]
-            best = max(found, key=lambda each: each.value(self._over), default=None)
-            if hope.comes_up_to(best, LANES.enough) or (any_will_do and best is not None):
-                break
-        return best
+        closed = self._path.closed
+        search = RouteSearch(tasks, layers, steps, self._over, is_closed=closed)
+        best = search.best(ROUTE.first_rounds, any_will_do=any_will_do)
+        if (best is not None and any_will_do) or search.comes_up_to(best, ROUTE.enough):
+            return best
+        further = self._further(tasks)
+        search = RouteSearch(tasks, layers, steps, self._over, further, is_closed=closed)
+        rounds = ROUTE.first_rounds if any_will_do else ROUTE.rounds
+        found = [best, search.best(rounds, share=ROUTE.enough, any_will_do=any_will_do)]
+        known = [each for each in found if each is not None]
+        return max(known, key=lambda each: each.value(self._over), default=None)
 
-    def _with_lanes(
-        self, tasks: PathTasks, layers: list[list[PathCandidate]]
-    ) -> list[list[PathCandidate]]:
-        """Candidates with further ones, but where the pressures are given."""
+    def _further(self, tasks: PathTasks) -> list[list[PathCandidate]]:
+        """Further candidates, but where the pressures are given."""
         if self._lanes is None:
             self._lanes = lanes(tasks)
-        given = {0: self._ends[0], len(layers) - 1: self._ends[1]}
-        return [
-            layer if given.get(index) is not None else [*layer, *lane]
-            for index, (layer, lane) in enumerate(zip(layers, self._lanes, strict=True))
-        ]
-
-    def _best_of(
-        self,
-        tasks: PathTasks,
-        layers: list[list[PathCandidate]],
-        steps: Vector,
-        rounds: int,
-        any_will_do: bool,
-    ) -> Route | None:
-        """The best sequence of candidates; that of a closed path ends where it begins."""
-
-        def best(layers: list[list[PathCandidate]]) -> Route | None:
-            search = RouteSearch(tasks, layers, steps, self._over)
-            return search.best(rounds, any_will_do=any_will_do)
-
-        if not self._path.closed:
-            return best(layers)
-        found: list[Route] = []
-        for first in layers[0][: CANDIDATES.kept]:
-            route = best([[first], *layers[1:-1], [first]])
-            if route is not None:
-                found.append(route)
-        return max(found, key=lambda each: each.value(self._over), default=None)
+            for index, end in ((0, self._ends[0]), (-1, self._ends[1])):
+                if end is not None or self._path.closed:
+                    self._lanes[index] = []
+        return self._lanes
 
     def _slower(
         self, tasks: PathTasks, layers: list[list[PathCandidate]], steps: Vector
@@ -292,7 +262,7 @@ class _PathSolver:
     def _fastest(self, pressures: Vector) -> Vector:
         """Times (N,) at which the points come as soon as the rates allow."""
         if self._slew is None:
-            raise self._path._error(
+            raise self._path.error_at(
                 "timing.fastest", "needs to know the rates; give pressure.slew here or in the robot"
             )
         least = np.maximum(least_times(pressures, self._slew), RATES.least_time)
@@ -300,9 +270,7 @@ class _PathSolver:
 
     # -- judgement ------------------------------------------------------------------------------
 
-    def _judged(
-        self, tasks: PathTasks, pressures: Vector, times: Vector, alone: Vector
-    ) -> PathSolution:
+    def _judged(self, pressures: Vector, times: Vector, alone: Vector) -> PathSolution:
         """The solution at pressures (N, n), judged by the model against the path as given."""
         own = PathTasks(self._robot, self._tasks, self._seed)
         judgements = own.judged(pressures)

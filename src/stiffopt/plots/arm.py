@@ -12,6 +12,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.plots import style
 from stiffopt.plots.scene import draw_objects
+from stiffopt.plots.shapes import segment_poses
 from stiffopt.plots.wording import MM
 
 Vector = NDArray[np.float64]
@@ -47,7 +48,7 @@ class ArmDrawing:
     def draw_tube(self, pressures: Vector, shade: float = 0.38) -> None:
         """Tube with each segment in its colour, its backbone, and a ring at each end."""
         description = self.robot.description
-        poses = _poses(self.robot, pressures)
+        poses = segment_poses(self.robot, pressures, _STATIONS)
         angle = np.linspace(0, 2 * np.pi, _SPOKES + 1)
         for number, segment in enumerate(description.segments):
             mine = poses[number]
@@ -130,21 +131,6 @@ class ArmDrawing:
             handles=self.handles, loc="upper left", bbox_to_anchor=(0.02, 0.84), fontsize=9,
             frameon=False,
         )  # fmt: skip
-
-
-def _poses(robot: Manipulator, pressures: Vector) -> list[Vector]:
-    """Poses along each segment with its connector."""
-    description = robot.description
-    count = _STATIONS * robot.n_segments
-    poses = robot.backbone(np.asarray(pressures), 4 * count + 1)
-    stations = np.linspace(0.0, robot.length, len(poses))
-    parts, start = [], 0.0
-    for segment in description.segments:
-        end = start + segment.length + segment.connector
-        wanted = np.linspace(start, end, _STATIONS)
-        parts.append(poses[np.abs(stations[:, None] - wanted).argmin(axis=0)])
-        start = end
-    return parts
 
 
 def _cone(point: Vector, way: Vector, length: float) -> Vector:

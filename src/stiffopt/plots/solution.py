@@ -18,6 +18,7 @@ from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.arm import ArmDrawing
+from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.style import literal, new_figure, tidy
 from stiffopt.plots.wording import (
     BAR,
@@ -289,16 +290,11 @@ class _Drawing(ArmDrawing):
     # -- stiffness --------------------------------------------------------------------------
 
     def draw_ellipsoid(self) -> None:
-        """The ellipsoid of forces f with f'C_vv f = 1, in base axes.
-
-        The square of a radius is the free stiffness in that direction.
-
-        Its axes are the eigenvectors of C_vv^-1; the square root keeps the thin ones visible.
-        """
-        compliance = np.asarray(self.solution.compliance)[:3, :3]
-        stiffness = self.rotation @ np.linalg.inv((compliance + compliance.T) / 2) @ self.rotation.T
-        values, ways = np.linalg.eigh(stiffness)
-        radii = _ELLIPSOID_SHARE * self.size * np.sqrt(np.abs(values) / np.abs(values).max())
+        """The stiffness ellipsoid with its axes; see `StiffnessEllipsoid`."""
+        values, ways = found = StiffnessEllipsoid.of(
+            np.asarray(self.solution.compliance), self.rotation
+        )
+        radii = found.radii(_ELLIPSOID_SHARE * self.size)
         u, v = np.meshgrid(np.linspace(0, 2 * np.pi, 37), np.linspace(0, np.pi, 19))
         ball = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
         points = np.einsum("ij,j...->i...", ways * radii, ball)

@@ -112,9 +112,9 @@ def map_workspace(
             raise InputError("give threads or a scheduler, not both")
 
     def report(done: int, total: int) -> None:
-        checkpoint()
         if progress is not None:
             progress(done, total)
+        checkpoint()
 
     with giving_up(timeout, cancel), ExitStack() as stack:
         store = None if path is None else _opened(path, plan, overwrite, stack)

@@ -15,7 +15,7 @@
  *     if (!object_nearest(&line, &object, ranges, count, cutoff, &nearest)) ...
  *
  * Where the distance is above `cutoff` (m; INFINITY for never), nearest.distance is only known to be
- * above it.  A term with a row for each object and segment asks for one range at a time; a ring
+ * above it.  object_nearest_by does the same with another precision.  A term with a row for each object and segment asks for one range at a time; a ring
  * (`passage` is not NULL) must be asked for all ranges of the arm.  The change of a distance with
  * the pressures is nearest.normal . d position - nearest.radius_share d radius at nearest.s, as
  * nearest.s is a minimum or an end.  Formulas are those of `stiffopt.model.obstacles`, whose
@@ -36,6 +36,9 @@ enum { CONVEX, CONCAVE, ANY_COURSE };
 #define FINE 3e-4            /* m of arc length, on which any object is as a convex one */
 #define IN_PLANE 1e-9        /* m above a ring's plane that are none */
 #define SHARPENED 1e-4       /* m of arc length, over which a slope's change is measured */
+#define LEVEL 1e-9           /* m, by which a minimum may be lower than what was found, */
+#define NOT_LEVEL 1e-3       /* and as a share of what is more than is asked */
+#define MOST_TURNS 8         /* of looking for it */
 #define STEEPEST 1.5         /* change of an interpolated distance with the way */
 #define MORE_CURVED 1.35     /* than the curvature that coarse stations show */
 
@@ -90,11 +93,17 @@ typedef struct {
     int64_t nearest;
 } PieceBounds;
 
+/* What a least distance may be too large by: `error`, and a share of what it is above `asked`. */
+typedef struct {
+    double cutoff, error, share, asked;
+    int settled; /* whether the normal is to be what the least distance changes with */
+} Precision;
+
 typedef struct {
     const CentreLine *line;
     const SceneObject *object;
     const Range *range;
-    double cutoff;
+    Precision to;
     Nearest *best;
     double slope;        /* at the best */
     const Range *within; /* that has the best */
@@ -232,7 +241,9 @@ static int probe_at(NearestSearch *search, const BodyPoint *point, Probe *probe)
 }
 
 static double to_beat(const NearestSearch *search) {
-    return fmin(search->best->distance, search->cutoff) - CLEARANCE_ERROR;
+    const Precision *to = &search->to;
+    double least = fmin(search->best->distance, to->cutoff);
+    return least - fmax(to->error, to->share * (least - to->asked));
 }
 
 /* By how much a distance changes with arc length at rest at most. */
@@ -326,14 +337,61 @@ static int search_range(NearestSearch *search, const Range *range) {
     return 1;
 }
 
+/* A probe next to the best where the slope has the other sign; 0 where there is none. */
+static int probe_beyond(NearestSearch *search, const Probe *from, BodyPoint *point, Probe *probe) {
+    const Range *range = search->range;
+    double low = range->points[0].s, high = range->points[range->count - 1].s;
+    double step = from->slope > 0 ? -SHARPENED : SHARPENED;
+    for (int turn = 0; turn < 3; turn++, step *= 4) {
+        double s = fmin(fmax(from->point->s + step, low), high);
+        if (!body_point(search->line, s, point) || !probe_at(search, point, probe)) return 0;
+        if (from->slope * probe->slope < 0) return 1;
+        if (s == low || s == high) return 0;
+    }
+    return 0;
+}
+
+/* Bring the best to its minimum along the body, a kink or not, and put what the distance changes
+ * with when the body moves in place of its normal.
+ *
+ * Where the nearest piece, or cube of a grid, changes at the minimum s, two normals meet there.  As
+ * s moves too, the least distance changes with the mean of them that has no slope along the body. */
+static int settle_at_minimum(NearestSearch *search) {
+    Nearest *best = search->best;
+    BodyPoint points[3];
+    Probe first, second, middle, *a = &first, *b = &second;
+    search->range = search->within;
+    if (best->distance >= search->to.cutoff || search->slope == 0) return 1;
+    if (!body_point(search->line, best->s, points) || !probe_at(search, points, a)) return 0;
+    if (!probe_beyond(search, a, points + 1, b)) return 1;
+    for (int turn = 0; turn < MOST_TURNS; turn++) {
+        double h = b->point->s - a->point->s;
+        double meeting = (b->value - a->value - b->slope * h) / (a->slope - b->slope); /* of tangents */
+        double gap = fmin(a->value, b->value) - a->value - a->slope * meeting;
+        if (fabs(gap) < LEVEL + NOT_LEVEL * (best->distance - search->to.asked)) break;
+        double way = turn % 2 ? meeting : h * a->slope / (a->slope - b->slope);
+        BodyPoint *other = points + 2;
+        if (!(way / h > 0 && way / h < 1)) break;
+        if (!body_point(search->line, a->point->s + way, other) || !probe_at(search, other, &middle))
+            return 0;
+        Probe *to = middle.slope * a->slope > 0 ? a : b;
+        BodyPoint *at = to->point == points ? points : points + 1;
+        *at = *other, *to = middle, to->point = at;
+    }
+    for (int k = 0; k < 3; k++)
+        best->normal[k] = (b->slope * a->normal[k] - a->slope * b->normal[k]) / (b->slope - a->slope);
+    return 1;
+}
+
 /* Bring the best to where the slope is zero, so that its normal is right to first order too. */
 static int sharpen(NearestSearch *search) {
+    if (search->to.settled) return settle_at_minimum(search);
     const Range *range = search->range = search->within;
     double low = range->points[0].s, high = range->points[range->count - 1].s;
     double s = search->best->s, slope = search->slope, step = slope > 0 ? -SHARPENED : SHARPENED;
     BodyPoint point;
     Probe probe;
-    if (search->best->distance >= search->cutoff || s + step <= low || s + step >= high) return 1;
+    if (search->best->distance >= search->to.cutoff || s + step <= low || s + step >= high) return 1;
     if (!body_point(search->line, s + step, &point) || !probe_at(search, &point, &probe)) return 0;
     step *= slope / (slope - probe.slope);
     if (!(fabs(step) < FINE) || s + step <= low || s + step >= high) return 1;
@@ -373,49 +431,57 @@ static int passes_between(const CentreLine *line, const SceneObject *o, const Bo
     return 1;
 }
 
-/* A ring's distance is that of its circle; negative where the centre line is beside it. */
-static int ring_nearest(NearestSearch *search, const Range *ranges, int64_t count) {
-    const SceneObject *o = search->object;
-    Nearest *best = search->best;
-    int crossed = 0, passed = 0;
-    const BodyPoint *last = NULL;
-    Passage before, now;
-    search->cutoff = INFINITY;
-    for (int64_t r = 0; r < count; r++) {
-        if (!search_range(search, ranges + r)) return 0;
-        for (int64_t i = 0; i < ranges[r].count; i++, last = ranges[r].points + i - 1) {
+/* Whether the centre line crosses the plane of a ring, and passes through it; `last` is its tip. */
+static int passes(const CentreLine *line, const SceneObject *o, const Range *ranges, int64_t count,
+                  int *crossed, int *passed, Passage *last) {
+    const BodyPoint *before = NULL;
+    Passage now;
+    *crossed = *passed = 0, *last = (Passage){0};
+    for (int64_t r = 0; r < count; r++)
+        for (int64_t i = 0; i < ranges[r].count; before = ranges[r].points + i++, *last = now) {
             const BodyPoint *point = ranges[r].points + i;
             if (!passage_of(o, point->position, &now)) return 0;
-            if (last && now.height != 0 && before.height * now.height <= 0) {
-                int inside = before.height == 0 && before.beyond <= 0;
-                if (before.height != 0 &&
-                    !passes_between(search->line, o, last, point, before, now, &inside))
-                    return 0;
-                crossed = 1, passed ^= inside;
-            }
-            before = now;
+            if (!before || now.height == 0 || last->height * now.height > 0) continue;
+            int inside = last->height == 0 && last->beyond <= 0;
+            if (last->height != 0 &&
+                !passes_between(line, o, before, point, *last, now, &inside))
+                return 0;
+            *crossed = 1, *passed ^= inside;
         }
-    }
-    if (!sharpen(search)) return 0;
-    if (passed) return 1;
-    if (crossed) {
-        BodyPoint nearest;
-        if (!body_point(search->line, best->s, &nearest)) return 0;
-        best->distance = -best->distance - 2 * nearest.radius;
-        for (int k = 0; k < 3; k++) best->normal[k] = -best->normal[k];
+    return 1;
+}
+
+/* A ring's distance is that of its circle; negative where the centre line is beside it. */
+static int ring_nearest(NearestSearch *search, const Range *ranges, int64_t count) {
+    Nearest *best = search->best;
+    int crossed, passed;
+    Passage tip;
+    if (!passes(search->line, search->object, ranges, count, &crossed, &passed, &tip)) return 0;
+    if (!crossed) {
+        const Range *last = ranges + count - 1;
+        const BodyPoint *end = last->points + last->count - 1;
+        best->distance = -tip.from_disc, best->s = end->s, best->radius_share = 0;
+        for (int k = 0; k < 3; k++)
+            best->position[k] = end->position[k], best->normal[k] = -tip.normal[k];
         return 1;
     }
-    best->distance = -now.from_disc, best->s = last->s, best->radius_share = 0;
-    for (int k = 0; k < 3; k++)
-        best->position[k] = last->position[k], best->normal[k] = -now.normal[k];
+    if (!passed) search->to.cutoff = INFINITY, search->to.share = 0;
+    for (int64_t r = 0; r < count; r++)
+        if (!search_range(search, ranges + r)) return 0;
+    if (!sharpen(search)) return 0;
+    if (passed) return 1;
+    BodyPoint nearest;
+    if (!body_point(search->line, best->s, &nearest)) return 0;
+    best->distance = -best->distance - 2 * nearest.radius;
+    for (int k = 0; k < 3; k++) best->normal[k] = -best->normal[k];
     return 1;
 }
 
 /* The nearest point of an object along ranges that have been surveyed. */
-static int object_nearest(const CentreLine *line, const SceneObject *object, const Range *ranges,
-                          int64_t count, double cutoff, Nearest *nearest) {
+static int object_nearest_by(Precision to, const CentreLine *line, const SceneObject *object,
+                             const Range *ranges, int64_t count, Nearest *nearest) {
     double most[object->pieces];
-    NearestSearch search = {line, object, ranges, cutoff, nearest, 0, ranges, no_bounds(object, most)};
+    NearestSearch search = {line, object, ranges, to, nearest, 0, ranges, no_bounds(object, most)};
     nearest->distance = INFINITY;
     if (object->passage) return ring_nearest(&search, ranges, count);
     BodyPoint points[ranges->count];
@@ -424,6 +490,12 @@ static int object_nearest(const CentreLine *line, const SceneObject *object, con
     for (int64_t r = 0; r < count; r++)
         if (!search_range(&search, r ? ranges + r : &first)) return 0;
     return sharpen(&search);
+}
+
+static int object_nearest(const CentreLine *line, const SceneObject *object, const Range *ranges,
+                          int64_t count, double cutoff, Nearest *nearest) {
+    Precision to = {cutoff, CLEARANCE_ERROR, 0, 0, 0};
+    return object_nearest_by(to, line, object, ranges, count, nearest);
 }
 
 #endif

@@ -17,9 +17,8 @@
 #include "body.h"
 #include "scene.h"
 
-#define QUICK_TURNS 8   /* of looking closer */
-#define QUICK_ERROR 1e-6 /* m of the least distance, at which that ends */
-#define QUICK_NEAR 4e-3  /* m above the clearance, from which it is worth it */
+#define ROUGH_ERROR 1e-2 /* m of a least distance, where starts are ranked */
+#define FAR_ERROR 0.3   /* of what a least distance is above the clearance */
 
 /* Mirrored by `_Obstacles` in obstacles.py. */
 typedef struct {
@@ -30,7 +29,7 @@ typedef struct {
     const int64_t *ends;     /* (segments) ranges of the arm up to the end of each */
     const double *bounds;    /* (ranges, 2) arc lengths; a range is a piece of the body */
     const int64_t *stations; /* (ranges) coarse ones of each */
-    double clearance, margin, cutoff, allowed;
+    double clearance, margin, cutoff;
 } Obstacles;
 
 /* The body among the objects, at the pressures of the last evaluation. */
@@ -91,104 +90,6 @@ static int move_body(const Program *P, const double *pressures, const double *st
     return 1;
 }
 
-/* A station with its distance from an object, and how that changes with arc length at rest. */
-typedef struct {
-    BodyPoint point;
-    double value, slope, normal[3];
-} Look;
-
-static int look_at(const SceneObject *object, PieceBounds *bounds, const Range *range,
-                   const BodyPoint *point, Look *to) {
-    int64_t piece;
-    to->point = *point;
-    if (!object_distance(object, bounds, point->position, &to->value, to->normal, &piece)) return 0;
-    to->value -= point->radius;
-    to->slope = range->speed * scene_dot(to->normal, point->tangent);
-    return 1;
-}
-
-/* The nearest point by the coarse stations alone, then where the slope vanishes next to the nearest
- * of them: what object_nearest finds, but for a second minimum that is nearly as low. */
-static int quickly_nearest(const Surroundings *around, const SceneObject *object, int64_t begin,
-                           int64_t end, double cutoff, double near, Nearest *nearest) {
-    Look best, look, other;
-    BodyPoint points[around->ranges[begin].count];
-    double most[object->pieces];
-    PieceBounds bounds = no_bounds(object, most);
-    Range first;
-    const Range *in = NULL;
-    int64_t index = 0;
-    best.value = INFINITY;
-    if (!counted_range(&around->line, object, around->ranges + begin, points, &first)) return 0;
-    for (int64_t k = begin; k < end; k++) {
-        const Range *range = k > begin ? around->ranges + k : &first;
-        double skip = -INFINITY;
-        for (int64_t i = 0; i < range->count; i++) {
-            const BodyPoint *point = range->points + i;
-            if (point->s < skip && i + 1 < range->count) continue;
-            if (!look_at(object, &bounds, range, point, &look)) return 0;
-            /* within this way nothing is nearer than what was seen, or matters */
-            skip = point->s + (look.value - fmin(best.value, cutoff)) / range->speed;
-            if (look.value < best.value) best = look, in = range, index = i;
-        }
-    }
-    int64_t next = best.slope < 0 ? index + 1 : index - 1;
-    if (best.value < near && next >= 0 && next < in->count) {
-        if (!look_at(object, &bounds, in, in->points + next, &other)) return 0;
-        Look edge = best;
-        for (int turn = 0; turn < QUICK_TURNS && edge.slope * other.slope < 0; turn++) {
-            BodyPoint middle;
-            double share = fmin(fmax(edge.slope / (edge.slope - other.slope), 0.05), 0.95);
-            double s = edge.point.s + share * (other.point.s - edge.point.s);
-            if (!body_point(&around->line, s, &middle) ||
-                !look_at(object, &bounds, in, &middle, &look))
-                return 0;
-            if (look.value < best.value) best = look;
-            double curved = (edge.slope - other.slope) / (edge.point.s - other.point.s);
-            if (look.slope * look.slope < 2 * fabs(curved) * QUICK_ERROR) break;
-            if (look.slope * edge.slope > 0) edge = look;
-            else other = look;
-        }
-    }
-    nearest->distance = best.value, nearest->s = best.point.s, nearest->radius_share = 1;
-    memcpy(nearest->normal, best.normal, sizeof nearest->normal);
-    return 1;
-}
-
-/* The same of a ring, by the straight lines between coarse stations; see ring_nearest. */
-static int ring_quickly_nearest(const Surroundings *around, const SceneObject *object, int64_t end,
-                                double near, Nearest *nearest) {
-    const BodyPoint *last = NULL;
-    Passage before = {0}, at;
-    int crossed = 0, passed = 0;
-    for (int64_t k = 0; k < end; k++)
-        for (int64_t i = 0; i < around->ranges[k].count; i++) {
-            const BodyPoint *point = around->ranges[k].points + i;
-            if (!passage_of(object, point->position, &at)) return 0;
-            if (last && (before.height <= 0) != (at.height <= 0)) {
-                double share = before.height / (before.height - at.height), position[3];
-                Passage there;
-                for (int j = 0; j < 3; j++)
-                    position[j] = last->position[j] + share * (point->position[j] - last->position[j]);
-                if (!passage_of(object, position, &there)) return 0;
-                crossed = 1, passed ^= there.beyond <= 0;
-            }
-            before = at, last = point;
-        }
-    if (!crossed) {
-        nearest->distance = -at.from_disc, nearest->s = last->s, nearest->radius_share = 0;
-        for (int j = 0; j < 3; j++) nearest->normal[j] = -at.normal[j];
-        return 1;
-    }
-    if (!quickly_nearest(around, object, 0, end, INFINITY, passed ? near : INFINITY, nearest)) return 0;
-    if (passed) return 1;
-    BodyPoint point;
-    if (!body_point(&around->line, nearest->s, &point)) return 0;
-    nearest->distance = -nearest->distance - 2 * point.radius;
-    for (int j = 0; j < 3; j++) nearest->normal[j] = -nearest->normal[j];
-    return 1;
-}
-
 /* One row and, unless J is NULL, its derivatives (n) by x. */
 static int obstacle_row(const Program *P, const SceneObject *object, int64_t begin, int64_t end,
                         double *r, double *J) {
@@ -196,16 +97,10 @@ static int obstacle_row(const Program *P, const SceneObject *object, int64_t beg
     const Obstacles *o = s->obstacles;
     Surroundings *around = P->around;
     Nearest nearest;
-    double near = P->sight == ROUGH ? -INFINITY : o->clearance + QUICK_NEAR;
-    int found;
-    if (P->sight == EXACT)
-        found = object_nearest(&around->line, object, around->ranges + begin, end - begin,
-                               o->cutoff, &nearest);
-    else if (object->passage)
-        found = ring_quickly_nearest(around, object, end, near, &nearest);
-    else
-        found = quickly_nearest(around, object, begin, end, o->cutoff, near, &nearest);
-    if (!found) return 0;
+    Precision to = {o->cutoff, P->sight == ROUGH ? ROUGH_ERROR : CLEARANCE_ERROR,
+                    P->sight == EXACT ? 0 : FAR_ERROR, o->clearance, P->sight == NEAR};
+    if (!object_nearest_by(to, &around->line, object, around->ranges + begin, end - begin, &nearest))
+        return 0;
     *r = o->margin - (fmin(nearest.distance, o->cutoff) - o->clearance);
     if (!J) return 1;
     memset(J, 0, (size_t)s->n * sizeof(double));
@@ -245,20 +140,7 @@ static int put_obstacles(const Program *P, const double *pressures, const double
     return 1;
 }
 
-/* Whether rows say that the body keeps the clearance. */
-static int is_clear(const Program *P, const double *rows) {
-    const Obstacles *o = P->setup->obstacles;
-    for (int64_t i = 0; i < P->setup->rows - P->setup->own_rows; i++)
-        if (!(rows[i] <= o->margin + o->allowed)) return 0;
-    return 1;
-}
-
 #else
-
-static int is_clear(const Program *P, const double *rows) {
-    (void)P, (void)rows;
-    return 1;
-}
 
 static int add_surroundings(Program *P) {
     P->around = NULL;

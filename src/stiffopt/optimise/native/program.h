@@ -75,9 +75,9 @@ typedef struct {
     const double *radius; /* (balls) of the target */
 } Stage;
 
-/* How obstacles are seen: as they were at the same pressures a moment ago, by coarse stations and
- * without slopes, by a few more stations, or by the least distance for certain. */
-enum { KNOWN, ROUGH, QUICK, EXACT };
+/* How obstacles are seen: as they were at the same pressures a moment ago, roughly and without
+ * slopes, exactly where they are near, or exactly. */
+enum { KNOWN, ROUGH, NEAR, EXACT };
 
 typedef struct {
     const Setup *setup;

@@ -2,7 +2,7 @@
  *
  * A task is a row of numbers: parameters of its functions, radii of the balls, lower and upper
  * pressure limits (Pa), floors, the `Nearness` of each term, what is asked for and a guess (Pa).
- * An answer is a row of numbers too, see `solve_by_sight`.
+ * An answer is a row of numbers too, see `solve_row`.
  */
 #include "functions.h"
 
@@ -19,8 +19,6 @@ void point_rows(void); /* follows the code of `point` */
 enum { SEARCH, GUESS_FIRST, GUESS_ALONE, JUDGE, COME, CLOSEST, CLOSEST_FROM };
 enum { NEEDS_GENERAL_METHOD, LOCAL, GLOBAL, JUDGED, CAME, NEAREST, NOT_FINITE, TOO_SOFT };
 
-enum { FOUND_AT = 4, PRESSURES_AT = 14 }; /* in an answer, see solve_by_sight */
-
 /* From a guess (n) in Pa; whether the descent from there ended at an optimum, or was stopped. */
 static int from_guess(Program *P, const double *guess, Point *p, Descent *end, Found *found) {
     const Setup *s = P->setup;
@@ -36,10 +34,9 @@ static int from_guess(Program *P, const double *guess, Point *p, Descent *end, F
 /* Row of an answer: outcome, value, violation, converged, the seven numbers of Found, three
  * counts of evaluations, pressures (n) in Pa, slope (n) per unit of x of the error of the closest
  * configuration, then what judge_at writes: not of a guess alone, which is judged when it is
- * looked at, but where there are obstacles.  Returns 0 where obstacles need
- * a closer look.
+ * looked at, but where there are obstacles.
  */
-static int solve_by_sight(Program *P, const double *task, double *answer, int sight) {
+static void solve_row(Program *P, const double *task, double *answer) {
     const Setup *s = P->setup;
     P->parameters = task, task += s->parameters;
     P->radius = task, task += s->balls;
@@ -51,7 +48,7 @@ static int solve_by_sight(Program *P, const double *task, double *answer, int si
     P->near = task, task += 18 * s->near;
     int64_t asked = (int64_t)*task++, outcome = NEEDS_GENERAL_METHOD;
     P->poses = P->points = P->programs = 0;
-    P->sight = sight;
+    P->sight = NEAR;
 
     NEW_POINT(p, s);
     Descent end = {0, 0, 0, 0};
@@ -83,31 +80,7 @@ static int solve_by_sight(Program *P, const double *task, double *answer, int si
     memcpy(out, slope, sizeof slope), out += s->n;
     int judged = outcome == GLOBAL || outcome == NEAREST || outcome == JUDGED || outcome == TOO_SOFT ||
                  (outcome == LOCAL && (asked != GUESS_ALONE || P->around));
-    if (!judged) /* a descent may have failed for what a quick look misses */
-        return !(P->around && outcome == NEEDS_GENERAL_METHOD && found.reached);
-    if (!judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
-    return outcome == JUDGED || is_clear(P, out + s->own_rows);
-}
-
-/* Go on from an answer (n), with a closer look at obstacles; whether the body keeps clear then. */
-static int go_on(Program *P, const double *task, double *answer) {
-    const Setup *s = P->setup;
-    int64_t before = s->parameters + s->balls + 2 * s->n + s->floors + 18 * s->near;
-    double next[before + 1 + s->n], searched[PRESSURES_AT], *asked = next + before;
-    memcpy(next, task, sizeof next), memcpy(searched, answer, sizeof searched);
-    *asked = GUESS_ALONE;
-    memcpy(asked + 1, answer + PRESSURES_AT, (size_t)s->n * sizeof(double));
-    int clear = solve_by_sight(P, next, answer, EXACT) && answer[0] == LOCAL;
-    answer[0] = searched[0]; /* what was asked for, and how hard it was searched */
-    memcpy(answer + FOUND_AT, searched + FOUND_AT, (PRESSURES_AT - FOUND_AT) * sizeof(double));
-    return clear;
-}
-
-/* A row of an answer, with a closer look at obstacles where a quick one has not been enough. */
-static void solve_row(Program *P, const double *task, double *answer) {
-    if (solve_by_sight(P, task, answer, QUICK)) return;
-    if ((answer[0] == LOCAL || answer[0] == GLOBAL) && go_on(P, task, answer)) return;
-    solve_by_sight(P, task, answer, EXACT);
+    if (judged && !judge_at(P, pressures, out)) answer[0] = NEEDS_GENERAL_METHOD;
 }
 
 /* Fetch code ahead, many lines of the cache at once; a processor that follows code which is not in

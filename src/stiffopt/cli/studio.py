@@ -1,0 +1,47 @@
+"""The command `stiffopt studio`: its options and its help."""
+
+from typing import Annotated
+
+import typer
+
+from stiffopt.cli.exits import with_exit_code
+
+STUDIO_HELP = """\
+Open a page in the browser in which a robot and a task are seen and changed by hand.
+
+FILE is a built-in robot, a robot file or a task file. Drag the target and the arm follows, with its
+pressures and its stiffness. The page is for this machine, and only the address that is printed
+opens it. Needs the extra 'studio'.
+"""
+
+STUDIO_EPILOG = """\
+\b
+Examples:
+  stiffopt studio
+  stiffopt studio my-arm.yaml
+  stiffopt studio problems/two_segment_stiff_x.yaml
+
+\b
+Exit codes:
+  0    ended by Ctrl-C or a signal
+  2    bad input: a file or an option is wrong, a port in use, a missing library
+"""
+
+
+@with_exit_code
+def studio(
+    file: Annotated[str, typer.Argument(metavar="[FILE]", help="What is shown.")] = "stiff-flop-2",
+    host: Annotated[
+        str, typer.Option(metavar="HOST", help="Where to listen; other machines reach others.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(metavar="PORT", min=0, max=65535, help="0 is any free one.")
+    ] = 0,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Only print the address.")
+    ] = False,
+) -> None:
+    """Open the studio."""
+    from stiffopt.cli.studio_run import run  # here, so that --help waits for no numerics
+
+    run(file, host=host, port=port, browser=not no_browser)

@@ -1,0 +1,34 @@
+"""What `stiffopt studio` does: open the page, and wait until it is ended."""
+
+from __future__ import annotations
+
+import threading
+import webbrowser
+from contextlib import closing
+
+from stiffopt.cli.console import report_note, write_line
+from stiffopt.cli.exits import ENDING_SIGNALS, handled
+from stiffopt.daemon.secret import is_loopback
+from stiffopt.errors import require_package
+
+
+def run(file: str, *, host: str, port: int, browser: bool) -> None:
+    """Show a file in the studio until a signal ends it."""
+    require_package("viser", "studio")
+    from stiffopt.studio.opening import open_studio
+
+    over = threading.Event()
+    with (
+        handled(dict.fromkeys(ENDING_SIGNALS, lambda number, frame: over.set())),
+        closing(open_studio(file, host=host, port=port)) as shown,
+    ):
+        write_line(f"the studio is open at {shown.url}")
+        write_line("Ctrl-C ends it")
+        if not is_loopback(host):
+            report_note(
+                f"other machines can reach {host}, unencrypted: who can listen in on the network "
+                "can open the page too"
+            )
+        if browser:
+            webbrowser.open(shown.url)
+        over.wait()

@@ -1,0 +1,46 @@
+"""The rule for the headers Host and Origin, by which foreign web pages are kept out.
+
+A web page in a browser on this machine can send requests to servers on it. So the header Host must
+be an IP address or a known name, which no foreign name server can resolve to this machine (DNS
+rebinding), and the header Origin, if there is one, must be the server's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from urllib.parse import urlsplit
+
+from stiffopt.daemon.reports import RefusalError
+from stiffopt.daemon.secret import is_address
+
+
+def check_place(hosts: Sequence[str], origins: Iterable[str], known: Iterable[str]) -> None:
+    """Raise `RefusalError` unless a request was sent by a page of the server itself, or by none.
+
+    Parameters
+    ----------
+    hosts, origins :
+        All headers Host and Origin of the request.
+    known :
+        Names of this machine, other than localhost.
+    """
+    names = {"localhost", *(host.lower().rstrip(".") for host in known)} - {""}
+    name = _host_name(hosts[0]) if len(hosts) == 1 else ""
+    if name not in names and not is_address(name):
+        raise RefusalError(
+            403,
+            "host",
+            "the header Host names no address of this daemon; use its IP address, localhost, "
+            "or the host of the rig file's service",
+        )
+    for origin in origins:
+        scheme, _, place = origin.partition("://")
+        if scheme not in ("http", "https") or place.lower() != hosts[0].lower():
+            raise RefusalError(403, "origin", "pages of other sites may not speak to this daemon")
+
+
+def _host_name(host: str) -> str:
+    try:
+        return (urlsplit(f"//{host}").hostname or "").rstrip(".")
+    except ValueError:
+        return ""

@@ -1,0 +1,64 @@
+"""Shapes that figures and the studio draw: stations along the segments, and the ellipsoid."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.model.manipulator import Manipulator
+
+Vector = NDArray[np.float64]
+
+
+def segment_poses(robot: Manipulator, pressures: ArrayLike, count: int) -> Vector:
+    """Poses (segments, count, 4, 4) along each segment with its connector, ends included.
+
+    Parameters
+    ----------
+    robot : Manipulator
+    pressures : (n,)
+        In Pa.
+    count : int
+        Stations of each segment, 2 or more.
+    """
+    stations = robot.kept(("segment stations", count), lambda: _stations(robot, count))
+    poses = np.concatenate([np.eye(4)[None], robot.pose(pressures, stations[1:])])
+    return poses.reshape(robot.n_segments, count, 4, 4)
+
+
+def _stations(robot: Manipulator, count: int) -> Vector:
+    lengths = [each.length + each.connector for each in robot.description.segments]
+    ends = np.concatenate([[0.0], np.cumsum(lengths)])
+    ends[-1] = robot.length
+    return np.concatenate([np.linspace(*pair, count) for pair in pairwise(ends)])
+
+
+class StiffnessEllipsoid(NamedTuple):
+    """The ellipsoid of forces f with ``f'C_vv f = 1``, in base axes.
+
+    The square of a radius is the free stiffness along it: the square root keeps the thin ones
+    visible.
+
+    Attributes
+    ----------
+    stiffnesses : (3,), of its axes, in N/m, increasing.
+    axes : (3, 3), right-handed, in the columns.
+    """
+
+    stiffnesses: Vector
+    axes: Vector
+
+    @classmethod
+    def of(cls, compliance: ArrayLike, rotation: ArrayLike) -> StiffnessEllipsoid:
+        """That of a tip with a compliance (6, 6) in tip axes, turned by a rotation (3, 3)."""
+        linear, turn = np.asarray(compliance)[:3, :3], np.asarray(rotation)
+        stiffness = turn @ np.linalg.inv((linear + linear.T) / 2) @ turn.T
+        values, axes = np.linalg.eigh(stiffness)
+        return cls(np.abs(values), axes * np.sign(np.linalg.det(axes)))
+
+    def radii(self, largest: float) -> Vector:
+        """Semi-axes (3,), the largest of this length."""
+        return np.asarray(largest * np.sqrt(self.stiffnesses / self.stiffnesses.max()))

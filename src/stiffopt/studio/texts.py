@@ -1,0 +1,286 @@
+"""What the studio's panel says, as HTML, and what is copied from it, as files and as Python.
+
+Names and messages may come from files of others: all of them are escaped here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from math import degrees
+from pprint import pformat
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stiffopt.files import file_text
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.scene import Scene
+from stiffopt.optimise.measures.directional import StiffnessMeasure
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.plots import style
+from stiffopt.plots.wording import BAR, MM, direction_text, figures, gain_text, limit_of, unit_text
+from stiffopt.studio.design import Design
+from stiffopt.studio.workbench import StudioAnswer, Workbench
+
+STATUS_WORDS = {"solved": "solved", "unreachable": "out of reach", "failed": "no answer"}
+ROBOT_FILE = "my-arm.yaml"
+"""Under which a changed robot is to be saved, so that a copied task finds it."""
+_BEST = "best that was found everywhere"
+_LOCAL = "next to the previous one; the best is searched for when you pause"
+_SEARCHING = "searching; the first task of a kind compiles its solver, which takes a while ..."
+_COPY = "navigator.clipboard.writeText(this.nextElementSibling.value)"
+
+
+# -- the answer -----------------------------------------------------------------------------------
+
+
+def answer_html(bench: Workbench) -> str:
+    """Return the answer as the panel shows it: status, numbers and pressures."""
+    answer = bench.answer
+    if answer is None:
+        return _padded(_headline("failed" if bench.trouble else "", bench.trouble or _SEARCHING))
+    solution = answer.solution
+    message = bench.trouble or solution.message
+    status = "failed" if bench.trouble else solution.status
+    return _padded(
+        _headline(status, message)
+        + _table(_rows(answer))
+        + pressures_html(answer.robot.description, *_bars(answer))
+    )
+
+
+def _padded(html: str) -> str:
+    return f"<div style='padding:0 10px'>{html}</div>"
+
+
+def _headline(status: str, message: str) -> str:
+    colour = style.STATUS.get(status, style.GREY)
+    word = STATUS_WORDS.get(status, "")
+    text = f"<div style='font-size:0.85em;margin:2px 0 4px'>{escape(message)}</div>"
+    return f"<div style='font-weight:700;font-size:1.15em;color:{colour}'>{word}</div>{text}"
+
+
+def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
+    solution, tolerance = answer.solution, answer.design.task.target.tolerance
+    plain = answer.plain_stiffness
+    for number, (measure, value) in enumerate(
+        zip(answer.design.task.measures, solution.stiffnesses, strict=False)
+    ):
+        text = f"<b>{figures(value)} {unit_text(measure.unit)}</b> {direction_text(measure)}"
+        if number == 0 and plain is not None:
+            text += f"<br>plain pressures: {figures(plain)} ({gain_text(value, plain)})"
+        yield "stiffness", text
+    if solution.position_error is not None:
+        yield (
+            "tip error",
+            f"{solution.position_error * MM:.3g} mm (tolerance {tolerance.position * MM:.3g} mm)",
+        )
+    if solution.angle_error is not None:
+        angle = degrees(solution.angle_error)
+        yield "angle error", f"{angle:.3g}&deg; (tolerance {degrees(tolerance.angle):.3g}&deg;)"
+    if solution.tip_pose is not None:
+        yield "tip", f"{position_text(solution.tip_pose[:3, 3])} mm"
+    if solution.active_bounds:
+        yield "at a limit", escape(_limits_text(solution.active_bounds))
+    if answer.design.task.scene is not None:
+        clearance = answer.robot.clearance(answer.pressures, answer.design.task.scene)
+        yield "clearance", f"{clearance * MM:.3g} mm"
+    yield "answer", _BEST if answer.is_best else _LOCAL
+
+
+def _limits_text(bounds: Iterable[str]) -> str:
+    """Return limits such as ``segment 1 channel 2 min``, those of one segment together."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for bound in bounds:
+        segment, _, rest = bound.partition(" channel ")
+        channel, _, side = rest.partition(" ")
+        found.setdefault((segment, side), []).append(channel)
+    return "; ".join(f"{segment}: {', '.join(c)} at {side}" for (segment, side), c in found.items())
+
+
+def position_text(position: ArrayLike) -> str:
+    """Return a position in mm, to a tenth."""
+    return f"({', '.join(f'{round(float(x), 1) + 0.0:.1f}' for x in np.asarray(position) * MM)})"
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> str:
+    cells = "".join(
+        f"<tr><td style='color:#666;padding-right:8px;vertical-align:top'>{name}</td>"
+        f"<td>{text}</td></tr>"
+        for name, text in rows
+    )
+    return f"<table style='font-size:0.85em;border-spacing:0 2px'>{cells}</table>"
+
+
+def _bars(answer: StudioAnswer) -> tuple[Any, ...]:
+    solution, description = answer.solution, answer.robot.description
+    low, high = answer.design.task.pressure_bounds(description)
+    at_limit = [
+        bool(limit_of(solution, description.channel_name(k)))
+        for k in range(description.n_pressures)
+    ]
+    plain = None if answer.plain is None else answer.plain.pressures
+    return answer.pressures, low, high, at_limit, plain
+
+
+def pressures_html(
+    description: RobotDescription,
+    pressures: ArrayLike,
+    low: ArrayLike,
+    high: ArrayLike,
+    at_limit: Sequence[bool],
+    marks: ArrayLike | None = None,
+    mark: str = "plain pressures",
+) -> str:
+    """Return bars of pressures between their limits, with marks at other pressures.
+
+    Parameters
+    ----------
+    description :
+        The robot, with n channels.
+    pressures, low, high : (n,)
+        In Pa.
+    at_limit : (n,)
+        Which bars stand out.
+    marks : (n,), optional
+        In Pa, called `mark` in the legend.
+    """
+    p, low, high = (np.asarray(each, dtype=float) for each in (pressures, low, high))
+    top, bottom = max(high.max(), p.max()), min(low.min(), 0.0)
+    rows, index = [], 0
+
+    def share(value: float) -> str:
+        return f"{np.clip(100 * (value - bottom) / (top - bottom), 0, 100):.1f}%"
+
+    for number, segment in enumerate(description.segments):
+        rows.append(
+            f"<div style='color:{style.segment_text_colour(number)};font-weight:600;"
+            f"margin-top:4px'>segment {number + 1}</div>"
+        )
+        for channel in range(segment.n_channels):
+            colour = style.AT_LIMIT if at_limit[index] else style.WITHIN_LIMITS
+            tick = ""
+            if marks is not None:
+                tick = _line(share(float(np.asarray(marks)[index])), "#222", 2)
+            rows.append(
+                "<div style='display:flex;align-items:center;gap:6px;height:15px'>"
+                f"<span style='width:1em'>{channel + 1}</span>"
+                f"<span style='position:relative;flex:1;height:10px;background:{style.RANGE}'>"
+                f"<span style='position:absolute;left:0;top:0;bottom:0;"
+                f"width:{share(p[index])};background:{colour}'></span>"
+                f"{_line(share(high[index]), style.BOUND, 2)}{tick}</span>"
+                f"<span style='width:4.6em;text-align:right'>{p[index] * BAR + 0.0:.2f} bar</span>"
+                "</div>"
+            )
+            index += 1
+    legend = f"orange: at a limit{'' if marks is None else f' &middot; black mark: {mark}'}"
+    return (
+        f"<div style='font-size:0.8em'>{''.join(rows)}"
+        f"<div style='color:#666;margin-top:3px'>{legend}</div></div>"
+    )
+
+
+def _line(left: str, colour: str, width: int) -> str:
+    return (
+        f"<span style='position:absolute;left:{left};top:-2px;bottom:-2px;width:{width}px;"
+        f"background:{colour}'></span>"
+    )
+
+
+# -- answers side by side -------------------------------------------------------------------------
+
+
+def compared_html(bench: Workbench, colours: Sequence[str]) -> str:
+    """Return a table of the answer now and of those that were kept, each with its colour."""
+    now = [] if bench.answer is None else [(style.DARK, "now", bench.answer)]
+    kept = [(colours[k % len(colours)], str(k + 1), answer) for k, answer in enumerate(bench.kept)]
+    if not kept:
+        return _padded("<div style='font-size:0.85em'>Keep an answer to compare others.</div>")
+    head = "".join(f"<th style='text-align:left;padding-right:8px'>{t}</th>" for t in
+                   ("", "stiffness", "tip (mm)", "pressures (bar)"))  # fmt: skip
+    rows = "".join(
+        f"<tr><td style='color:{colour};font-weight:700;padding-right:8px'>{name}</td>"
+        f"<td style='padding-right:8px'>{_stiffness_text(answer.solution)}</td>"
+        f"<td style='padding-right:8px'>{position_text(answer.solution.tip_pose[:3, 3])}</td>"
+        f"<td>{_in_bar(answer.pressures)}</td></tr>"
+        for colour, name, answer in now + kept
+        if answer.solution.tip_pose is not None
+    )
+    table = f"<table style='font-size:0.8em;border-spacing:0 3px'><tr>{head}</tr>{rows}</table>"
+    return _padded(table)
+
+
+def _stiffness_text(solution: PressureSolution) -> str:
+    measures = solution.task.measures
+    if solution.stiffness is None or not measures:
+        return "-"
+    text = f"{figures(solution.stiffness)} {unit_text(solution.stiffness_unit)}"
+    text += f" {direction_text(measures[0])}" if isinstance(measures[0], StiffnessMeasure) else ""
+    return text if solution.found else f"{text} ({STATUS_WORDS[solution.status]})"
+
+
+def _in_bar(pressures: ArrayLike) -> str:
+    return " ".join(f"{value * BAR + 0.0:.2f}" for value in np.asarray(pressures))
+
+
+# -- copies ---------------------------------------------------------------------------------------
+
+
+def task_text(design: Design) -> str:
+    """Return the design's task file; its robot is that of `robot_text` where that is needed."""
+    robot = ROBOT_FILE if design.has_own_robot else design.robot
+    return file_text("task", design.task.model_copy(update={"robot": robot}))
+
+
+def robot_text(design: Design) -> str:
+    """Return the design's robot file."""
+    return file_text("robot", design.description)
+
+
+def scene_text(scene: Scene) -> str:
+    """Return a scene file."""
+    return file_text("scene", scene)
+
+
+def python_text(design: Design) -> str:
+    """Return a program that solves the design."""
+    lines = ["import stiffopt", "", f"robot = stiffopt.load_robot({design.robot!r})"]
+    update = {
+        key: value for key, value in design.description if value != getattr(design.original, key)
+    }
+    if update:
+        lines.append(
+            f"robot = stiffopt.load_robot(robot.description.model_copy(update={_literal(update)}))"
+        )
+    given = design.task.model_dump(
+        exclude_none=True, exclude_defaults=True, by_alias=True, exclude={"robot"}
+    )
+    lines += ["task = stiffopt.Task("]
+    lines += [f"    {key}={_literal(value)}," for key, value in given.items()]
+    lines += [")", "solution = stiffopt.solve_pressure(robot, task)", "print(solution)", ""]
+    return "\n".join(lines)
+
+
+def _literal(value: Any) -> str:
+    """Return plain data as Python, on several lines where they are long."""
+    return pformat(_plain(value), width=88, sort_dicts=False).replace("\n", "\n    ")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(_plain(item) for item in value)
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def copy_html(title: str, text: str) -> str:
+    """Return a field with a text and a button that copies it."""
+    return _padded(
+        f"<div style='font-size:0.85em;margin-bottom:3px'>{escape(title)}</div>"
+        f"<button onclick='{_COPY}' style='cursor:pointer;padding:2px 10px'>copy</button>"
+        f"<textarea readonly rows='14' spellcheck='false' style='width:100%;font-family:monospace;"
+        f"font-size:11px;white-space:pre'>{escape(text)}</textarea>"
+    )

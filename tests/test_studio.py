@@ -1,0 +1,300 @@
+"""The studio's model, without a browser: designs, their answers, what is said and copied."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from http.client import HTTPConnection
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stiffopt
+from stiffopt.errors import FileError, InputError
+from stiffopt.studio import texts
+from stiffopt.studio.design import Design
+from stiffopt.studio.workbench import NewestWins, Workbench
+
+ROOT = Path(__file__).resolve().parent.parent
+TASK = ROOT / "problems" / "two_segment_stiff_x.yaml"
+
+
+def never() -> bool:
+    return False
+
+
+@pytest.fixture
+def design() -> Design:
+    return Design.of_task(stiffopt.load_task(TASK))
+
+
+@pytest.fixture
+def bench(design: Design, compiled: Path, monkeypatch: pytest.MonkeyPatch) -> Workbench:
+    monkeypatch.setattr("stiffopt.studio.workbench.QUICK", 10.0)  # the machine may be busy
+    bench = Workbench(design)
+    assert bench.answer_best(never)
+    return bench
+
+
+# -- designs --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("robot", stiffopt.builtin_robots())
+def test_a_bare_robot_gets_a_task(robot: str) -> None:
+    design = Design.of_robot(robot)
+    assert design.measure is not None
+    assert not any(design.free)
+    assert not design.has_own_robot
+
+
+def test_a_dragged_pose_changes_what_is_asked_for_and_no_more(design: Design) -> None:
+    turned = (0.9238795, 0.3826834, 0.0, 0.0)  # by 45 degrees about x
+    moved = design.with_free((False, True, False), (0, 0, 0)).at_pose((0.01, 0.5, 0.18), turned)
+    assert moved.task.target.position == (0.01, None, 0.18)
+    assert moved.task.target.pointing is None
+    pointed = moved.with_angular("pointing", (1, 0, 0, 0)).at_pose((0.0, 0.0, 0.18), turned)
+    np.testing.assert_allclose(pointed.task.target.pointing, (0, -(0.5**0.5), 0.5**0.5), atol=1e-4)
+    oriented = pointed.with_angular("orientation", turned)
+    np.testing.assert_allclose(oriented.task.target.orientation, turned, atol=1e-4)
+    assert oriented.angular == "orientation"
+    held = oriented.with_free((False, False, False), (0.1, 0.02, 0.3))
+    assert held.task.target.position == (0.0, 0.02, 0.18)
+
+
+def test_what_makes_no_sense_is_refused_and_changes_nothing(design: Design) -> None:
+    bench = Workbench(design)
+    with pytest.raises(InputError, match="asks for nothing"):
+        bench.change("free", lambda d: d.with_free((True, True, True), (0, 0, 0)))
+    with pytest.raises(InputError, match="tip_mass"):
+        bench.change("gravity", lambda d: d.with_gravity((0, 0, 9.81), -0.1))
+    assert bench.design == design
+    assert not bench.undo()
+
+
+def test_undo_takes_back_a_whole_drag(design: Design) -> None:
+    bench = Workbench(design)
+    for x in (0.0, 0.01, 0.02):
+        assert bench.change("target", lambda d, x=x: d.with_target(position=(x, 0.0, 0.19)))
+    assert not bench.change("target", lambda d: d)
+    bench.end_step()
+    bench.change("target", lambda d: d.with_target(position=(0.03, 0.0, 0.19)))
+    bench.change("direction", lambda d: d.with_measure(direction=(0, 1, 0)))
+    assert bench.undo()
+    assert bench.design.measure == design.measure
+    assert bench.undo()
+    assert bench.design.task.target.position == (0.02, 0.0, 0.19)
+    assert bench.undo()
+    assert bench.design == design
+
+
+# -- answers --------------------------------------------------------------------------------------
+
+
+def test_answers_are_those_of_the_solver(bench: Workbench) -> None:
+    answer, expected = (
+        bench.answer,
+        stiffopt.solve_pressure(stiffopt.load_robot("stiff-flop-2"), stiffopt.load_task(TASK)),
+    )
+    assert answer is not None
+    assert answer.is_best
+    np.testing.assert_allclose(answer.pressures, expected.pressures, atol=1.0)
+    assert answer.plain_stiffness is not None
+    assert answer.plain_stiffness < answer.solution.stiffness
+    html = texts.answer_html(bench)
+    assert "solved" in html
+    assert "1.445 N/m" in html
+    assert "plain pressures: 1.308 (+10 %)" in html
+    assert "segment 1: 1, 2, 3 at min" in html
+
+
+def test_an_answer_follows_a_drag_and_says_what_limits_it(bench: Workbench) -> None:
+    bench.change("target", lambda d: d.with_target(position=(-0.028, 0.01, 0.19)))
+    assert bench.answer_quickly(never)
+    answer = bench.answer
+    assert answer is not None
+    assert not answer.is_best
+    assert answer.solution.found
+    np.testing.assert_allclose(answer.solution.tip_pose[:3, 3], (-0.028, 0.01, 0.19), atol=1.1e-4)
+    assert bench.keep()
+    assert not bench.keep()
+    bench.change("target", lambda d: d.with_target(position=(-0.15, 0.0, 0.19)))
+    bench.answer_quickly(never)
+    bench.answer_best(never)
+    html = texts.answer_html(bench)
+    assert "out of reach" in html
+    assert "6.562 mm away; held back by segment 1 channel 1 max" in html
+    compared = texts.compared_html(bench, ("#111111",))
+    assert compared.count("<tr>") == 3
+    assert "(-28.0, 10.0, " in compared
+
+
+def test_a_search_that_is_given_up_keeps_the_answer(bench: Workbench) -> None:
+    before = bench.answer
+    bench.change("target", lambda d: d.with_target(position=(0.0, 0.01, 0.19)))
+    bench.answer_best(lambda: True)
+    assert bench.answer is before or bench.answer.solution.found
+
+
+def test_the_newest_request_wins() -> None:
+    asked, is_full, go = [], threading.Event(), threading.Event()
+    value = 0
+
+    def quickly(cancel: object) -> None:
+        asked.append(value)
+        go.wait(10)
+
+    def fully(cancel: object) -> None:
+        is_full.set()
+
+    worker = NewestWins(quickly, fully)
+    for value in (1, 2, 3):  # noqa: B007 - read in the other thread
+        worker.request()
+    go.set()
+    assert is_full.wait(10)
+    worker.close()
+    assert asked[-1] == 3
+    assert len(asked) <= 2
+
+
+# -- copies ---------------------------------------------------------------------------------------
+
+
+def changes() -> Iterator[object]:
+    rib = stiffopt.SceneObject(
+        name="rib", capsule={"from": (0.08, -0.03, 0.09), "to": (0.08, 0.03, 0.09), "radius": 0.006}
+    )
+    yield pytest.param(lambda d: d, id="as it was")
+    yield pytest.param(
+        lambda d: (
+            d.with_angular("pointing", (0.99, 0.1, 0.05, 0.0))
+            .with_measure(kind="rotation", boundary="clamped", direction=(1, 2, 3))
+            .with_force((0.0, 0.01, -0.02))
+            .with_highest(1.2e5)
+            .with_tolerance(5e-4, 0.05)
+        ),
+        id="task",
+    )
+    yield pytest.param(lambda d: d.with_objects([rib]).with_clearance(0.002), id="scene")
+    yield pytest.param(lambda d: d.with_least_pressure(), id="least pressure")
+
+
+@pytest.mark.parametrize("change", list(changes()))
+def test_copies_load_as_they_are(change: object, design: Design, tmp_path: Path) -> None:
+    changed = change(design)
+    path = tmp_path / "task.yaml"
+    path.write_text(texts.task_text(changed), encoding="utf-8")
+    loaded = stiffopt.load_task(path)
+    assert loaded.model_copy(update={"source": None}) == changed.task.model_copy(
+        update={"robot": "stiff-flop-2", "source": None}
+    )
+    names = ran(texts.python_text(changed))
+    assert names["task"] == changed.task.model_copy(update={"robot": None, "source": None})
+    assert names["robot"].description == changed.description
+
+
+def test_a_changed_robot_is_copied_with_its_task(tmp_path: Path) -> None:
+    design = Design.of_robot("stiff-flop-2-hanging").with_gravity((0.0, 0.0, 0.0), 0.012)
+    assert design.has_own_robot
+    (tmp_path / texts.ROBOT_FILE).write_text(texts.robot_text(design), encoding="utf-8")
+    path = tmp_path / "task.yaml"
+    path.write_text(texts.task_text(design), encoding="utf-8")
+    again = Design.of_task(stiffopt.load_task(path))
+    assert again.description == design.description
+    assert ran(texts.python_text(design))["robot"].description == design.description
+
+
+def ran(program: str) -> dict[str, object]:
+    """Run a copied program but for its search, and return its names."""
+    names: dict[str, object] = {}
+    exec(program.partition("solution =")[0], names)
+    return names
+
+
+def test_what_files_say_is_escaped(design: Design) -> None:
+    bench = Workbench(design)
+    bench.trouble = "<script>alert(1)</script>"
+    assert "<script>" not in texts.answer_html(bench)
+    assert "&lt;script&gt;" in texts.answer_html(bench)
+    assert "</textarea><" not in texts.copy_html("", "</textarea><script>").removesuffix(
+        "</textarea></div>"
+    )
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+viser = pytest.importorskip("viser", reason="viser is missing: pip install 'stiffopt[studio]'")
+
+
+@pytest.fixture
+def page() -> Iterator[object]:
+    from stiffopt.studio.page import StudioPage
+
+    page = StudioPage()
+    yield page
+    page.close()
+
+
+UPGRADE = {
+    "Connection": "Upgrade",
+    "Upgrade": "websocket",
+    "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "c3RpZmZvcHQgc3R1ZGlvIQ==",
+}
+
+
+def asked(page: object, path: str = "/", **headers: str) -> tuple[int, dict[str, str]]:
+    """Return the status and the headers of the answer to a request."""
+    connection = HTTPConnection("127.0.0.1", page.port, timeout=10)
+    named = {key.replace("_", "-"): value for key, value in headers.items()}
+    connection.request("GET", path, headers=named)
+    answer = connection.getresponse()
+    found = answer.status, dict(answer.getheaders())
+    connection.close()
+    return found
+
+
+def test_only_the_key_opens_the_page_and_its_socket(page: object) -> None:
+    key = page.url.partition("?key=")[2]
+    assert asked(page)[0] == 403
+    assert asked(page, "/?key=wrong")[0] == 403
+    assert asked(page, **UPGRADE)[0] == 403
+    assert asked(page, f"/?key={key}", Host="evil.example")[0] == 403
+    status, headers = asked(page, f"/?key={key}")
+    assert (status, headers["Location"]) == (303, "/")
+    assert "HttpOnly; SameSite=Lax" in headers["Set-Cookie"]
+    cookie = headers["Set-Cookie"].partition(";")[0]
+    assert asked(page, Cookie=cookie)[0] == 200
+    assert asked(page, Cookie=cookie, **UPGRADE)[0] == 101
+    for origin, expected in (
+        ("http://evil.example", 403),
+        ("null", 403),
+        (f"http://127.0.0.1:{page.port + 1}", 403),
+        (f"http://127.0.0.1:{page.port}", 101),
+    ):
+        assert asked(page, Cookie=cookie, Origin=origin, **UPGRADE)[0] == expected
+    assert asked(page, Cookie=cookie, Host=f"evil.example:{page.port}", **UPGRADE)[0] == 403
+
+
+def test_the_page_is_never_published(page: object) -> None:
+    assert page.server.request_share_url() is None
+
+
+def test_a_port_in_use_is_told(page: object) -> None:
+    from stiffopt.studio.page import StudioPage
+
+    with pytest.raises(InputError, match="cannot listen on 127"):
+        StudioPage(port=page.port)
+
+
+def test_what_the_studio_does_not_show_is_told(tmp_path: Path) -> None:
+    from stiffopt.studio.opening import kind_of
+
+    assert kind_of("stiff-flop-2") == "robot"
+    assert kind_of(str(TASK)) == "task"
+    path = tmp_path / "result.yaml"
+    path.write_text("format: stiffopt-result/1\n", encoding="utf-8")
+    with pytest.raises(FileError, match="nothing that the studio shows"):
+        kind_of(str(path))
+    with pytest.raises(FileError, match="no such file"):
+        kind_of("nowhere.yaml")

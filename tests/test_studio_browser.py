@@ -1,0 +1,111 @@
+"""The studio in a real browser without a screen: what is dragged and pressed there, and seen."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stiffopt
+from stiffopt import lie
+
+pytest.importorskip("viser", reason="viser is missing: pip install 'stiffopt[studio]'")
+playwright = pytest.importorskip(
+    "playwright.sync_api", reason="playwright is missing: pip install playwright"
+)
+CHROMIUM = shutil.which("chromium")
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None, reason="there is no chromium: apt install chromium"
+)
+
+ROOT = Path(__file__).resolve().parent.parent
+TASK = ROOT / "problems" / "two_segment_stiff_x.yaml"
+SOFTWARE = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
+            "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]  # fmt: skip
+X = np.array([1.0, 0.0, 0.0])
+PATIENCE = 50_000  # ms
+
+
+@pytest.fixture
+def browser_page() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, headless=True, args=SOFTWARE)
+        page = browser.new_page(viewport={"width": 720, "height": 460})
+        page.set_default_timeout(PATIENCE)
+        yield page
+        browser.close()
+
+
+def until(holds: Callable[[], bool], seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def on_screen(client: Any, point: Any) -> np.ndarray:
+    """Return where a point in space is seen, in pixels."""
+    camera = client.camera
+    axes = np.asarray(lie.rotation_from_quaternion(np.asarray(camera.wxyz)))
+    x, y, z = axes.T @ (np.asarray(point) - camera.position)
+    focus = camera.image_height / 2 / np.tan(camera.fov / 2)
+    return np.array(
+        [camera.image_width / 2 + focus * x / z, camera.image_height / 2 + focus * y / z]
+    )
+
+
+def test_the_arm_follows_a_target_that_is_dragged(browser_page: Any, compiled: Path) -> None:
+    from stiffopt.studio.opening import open_studio
+
+    studio, page, mistakes = open_studio(str(TASK)), browser_page, []
+    page.on("console", lambda said: mistakes.append(said.text) if said.type == "error" else None)
+    try:
+        page.goto(studio.url)
+        page.wait_for_selector("text=1.445 N/m")
+        assert page.url == f"http://127.0.0.1:{studio.page.port}/"  # the key is gone
+        (client,) = studio.page.server.get_clients().values()
+        view, bench = studio.view, studio.view.bench
+        start = view.target_position
+
+        grip = on_screen(client, start + X * 0.03)  # the arrow along x
+        way = on_screen(client, start + X * 0.045) - grip
+        page.mouse.move(*grip)
+        page.wait_for_timeout(500)
+        page.mouse.down()
+        for share in np.linspace(0.1, 1.0, 10):
+            page.mouse.move(*(grip + share * way))
+            page.wait_for_timeout(60)
+        page.mouse.up()
+
+        until(lambda: bench.answer.is_best and bench.answer.design == bench.design)
+        target = np.asarray(bench.design.task.target.position)
+        assert target[0] - start[0] == pytest.approx(0.015, abs=0.005)
+        np.testing.assert_allclose(target[1:], start[1:], atol=1e-5)
+        tip = bench.answer.solution.tip_pose[:3, 3]
+        assert np.linalg.norm(tip - target) < 1.01e-4
+        said = f"({', '.join(f'{1e3 * x + 0.0:.1f}' for x in tip)}) mm"
+        page.wait_for_selector(f"text={said}")
+        np.testing.assert_allclose(view.arm_end, tip, atol=1e-6)
+
+        page.get_by_role("button", name="undo").click()
+        page.wait_for_selector("text=1.445 N/m")
+        page.get_by_role("tab", name="copy").click()
+        page.get_by_role("button", name="copy as task file").click()
+        copied = page.locator("textarea").input_value()
+        assert copied.startswith("format: stiffopt-task/1")
+        assert not mistakes
+    finally:
+        studio.close()
+
+
+def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from stiffopt.cli.main import main
+
+    monkeypatch.setattr("stiffopt.errors.find_spec", lambda name: None)
+    assert main(["studio"]) == 2
+    assert stiffopt.MissingExtraError("viser", "studio").extra == "studio"
