@@ -1,6 +1,6 @@
 """How much stiffness is gained over plain pressures, by arm, law, freedom and load.
 
-    python benchmarks/gains.py                     # all rows, ten minutes or so, to results/gains.json
+    python benchmarks/gains.py                     # all rows, some minutes, to results/gains.json
     python benchmarks/gains.py --tasks 5 --only 'position, 2 segments' --out /tmp/gains.json
     python benchmarks/gains.py --table             # prints the table of what was measured
 
@@ -48,7 +48,7 @@ class Row:
     name: str
     robot: Callable[[], Manipulator]
     kind: str = "position"
-    tolerance: Tolerance = Tolerance()
+    tolerance: Tolerance | None = None
     load: Load | None = None
     relaxes: str = ""  # kind of the exact task of which this is a relaxed form
 
@@ -82,7 +82,10 @@ def rows() -> Iterator[Row]:
                 continue  # three channels cannot reach such a pose to within 0.1 mm and 1 deg anew
             name = f"{words}, {segments} segment{'s' * (segments > 1)}"
             yield Row("arm and pose", name, lambda n=segments: arm(n), kind)
-    for kind, words in {"pointing": "pointing alone", "free-axis": "position, one axis free"}.items():
+    for kind, words in {
+        "pointing": "pointing alone",
+        "free-axis": "position, one axis free",
+    }.items():
         relaxes = "position" if kind == "free-axis" else "pose-5"
         yield Row("freedom", words, lambda: arm(2), kind, relaxes=relaxes)
     for size in (1e-3, 5e-3, 10e-3):
@@ -140,7 +143,8 @@ def tasks_of(row: Row, seed: int, count: int) -> Iterator[tuple[Manipulator, Tas
             for kind in (row.kind, row.relaxes or row.kind)
         )
         exact = exact.model_copy(update={"stiffness": task.stiffness, "load": row.load})
-        target = task.target.model_copy(update={"tolerance": row.tolerance})
+        tolerance = row.tolerance or Tolerance()
+        target = task.target.model_copy(update={"tolerance": tolerance})
         yield robot, task.model_copy(update={"target": target, "load": row.load}), exact
 
 
@@ -228,6 +232,7 @@ def table(measured: list[dict]) -> str:
 
 
 def main() -> int:
+    """Measure, or print what was measured."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tasks", type=int, default=50, help="of a row and a seed")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4])

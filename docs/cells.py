@@ -11,8 +11,13 @@ plt.rcParams.update({"figure.dpi": 110, "axes.spines.top": False, "axes.spines.r
 
 
 @register_cell_magic
-def sh(_line: str, cell: str) -> None:
-    """Run a cell as a shell would outside of a terminal, and print all that it says at its end."""
-    done = subprocess.run(cell, shell=True, text=True, stdout=-1, stderr=subprocess.STDOUT)
+def sh(line: str, cell: str) -> None:
+    """Run a cell as a shell would outside of a terminal; `%%sh checkout`: in the checkout.
+
+    What it notes meanwhile (on stderr) is shown only if it fails.
+    """
+    folder = os.environ["STIFFOPT_CHECKOUT"] if line == "checkout" else None
+    done = subprocess.run(cell, cwd=folder, shell=True, text=True, capture_output=True)
     print(done.stdout, end="")
-    done.check_returncode()
+    if done.returncode:
+        raise RuntimeError(done.stderr)

@@ -9,6 +9,7 @@ from typing import Any
 from docutils.nodes import SkipNode, literal_block
 from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx_gallery.scrapers import figure_rst
 
 import stiffopt
 
@@ -16,7 +17,7 @@ HERE = Path(__file__).resolve().parent
 
 project = "stiffopt"
 author = "The stiffopt authors"
-copyright = author
+project_copyright = author
 extensions = [
     "myst_nb",
     "numpydoc",
@@ -31,6 +32,7 @@ exclude_patterns = ["gallery/*", "auto_gallery/*.ipynb", "**sg_execution_times.r
 source_suffix = {".md": "myst-nb", ".rst": "restructuredtext"}
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
 myst_heading_anchors = 4
+suppress_warnings = ["config.cache"]  # of sphinx_gallery_conf, which has a function
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", r".*")]  # types in docstrings are words for people
 
@@ -54,7 +56,19 @@ os.environ |= {
 
 # -- Gallery --------------------------------------------------------------------------------------
 
+
+def _figure_of_script(block: Any, variables: dict[str, Any], settings: dict[str, Any]) -> str:
+    """Save what a script calls `figure`; stiffopt's figures are not pyplot's."""
+    figure = variables["example_globals"].pop("figure", None)
+    if figure is None:
+        return ""
+    path = next(variables["image_path_iterator"])
+    figure.savefig(path, dpi=100)
+    return figure_rst([path], settings["src_dir"])
+
+
 sphinx_gallery_conf = {
+    "image_scrapers": (_figure_of_script,),
     "examples_dirs": "gallery",
     "gallery_dirs": "auto_gallery",
     "filename_pattern": r"\.py$",
@@ -86,13 +100,13 @@ html_show_sphinx = False
 
 
 def _inline_mathml(translator: Any, node: Any) -> None:
-    translator.body.append(convert(_tex(node.astext())))
+    translator.body.append(_mathml(node))
     _skip()
 
 
 def _display_mathml(translator: Any, node: Any) -> None:
     translator.body.append(translator.starttag(node, "div", CLASS="math"))
-    translator.body.append(convert(_tex(node.astext()), display="block"))
+    translator.body.append(_mathml(node, "block"))
     translator.body.append("</div>\n")
     _skip()
 
@@ -101,15 +115,17 @@ def _skip() -> None:
     raise SkipNode
 
 
-def _tex(text: str) -> str:
-    """TeX that the converter knows in place of what it does not."""
-    return text.replace(r"\tfrac", r"\frac").strip()
+def _mathml(node: Any, display: str = "inline") -> str:
+    """A formula as MathML; `tfrac` is unknown to the converter, and primes come out too small."""
+    found = convert(node.astext().replace(r"\tfrac", r"\frac").strip(), display=display)
+    prime = r"<msup>(<mi>[^<]*</mi>)<mi>(&#x0203[23];)</mi></msup>"
+    return re.sub(prime, r'<mrow>\1<mo lspace="0" rspace="0">\2</mo></mrow>', found)
 
 
 def _shell_cells(app: Sphinx, tree: Any) -> None:
     """Cells that the shell runs look like a terminal."""
     for block in tree.findall(literal_block):
-        if block.astext().startswith("%%sh\n"):
+        if block.astext().startswith("%%sh"):
             lines = block.astext().splitlines()[1:]
             shown = "\n".join(f"$ {line}" for line in lines)
             block.replace_self(literal_block(shown, shown, language="console"))

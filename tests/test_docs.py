@@ -232,7 +232,9 @@ def test_the_site_has_a_place_for_every_page() -> None:
     assert settings["html_theme"] == "furo"
     listed = ["index"]
     for page in docs.glob("*.md"):
-        for tree in re.findall(r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S):
+        for tree in re.findall(
+            r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S
+        ):
             listed += [line for line in tree.splitlines() if line and not line.startswith(":")]
     listed.remove("auto_gallery/index")  # made of docs/gallery
     assert sorted(listed) == sorted(page.stem for page in docs.glob("*.md"))

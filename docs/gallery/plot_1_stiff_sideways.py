@@ -2,8 +2,8 @@
 A position, stiff along x
 =========================
 
-The first example: two segments bring the tip to a position and are as stiff as possible along x. The grey
-percentage is the gain over the plain pressures, which ignore stiffness.
+The first example: two segments bring the tip to a position and are as stiff as possible along
+x. The grey percentage is the gain over the plain pressures, which ignore stiffness.
 """
 
 import stiffopt

@@ -2,8 +2,8 @@
 A free axis
 ===========
 
-The same position, but its height does not matter. The tip chooses its height, and the arm is stiffer.
-A free axis is often the cheapest way to gain stiffness.
+The same position, but its height does not matter. The tip chooses its height, and the arm is
+stiffer. A free axis is often the cheapest way to gain stiffness.
 """
 
 import stiffopt

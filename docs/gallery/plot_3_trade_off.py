@@ -2,8 +2,8 @@
 Stiffness against tip error
 ===========================
 
-How much stiffness would a larger tolerance gain? The task is solved at several tolerances. Each point is
-the stiffest answer at its error.
+How much stiffness would a larger tolerance gain? The task is solved at several tolerances. Each
+point is the stiffest answer at its error.
 """
 
 import stiffopt

@@ -2,8 +2,8 @@
 Among obstacles
 ===============
 
-A sideways push past a rib and a post, under a table and through a port. The whole body keeps its
-clearance from every object, and the arm is as stiff as that permits.
+A sideways push past a rib and a post, under a table and through a port. The whole body keeps
+its clearance from every object, and the arm is as stiff as that permits.
 """
 
 import stiffopt

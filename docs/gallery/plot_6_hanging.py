@@ -2,8 +2,8 @@
 A hanging arm that lifts
 ========================
 
-With gravity, a tip mass and a load every quantity is that of the loaded arm: its static equilibrium, and
-the tangent stiffness there.
+With gravity, a tip mass and a load every quantity is that of the loaded arm: its static
+equilibrium, and the tangent stiffness there.
 """
 
 import stiffopt
