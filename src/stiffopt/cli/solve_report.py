@@ -206,7 +206,7 @@ def _small_gain(solved: SolvedTask) -> Iterable[Line]:
     if solution.freedom == 0:
         reason = "no freedom is left, the pose fixes all channels"
     else:
-        reason = "the plain pressures are all but the stiffest that reach the target"
+        reason = "the plain pressures are all but the stiffest here"
     advice = "a free axis or a larger tolerance may gain more"
     yield "gain", Text(f"below {SMALL_GAIN:.0%}: {reason}\n{advice}".replace("%", " %"))
 
