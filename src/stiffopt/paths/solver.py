@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
+from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel, giving_up
 from stiffopt.optimise.solution import Judgement, PressureSolution
@@ -60,10 +60,10 @@ def solve_path(
         raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
     if not isinstance(path, Path):
         raise InputError(f"path must be a Path, see load_path; got {shown(path)}")
-    begin = perf_counter()
+    watch = Stopwatch()
     with giving_up(timeout, cancel):
         solution = _PathSolver(robot, path, seed).solve()
-    solution.timings["total"] = perf_counter() - begin
+    solution.timings.update(watch.timings())
     return solution
 
 
