@@ -44,6 +44,7 @@ _ANGULAR: dict[str, Angular] = {
     "full orientation": "orientation",
 }
 _MAXIMISE, _LEAST, _FILE = "stiff along a direction", "least pressure", "as in the file"
+_PREVIEW = "Preview (violet): the arm does not move until you send it."
 _NO_MAP = "do not show"
 _GRAVITY = {
     "none": (0.0, 0.0, 0.0),
@@ -141,6 +142,8 @@ class TaskView:
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.set_width(400)
+        if self._is_preview:
+            gui.add_html(texts.note_html(_PREVIEW))
         self._words = gui.add_html("")
         undo = gui.add_button("undo", hint="Take the last change back.")
         undo.on_click(self._undo)
