@@ -30,6 +30,11 @@ test: $(VENV)/.installed-dev  ## run the tests (make test ARGS=--long for the lo
 schemas: $(VENV)/.installed-dev  ## make the JSON Schemas anew from the models
 	$(BIN)/python -c "from stiffopt.json_schemas import write_schema_files as w; w()"
 
+docs: $(VENV)/.installed-docs  ## build the documentation into build/docs/html
+	@rm -rf docs/auto_gallery build/docs/html
+	$(BIN)/python -m sphinx -b html -W --keep-going -q -d build/docs/doctrees docs build/docs/html
+	@echo "The documentation is in build/docs/html/index.html."
+
 mutate: $(VENV)/.installed-dev  ## try mutants of the safety package (make mutate ARGS=--short: some)
 	$(BIN)/python tests/mutation.py $(ARGS)
 
@@ -82,6 +87,11 @@ $(VENV)/.installed-dev: $(VENV)/.created pyproject.toml
 	@echo "Installing stiffopt and its development tools into $(VENV) ..."
 	@$(PIP) install --editable '.[dev,plot]'
 	@touch $@ $(VENV)/.installed-plot
+
+$(VENV)/.installed-docs: $(VENV)/.created pyproject.toml
+	@echo "Installing what builds the documentation into $(VENV) ..."
+	@$(PIP) install --editable '.[docs]'
+	@touch $@
 
 # The peers of the benchmarks are heavy and have an environment of their own.
 $(BENCH)/.installed: $(VENV)/.created pyproject.toml

@@ -112,6 +112,16 @@ def test_table_says_what_a_limit_is_worth(write: Write) -> None:
     assert re.search(r"N/m per bar by which segment 2 channel \d max is raised", text)
 
 
+def test_table_says_why_a_gain_is_small(write: Write) -> None:
+    exact = ONE.replace("-20 mm, 5 mm, free", "-18 mm, -3 mm, 92 mm").replace("0.5", "0.1")
+    text = run(write("exact.yaml", exact)).stdout
+    assert "gain       below 1 %: no freedom is left, the pose fixes all channels\n" in text
+    turning = TWO.replace("[1, 0, 0]", "[0, 1, 0], kind: rotation")
+    text = run(write("turning.yaml", turning)).stdout
+    assert "gain       below 1 %: the plain pressures are all but the stiffest" in text
+    assert "gain " not in run(write("two.yaml", TWO)).stdout
+
+
 def test_table_fits_80_columns_and_has_no_colour_codes_in_a_file(write: Write) -> None:
     done = process(write("one.yaml", ONE), write("far.yaml", FAR), "--pareto", "3")
     assert done.returncode == 3

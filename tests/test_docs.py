@@ -220,3 +220,21 @@ def headings(page: Path) -> set[str]:
     lines = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
     titles = re.findall(r"^#+ (.*)$", lines, re.M)
     return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def test_the_site_has_a_place_for_every_page() -> None:
+    """The configuration loads, and each page stands in the table of contents once."""
+    pytest.importorskip("sphinx")
+    docs = ROOT / "docs"
+    settings: dict[str, Any] = {"__file__": str(docs / "conf.py"), "__name__": "conf"}
+    exec(compile((docs / "conf.py").read_text(encoding="utf-8"), "conf.py", "exec"), settings)
+    assert callable(settings["setup"])
+    assert settings["html_theme"] == "furo"
+    listed = ["index"]
+    for page in docs.glob("*.md"):
+        for tree in re.findall(
+            r"^```\{toctree\}\n(.*?)^```", page.read_text(encoding="utf-8"), re.M | re.S
+        ):
+            listed += [line for line in tree.splitlines() if line and not line.startswith(":")]
+    listed.remove("auto_gallery/index")  # made of docs/gallery
+    assert sorted(listed) == sorted(page.stem for page in docs.glob("*.md"))

@@ -153,6 +153,23 @@ def test_one_library_serves_all_arms_of_a_layout(compiled, tmp_path, monkeypatch
     assert len(cached(tmp_path)) == 1
 
 
+def test_times_of_answers_leave_out_the_compilation(
+    code_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is told apart, once: code is made for the first answer of a kind."""
+    monkeypatch.setenv("STIFFOPT_COMPILER", "cc -O0")
+    monkeypatch.setenv("STIFFOPT_CACHE_DIR", str(tmp_path / "empty"))
+    robot = so.load_robot("stiff-flop-1")
+    task = so.Task(target=so.Target(position=(-0.01, 0.004, None)))
+    begin = time.perf_counter()
+    first = so.solve_pressure(robot, task)
+    elapsed = time.perf_counter() - begin
+    second = so.solve_pressure(robot, task)
+    assert first.timings["compilation"] > 0.3 * elapsed
+    assert first.timings["total"] + first.timings["compilation"] <= elapsed
+    assert "compilation" not in second.timings
+
+
 # -- in the background ----------------------------------------------------------------------
 
 

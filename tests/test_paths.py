@@ -193,6 +193,26 @@ def test_pressures_at_the_start_that_are_elsewhere_are_refused(robot):
         solve_path(robot, path)
 
 
+def test_objects_on_the_path_are_named_with_the_nearest_path(robot, compiled):
+    """Next to objects the nearest points are borders of what can be had, which descents miss."""
+    tenths = [(795, -410, 1311), (793, -420, 1309), (792, -429, 1306), (790, -439, 1303)]
+    centres = [(0.0605, -0.0811, 0.0837), (0.0208, -0.0228, 0.134), (0.0372, -0.0742, 0.0979)]
+    objects = [
+        {"name": f"post {k}", "sphere": {"centre": centre, "radius": 0.006}}
+        for k, centre in enumerate(centres)
+    ]
+    scene = {"clearance": 0.001, "objects": objects}
+    path = path_of(through(np.array(tenths) * 1e-4), points=None, scene=scene)
+    solution = solve_path(robot, path)
+    assert (solution.status, len(solution.pressures)) == ("unreachable", 4)
+    assert "cannot be reached" in solution.message
+    assert "'post 1'" in solution.message
+    assert robot.clearance(solution.pressures, path.scene).min() > 0.001 - 2e-5
+    reached = solution.position_errors <= 1e-4
+    assert reached[: solution.first_failure].all()
+    assert not reached[solution.first_failure]
+
+
 def test_a_point_out_of_reach_is_named_with_the_nearest_path(robot, compiled):
     path = path_of({"line": {"from": (-0.03, 0, 0.19), "to": (-0.16, 0, 0.19)}})
     solution = solve_path(robot, path)

@@ -199,7 +199,7 @@ def test_a_view_is_asked_for_in_radians_or_with_a_unit() -> None:
         axes = plots.plot_solution(arm, solution, view=view).axes[0]
         assert (axes.elev, axes.azim, axes.roll) == pytest.approx((30, 10, 0))
     for wrong in (("30 deg",), "30 deg", ("100 deg", "0 deg"), ("1 mm", "2 mm"), (np.nan, 0.0)):
-        with pytest.raises(stiffopt.InputError, match="view|angle|finite"):
+        with pytest.raises(stiffopt.InputError, match=r"view|angle|finite"):
             plots.plot_solution(arm, solution, view=wrong)
 
 

@@ -11,9 +11,13 @@ import numpy as np
 import pytest
 
 import stiffopt
+from stiffopt.cli.path_records import csv_text
 from stiffopt.errors import FileError, InputError
-from stiffopt.studio import texts
+from stiffopt.studio import objects, texts
+from stiffopt.studio.cloud import StiffnessCloud, check_map
 from stiffopt.studio.design import Design
+from stiffopt.studio.sources import kind_of, timeline_of
+from stiffopt.studio.timeline import Timeline
 from stiffopt.studio.workbench import NewestWins, Workbench
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -288,8 +292,6 @@ def test_a_port_in_use_is_told(page: object) -> None:
 
 
 def test_what_the_studio_does_not_show_is_told(tmp_path: Path) -> None:
-    from stiffopt.studio.opening import kind_of
-
     assert kind_of("stiff-flop-2") == "robot"
     assert kind_of(str(TASK)) == "task"
     path = tmp_path / "result.yaml"
@@ -298,3 +300,98 @@ def test_what_the_studio_does_not_show_is_told(tmp_path: Path) -> None:
         kind_of(str(path))
     with pytest.raises(FileError, match="no such file"):
         kind_of("nowhere.yaml")
+
+
+# -- scenes ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["sphere", "box", "capsule", "cylinder", "half_space"])
+def test_objects_are_placed_moved_and_saved(kind: str, design: Design, tmp_path: Path) -> None:
+    first = objects.new_object(kind, (), design.description.length)
+    second = objects.new_object(kind, (first,), design.description.length)
+    assert {first.name, second.name} == {f"{kind} 1", f"{kind} 2"}
+    there = np.array([0.09, -0.02, 0.11])
+    moved = objects.moved(first, there)
+    np.testing.assert_allclose(objects.place_of(moved.shape), there, atol=1e-4)
+    size = objects.size_of(first.shape)
+    if size is not None:
+        assert objects.size_of(objects.resized(moved, 2 * size).shape) == pytest.approx(2 * size)
+    vertices, faces = objects.surface_mesh(moved.shape, 0.2)
+    assert faces.max() < len(vertices)
+    with_both = design.with_objects([first, second])
+    changed = with_both.with_objects(objects.replaced(with_both.objects, moved))
+    assert changed.objects == (moved, second)
+    path = tmp_path / "scene.yaml"
+    objects.save_scene(path, changed.task.scene)
+    assert stiffopt.load_scene(path).objects == changed.objects
+    objects.save_scene(path, with_both.task.scene)
+    with pytest.raises(FileError, match="no scene file"):
+        objects.save_scene(TASK, changed.task.scene)
+    with pytest.raises(FileError, match=r"ends in \.yaml"):
+        objects.save_scene(tmp_path / "scene.txt", changed.task.scene)
+
+
+def test_an_object_on_the_base_is_refused(design: Design) -> None:
+    item = objects.moved(objects.new_object("sphere", (), 0.2), (0.0, 0.0, 0.01))
+    with pytest.raises(InputError, match="the arm's base"):
+        design.with_objects([item])
+
+
+# -- timelines ------------------------------------------------------------------------------------
+
+
+def test_a_path_plays(compiled: Path, tmp_path: Path) -> None:
+    path = stiffopt.load_path(ROOT / "problems" / "paths" / "path_line_stiff_x.yaml")
+    path = path.model_copy(update={"count": 6})
+    solution = stiffopt.solve_path(stiffopt.load_robot("stiff-flop-2"), path)
+    timeline = Timeline.of_path(path, solution)
+    assert timeline.charts[0].title == "stiffness (N/m)"
+    assert timeline.charts[-1].values.shape == (6, 3)
+    halfway = timeline.at(float(solution.times[2:4].mean()))
+    np.testing.assert_allclose(halfway.pressures, solution.pressures[2:4].mean(axis=0))
+    assert halfway.row == 2
+    np.testing.assert_array_equal(timeline.at(1e9).pressures, solution.pressures[-1])
+    np.testing.assert_array_equal(timeline.at(-1.0).pressures, solution.pressures[0])
+    html = texts.moment_html(timeline, 0.0)
+    assert "solved" in html
+    assert "tip of the model" in html
+
+    motion = tmp_path / "motion.csv"
+    motion.write_text(csv_text(solution), encoding="utf-8")
+    again = timeline_of(str(motion), "stiff-flop-2")
+    np.testing.assert_allclose(again.pressures, solution.pressures, rtol=1e-8)
+    with pytest.raises(FileError, match="has more channels"):
+        timeline_of(str(motion), "stiff-flop-1")
+
+
+def test_a_recording_plays_with_what_was_seen(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    file.write_text(
+        "time_s,p1_pa,p2_pa,p3_pa,tip_x_m,tip_y_m,tip_z_m\n"
+        "10,0,0,0,0,0,0.09\n10.5,20000,0,0,,,\n11,40000,0,0,0.001,0,0.09\n",
+        encoding="utf-8",
+    )
+    timeline = timeline_of(str(file), "stiff-flop-1")
+    assert timeline.duration == 1.0
+    np.testing.assert_allclose(timeline.at(0.75).pressures, (30000, 0, 0))
+    np.testing.assert_allclose(timeline.at(0.75).seen, (0, 0, 0.09))
+    np.testing.assert_allclose(timeline.at(1.0).seen, (0.001, 0, 0.09))
+    assert "tip seen" in texts.moment_html(timeline, 1.0)
+    with pytest.raises(FileError, match="name the robot that was recorded"):
+        timeline_of(str(file), "stiff-flop-2")
+
+
+# -- maps -----------------------------------------------------------------------------------------
+
+
+def test_a_map_becomes_a_coloured_cloud() -> None:
+    robot = stiffopt.load_robot("stiff-flop-1")
+    found = stiffopt.map_workspace(robot, samples=300, directions=[(1, 0, 0), (0, 0, 1)])
+    cloud = StiffnessCloud.of(found, 1)
+    assert cloud.points.shape == cloud.colours.shape == (len(found.centres), 3)
+    stiffest = int(np.argmax(found.best[1]))
+    assert cloud.colours[stiffest].tolist() == [253, 231, 37]
+    assert cloud.legend.startswith("stiffest along z: violet ")
+    check_map(found, robot.description)
+    with pytest.raises(InputError, match="another arm than 'stiff-flop-2'"):
+        check_map(found, stiffopt.load_robot("stiff-flop-2").description)

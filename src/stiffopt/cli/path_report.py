@@ -23,7 +23,7 @@ _ROWS = 10  # of the table, about
 def block(solved: SolvedPath) -> RenderableType:
     """Return the full report of one path, about 80 columns wide."""
     solution = solved.solution
-    title = block_title(printable(solved.file), solution.status, solution.timings.get("total", 0.0))
+    title = block_title(printable(solved.file), solution.status, solution.timings)
     parts: list[RenderableType] = [title, labelled(_lines(solved))]
     if len(solution.times):
         parts += ["", points_table(solution)]

@@ -144,8 +144,7 @@ class PlanCommand:
         from stiffopt.cli.tables import block_title, labelled
 
         robot = solution.robot.description
-        seconds = solution.timings.get("total", 0.0)
-        title = block_title(f"motion of {printable(robot.name)}", solution.status, seconds)
+        title = block_title(f"motion of {printable(robot.name)}", solution.status, solution.timings)
         parts: list[RenderableType] = [title, labelled(self._lines(scene, solution))]
         if len(solution.times):
             parts += ["", points_table(solution)]

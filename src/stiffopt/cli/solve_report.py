@@ -36,6 +36,9 @@ _PARTS = {
     "residual": "what no parameter explained in the recordings",
 }
 
+SMALL_GAIN = 0.01
+"""Gain over plain pressures below which the table says why."""
+
 Vector = NDArray[Any]
 Line = tuple[str, RenderableType]
 
@@ -43,7 +46,7 @@ Line = tuple[str, RenderableType]
 def block(solved: SolvedTask) -> RenderableType:
     """Return the full report of one task, about 80 columns wide."""
     solution = solved.solution
-    title = block_title(printable(solved.file), solution.status, solution.timings.get("total", 0.0))
+    title = block_title(printable(solved.file), solution.status, solution.timings)
     return Group(title, labelled(_lines(solved)), "")
 
 
@@ -60,6 +63,7 @@ def _lines(solved: SolvedTask) -> Iterable[Line]:
     yield from _clearance(solution)
     yield from _uncertainty(solved)
     yield from _stiffnesses(solved)
+    yield from _small_gain(solved)
     yield from _worth(solution)
     if solution.confidence is not None and solution.confidence.reached:
         yield "search", Text(str(solution.confidence))
@@ -190,6 +194,22 @@ def _stiffnesses(solved: SolvedTask) -> Iterable[Line]:
                 "(relative Frobenius distance)",
             ),
         )
+
+
+def _small_gain(solved: SolvedTask) -> Iterable[Line]:
+    """Why an answer is hardly stiffer than plain pressures, where it is not."""
+    solution = solved.solution
+    goal, value = solution.task.stiffness, least_maximised(solution)
+    if goal is None or value is None or not solved.plain:
+        return
+    if value >= (1 + SMALL_GAIN) * min(solved.plain[: len(goal.maximise)]):
+        return
+    if solution.freedom == 0:
+        reason = "no freedom is left, the pose fixes all channels"
+    else:
+        reason = "the plain pressures are all but the stiffest here"
+    advice = "a free axis or a larger tolerance may gain more"
+    yield "gain", Text(f"below {SMALL_GAIN:.0%}: {reason}\n{advice}".replace("%", " %"))
 
 
 def _stiffness(

@@ -9,9 +9,10 @@ from stiffopt.cli.exits import with_exit_code
 STUDIO_HELP = """\
 Open a page in the browser in which a robot and a task are seen and changed by hand.
 
-FILE is a built-in robot, a robot file or a task file. Drag the target and the arm follows, with its
-pressures and its stiffness. The page is for this machine, and only the address that is printed
-opens it. Needs the extra 'studio'.
+FILE is a built-in robot, or a robot, task or scene file: drag the target and the arm follows, with
+its pressures and its stiffness. A path file, a motion (.csv of 'stiffopt plan') and a recording
+(.csv, .mcap) play. The page is for this machine, and only the address that is printed opens it.
+Needs the extra 'studio'.
 """
 
 STUDIO_EPILOG = """\
@@ -31,6 +32,16 @@ Exit codes:
 @with_exit_code
 def studio(
     file: Annotated[str, typer.Argument(metavar="[FILE]", help="What is shown.")] = "stiff-flop-2",
+    robot: Annotated[
+        str | None,
+        typer.Option(metavar="ROBOT", help="For a FILE that names none; else stiff-flop-2."),
+    ] = None,
+    map_file: Annotated[
+        str | None,
+        typer.Option(
+            "--map", metavar="MAP.zarr", help="Show a workspace map, coloured by stiffness."
+        ),
+    ] = None,
     host: Annotated[
         str, typer.Option(metavar="HOST", help="Where to listen; other machines reach others.")
     ] = "127.0.0.1",
@@ -44,4 +55,4 @@ def studio(
     """Open the studio."""
     from stiffopt.cli.studio_run import run  # here, so that --help waits for no numerics
 
-    run(file, host=host, port=port, browser=not no_browser)
+    run(file, robot=robot, map_file=map_file, host=host, port=port, browser=not no_browser)

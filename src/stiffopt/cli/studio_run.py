@@ -12,7 +12,9 @@ from stiffopt.daemon.secret import is_loopback
 from stiffopt.errors import require_package
 
 
-def run(file: str, *, host: str, port: int, browser: bool) -> None:
+def run(
+    file: str, *, robot: str | None, map_file: str | None, host: str, port: int, browser: bool
+) -> None:
     """Show a file in the studio until a signal ends it."""
     require_package("viser", "studio")
     from stiffopt.studio.opening import open_studio
@@ -20,7 +22,7 @@ def run(file: str, *, host: str, port: int, browser: bool) -> None:
     over = threading.Event()
     with (
         handled(dict.fromkeys(ENDING_SIGNALS, lambda number, frame: over.set())),
-        closing(open_studio(file, host=host, port=port)) as shown,
+        closing(open_studio(file, robot=robot, map_file=map_file, host=host, port=port)) as shown,
     ):
         write_line(f"the studio is open at {shown.url}")
         write_line("Ctrl-C ends it")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -154,8 +154,9 @@ def _cell(text: str) -> str:
     return _escaped(text).replace("|", r"\|")
 
 
-def block_title(name: str, status: str, seconds: float) -> Text:
+def block_title(name: str, status: str, timings: Mapping[str, float]) -> Text:
     """Return the first line of a report: what was solved, how that ended, and the time it took."""
-    return Text.assemble(
-        (name, "bold"), "  ", (status, f"bold {STATUS_COLOURS[status]}"), f"  {seconds:.2f} s"
-    )
+    seconds = f"  {timings.get('total', 0.0):.2f} s"
+    if "compilation" in timings:
+        seconds += f", after compiling once for {timings['compilation']:.0f} s"
+    return Text.assemble((name, "bold"), "  ", (status, f"bold {STATUS_COLOURS[status]}"), seconds)

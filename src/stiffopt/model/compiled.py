@@ -222,10 +222,13 @@ def library(
                 if not _is_made_in_background(cache, key, wanted):
                     _loaded[cache, key] = None
                 return _loaded.get((cache, key))
+            begin = time.perf_counter()
             try:
                 found = _make(cache, key, compiler, wanted)
             except build.BuildError as error:
                 _notify(error)
+            finally:
+                Stopwatch.compilation += time.perf_counter() - begin
         _loaded[cache, key] = found
         _awaited.pop(request, None)
         return found
@@ -290,6 +293,22 @@ def make_in_background() -> None:
     except build.BuildError as error:
         with suppress(OSError):
             build.write_atomically(cache / f"{key}.failed", str(error).encode())
+
+
+class Stopwatch:
+    """The time that an answer takes, apart from machine code that is made once before it."""
+
+    compilation = 0.0  # s, of this process so far
+
+    def __init__(self) -> None:
+        self._begin = time.perf_counter()
+        self._compiled = Stopwatch.compilation
+
+    def timings(self) -> dict[str, float]:
+        """Return ``total`` in s and, where code was made, the further ``compilation``."""
+        compiled = Stopwatch.compilation - self._compiled
+        total = max(0.0, time.perf_counter() - self._begin - compiled)
+        return {"total": total, "compilation": compiled} if compiled else {"total": total}
 
 
 def interpreted(make: Make) -> dict[str, InterpretedFunction]:

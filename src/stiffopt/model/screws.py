@@ -98,7 +98,7 @@ class Twist(_Screw):
 
     @classmethod
     def from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float = 0.0) -> Self:
-        """Twist about an axis through `point`, |direction| its rotation, `pitch` in m."""
+        """Twist about an axis through `point`; rotation as long as `direction`, `pitch` in m."""
         omega, v = cls._from_axis(point, direction, pitch)
         return cls(np.concatenate([v, omega]))
 
@@ -125,7 +125,7 @@ class Wrench(_Screw):
 
     @classmethod
     def from_axis(cls, point: ArrayLike, direction: ArrayLike, pitch: float = 0.0) -> Self:
-        """Wrench along an axis through `point`, |direction| its force, `pitch` in m."""
+        """Wrench along an axis through `point`; force as long as `direction`, `pitch` in m."""
         force, moment = cls._from_axis(point, direction, pitch)
         return cls(np.concatenate([force, moment]))
 

@@ -174,7 +174,7 @@ class PressureSolution:
         Work that was done: starts, descents, iterations, evaluations of the pose and of everything
         with gradients, quadratic programs.
     timings : dict of str to float
-        Seconds.
+        Seconds: ``total`` and, where machine code was made first, the further ``compilation``.
     errors : dict of str to float
         By name of each term of the target: the length of its residual or, of an inequality, the
         margin by which it holds, in the term's unit.

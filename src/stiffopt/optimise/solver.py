@@ -4,7 +4,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from itertools import islice
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
 from stiffopt.model.arguments import checked_integer, checked_vector
 from stiffopt.model.compiled import (
     CodeReadyError,
+    Stopwatch,
     compilation_is_held_off,
     compiling_at_once,
     until_ready,
@@ -103,12 +103,12 @@ class PressureSolver:
         """
         if target is not None and not isinstance(target, Target):
             raise InputError(f"target must be a Target; got {shown(target)}")
-        begin = perf_counter()
+        watch = Stopwatch()
         start = self._checked(guess)
         task = self.task if target is None else self.task.model_copy(update={"target": target})
         with giving_up(timeout, cancel):
             solution = self._compiled(task, start) or self._otherwise(task, start)
-        solution.timings["total"] = perf_counter() - begin
+        solution.timings.update(watch.timings())
         return solution
 
     def warm(
@@ -732,7 +732,7 @@ def solve_batch(
         If an argument is wrong or a task's pressure limits do not suit the robot; nothing is
         solved then.
     """
-    begin = perf_counter()
+    watch = Stopwatch()
     if threads is not None:
         threads = checked_integer("threads", threads, 1)
     if isinstance(tasks, Task) or not isinstance(tasks, Iterable):
@@ -748,11 +748,13 @@ def solve_batch(
     solvers = [PressureSolver(robot, task, seed=seed) for task in tasks]
     checked = [solver._checked(guess) for solver, guess in zip(solvers, starts, strict=True)]
     with giving_up(timeout, cancel):
-        return _solved(list(zip(solvers, tasks, checked, strict=True)), threads, begin)
+        return _solved(list(zip(solvers, tasks, checked, strict=True)), threads, watch)
 
 
 def _solved(
-    asked: list[tuple[PressureSolver, Task, Vector | None]], threads: int | None, begin: float
+    asked: list[tuple[PressureSolver, Task, Vector | None]],
+    threads: int | None,
+    watch: Stopwatch,
 ) -> list[PressureSolution]:
     """Solutions of checked tasks, those of one structure together."""
     found: dict[int, PressureSolution | None] = {}
@@ -766,15 +768,17 @@ def _solved(
         for (index, _, program), answer in zip(members, answers, strict=True):
             solver, task, _ = asked[index]
             found[index] = solver._accepted(task, program, answer)
-    share = (perf_counter() - begin) / max(1, len(asked))
+    shares = {name: time / max(1, len(asked)) for name, time in watch.timings().items()}
     solutions = []
     for index, (solver, task, guess) in enumerate(asked):
-        started = perf_counter()
+        watch = Stopwatch()
         solution = found.get(index)
         if index not in found:  # there was no code then; there may be now
             solution = solver._compiled(task, guess)
         solution = solution or solver._otherwise(task, guess)
-        solution.timings["total"] = share + perf_counter() - started
+        solution.timings.update(shares)
+        for name, time in watch.timings().items():
+            solution.timings[name] = shares.get(name, 0.0) + time
         solutions.append(solution)
     return solutions
 

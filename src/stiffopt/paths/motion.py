@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import EquilibriumError, StoppedError
+from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.motion_clearance import MOTION_ERROR, ClearMotions
 from stiffopt.model.scene import Scene
@@ -95,7 +96,7 @@ def plan_motion(
     MissingExtraError
         The straight way is not clear, and OMPL is not installed.
     """
-    begin = perf_counter()
+    watch = Stopwatch()
     request = MotionRequest.of(robot, start, goal, scene, clearance, slew, load, seed)
     timings: dict[str, float] = {}
     try:
@@ -107,8 +108,7 @@ def plan_motion(
         found = request.without_answer(str(reason), "unreachable")
     except (StoppedError, EquilibriumError) as error:
         found = request.without_answer(str(error), "failed")
-    timings["total"] = perf_counter() - begin
-    found.timings.update(timings)
+    found.timings.update(timings | watch.timings())
     return found
 
 

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
+from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel, giving_up
 from stiffopt.optimise.solution import Judgement, PressureSolution
@@ -60,10 +60,10 @@ def solve_path(
         raise InputError(f"robot must be a Manipulator, see load_robot; got {shown(robot)}")
     if not isinstance(path, Path):
         raise InputError(f"path must be a Path, see load_path; got {shown(path)}")
-    begin = perf_counter()
+    watch = Stopwatch()
     with giving_up(timeout, cancel):
         solution = _PathSolver(robot, path, seed).solve()
-    solution.timings["total"] = perf_counter() - begin
+    solution.timings.update(watch.timings())
     return solution
 
 
@@ -144,6 +144,7 @@ class _PathSolver:
     ) -> tuple[PathTasks, list[list[PathCandidate]]]:
         """Tasks and candidates with, for points out of reach, the nearest that can be had."""
         moved = list(self._tasks)
+        closest: dict[int, Vector] = {}
         for index, layer in enumerate(layers):
             if layer:
                 continue
@@ -157,10 +158,17 @@ class _PathSolver:
             if self._unreachable is None:
                 self._unreachable = index, solution.message
             moved[index] = _at_tip(self._tasks[index], solution)
+            if solution.pressures is not None:
+                closest[index] = solution.pressures
         if self._unreachable is None:
             return tasks, layers
         nearest = PathTasks(self._robot, moved, self._seed)
         found, _ = candidates(nearest)
+        for index, layer in enumerate(found):
+            if not layer:  # just at the border of what can be reached
+                found[index] = list(layers[index])
+                own = nearest.candidate(index, closest[index]) if index in closest else None
+                found[index] += [] if own is None else [own]
         return nearest, found
 
     # -- the answer ----------------------------------------------------------------------------
@@ -302,7 +310,7 @@ class _PathSolver:
         if self._unreachable is not None:
             index, why = self._unreachable
             message = (
-                f"{self._name(index)} cannot be reached: {why.removeprefix('unreachable: ')}.  "
+                f"{self._cannot_be_reached(index, why)}.  "
                 "The nearest path that can be followed is given."
             )
             return replace(solution, status="unreachable", message=message, first_failure=index)
@@ -370,6 +378,11 @@ class _PathSolver:
     ) -> PathSolution:
         """The answer where no sequence of pressures is continuous, however slow."""
         empty = next((i for i, layer in enumerate(layers) if not layer), None)
+        if self._unreachable is not None:
+            point, why = self._unreachable
+            message = f"{self._cannot_be_reached(point, why)}, and no path near it can be followed"
+            unreachable = replace(self._failed(message), status="unreachable")
+            return replace(unreachable, first_failure=point)
         if empty is not None:
             return self._failed(f"{self._name(empty)}: no pressures were found near the target")
         index = RouteSearch(tasks, list(map(list, layers)), steps, self._over).furthest
@@ -389,6 +402,9 @@ class _PathSolver:
         return PathSolution(
             "failed", message, self._robot, np.zeros(0), none, np.zeros((0, 4, 4)), self._slew
         )
+
+    def _cannot_be_reached(self, index: int, why: str) -> str:
+        return f"{self._name(index)} cannot be reached: {why.removeprefix('unreachable: ')}"
 
     def _name(self, index: int) -> str:
         length = 1e3 * self._points.lengths[index]

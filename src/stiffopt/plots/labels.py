@@ -31,9 +31,10 @@ class PlacedLabel(Annotation):
     """A text that stays beside a point in space when the view changes."""
 
     def __init__(self, label: Label) -> None:
+        text = "\n".join(map(literal, label.text.split("\n")))
         super().__init__(
-            "\n".join(map(literal, label.text.split("\n"))), (0, 0), (0, 0), textcoords="offset points", fontsize=_SIZE,
-            color=label.colour, ha="center", va="center", zorder=20, annotation_clip=False,
+            text, (0, 0), (0, 0), textcoords="offset points", fontsize=_SIZE, color=label.colour,
+            ha="center", va="center", zorder=20, annotation_clip=False,
             arrowprops={"arrowstyle": "-", "color": label.colour, "linewidth": 0.7, "shrinkA": 1},
         )  # fmt: skip
         self.point = label.point

@@ -188,8 +188,8 @@ def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) ->
         for place, value, colour in zip(places, values, colours, strict=True):
             axes.text(
                 place, max(value, 0.0) + 0.012 * top, bar_text(value / BAR), ha="center",
-                va="bottom", fontsize=9 if len(values) < 10 else 6.5, color=colour if colour == style.AT_LIMIT else "#20394f",
-                weight="bold", zorder=4,
+                va="bottom", fontsize=9 if len(values) < 10 else 6.5, weight="bold", zorder=4,
+                color=colour if colour == style.AT_LIMIT else "#20394f",
             )  # fmt: skip
     _label_channels(axes, robot, places)
     axes.set_ylabel("pressure (bar)")

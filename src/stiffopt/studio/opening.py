@@ -1,17 +1,18 @@
-"""Opens the studio: what a file is, and the view that shows it."""
+"""Opens the studio: a page with the view of a file."""
 
 from __future__ import annotations
 
-from stiffopt.documents import read_document
-from stiffopt.errors import FileError
-from stiffopt.model.robot_files import builtin_robots
-from stiffopt.optimise.task import load_task
-from stiffopt.studio.design import Design
-from stiffopt.studio.page import StudioPage
-from stiffopt.studio.task_view import TaskView
-from stiffopt.studio.workbench import Workbench
+from pathlib import Path as FilePath
+from typing import Any
 
-_KINDS = ("robot", "task")
+from stiffopt.errors import InputError
+from stiffopt.studio.cloud import check_map
+from stiffopt.studio.page import StudioPage
+from stiffopt.studio.sources import design_of, kind_of, timeline_of
+from stiffopt.studio.task_view import TaskView
+from stiffopt.studio.timeline_view import TimelineView
+from stiffopt.studio.workbench import Workbench
+from stiffopt.workspace.mapping import open_workspace_map
 
 
 class OpenStudio:
@@ -23,7 +24,7 @@ class OpenStudio:
     view : what draws on it.
     """
 
-    def __init__(self, page: StudioPage, view: TaskView) -> None:
+    def __init__(self, page: StudioPage, view: Any) -> None:
         self.page, self.view = page, view
 
     @property
@@ -37,13 +38,24 @@ class OpenStudio:
         self.page.close()
 
 
-def open_studio(file: str, *, host: str = "127.0.0.1", port: int = 0) -> OpenStudio:
+def open_studio(
+    file: str,
+    *,
+    robot: str | None = None,
+    map_file: str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 0,
+) -> OpenStudio:
     """Show a file on a page, and return when it can be opened.
 
     Parameters
     ----------
     file :
-        A built-in robot, a robot file or a task file.
+        A built-in robot, or a file of a kind that the studio shows.
+    robot :
+        For a file that names none, by default `stiffopt.studio.sources.ROBOT`.
+    map_file :
+        A workspace map to show with a robot, a task or a scene.
     host, port :
         Where to listen, see `StudioPage`.
 
@@ -52,26 +64,18 @@ def open_studio(file: str, *, host: str = "127.0.0.1", port: int = 0) -> OpenStu
     InputError
         The file is wrong or of another kind, or the address cannot be listened on.
     MissingExtraError
-        viser is not installed.
+        viser, or what reads the file, is not installed.
     """
-    design = Design.of_task(load_task(file)) if kind_of(file) == "task" else Design.of_robot(file)
+    kind = kind_of(file)
+    if kind in ("path", "recording"):
+        if map_file is not None:
+            raise InputError("--map: a map is shown with a robot, a task or a scene only")
+        timeline = timeline_of(file, robot)
+        page = StudioPage(host, port, f"stiffopt studio: {FilePath(file).name}")
+        return OpenStudio(page, TimelineView(page.server, timeline))
+    design, found = design_of(file, robot), None
+    if map_file is not None:
+        found = open_workspace_map(map_file)
+        check_map(found, design.description)
     page = StudioPage(host, port, f"stiffopt studio: {design.description.name}")
-    return OpenStudio(page, TaskView(page.server, Workbench(design)))
-
-
-def kind_of(file: str) -> str:
-    """Return what a file is, by its ``format``; what is no path is a robot.
-
-    Raises
-    ------
-    FileError
-        It cannot be read, or is nothing that the studio shows.
-    """
-    if file in builtin_robots():
-        return "robot"
-    given = read_document(file).data.get("format")
-    kind = given.partition("/")[0].removeprefix("stiffopt-") if isinstance(given, str) else ""
-    if kind not in _KINDS:
-        known = ", ".join(_KINDS[:-1]) + f" or {_KINDS[-1]}"
-        raise FileError(file, f"is nothing that the studio shows; expected a {known} file")
-    return kind
+    return OpenStudio(page, TaskView(page.server, Workbench(design), found))

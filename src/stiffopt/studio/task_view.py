@@ -17,6 +17,7 @@ from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.wording import BAR, figures, unit_text
 from stiffopt.studio import texts
+from stiffopt.studio.cloud import StiffnessCloud
 from stiffopt.studio.design import Angular, Design
 from stiffopt.studio.drawing import (
     KEPT,
@@ -28,7 +29,9 @@ from stiffopt.studio.drawing import (
     rgb,
     turn,
 )
+from stiffopt.studio.scene_view import SceneView
 from stiffopt.studio.workbench import NewestWins, StudioAnswer, Workbench
+from stiffopt.workspace.map import WorkspaceMap
 
 Change = Callable[[Design], Design]
 
@@ -41,6 +44,7 @@ _ANGULAR: dict[str, Angular] = {
     "full orientation": "orientation",
 }
 _MAXIMISE, _LEAST, _FILE = "stiff along a direction", "least pressure", "as in the file"
+_NO_MAP = "do not show"
 _GRAVITY = {
     "none": (0.0, 0.0, 0.0),
     "standing": (0.0, 0.0, -9.81),
@@ -56,15 +60,18 @@ class TaskView:
     ----------
     server : viser.ViserServer
     bench : Workbench
+    found : WorkspaceMap, optional
+        To show as a cloud; of the same arm.
     """
 
-    def __init__(self, server: Any, bench: Workbench) -> None:
-        self.server, self.bench = server, bench
+    def __init__(self, server: Any, bench: Workbench, found: WorkspaceMap | None = None) -> None:
+        self.server, self.bench, self._map = server, bench, found
         self._length = bench.design.description.length
         self._dragged: Any = None
         self._kept: list[ArmTube] = []
         add_surroundings(server, bench.design.description)
         self._add_scene()
+        self._scene = SceneView(server, lambda: bench.design, self._change)
         self._add_panel()
         self.worker = NewestWins(self._quickly, self._fully)
         self._show_design()
@@ -103,7 +110,9 @@ class TaskView:
             "/loads", NOWHERE, rgb(style.LOAD), shaft_radius=0.005 * length,
             head_radius=0.013 * length, head_length=0.04 * length,
         )  # fmt: skip
-        self._miss = scene.add_line_segments("/miss", NOWHERE, rgb(style.TARGET), thickness=3.0)
+        self._miss = scene.add_line_segments(
+            "/miss", NOWHERE, rgb(style.TARGET), thickness=3.0, thickness_units="screen"
+        )
         self._label = scene.add_label("/stiffness", "", visible=False)
         self._target = scene.add_transform_controls(
             "/target", scale=0.24 * length, line_width=3.0, depth_test=False
@@ -131,6 +140,11 @@ class TaskView:
             self._add_stiffness_inputs(gui)
         with tabs.add_tab("loads"):
             self._add_load_inputs(gui)
+        with tabs.add_tab("scene"):
+            self._scene.add_inputs(gui)
+        if self._map is not None:
+            with tabs.add_tab("map"):
+                self._add_map_inputs(gui, self._map)
         with tabs.add_tab("compare"):
             self._add_compare_inputs(gui)
         with tabs.add_tab("copy"):
@@ -223,6 +237,25 @@ class TaskView:
             button.on_click(lambda _, make=make: self._show_copy(make))
         self._copied = gui.add_html("")
 
+    def _add_map_inputs(self, gui: Any, found: WorkspaceMap) -> None:
+        names = tuple(f"along {name}" for name in found.direction_names)
+        self._shown_map = gui.add_dropdown("stiffness", (*names, _NO_MAP))
+        self._legend = gui.add_html("")
+        cloud = StiffnessCloud.of(found, 0)
+        self._cloud = self.server.scene.add_point_cloud(
+            "/map", cloud.points, cloud.colours, point_size=cloud.size, point_shape="circle"
+        )
+        self._legend.content = texts.note_html(cloud.legend)
+        self._shown_map.on_update(lambda event: self._show_map(found, event.target.value, names))
+
+    def _show_map(self, found: WorkspaceMap, chosen: str, names: tuple[str, ...]) -> None:
+        self._cloud.visible = chosen in names
+        if chosen in names:
+            cloud = StiffnessCloud.of(found, names.index(chosen))
+            with self.server.atomic():
+                self._cloud.points, self._cloud.colors = cloud.points, cloud.colours
+            self._legend.content = texts.note_html(cloud.legend)
+
     # -- what is done in the browser ----------------------------------------------------------
 
     def _on(self, kind: str, change: Callable[[Design, Any], Design]) -> Callable[[Any], None]:
@@ -312,7 +345,7 @@ class TaskView:
         self._answer(self.bench.answer_quickly, cancel)
 
     def _fully(self, cancel: Cancel) -> None:
-        if self._dragged is None:
+        if self._dragged is None and not self._scene.is_held:
             self.bench.end_step()
         self._answer(self.bench.answer_best, cancel)
 
@@ -344,6 +377,7 @@ class TaskView:
             _set(self._angle, min(20.0, degrees(target.tolerance.angle)))
             self._show_goal(design)
             self._show_loads(design)
+            self._scene.show()
 
     def _show_target(self, design: Design) -> None:
         target = design.task.target

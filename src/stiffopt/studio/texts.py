@@ -22,6 +22,7 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.wording import BAR, MM, direction_text, figures, gain_text, limit_of, unit_text
 from stiffopt.studio.design import Design
+from stiffopt.studio.timeline import Timeline
 from stiffopt.studio.workbench import StudioAnswer, Workbench
 
 STATUS_WORDS = {"solved": "solved", "unreachable": "out of reach", "failed": "no answer"}
@@ -30,6 +31,7 @@ ROBOT_FILE = "my-arm.yaml"
 _BEST = "best that was found everywhere"
 _LOCAL = "next to the previous one; the best is searched for when you pause"
 _SEARCHING = "searching; the first task of a kind compiles its solver, which takes a while ..."
+_AT_LIMIT = 1e-3  # of the range, within which a pressure counts as at its limit
 _COPY = "navigator.clipboard.writeText(this.nextElementSibling.value)"
 
 
@@ -189,6 +191,11 @@ def _line(left: str, colour: str, width: int) -> str:
     )
 
 
+def note_html(text: str) -> str:
+    """Return a sentence as the panel shows it below an input."""
+    return _padded(f"<div style='font-size:0.85em'>{escape(text)}</div>")
+
+
 # -- answers side by side -------------------------------------------------------------------------
 
 
@@ -284,3 +291,28 @@ def copy_html(title: str, text: str) -> str:
         f"<textarea readonly rows='14' spellcheck='false' style='width:100%;font-family:monospace;"
         f"font-size:11px;white-space:pre'>{escape(text)}</textarea>"
     )
+
+
+# -- timelines ------------------------------------------------------------------------------------
+
+
+def moment_html(timeline: Timeline, time: float) -> str:
+    """Return one moment of a timeline as the panel shows it."""
+    moment = timeline.at(time)
+    description = timeline.robot.description
+    tip = timeline.robot.tip_pose(moment.pressures)[:3, 3]
+    rows = [("time", f"{time:.2f} of {timeline.duration:.2f} s")]
+    for chart in timeline.charts:
+        if "pressure (bar)" not in chart.title:
+            values = ", ".join(f"{value:.3g}" for value in chart.values[moment.row][:1])
+            rows.append((escape(chart.title), values))
+    rows.append(("tip of the model", f"{position_text(tip)} mm"))
+    if moment.seen is not None:
+        rows.append(("tip seen (blue)", f"{position_text(moment.seen)} mm"))
+    for when, text in timeline.events_until(time):
+        rows.append((f"{when:.1f} s", escape(text)))
+    low, high = timeline.robot.pressure_min, timeline.robot.pressure_max
+    at_limit = moment.pressures >= high - _AT_LIMIT * (high - low)
+    bars = pressures_html(description, moment.pressures, low, high, at_limit.tolist())
+    headline = f"<div style='font-size:0.9em;margin:2px 0 4px'>{escape(timeline.headline)}</div>"
+    return _padded(headline + _table(rows) + bars)

@@ -1,0 +1,14 @@
+"""
+A path
+======
+
+The tip follows a line. The pressures of all points are chosen together, so that the least
+stiffness on the line is as large as possible and no pressure changes faster than it may.
+"""
+
+import stiffopt
+from stiffopt.plots import plot_path
+
+path = stiffopt.load_path("../../problems/paths/path_line_stiff_x.yaml")
+robot = stiffopt.load_robot(path.resolve_robot())
+figure = plot_path(path, stiffopt.solve_path(robot, path))

@@ -1,0 +1,66 @@
+"""A workspace map as a cloud of points, coloured by stiffness."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import InputError
+from stiffopt.model.description import RobotDescription
+from stiffopt.plots.wording import figures
+from stiffopt.workspace.map import WorkspaceMap
+
+_MOST = 30_000  # points that are sent to the browser
+_SCALE = np.array([(68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)])
+
+
+class StiffnessCloud(NamedTuple):
+    """The cells of a map in one direction.
+
+    Attributes
+    ----------
+    points : (m, 3), centres of cells in m.
+    colours : (m, 3), from violet (soft) to yellow (stiff).
+    legend : what the colours mean.
+    size : of a point, in m.
+    """
+
+    points: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    legend: str
+    size: float
+
+    @classmethod
+    def of(cls, found: WorkspaceMap, direction: int) -> StiffnessCloud:
+        """The stiffest that each cell has in a direction of the map, counted from 0."""
+        best = found.best[direction]
+        kept = np.flatnonzero(np.isfinite(best))
+        kept = kept[:: max(1, -(-len(kept) // _MOST))]
+        values = best[kept]
+        if not len(values):
+            raise InputError("the map has no cells to show")
+        low, high = np.percentile(values, (2, 98))
+        share = np.clip((values - low) / max(high - low, 1e-12), 0, 1) * (len(_SCALE) - 1)
+        colours = np.stack(
+            [np.interp(share, np.arange(len(_SCALE)), column) for column in _SCALE.T], axis=1
+        )
+        unit = "N/m" if found.plan.measures[direction].kind == "translation" else "N m/rad"
+        legend = (
+            f"stiffest along {found.direction_names[direction]}: violet {figures(float(low))}, "
+            f"yellow {figures(float(high))} {unit}"
+        )
+        return cls(
+            found.centres[kept].astype(np.float32), colours.astype(np.uint8), legend,
+            0.35 * found.plan.cell,
+        )  # fmt: skip
+
+
+def check_map(found: WorkspaceMap, description: RobotDescription) -> None:
+    """Raise `InputError` unless a map is of a robot of these segments."""
+    if found.plan.robot.description.segments != description.segments:
+        raise InputError(
+            f"--map: the map is of '{found.plan.robot.description.name}', which is another arm "
+            f"than '{description.name}'"
+        )

@@ -1,0 +1,95 @@
+"""What a file is, and the model that shows it: a design or a timeline."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path as FilePath
+
+from stiffopt.daemon.run_log import read_log_of_recording, read_run
+from stiffopt.documents import read_document, write_whole
+from stiffopt.errors import FileError
+from stiffopt.logs import read_log
+from stiffopt.logs.mcap_file import read_mcap
+from stiffopt.logs.mcap_log import LOG_METADATA
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import load_robot
+from stiffopt.model.robot_files import builtin_robots, load_description
+from stiffopt.model.scene import load_scene
+from stiffopt.optimise.task import load_task
+from stiffopt.paths.path import load_path
+from stiffopt.paths.solver import solve_path
+from stiffopt.studio.design import Design
+from stiffopt.studio.timeline import Timeline
+
+ROBOT = "stiff-flop-2"
+"""The robot where none is named."""
+_KINDS = ("robot", "task", "scene", "path")
+_MOTION = "position_error_m"  # a column that logs have not
+
+
+def kind_of(file: str) -> str:
+    """Return what a file is, by its ending and its ``format``; a built-in name is a robot.
+
+    Raises
+    ------
+    FileError
+        It cannot be read, or is nothing that the studio shows.
+    """
+    if file in builtin_robots():
+        return "robot"
+    if FilePath(file).suffix.lower() in (".csv", ".mcap"):
+        return "recording"
+    given = read_document(file).data.get("format")
+    kind = given.partition("/")[0].removeprefix("stiffopt-") if isinstance(given, str) else ""
+    if kind not in _KINDS:
+        known = ", ".join(_KINDS)
+        raise FileError(
+            file, f"is nothing that the studio shows; expected a file of a {known} or recording"
+        )
+    return kind
+
+
+def design_of(file: str, robot: str | None = None) -> Design:
+    """Return what is designed of a robot, a task or a scene file."""
+    kind = kind_of(file)
+    if kind == "task":
+        return Design.of_task(load_task(file))
+    if kind == "scene":
+        design, scene = Design.of_robot(robot or ROBOT), load_scene(file)
+        scene.check_against(design.description)
+        return design.with_task(scene=scene)
+    return Design.of_robot(file)
+
+
+def timeline_of(file: str, robot: str | None = None) -> Timeline:
+    """Return what is played of a path file, a motion or a recording."""
+    if kind_of(file) == "path":
+        path = load_path(file)
+        return Timeline.of_path(path, solve_path(load_robot(path.resolve_robot()), path))
+    if FilePath(file).suffix.lower() == ".csv":
+        description = load_description(robot or ROBOT)
+        if _is_motion(file):
+            return Timeline.of_motion(file, description)
+        return Timeline.of_log(file, read_log(file), description)
+    if LOG_METADATA in read_mcap(file).metadata:
+        log, _ = read_log_of_recording(file)
+        return Timeline.of_log(file, log, load_description(robot or ROBOT))
+    run = read_run(file)
+    description = load_description(robot) if robot else _robot_of(run.about.get("robot_file", ""))
+    return Timeline.of_run(file, run, description)
+
+
+def _robot_of(text: str) -> RobotDescription:
+    """The robot whose file a recording has kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = FilePath(folder) / "robot.yaml"
+        write_whole(path, text.encode())
+        return load_description(path)
+
+
+def _is_motion(file: str) -> bool:
+    try:
+        with open(file, encoding="utf-8", errors="replace") as stream:
+            return _MOTION in stream.readline().split(",")
+    except OSError as error:
+        raise FileError(file, f"cannot be read: {error.strerror}") from None

@@ -1,0 +1,242 @@
+"""Pressures over time as the studio plays them: of a path, a motion or a recording."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.daemon.run_log import RecordedRun, log_of_run
+from stiffopt.errors import FileError, InputError
+from stiffopt.logs.log import Log
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.scene import Scene
+from stiffopt.paths.path import Path
+from stiffopt.paths.solution import PathSolution
+from stiffopt.plots.wording import BAR, MM, figures, unit_text
+
+Vector = NDArray[np.float64]
+
+_SHOWN = 400  # points of a chart
+
+
+class TimelineChart(NamedTuple):
+    """A chart over time.
+
+    Attributes
+    ----------
+    title : with the unit.
+    names : of the k lines.
+    values : (N, k).
+    """
+
+    title: str
+    names: tuple[str, ...]
+    values: Vector
+
+
+class TimelineMoment(NamedTuple):
+    """What is shown of one moment.
+
+    Attributes
+    ----------
+    row : the last one until then.
+    pressures : (n,) in Pa, interpolated.
+    seen : (3,) where the tip was seen last, in m, or None.
+    """
+
+    row: int
+    pressures: Vector
+    seen: Vector | None
+
+
+@dataclass(frozen=True, eq=False)
+class Timeline:
+    """Pressures over time with what belongs to them.
+
+    Attributes
+    ----------
+    robot : the arm, with the load of the path.
+    times : (N,) in s, from 0, increasing.
+    pressures : (N, n) in Pa, without gaps.
+    charts : what is drawn over time.
+    headline : status and what there is to say, for people.
+    asked : (N, 3) positions that are asked for, in m, or None.
+    seen : (N, 3) positions at which the tip was seen, NaN where it was not, or None.
+    events : times and texts of what happened.
+    scene : what is around the arm, or None.
+    """
+
+    robot: Manipulator
+    times: Vector
+    pressures: Vector
+    charts: tuple[TimelineChart, ...] = ()
+    headline: str = ""
+    asked: Vector | None = None
+    seen: Vector | None = None
+    events: tuple[tuple[float, str], ...] = field(default=())
+    scene: Scene | None = None
+
+    @property
+    def duration(self) -> float:
+        """In s."""
+        return float(self.times[-1])
+
+    def at(self, time: float) -> TimelineMoment:
+        """What is shown at a time in s."""
+        index = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, None))
+        after = min(index + 1, len(self.times) - 1)
+        begin, end = self.times[index], self.times[after]
+        share = 0.0 if end == begin else float(np.clip((time - begin) / (end - begin), 0, 1))
+        pressures = (1 - share) * self.pressures[index] + share * self.pressures[after]
+        seen = None
+        if self.seen is not None:
+            known = np.flatnonzero(np.isfinite(self.seen[: index + 1]).all(axis=1))
+            seen = self.seen[known[-1]] if len(known) else None
+        return TimelineMoment(index, pressures, seen)
+
+    def events_until(self, time: float, count: int = 4) -> tuple[tuple[float, str], ...]:
+        """The last events until a time, the newest first."""
+        return tuple([event for event in self.events if event[0] <= time][-count:][::-1])
+
+    def shown_rows(self) -> NDArray[np.int_]:
+        """The rows that a chart shows: all, or some hundreds of them."""
+        count = min(len(self.times), _SHOWN)
+        return np.unique(np.linspace(0, len(self.times) - 1, count).astype(int))
+
+    # -- what is played -----------------------------------------------------------------------
+
+    @classmethod
+    def of_path(cls, path: Path, solution: PathSolution) -> Timeline:
+        """A path that was solved.
+
+        Raises
+        ------
+        InputError
+            The solution has no points.
+        """
+        if not len(solution.times):
+            raise InputError(f"there is nothing to play: {solution.message}")
+        charts = []
+        headline = f"{solution.status}. {solution.message}".strip()
+        if solution.stiffness is not None:
+            unit = unit_text(solution.stiffness_unit)
+            lines, names = [solution.stiffness], ["on the path"]
+            if solution.alone is not None:
+                lines, names = [*lines, solution.alone], [*names, "each point alone"]
+            charts.append(
+                TimelineChart(f"stiffness ({unit})", tuple(names), np.stack(lines, axis=1))
+            )
+            headline += f" Least stiffness {figures(float(solution.stiffness.min()))} {unit}."
+        if solution.clearance is not None:
+            charts.append(
+                TimelineChart("clearance (mm)", ("body",), MM * solution.clearance[:, None])
+            )
+        description = solution.robot.description
+        asked = path.points().positions
+        return cls(
+            solution.robot, solution.times, solution.pressures,
+            (*charts, *_pressure_charts(description, solution.pressures)), headline,
+            asked if asked.shape == (len(solution.times), 3) else None, scene=path.scene,
+        )  # fmt: skip
+
+    @classmethod
+    def of_motion(cls, file: str | os.PathLike[str], description: RobotDescription) -> Timeline:
+        """What `stiffopt path` or `stiffopt plan` has written as CSV."""
+        try:
+            table = np.genfromtxt(file, delimiter=",", names=True, dtype=float, ndmin=1)
+            names = table.dtype.names or ()
+            times = np.asarray(table["time_s"])
+            pressures = np.stack(
+                [table[f"p{k + 1}_pa"] for k in range(description.n_pressures)], axis=1
+            )
+        except (ValueError, OSError) as error:
+            raise FileError(file, f"is no motion of '{description.name}': {error}") from None
+        if f"p{description.n_pressures + 1}_pa" in names:
+            raise FileError(file, f"has more channels than '{description.name}'")
+        _check_rows(file, times, pressures)
+        charts = [
+            TimelineChart(name.replace("_", " "), ("",), np.asarray(table[name])[:, None])
+            for name in names
+            if name.startswith("stiffness")
+        ]
+        return cls(
+            load_robot(description), times - times[0], pressures,
+            (*charts, *_pressure_charts(description, pressures)), FilePath(file).name,
+        )  # fmt: skip
+
+    @classmethod
+    def of_log(
+        cls,
+        file: str | os.PathLike[str],
+        log: Log,
+        description: RobotDescription,
+        events: Sequence[tuple[float, str]] = (),
+    ) -> Timeline:
+        """A recording; the robot's `recordings` say which columns and frames are meant."""
+        given, columns = description.recordings, list(range(description.n_pressures))
+        if given is not None and given.channels:
+            columns = [column - 1 for column in given.channels]
+        if max(columns) >= log.n or (len(columns) != log.n and given is None):
+            raise FileError(
+                file,
+                f"has {log.n} channels and the robot '{description.name}' {len(columns)}; name "
+                "the robot that was recorded",
+            )
+        pressures = np.asarray(log.pressures[:, columns])
+        usable = np.isfinite(pressures).all(axis=1)
+        times, pressures = log.time[usable], pressures[usable]
+        _check_rows(file, times, pressures)
+        seen = log.tip_position[usable]
+        if given is not None:
+            turns = None if log.tip_quaternion is None else log.tip_quaternion[usable]
+            seen = np.stack([
+                given.registration.tip_in_base(
+                    place, None if turns is None or np.isnan(turns[k]).any() else turns[k]
+                )[0]
+                for k, place in enumerate(seen)
+            ])  # fmt: skip
+        robot, begin = load_robot(description), times[0]
+        offset = MM * np.linalg.norm(seen - robot.tip_pose(pressures)[:, :3, 3], axis=1)
+        return cls(
+            robot, times - begin, pressures,
+            (
+                TimelineChart("tip seen from the model's (mm)", ("",), offset[:, None]),
+                *_pressure_charts(description, pressures),
+            ),
+            FilePath(file).name, seen=seen,
+            events=tuple((when - begin, text) for when, text in events),
+        )  # fmt: skip
+
+    @classmethod
+    def of_run(
+        cls, file: str | os.PathLike[str], run: RecordedRun, description: RobotDescription
+    ) -> Timeline:
+        """A recording of the daemon, with its events."""
+        events = [(event.time, event.text) for event in run.events]
+        return cls.of_log(file, log_of_run(run), description, events)
+
+
+def _check_rows(file: str | os.PathLike[str], times: Vector, pressures: Vector) -> None:
+    if len(times) < 2:
+        raise FileError(file, "has too few rows with pressures to play; expected two or more")
+    if not np.isfinite(pressures).all() or not (np.diff(times) > 0).all():
+        raise FileError(file, "has pressures that are missing, or times that do not increase")
+
+
+def _pressure_charts(description: RobotDescription, pressures: Vector) -> tuple[TimelineChart, ...]:
+    """A chart of the pressures of each segment, in bar."""
+    charts, begin = [], 0
+    for number, segment in enumerate(description.segments):
+        mine = slice(begin, begin + segment.n_channels)
+        names = tuple(f"channel {k + 1}" for k in range(segment.n_channels))
+        title = f"segment {number + 1}: pressure (bar)"
+        charts.append(TimelineChart(title, names, BAR * pressures[:, mine]))
+        begin += segment.n_channels
+    return tuple(charts)
