@@ -600,10 +600,19 @@ def test_out_to_a_device(write: Write) -> None:
 # -- pictures -------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("view", ["20 deg", "120 deg, 0 deg", "1 mm, 2 mm"])
+def test_no_view(view: str, write: Write) -> None:
+    result = run(write("a.yaml", ONE), "--view", view)
+    assert result.exit_code == 2
+    assert result.stderr.startswith("error: --view: ")
+    assert result.stdout == ""
+
+
 def test_plot_of_one_and_of_several(tmp_path: Path, write: Write) -> None:
     (tmp_path / "sub").mkdir()
     one, far = write("one.yaml", ONE), write("far.yaml", FAR)
-    assert run("-q", one, "--plot", str(tmp_path / "p.png")).exit_code == 0
+    view = ("--view", "10 deg, -0.5 rad")
+    assert run("-q", one, "--plot", str(tmp_path / "p.png"), *view).exit_code == 0
     assert (tmp_path / "p.png").read_bytes().startswith(b"\x89PNG")
     again = write("sub/one.yaml", ONE)
     assert run("-q", one, far, again, "--plot", str(tmp_path / "q.png")).exit_code == 3
@@ -653,7 +662,16 @@ def test_unknown_option_is_2() -> None:
 def test_help_shows_examples_and_exit_codes() -> None:
     text = process("--help").stdout
     assert text.count("\n    solve-pressure ") >= 5
-    for option in ("--json", "--out", "--plot", "--pareto", "--seed", "--quiet", "--version"):
+    for option in (
+        "--json",
+        "--out",
+        "--plot",
+        "--view",
+        "--pareto",
+        "--seed",
+        "--quiet",
+        "--version",
+    ):
         assert option in text
     assert "Exit codes" in text
     assert "  format: stiffopt-task/1" in text

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import sys
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from matplotlib.text import Text
 
 import stiffopt
+from examples import run_examples
 from stiffopt import plots
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
@@ -153,6 +156,126 @@ def test_a_hanging_arm_hangs() -> None:
     assert "gravity" in texts(figure)
 
 
+def on_page(axes: Any, *points: tuple[float, float, float]) -> Any:
+    """Points in mm in the plane of the picture, (k, 2)."""
+    from mpl_toolkits.mplot3d import proj3d
+
+    return np.stack([proj3d.proj_transform(*point, axes.get_proj())[:2] for point in points])
+
+
+@pytest.mark.parametrize("name", ["stiff-flop-2", "stiff-flop-2-hanging"])
+@pytest.mark.parametrize("channel", [1, 5])
+def test_all_figures_have_one_view_with_x_to_the_right(name: str, channel: int) -> None:
+    """Wherever the arm bends to."""
+    from matplotlib.figure import Figure
+
+    arm = stiffopt.load_robot(name)
+    axes = Figure().add_subplot(projection="3d", computed_zorder=False)
+    pressures = np.zeros(6)
+    pressures[channel] = 6e4
+    assert [each.get_label() for each in plots.draw_arm(axes, arm, pressures)] == [
+        "segment 1",
+        "segment 2",
+    ]
+    origin, x, z = on_page(axes, (0, 0, 0), (10, 0, 0), (0, 0, 10))
+    assert x[0] - origin[0] > 3 * abs(x[1] - origin[1])
+    assert z[0] == pytest.approx(origin[0], abs=0.1 * abs(z[1] - origin[1]))
+    assert (z[1] > origin[1]) == (name == "stiff-flop-2")
+    assert abs(axes.elev) == pytest.approx(14)
+    assert abs(axes.azim) == pytest.approx(66)
+
+
+def test_the_arm_fills_its_panel() -> None:
+    axes = plots.plot_solution(*solved()).axes[0]
+    axes.apply_aspect()
+    low, high = axes.transData.transform(on_page(axes, (0, 0, 0), (-30, 10, 190)))
+    assert high[1] - low[1] > 0.6 * axes.bbox.height
+    assert axes.bbox.y0 < low[1] < high[1] < axes.bbox.y1
+
+
+def test_a_view_is_asked_for_in_radians_or_with_a_unit() -> None:
+    arm, solution = solved()
+    for view in ((np.radians(30), np.radians(10)), ("30 deg", "10 deg")):
+        axes = plots.plot_solution(arm, solution, view=view).axes[0]
+        assert (axes.elev, axes.azim, axes.roll) == pytest.approx((30, 10, 0))
+    for wrong in (("30 deg",), "30 deg", ("100 deg", "0 deg"), ("1 mm", "2 mm"), (np.nan, 0.0)):
+        with pytest.raises(stiffopt.InputError, match=r"view|angle|finite"):
+            plots.plot_solution(arm, solution, view=wrong)
+
+
+TASKS: dict[str, dict[str, Any]] = {
+    "one": {},
+    "several": {
+        "stiffness": {
+            "maximise": [{"direction": (1, 0, 0)}, {"direction": (0, 1, 0)}],
+            "at_least": {"direction": (0, 0, 1), "frame": "tip", "value": 0.5},
+        }
+    },
+    "load": {"load": {"force": (0, 0, -0.02)}},
+    "scene": {
+        "scene": {
+            "objects": [
+                {"name": "post", "sphere": {"centre": (0.05, 0.0, 0.15), "radius": 0.01}},
+                {"name": "rib", "sphere": {"centre": (-0.07, 0.02, 0.19), "radius": 0.01}},
+            ]
+        }
+    },
+}
+
+
+@pytest.mark.parametrize("kind", TASKS)
+@pytest.mark.parametrize("bend", [(1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0), (0.5, 0.5, 0.5)])
+def test_labels_cover_neither_each_other_nor_the_arm(kind: str, bend: tuple[float, ...]) -> None:
+    arm = stiffopt.load_robot("stiff-flop-2")
+    p = 1e5 * np.array([*bend, *bend[::-1]])
+    tip = arm.tip_pose(p)
+    changes = {"stiffness": MAXIMISE, **TASKS[kind]}
+    task = stiffopt.Task(robot="stiff-flop-2", target={"position": tuple(tip[:3, 3])}, **changes)
+    solution = PressureSolution(
+        "solved", "", task, p, tip, 0.0, compliance=arm.tip_compliance(p),
+        stiffnesses=(1.0,) * len(task.measures), robot=arm,
+    )  # fmt: skip
+    figure = plots.plot_solution(arm, solution)
+    axes = figure.axes[0]
+    figure.canvas.draw()
+    labels = [each for each in axes.texts if each.get_text()]
+    assert len(labels) >= 2
+    assert any("ellipsoid" in each.get_text() for each in labels)
+    assert any("along x" in each.get_text() for each in labels)
+    boxes = [Text.get_window_extent(each) for each in labels]  # without its line
+    backbone = axes.transData.transform(
+        on_page(axes, *(tuple(point) for point in arm.backbone(p, 60)[:, :3, 3] * 1e3))
+    )
+    for number, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:number])
+        assert not any(box.contains(*point) for point in backbone)  # with the target at its end
+        assert box.x0 > 0
+        assert box.y1 < figure.bbox.y1
+
+
+def test_numbers_on_bars_are_those_of_the_table() -> None:
+    from stiffopt.plots.wording import bar_text
+
+    arm, solution = solved()
+    assert solution.pressures is not None
+    text = texts(plots.plot_solution(arm, solution))
+    for pressure in solution.pressures:
+        assert bar_text(pressure) in text
+
+
+@pytest.mark.parametrize("name", ["stiff-flop-1", "stiff-flop-3"])
+def test_numbers_on_bars_stand_apart(name: str) -> None:
+    arm = stiffopt.load_robot(name)
+    p = np.full(arm.n_pressures, 1.1e5)
+    task = stiffopt.Task(robot=name, target={"position": (0, 0, 0.1)})
+    solution = PressureSolution("solved", "", task, p, arm.tip_pose(p), compliance=np.eye(6))
+    figure = plots.plot_solution(arm, solution)
+    figure.canvas.draw()
+    boxes = [each.get_window_extent() for each in figure.axes[1].texts if "." in each.get_text()]
+    assert len(boxes) == arm.n_pressures
+    assert all(not one.overlaps(other) for one, other in pairwise(boxes))
+
+
 def test_many_channels_have_no_numbers_on_top_of_each_other() -> None:
     arm, solution = solved("stiff-flop-3", target=(-0.06, 0.02, 0.25))
     assert len(plots.plot_solution(arm, solution).axes[1].get_xticks()) == 9
@@ -215,3 +338,22 @@ def test_the_scene_is_drawn_with_the_names_of_its_objects(tmp_path: Path) -> Non
     far = {"name": "far", "sphere": {"centre": (9, 0, 0), "radius": 0.01}}
     figure = plots.plot_solution(*solved(), scene=stiffopt.Scene(objects=[far]))
     assert figure.axes[0].get_xlim()[1] < 400  # mm
+
+
+def test_the_page_of_figures_runs() -> None:
+    page = Path(__file__).resolve().parent.parent / "docs" / "figures.md"
+    assert run_examples(page.read_text(encoding="utf-8"), page.name) == 1
+
+
+def test_panels_of_an_empty_path_say_so() -> None:
+    arm = stiffopt.load_robot("stiff-flop-1")
+    nothing = stiffopt.PathSolution("failed", "", arm, *[np.empty(0)] * 3)
+    draws: tuple[Any, ...] = (
+        lambda: plots.draw_path(None, nothing),
+        lambda: plots.draw_stiffness_along(None, nothing),
+        lambda: plots.draw_clearance_along(None, nothing),
+        lambda: plots.draw_pressures_along(None, nothing, 1),
+    )
+    for draw in draws:
+        with pytest.raises(stiffopt.InputError, match="nothing to draw"):
+            draw()

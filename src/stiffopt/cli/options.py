@@ -45,3 +45,10 @@ BoundaryOption = Annotated[
 FrameOption = Annotated[
     str, typer.Option(metavar="FRAME", help="base or tip: the axes of the directions.")
 ]
+ViewOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="ANGLES",
+        help="From where --plot looks: elevation and azimuth about z from x, '20 deg, -60 deg'.",
+    ),
+]

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Quiet
+from stiffopt.cli.options import Quiet, ViewOption
 
 PATH_HELP = """\
 Find the pressures with which the tip follows a path, as stiff as possible along it.
@@ -67,6 +67,7 @@ def path(
             "each in FILE-<path>.png.",
         ),
     ] = None,
+    view: ViewOption = None,
     seed: Annotated[
         int,
         typer.Option(
@@ -78,4 +79,4 @@ def path(
     """Solve path files."""
     from stiffopt.cli.path_run import PathBatch  # here, so that --help waits for no numerics
 
-    return PathBatch(as_json, tuple(out or ()), plot, seed, quiet).run(paths)
+    return PathBatch(as_json, tuple(out or ()), plot, seed, quiet, view).run(paths)

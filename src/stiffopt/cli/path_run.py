@@ -7,7 +7,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from stiffopt.cli import exits, path_records
+from stiffopt.cli import exits, path_records, quantities
 from stiffopt.cli.batch import Batch
 from stiffopt.cli.console import show, warnings_as_notes, write_json
 from stiffopt.cli.exits import interruptible
@@ -27,10 +27,17 @@ class PathBatch(Batch[SolvedPath]):
     """The path files of one command; the arguments are its options."""
 
     def __init__(
-        self, as_json: bool, out: tuple[str, ...], plot: str | None, seed: int, quiet: bool
+        self,
+        as_json: bool,
+        out: tuple[str, ...],
+        plot: str | None,
+        seed: int,
+        quiet: bool,
+        view: str | None = None,
     ) -> None:
         super().__init__(as_json, quiet, writes_files=bool(out) or plot is not None)
         self.out, self.plot, self.seed = out, plot, seed
+        self.view = quantities.view(view)
 
     def run(self, files: Sequence[str]) -> int:
         """Solve path files; return the exit code."""
@@ -91,7 +98,8 @@ class PathBatch(Batch[SolvedPath]):
         """See `Batch.draw`."""
         from stiffopt.plots import plot_path, save_figure
 
-        figure = plot_path(answer.path, answer.solution, title=FilePath(answer.file).stem)
+        title = FilePath(answer.file).stem
+        figure = plot_path(answer.path, answer.solution, title=title, view=self.view)
         save_figure(figure, picture)
 
     def is_drawable(self, answer: SolvedPath) -> bool:

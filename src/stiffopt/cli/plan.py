@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet
+from stiffopt.cli.options import Json, Quiet, ViewOption
 
 PLAN_HELP = """\
 Find a motion from one configuration to another with the whole body clear of a scene all the way.
@@ -74,6 +74,7 @@ def plan(
         str | None,
         typer.Option(metavar="FILE.png", help="Draw the arm on its way, and its pressures."),
     ] = None,
+    view: ViewOption = None,
     seed: Annotated[
         int,
         typer.Option(metavar="N", min=0, help="Of the search: the same seed, the same motion."),
@@ -85,4 +86,4 @@ def plan(
     from stiffopt.cli.plan_run import PlanCommand  # here, so that --help waits for no numerics
 
     command = PlanCommand(robot, start, tuple(goals), scene, clearance, slew, seed, timeout)
-    return command.run(as_json=as_json, out=tuple(out or ()), plot=plot, quiet=quiet)
+    return command.run(as_json=as_json, out=tuple(out or ()), plot=plot, view=view, quiet=quiet)

@@ -16,6 +16,7 @@ from stiffopt.cli.outputs import check_picture
 from stiffopt.cli.path_records import csv_text, solution_quantities, solution_values
 from stiffopt.cli.path_run import RESULT_FORMAT, check_csv, is_csv
 from stiffopt.cli.quantities import listed, quantity
+from stiffopt.cli.quantities import view as view_angles
 from stiffopt.cli.solve_files import check_result_file
 from stiffopt.documents import write_file, write_whole
 from stiffopt.errors import InputError, StiffoptError, printable
@@ -42,7 +43,15 @@ class PlanCommand:
     seed: int
     timeout: str
 
-    def run(self, *, as_json: bool, out: tuple[str, ...], plot: str | None, quiet: bool) -> int:
+    def run(
+        self,
+        *,
+        as_json: bool,
+        out: tuple[str, ...],
+        plot: str | None,
+        view: str | None = None,
+        quiet: bool,
+    ) -> int:
         """Plan, print, write and draw; return the exit code."""
         ends = [self.start, *self.goals]
         for file in out:
@@ -51,6 +60,7 @@ class PlanCommand:
             else:
                 check_result_file(file, [each for each in ends if _is_file(each)], RESULT_FORMAT)
         check_picture(plot)
+        angles = view_angles(view)
         with interruptible_work(quiet=quiet) as progress:
             progress(0, 0, "planning")
             scene, solution = self._plan()
@@ -58,7 +68,7 @@ class PlanCommand:
             write_json({"from": self.start, "to": self.goals, **solution_values(solution)})
         elif not quiet:
             show(self._report(scene, solution))
-        return self._write(scene, solution, out, plot) or exits.OF_STATUS[solution.status]
+        return self._write(scene, solution, out, plot, angles) or exits.OF_STATUS[solution.status]
 
     def _plan(self) -> tuple[Scene | None, PathSolution]:
         """The scene that is kept clear of, and the motion."""
@@ -101,7 +111,12 @@ class PlanCommand:
         return rates[0] if len(rates) == 1 else rates
 
     def _write(
-        self, scene: Scene | None, solution: PathSolution, out: tuple[str, ...], plot: str | None
+        self,
+        scene: Scene | None,
+        solution: PathSolution,
+        out: tuple[str, ...],
+        plot: str | None,
+        view: tuple[float, ...] | None,
     ) -> int:
         """Write files, and draw; return an exit code if that fails."""
         code = exits.SOLVED
@@ -115,7 +130,7 @@ class PlanCommand:
             from stiffopt.plots import plot_motion, save_figure
 
             try:
-                save_figure(plot_motion(solution, scene), plot)
+                save_figure(plot_motion(solution, scene, view=view), plot)
             except StiffoptError as error:
                 report_error(f"no picture: {error}")
                 code = exits.BAD_INPUT

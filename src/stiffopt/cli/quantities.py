@@ -3,6 +3,7 @@
 Each function raises `InputError`, which names the option, if it cannot read the text.
 """
 
+import math
 import re
 
 from stiffopt.errors import InputError, shown
@@ -63,6 +64,25 @@ def listed(option: str, text: str, unit: str, what: str) -> tuple[float, ...]:
     if last is not None and all(_NUMBER.fullmatch(part) for part in parts[:-1]):
         parts[:-1] = [f"{part} {last[1]}" for part in parts[:-1]]
     return tuple(quantity(option, part, unit, what) for part in parts)
+
+
+def view(text: str | None) -> tuple[float, ...] | None:
+    """Return the elevation and the azimuth in rad of ``--view '20 deg, -60 deg'``, if it is given.
+
+    Raises
+    ------
+    InputError
+        If it is not two angles, or no view of an arm.
+    """
+    if text is None:
+        return None
+    angles = listed("--view", text, "rad", "angle")
+    if len(angles) != 2 or abs(angles[0]) > math.pi / 2:
+        raise InputError(
+            "--view: expected an elevation of at most 90 deg and an azimuth, such as "
+            f"'20 deg, -60 deg'; got {shown(text)}"
+        )
+    return angles
 
 
 def directions(option: str, text: str) -> tuple[tuple[float, ...], ...]:

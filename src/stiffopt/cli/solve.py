@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Quiet, Version
+from stiffopt.cli.options import Quiet, Version, ViewOption
 
 HELP = """\
 Find the chamber pressures that reach a tip pose and do best by its stiffness.
@@ -68,6 +68,7 @@ def solve(
             help="Draw the arm and its pressures; of several tasks, each in FILE-<task>.png.",
         ),
     ] = None,
+    view: ViewOption = None,
     pareto: Annotated[
         int | None,
         typer.Option(
@@ -89,4 +90,4 @@ def solve(
     """Solve task files."""
     from stiffopt.cli.solve_run import TaskBatch  # here, so that --help waits for no numerics
 
-    return TaskBatch(as_json, out, plot, pareto, seed, quiet).run(tasks)
+    return TaskBatch(as_json, out, plot, pareto, seed, quiet, view).run(tasks)

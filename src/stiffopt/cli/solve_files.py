@@ -137,7 +137,7 @@ def write_results(path: str, solved: Sequence[SolvedTask]) -> None:
     write_file(path, {"format": RESULT_FORMAT, "results": results})
 
 
-def draw(solved: SolvedTask, path: str) -> None:
+def draw(solved: SolvedTask, path: str, view: Sequence[float] | None) -> None:
     """Draw a solved task; raise `InputError` if the solver failed and there is nothing to draw."""
     from stiffopt.plots import plot_solution, save_figure
 
@@ -147,5 +147,6 @@ def draw(solved: SolvedTask, path: str) -> None:
         front=solved.front,
         plain=solved.plain[0] if solved.plain else None,
         title=Path(solved.file).stem,
+        view=view,
     )
     save_figure(figure, path)

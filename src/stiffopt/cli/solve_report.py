@@ -21,6 +21,7 @@ from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import (
     BAR,
     MM,
+    bar_text,
     figures,
     gain_text,
     least_maximised,
@@ -91,7 +92,7 @@ def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
             limit = limit_of(solved.solution, description.channel_name(index))
             cells.append(
                 Text.assemble(
-                    (f"{pressures[index] * BAR + 0.0:.3f} bar", "bold"),
+                    (f"{bar_text(pressures[index])} bar", "bold"),
                     (f" {limit}".rstrip(), "yellow"),
                 )
             )

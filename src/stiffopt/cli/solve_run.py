@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from stiffopt.cli import exits, solve_files, solve_records
+from stiffopt.cli import exits, quantities, solve_files, solve_records
 from stiffopt.cli.batch import Batch
 from stiffopt.cli.console import report_error, report_note, show, warnings_as_notes, write_json
 from stiffopt.cli.exits import interruptible
@@ -25,9 +25,11 @@ class TaskBatch(Batch[SolvedTask]):
         pareto: int | None,
         seed: int,
         quiet: bool,
+        view: str | None = None,
     ) -> None:
         super().__init__(as_json, quiet, writes_files=out is not None or plot is not None)
         self.out, self.plot, self.pareto, self.seed = out, plot, pareto, seed
+        self.view = quantities.view(view)
 
     def run(self, tasks: Sequence[str]) -> int:
         """Solve task files and folders of them; return the exit code."""
@@ -67,7 +69,7 @@ class TaskBatch(Batch[SolvedTask]):
 
     def draw(self, answer: SolvedTask, picture: str) -> None:
         """See `Batch.draw`."""
-        solve_files.draw(answer, picture)
+        solve_files.draw(answer, picture, self.view)
 
     def is_drawable(self, answer: SolvedTask) -> bool:
         """See `Batch.is_drawable`."""

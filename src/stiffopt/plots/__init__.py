@@ -1,14 +1,37 @@
 """Figures: of solutions, paths, maps, experiments, calibrations and runs.
 
 They need matplotlib, which the extra ``plot`` brings; it is imported when something is drawn, not
-before. Without it every function that draws raises `MissingExtraError`.
+before. Without it every function that makes a figure raises `MissingExtraError`. Functions whose
+names begin with ``draw_`` draw into axes that the caller gives.
 """
 
-from stiffopt.plots.path import plot_motion, plot_path
-from stiffopt.plots.solution import plot_pareto, plot_solution
+from stiffopt.plots.arm import draw_arm
+from stiffopt.plots.path import (
+    draw_clearance_along,
+    draw_path,
+    draw_pressures_along,
+    draw_stiffness_along,
+    plot_motion,
+    plot_path,
+)
+from stiffopt.plots.solution import (
+    draw_pareto,
+    draw_pressures,
+    draw_solution,
+    plot_pareto,
+    plot_solution,
+)
 from stiffopt.plots.style import require_matplotlib, save_figure
 
 __all__ = [
+    "draw_arm",
+    "draw_clearance_along",
+    "draw_pareto",
+    "draw_path",
+    "draw_pressures",
+    "draw_pressures_along",
+    "draw_solution",
+    "draw_stiffness_along",
     "plot_motion",
     "plot_pareto",
     "plot_path",

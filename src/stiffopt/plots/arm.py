@@ -1,34 +1,103 @@
-"""An arm in axes in 3-D, in mm: its base, its tube, the scene around it, a legend and the view."""
+"""An arm in axes in 3-D, in mm: its base, its tube, the scene around it, labels and the view."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.plots import style
 from stiffopt.plots.scene import draw_objects
 from stiffopt.plots.shapes import segment_poses
+from stiffopt.plots.view import View, ViewAngles, fill_panel
 from stiffopt.plots.wording import MM
 
 Vector = NDArray[np.float64]
 
 _STATIONS = 24  # of the tube, per segment
 _SPOKES = 28  # of the tube, around
+_ALONG = 24  # points of an arrow that no text should lie on
+_LEAST_SIDES = (0.5, 0.3, 0.5)  # of the box, as shares of its longest
+
+
+def draw_arm(
+    axes: Any,
+    robot: Manipulator,
+    pressures: ArrayLike,
+    *,
+    scene: Scene | None = None,
+    view: View | None = None,
+) -> list[Any]:
+    """Draw an arm in space, in mm.
+
+    Parameters
+    ----------
+    axes :
+        In 3-D: ``figure.add_subplot(projection="3d", computed_zorder=False)``. Their limits, labels
+        and view are set.
+    robot : Manipulator
+    pressures : (n,)
+        In Pa.
+    scene : Scene, optional
+        What is around it.
+    view : (elevation, azimuth), optional
+        From where to look: the angle of the eye above the horizontal, and about the z axis of the
+        base from its x axis; in rad, or as text with a unit: ``("20 deg", "-60 deg")``. By default
+        x points to the right, and z up or, of an arm that hangs, down.
+
+    Returns
+    -------
+    list
+        Handles for a legend.
+
+    Raises
+    ------
+    InputError
+        If the pressures are not those of such an arm, or the view cannot be had.
+    """
+    drawing = ArmDrawing(axes, robot)
+    drawing.draw_base()
+    drawing.draw_tube(np.asarray(pressures, dtype=float))
+    drawing.explain_segments()
+    if scene is not None:
+        drawing.draw_objects(scene)
+    return drawing.finish(view)
+
+
+class Label(NamedTuple):
+    """A text for a point (3,) in mm."""
+
+    point: Vector
+    text: str
+    colour: str
 
 
 @dataclass
 class ArmDrawing:
-    """Axes in 3-D and what has been drawn in them, in mm."""
+    """Axes in 3-D and what has been drawn in them, in mm.
+
+    Attributes
+    ----------
+    axes :
+    robot : Manipulator
+    corners : points (k, 3) that the figure has to show.
+    covered : points (k, 3), close together, on which no text should lie.
+    marks : points (3,) with a marker, on which none should lie either.
+    labels : texts beside points, the most important first.
+    handles : for a legend.
+    """
 
     axes: Any
     robot: Manipulator
     corners: list[Vector] = field(default_factory=list, kw_only=True)
     handles: list[Any] = field(default_factory=list, kw_only=True)
+    labels: list[Label] = field(default_factory=list, kw_only=True)
+    covered: list[Vector] = field(default_factory=list, kw_only=True)
+    marks: list[Vector] = field(default_factory=list, kw_only=True)
 
     @property
     def size(self) -> float:
@@ -65,7 +134,7 @@ class ArmDrawing:
                 )
             line = mine[:, :3, 3].T * MM
             self.axes.plot(*line, color=style.segment_text_colour(number), linewidth=2.2, zorder=4)
-            self.corners.append(tube.transpose(0, 2, 1).reshape(-1, 3))
+            self.add_body(tube.transpose(0, 2, 1).reshape(-1, 3))
 
     def explain_segments(self) -> None:
         """Add the colours of the segments to the legend."""
@@ -74,7 +143,10 @@ class ArmDrawing:
 
     def draw_objects(self, scene: Scene) -> None:
         """What is around the arm."""
-        self.corners.append(draw_objects(self.axes, scene, self.size, np.vstack(self.corners)))
+        seen, middles = draw_objects(self.axes, scene, self.size, np.vstack(self.corners))
+        self.corners.append(seen)
+        for item, middle in zip(scene.objects, middles, strict=True):
+            self.add_label(middle, item.name, style.DARK)
         self.add_patch(style.OBSTACLE, "scene")
 
     # -- parts ------------------------------------------------------------------------------
@@ -93,6 +165,7 @@ class ArmDrawing:
             x, y, z = _cone(end, vector / length, 0.2 * length)
             self.axes.plot_surface(x, y, z, color=colour, linewidth=0, shade=False, zorder=zorder)
         self.corners.append(np.stack([start, end]))
+        self.covered.append(start + np.linspace(0, 1, _ALONG)[:, None] * vector)
 
     def add_patch(self, colour: str, label: str) -> None:
         """Add a coloured field to the legend."""
@@ -107,30 +180,53 @@ class ArmDrawing:
         look = {"color": colour, "linestyle": linestyle, "linewidth": 2, **look}
         self.handles.append(Line2D([], [], label=label, **look))
 
-    def finish(self, tip: Vector) -> None:
-        """One scale for all axes, a view across the bend to a tip (3,), labels and legend."""
-        points = np.vstack(self.corners)
-        low, high = points.min(axis=0), points.max(axis=0)
-        middle, sides = (low + high) / 2, (high - low) + 0.06 * self.size
-        sides = np.maximum(sides, 0.55 * sides.max())  # room for the labels of a slender arm
-        for name, centre, side in zip("xyz", middle, sides, strict=True):
-            start = 0.0 - 0.03 * self.size if name == "z" and low[2] > -1e-9 else centre - side / 2
-            self.axes.set(**{f"{name}lim": (start, start + side), f"{name}label": f"{name} (mm)"})
-        self.axes.set_box_aspect(sides, zoom=0.97)
-        hangs = self.robot.description.gravity[2] > 0
-        azimuth = _across(tip[:2])
-        self.axes.view_init(elev=-18 if hangs else 18, azim=azimuth, roll=180 if hangs else 0)
-        self.axes.tick_params(labelsize=8, pad=1)
+    def add_label(self, point: Vector, text: str, colour: str) -> None:
+        """Ask for a text beside a point, in mm; those that are asked for first come first."""
+        self.labels.append(Label(np.asarray(point), text, colour))
+
+    def add_body(self, points: Vector) -> None:
+        """Show points (k, 3) in mm, on which no text should lie."""
+        self.corners.append(points)
+        self.covered.append(points)
+
+    def add_mark(self, point: Vector) -> None:
+        """Show a point with a marker, in mm."""
+        self.corners.append(point[None])
+        self.marks.append(point)
+
+    def finish(self, view: View | None = None) -> list[Any]:
+        """Set one scale for all axes and the view, and place the labels.
+
+        Returns
+        -------
+        list
+            Handles for a legend.
+        """
         from matplotlib.ticker import MaxNLocator
 
-        for axis, side in zip(
-            (self.axes.xaxis, self.axes.yaxis, self.axes.zaxis), sides, strict=True
-        ):
-            axis.set_major_locator(MaxNLocator(max(2, round(6 * side / sides.max()))))
-        self.axes.figure.legend(
-            handles=self.handles, loc="upper left", bbox_to_anchor=(0.02, 0.84), fontsize=9,
-            frameon=False,
-        )  # fmt: skip
+        from stiffopt.plots.labels import place_labels
+
+        points = np.vstack(self.corners)
+        low, high = points.min(axis=0), points.max(axis=0)
+        sides = (high - low) + 0.04 * self.size
+        sides = np.maximum(
+            sides, sides.max() * np.array(_LEAST_SIDES)
+        )  # room for the labels of a slender arm
+        for name, start, side in zip("xyz", (low + high - sides) / 2, sides, strict=True):
+            self.axes.set(**{f"{name}lim": (start, start + side)})
+            self.axes.set(**{f"{name}label": f"{name} (mm)"})
+            axis = getattr(self.axes, f"{name}axis")
+            prune = None if name == "z" else "both"  # two axes meet in a corner
+            axis.set_major_locator(MaxNLocator(max(3, round(7 * side / sides.max())), prune=prune))
+            axis.labelpad = 3 if name == "z" else -2
+        self.axes.tick_params(labelsize=8, pad=0)
+        self.axes.set_box_aspect(sides)
+        self.axes.patch.set_visible(False)
+        ViewAngles.of(self.robot, view).set(self.axes)
+        fill_panel(self.axes)
+        marks = np.array(self.marks).reshape(-1, 3)
+        place_labels(self.axes, self.labels, np.vstack(self.covered), marks)
+        return self.handles
 
 
 def _cone(point: Vector, way: Vector, length: float) -> Vector:
@@ -142,10 +238,3 @@ def _cone(point: Vector, way: Vector, length: float) -> Vector:
     ring = np.outer(across, np.cos(angle)) + np.outer(np.cross(way, across), np.sin(angle))
     base = (point - length * way)[:, None] + 0.35 * length * ring
     return np.stack([base, np.repeat(point[:, None], len(angle), axis=1)], axis=1)
-
-
-def _across(bend: Vector) -> float:
-    """Azimuth in degrees from which a bend towards this side is seen from the side."""
-    if np.linalg.norm(bend) < 1e-6:
-        return -60.0
-    return float(np.degrees(np.arctan2(bend[1], bend[0]))) - 65.0

@@ -1,10 +1,13 @@
-"""Figure of a solved path: the arm along it, its stiffness and its pressures over time."""
+"""Figure of a solved path: the arm along it, its stiffness and its pressures over time.
+
+Each panel is a function that draws into axes of the caller.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from math import degrees
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +19,7 @@ from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution
 from stiffopt.plots import style
 from stiffopt.plots.arm import ArmDrawing
+from stiffopt.plots.view import View
 from stiffopt.plots.wording import BAR, MM, figures, unit_text
 
 if TYPE_CHECKING:
@@ -27,7 +31,9 @@ _POSES = 5  # of the arm
 _FULL = 0.99  # share of a rate from which a pressure counts as changing at it
 
 
-def plot_path(path: Path, solution: PathSolution, *, title: str | None = None) -> Figure:
+def plot_path(
+    path: Path, solution: PathSolution, *, title: str | None = None, view: View | None = None
+) -> Figure:
     """Draw a solved path: the arm along it, and stiffness, clearance and pressures over time.
 
     Parameters
@@ -36,25 +42,36 @@ def plot_path(path: Path, solution: PathSolution, *, title: str | None = None) -
     solution : PathSolution
     title : str, optional
         By default the name of the path's file.
+    view : (elevation, azimuth), optional
+        From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
 
     Raises
     ------
     InputError
-        If the solution has no points, as the solver failed.
+        If the solution has no points, as the solver failed, or the view cannot be had.
     MissingExtraError
         If matplotlib is not installed.
     """
     source = path.source
-    drawn = _Drawn(
-        solution, path.scene, path.pressure_bounds(solution.robot.description),
-        path.points().positions if len(solution.times) else None,
-    )  # fmt: skip
     name = solution.robot.description.name if source is None else source.stem
-    return _figure(drawn, title or name, lambda: _key_numbers(path, solution))
+    limits = path.pressure_bounds(solution.robot.description)
+    return _figure(
+        solution,
+        path,
+        path.scene,
+        limits,
+        view,
+        title or name,
+        lambda: _key_numbers(path, solution),
+    )
 
 
 def plot_motion(
-    solution: PathSolution, scene: Scene | None = None, *, title: str | None = None
+    solution: PathSolution,
+    scene: Scene | None = None,
+    *,
+    title: str | None = None,
+    view: View | None = None,
 ) -> Figure:
     """Draw a motion of `stiffopt.plan_motion` as `plot_path` draws a path.
 
@@ -65,57 +82,60 @@ def plot_motion(
         That was kept clear of.
     title : str, optional
         By default the name of the robot.
+    view : (elevation, azimuth), optional
+        From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
 
     Raises
     ------
     InputError
-        If the solution has no points.
+        If the solution has no points, or the view cannot be had.
     MissingExtraError
         If matplotlib is not installed.
     """
     robot = solution.robot
-    drawn = _Drawn(solution, scene, (robot.pressure_min, robot.pressure_max), None)
+    limits = robot.pressure_min, robot.pressure_max
     name = title or robot.description.name
-    return _figure(drawn, name, lambda: _duration(solution))
+    return _figure(solution, None, scene, limits, view, name, lambda: _duration(solution))
 
 
-class _Drawn(NamedTuple):
-    """What is drawn: with the scene, limits of the pressures and the positions asked for."""
-
-    solution: PathSolution
-    scene: Scene | None
-    limits: tuple[Vector, Vector]
-    asked: Vector | None
-
-
-def _figure(drawn: _Drawn, title: str, key_numbers: Callable[[], str]) -> Figure:
-    solution = drawn.solution
+def _figure(
+    solution: PathSolution, path: Path | None, scene: Scene | None, limits: tuple[Vector, Vector],
+    view: View | None, title: str, key_numbers: Callable[[], str],
+) -> Figure:  # fmt: skip
     style.require_matplotlib()
-    if not len(solution.times):
-        raise InputError("there is nothing to draw: the solution has no points")
+    _require_points(solution)
     heights = [1.5] * (solution.stiffness is not None) + [0.8] * (solution.clearance is not None)
     heights += [1.2] * solution.robot.n_segments
     height = max(6.6, 1.4 + 1.35 * sum(heights))
     figure = style.new_figure(13, height)
     grid = figure.add_gridspec(
-        len(heights), 2, width_ratios=(1.15, 1), height_ratios=heights, left=0.03, right=0.975,
-        top=1 - 1.25 / height, bottom=0.55 / height, wspace=0.14, hspace=0.2,
+        len(heights), 1, height_ratios=heights, left=0.6, right=0.975, top=1 - 1.35 / height,
+        bottom=0.55 / height, hspace=0.2,
     )  # fmt: skip
-    _draw_arm(figure.add_subplot(grid[:, 0], projection="3d", computed_zorder=False), drawn)
+    axes = style.add_space(figure, (0.02, 0.1 / height, 0.52, 1 - 1.1 / height))
+    handles = draw_path(axes, solution, path=path, scene=scene, view=view)
+    style.legend_in_corner(axes, handles)
     panels: list[Any] = []
     for row in range(len(heights)):
-        panels.append(figure.add_subplot(grid[row, 1], sharex=panels[0] if panels else None))
+        panels.append(figure.add_subplot(grid[row, 0], sharex=panels[0] if panels else None))
         style.tidy(panels[-1])
         panels[-1].tick_params(labelbottom=row == len(heights) - 1)
-    panels[-1].set_xlabel("time (s)")
     left = iter(panels)
     if solution.stiffness is not None:
-        _draw_stiffness(next(left), solution)
+        draw_stiffness_along(next(left), solution)
     if solution.clearance is not None:
-        _draw_clearance(next(left), drawn)
-    _draw_pressures(list(left), drawn)
+        draw_clearance_along(next(left), solution, None if scene is None else scene.clearance)
+    for segment, panel in enumerate(left, start=1):
+        draw_pressures_along(panel, solution, segment, limits)
+    for panel in panels[:-1]:
+        panel.set_xlabel("")
     style.draw_outcome(figure, title, key_numbers(), solution.status, solution.message)
     return figure
+
+
+def _require_points(solution: PathSolution) -> None:
+    if not len(solution.times):
+        raise InputError("there is nothing to draw: the solution has no points")
 
 
 def _duration(solution: PathSolution) -> str:
@@ -140,9 +160,39 @@ def _key_numbers(path: Path, solution: PathSolution) -> str:
     return "      ".join(parts)
 
 
-def _draw_arm(axes: Any, drawn: _Drawn) -> None:
-    """The arm at some of the points, the path that was asked for and the one that is followed."""
-    solution = drawn.solution
+def draw_path(
+    axes: Any,
+    solution: PathSolution,
+    *,
+    path: Path | None = None,
+    scene: Scene | None = None,
+    view: View | None = None,
+) -> list[Any]:
+    """Draw the arm at some of the points, and the way of its tip.
+
+    Parameters
+    ----------
+    axes :
+        In 3-D, as for `draw_arm`.
+    solution : PathSolution
+    path : Path, optional
+        That was asked for, to be drawn beside the one that is followed.
+    scene : Scene, optional
+        What is around the arm.
+    view : (elevation, azimuth), optional
+        See `draw_arm`.
+
+    Returns
+    -------
+    list
+        Handles for a legend.
+
+    Raises
+    ------
+    InputError
+        If the solution has no points, or the view cannot be had.
+    """
+    _require_points(solution)
     drawing = ArmDrawing(axes, solution.robot)
     drawing.draw_base()
     last = len(solution.times) - 1
@@ -150,13 +200,14 @@ def _draw_arm(axes: Any, drawn: _Drawn) -> None:
         drawing.draw_tube(solution.pressures[index], 0.3 if index in (0, last) else 0.1)
     drawing.explain_segments()
     tips = solution.tip_poses[:, :3, 3].T * MM
-    if drawn.asked is not None:
-        axes.plot(*drawn.asked.T * MM, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
+    if path is not None:
+        asked = path.points().positions * MM
+        axes.plot(*asked.T, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
         drawing.add_line(style.TARGET, "path that is asked for", ":")
-        drawing.corners.append(drawn.asked * MM)
+        drawing.corners.append(asked)
     axes.plot(*tips, color=style.DARK, linewidth=2.2, zorder=8)
     drawing.add_line(style.DARK, "tip")
-    drawing.corners.append(tips.T)
+    drawing.add_body(tips.T)
     marks = [(0, "o", style.DARK, "start", 10), (last, "s", style.DARK, "end", 9)]
     if solution.worst_index is not None:
         marks.append((solution.worst_index, "D", style.AT_LIMIT, "least stiff", 7))
@@ -166,16 +217,37 @@ def _draw_arm(axes: Any, drawn: _Drawn) -> None:
         look = {"marker": marker, "markersize": size, "markeredgecolor": "white"}
         axes.plot(*tips[:, index, None], color=colour, linestyle="none", zorder=11, **look)
         drawing.add_line(colour, label, "none", **look)
-    if drawn.scene is not None:
-        drawing.draw_objects(drawn.scene)
-    drawing.finish(tips.mean(axis=1))
+        drawing.add_mark(tips[:, index])
+    _label_stiffness(drawing, solution, tips)
+    if scene is not None:
+        drawing.draw_objects(scene)
+    return drawing.finish(view)
 
 
-def _draw_stiffness(axes: Any, solution: PathSolution) -> None:
-    """Stiffness over time, and what each point alone could have."""
+def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) -> None:
+    """Write the least stiffness to where the tip has it."""
+    if solution.worst is not None:
+        text = f"least stiff:\n{figures(solution.worst)} {unit_text(solution.stiffness_unit)}"
+        drawing.add_label(tips[:, solution.worst_index], text, style.LEAST_STIFF_TEXT)
+
+
+def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
+    """Draw stiffness over time, and what each point alone could have.
+
+    Parameters
+    ----------
+    axes :
+        Of matplotlib.
+    solution : PathSolution
+
+    Raises
+    ------
+    InputError
+        If the solution has no stiffness: its path maximises none, or it has no points.
+    """
     index = solution.worst_index
     if solution.stiffness is None or index is None:
-        return
+        raise InputError("there is nothing to draw: the solution has no stiffness")
     if solution.alone is not None:
         axes.plot(
             solution.times, solution.alone, color=style.GREY, linewidth=5, alpha=0.35,
@@ -191,59 +263,94 @@ def _draw_stiffness(axes: Any, solution: PathSolution) -> None:
     )  # fmt: skip
     axes.set_ylim(bottom=0.85 * solution.stiffness[index])
     axes.set_ylabel(f"stiffness\n({unit_text(solution.stiffness_unit)})")
+    axes.set_xlabel("time (s)")
     _legend(axes)
 
 
-def _draw_clearance(axes: Any, drawn: _Drawn) -> None:
-    """Clearance over time against what is required."""
-    solution = drawn.solution
-    if solution.clearance is None:
-        return
+def draw_clearance_along(axes: Any, solution: PathSolution, required: float | None = None) -> None:
+    """Draw clearance over time against what is required.
+
+    Parameters
+    ----------
+    axes :
+        Of matplotlib.
+    solution : PathSolution
+    required : float, optional
+        In m.
+
+    Raises
+    ------
+    InputError
+        If the solution has no clearance: there is no scene, or it has no points.
+    """
+    if solution.clearance is None or not len(solution.times):
+        raise InputError("there is nothing to draw: the solution has no clearance")
     axes.plot(solution.times, solution.clearance * MM, color=style.OBSTACLE, linewidth=2)
-    if drawn.scene is not None:
-        required = drawn.scene.clearance * MM
-        axes.axhline(required, color=style.BOUND, linestyle=":", label="required")
+    if required is not None:
+        axes.axhline(required * MM, color=style.BOUND, linestyle=":", label="required")
         _legend(axes)
     axes.set_ylim(bottom=min(0.0, solution.clearance.min() * MM))
     axes.set_ylabel("clearance\n(mm)")
+    axes.set_xlabel("time (s)")
 
 
-def _draw_pressures(panels: list[Any], drawn: _Drawn) -> None:
-    """Pressures over time, a panel for each segment; steps at the full rate stand out."""
+def draw_pressures_along(
+    axes: Any, solution: PathSolution, segment: int, limits: tuple[Vector, Vector] | None = None
+) -> None:
+    """Draw the pressures of a segment over time; steps at the full rate stand out.
+
+    Parameters
+    ----------
+    axes :
+        Of matplotlib.
+    solution : PathSolution
+    segment : int
+        From 1, at the base.
+    limits : ((n,), (n,)), optional
+        The least and the largest pressures of all channels in Pa; by default the robot's.
+
+    Raises
+    ------
+    InputError
+        If the solution has no points, or the arm no such segment.
+    """
+    _require_points(solution)
+    segments = solution.robot.description.segments
+    if not 1 <= segment <= len(segments):
+        raise InputError(f"segment: the arm has segments 1 to {len(segments)}; got {segment}")
+    low, high = limits or (solution.robot.pressure_min, solution.robot.pressure_max)
+    before = sum(each.n_channels for each in segments[: segment - 1])
+    channels = slice(before, before + segments[segment - 1].n_channels)
+    values, fast = solution.pressures[:, channels] * BAR, _fast_steps(solution)[:, channels]
+    for channel in range(values.shape[1]):
+        axes.plot(
+            solution.times, values[:, channel], color=style.channel_colour(channel), linewidth=1.8,
+            label=f"channel {channel + 1}", zorder=3,
+        )  # fmt: skip
+    _mark_fast_steps(axes, solution.times, values, fast)
+    for value in np.unique([low[channels] * BAR, high[channels] * BAR]):
+        axes.axhline(value, color=style.BOUND, linestyle=":", linewidth=1.2, zorder=1)
+    bottom, top = low[channels].min() * BAR, high[channels].max() * BAR
+    axes.set_ylim(bottom - 0.05 * (top - bottom), top + 0.05 * (top - bottom))
+    axes.set_ylabel(
+        f"segment {segment}\n(bar)", color=style.segment_text_colour(segment - 1), weight="bold"
+    )
+    axes.set_xlabel("time (s)")
+    _legend(axes)
+
+
+def _mark_fast_steps(axes: Any, times: Vector, values: Vector, fast: Any) -> None:
+    """Mark the steps (N - 1, k) of pressures (N, k) in which they change at their full rate."""
     from matplotlib.collections import LineCollection
 
-    solution = drawn.solution
-    description = solution.robot.description
-    limits = [bound * BAR for bound in drawn.limits]
-    values, fast = solution.pressures * BAR, _fast_steps(solution)
-    start, is_any = 0, False
-    for number, (axes, segment) in enumerate(zip(panels, description.segments, strict=True)):
-        for k in range(segment.n_channels):
-            channel = start + k
-            axes.plot(
-                solution.times, values[:, channel], color=style.channel_colour(k), linewidth=1.8,
-                label=f"channel {k + 1}", zorder=3,
-            )  # fmt: skip
-            line = np.column_stack([solution.times, values[:, channel]])
-            parts = np.stack([line[:-1], line[1:]], axis=1)[fast[:, channel]]  # (k, 2, 2)
-            if len(parts):
-                label = "" if is_any else "at its rate"
-                axes.add_collection(
-                    LineCollection(
-                        parts, colors=style.AT_LIMIT, linewidths=5, alpha=0.5, label=label, zorder=2
-                    )
-                )
-                is_any = True
-        mine = slice(start, start + segment.n_channels)
-        for value in np.unique([bound[mine] for bound in limits]):
-            axes.axhline(value, color=style.BOUND, linestyle=":", linewidth=1.2, zorder=1)
-        low, high = limits[0][mine].min(), limits[1][mine].max()
-        axes.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
-        axes.set_ylabel(
-            f"segment {number + 1}\n(bar)", color=style.segment_text_colour(number), weight="bold"
+    lines = np.stack([np.broadcast_to(times[:, None], values.shape), values], axis=-1)  # (N, k, 2)
+    parts = np.stack([lines[:-1], lines[1:]], axis=2)[fast]  # (j, 2, 2)
+    if len(parts):
+        axes.add_collection(
+            LineCollection(
+                parts, colors=style.AT_LIMIT, linewidths=5, alpha=0.5, label="at its rate", zorder=2
+            )
         )
-        _legend(axes)
-        start += segment.n_channels
 
 
 def _fast_steps(solution: PathSolution) -> Any:

@@ -17,7 +17,7 @@ _SHADES = {"inside_tube": 0.12, "half_space": 0.2}
 _SHADE = 0.45
 
 
-def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> Vector:
+def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> tuple[Vector, list[Vector]]:
     """Draw a scene's objects, in mm.
 
     Parameters
@@ -33,10 +33,12 @@ def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> Vector:
 
     Returns
     -------
-    (j, 3) array
+    near : (j, 3)
         Points that the figure should show too: those of objects that are not far from the rest.
+    middles : list of (3,)
+        For each object a point where its name belongs.
     """
-    near = [seen]
+    near, middles = [seen], []
     low, high = seen.min(axis=0) - 0.6 * size, seen.max(axis=0) + 0.6 * size
     for item in scene.objects:
         shade = _SHADES.get(item.shape.key, _SHADE)
@@ -45,8 +47,8 @@ def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> Vector:
             points = surface.reshape(3, -1).T * MM
             near.append(points[((points > low) & (points < high)).all(axis=1)])
             middle = np.clip(points.mean(axis=0), low, high)
-        axes.text(*middle, f" {style.literal(item.name)}", color=style.DARK, fontsize=8, zorder=12)
-    return np.vstack(near)
+        middles.append(middle)
+    return np.vstack(near), middles
 
 
 def _draw_surface(axes: Any, surface: Vector, shade: float, is_mesh: bool) -> None:

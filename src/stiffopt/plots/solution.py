@@ -20,14 +20,17 @@ from stiffopt.plots import style
 from stiffopt.plots.arm import ArmDrawing
 from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.style import literal, new_figure, tidy
+from stiffopt.plots.view import View
 from stiffopt.plots.wording import (
     BAR,
     MM,
+    bar_text,
     direction_text,
     figures,
     gain_text,
     least_maximised,
     limit_of,
+    short_direction,
     unit_text,
 )
 
@@ -49,6 +52,7 @@ def plot_solution(
     plain: float | None = None,
     title: str | None = None,
     scene: Scene | None = None,
+    view: View | None = None,
 ) -> Figure:
     """Draw an answer: the arm in space, and its pressures against their limits.
 
@@ -65,28 +69,26 @@ def plot_solution(
         By default the name of the task's file.
     scene : Scene, optional
         What is around the arm, by default that of the task.
+    view : (elevation, azimuth), optional
+        From where to look at the arm, in rad or as text with a unit; see `draw_arm`.
 
     Raises
     ------
     InputError
-        If the solution has no pressures, as the solver failed.
+        If the solution has no pressures, as the solver failed, or the view cannot be had.
     MissingExtraError
         If matplotlib is not installed.
     """
     style.require_matplotlib()
-    if solution.pressures is None:
-        raise InputError("there is nothing to draw: the solution has no pressures")
-    load = solution.task.load
-    arm = robot.with_load(load.force, load.moment, load.frame) if load else robot
     figure = new_figure(13, 6.6 if front is None else 7.8)
     grid = figure.add_gridspec(
-        1 if front is None else 2, 3, width_ratios=(0.42, 1.15, 1), left=0.03, right=0.975,
-        top=0.825, bottom=0.09, wspace=0.2, hspace=0.42,
-    )  # fmt: skip
-    _draw_arm(figure, grid[:, 1], arm, solution, scene or solution.task.scene)
-    _draw_pressures(figure.add_subplot(grid[0, 2]), arm, solution)
+        1 if front is None else 2, 1, left=0.6, right=0.975, top=0.79, bottom=0.09, hspace=0.42
+    )
+    axes = style.add_space(figure, (0.02, 0.015, 0.52, 0.825))
+    style.legend_in_corner(axes, draw_solution(axes, robot, solution, scene=scene, view=view))
+    draw_pressures(figure.add_subplot(grid[0, 0]), robot, solution)
     if front is not None:
-        _draw_pareto(figure.add_subplot(grid[1, 2]), front, plain)
+        draw_pareto(figure.add_subplot(grid[1, 0]), front, plain=plain)
     source = solution.task.source
     name = robot.description.name if source is None else source.stem
     style.draw_outcome(
@@ -115,7 +117,7 @@ def plot_pareto(
     """
     figure = new_figure(6.4, 4.4, layout="constrained")
     axes = figure.add_subplot()
-    _draw_pareto(axes, front, plain)
+    draw_pareto(axes, front, plain=plain)
     if title:
         axes.set_title(literal(title))
     return figure
@@ -150,8 +152,22 @@ def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
     return "      ".join(parts)
 
 
-def _draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -> None:
-    """Bars of the pressures in bar against the limits that hold; those at a limit stand out."""
+def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -> None:
+    """Draw bars of the pressures in bar against the limits that hold; those at a limit stand out.
+
+    Parameters
+    ----------
+    axes :
+        Of matplotlib.
+    robot : Manipulator
+    solution : PressureSolution
+
+    Raises
+    ------
+    InputError
+        If the solution has no pressures.
+    """
+    _require_pressures(solution)
     description = robot.description
     lower, upper = (bound * BAR for bound in solution.task.pressure_bounds(description))
     values = np.asarray(solution.pressures) * BAR
@@ -171,9 +187,9 @@ def _draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -
     if len(values) <= _MOST_LABELS:
         for place, value, colour in zip(places, values, colours, strict=True):
             axes.text(
-                place, max(value, 0.0) + 0.012 * top, f"{value + 0.0:.2f}", ha="center",
-                va="bottom", fontsize=9, color=colour if colour == style.AT_LIMIT else "#20394f",
-                weight="bold", zorder=4,
+                place, max(value, 0.0) + 0.012 * top, bar_text(value / BAR), ha="center",
+                va="bottom", fontsize=9 if len(values) < 10 else 6.5, weight="bold", zorder=4,
+                color=colour if colour == style.AT_LIMIT else "#20394f",
             )  # fmt: skip
     _label_channels(axes, robot, places)
     axes.set_ylabel("pressure (bar)")
@@ -182,8 +198,20 @@ def _draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -
     tidy(axes)
 
 
-def _draw_pareto(axes: Any, front: Sequence[PressureSolution], plain: float | None) -> None:
-    """Stiffness against tip error, each point the stiffest at its error."""
+def draw_pareto(
+    axes: Any, front: Sequence[PressureSolution], *, plain: float | None = None
+) -> None:
+    """Draw stiffness against tip error, each point the stiffest at its error.
+
+    Parameters
+    ----------
+    axes :
+        Of matplotlib.
+    front : sequence of PressureSolution
+        As `stiffopt.pareto_front` returns it.
+    plain : float, optional
+        First stiffness of a stiffness-blind solution, to compare with.
+    """
     axes.set_title("stiffness gained by a larger tip error", fontsize=11, loc="left")
     tidy(axes)
     if not front:
@@ -253,22 +281,58 @@ def _pressure_legend(axes: Any, any_active: bool) -> None:
 # -- the arm in 3-D -------------------------------------------------------------------------------
 
 
-def _draw_arm(
-    figure: Any, place: Any, robot: Manipulator, solution: PressureSolution, scene: Scene | None
-) -> None:
-    """Draw the arm at a solution's pressures, in mm, all axes to one scale."""
-    axes = figure.add_subplot(place, projection="3d", computed_zorder=False)
-    drawing = _Drawing(axes, robot, solution)
+def draw_solution(
+    axes: Any,
+    robot: Manipulator,
+    solution: PressureSolution,
+    *,
+    scene: Scene | None = None,
+    view: View | None = None,
+) -> list[Any]:
+    """Draw an answer in space: the arm, its stiffness and what was asked of it.
+
+    Parameters
+    ----------
+    axes :
+        In 3-D, as for `draw_arm`.
+    robot : Manipulator
+        The arm; the load of the solution's task is put on it.
+    solution : PressureSolution
+    scene : Scene, optional
+        What is around the arm, by default that of the task.
+    view : (elevation, azimuth), optional
+        See `draw_arm`.
+
+    Returns
+    -------
+    list
+        Handles for a legend.
+
+    Raises
+    ------
+    InputError
+        If the solution has no pressures, or the view cannot be had.
+    """
+    _require_pressures(solution)
+    load = solution.task.load
+    arm = robot.with_load(load.force, load.moment, load.frame) if load else robot
+    drawing = _Drawing(axes, arm, solution)
     drawing.draw_base()
     drawing.draw_tube(np.asarray(solution.pressures))
     drawing.explain_segments()
-    drawing.draw_ellipsoid()
     drawing.draw_directions()
+    drawing.draw_ellipsoid()
     drawing.draw_target()
     drawing.draw_loads()
+    scene = scene or solution.task.scene
     if scene is not None:
         drawing.draw_objects(scene)
-    drawing.finish(drawing.tip)
+    return drawing.finish(view)
+
+
+def _require_pressures(solution: PressureSolution) -> None:
+    if solution.pressures is None:
+        raise InputError("there is nothing to draw: the solution has no pressures")
 
 
 @dataclass
@@ -305,8 +369,10 @@ class _Drawing(ArmDrawing):
         for radius, way in zip(radii, ways.T, strict=True):
             ends = self.tip + np.outer([-1, 1], way) * radius
             self.axes.plot(*ends.T, color=style.ELLIPSOID, linewidth=1.3, zorder=6)
-        self.corners.append(np.stack([x, y, z], axis=-1).reshape(-1, 3))
-        listed = ", ".join(f"{value:.3g}" for value in values[::-1])
+        self.add_body(np.stack([x, y, z], axis=-1).reshape(-1, 3))
+        longest = ways[:, -1] * np.copysign(radii[-1], self.rotation[:, 2] @ ways[:, -1])
+        self.add_label(self.tip + longest, f"ellipsoid\n{figures(values[-1])} N/m", style.ELLIPSOID)
+        listed = ", ".join(figures(value) for value in values[::-1])
         self.add_patch(
             style.ELLIPSOID, f"stiffness ellipsoid, radius² ∝ k:\n{listed} N/m\nalong its axes"
         )
@@ -320,7 +386,10 @@ class _Drawing(ArmDrawing):
             shade = style.DIRECTIONS[number % len(style.DIRECTIONS)]
             way = np.asarray(measure.direction)
             way = self.rotation @ way if measure.frame == "tip" else way
-            self.draw_arrow(self.tip, way * _ARROW_SHARE * self.size, shade, 9)
+            arrow = way * _ARROW_SHARE * self.size
+            self.draw_arrow(self.tip, arrow, shade, 9)
+            named = f"{figures(value)} {unit_text(measure.unit)}\n{short_direction(measure)}"
+            self.add_label(self.tip + arrow, named, shade)
             self.add_line(
                 shade,
                 f"{figures(value)} {unit_text(measure.unit)}\n{direction_text(measure)}\n"
@@ -350,12 +419,13 @@ class _Drawing(ArmDrawing):
             *point[:, None], marker="X", markersize=11, color=style.TARGET,
             markeredgecolor="white", linestyle="none", zorder=10,
         )  # fmt: skip
-        self.corners.append(point[None])
+        self.add_mark(point)
         for k in free:
             ends = np.stack([point, point])
             ends[:, k] += np.array([-0.3, 0.3]) * self.size
             self.axes.plot(*ends.T, color=style.TARGET, linestyle=":", linewidth=1.6, zorder=9)
             self.corners.append(ends)
+            self.covered.append(np.linspace(ends[0], ends[1], 40))
         names = ", ".join("xyz"[k] for k in free)
         label = f"target ({names} free)" if free else "target"
         self.add_line(
@@ -366,6 +436,7 @@ class _Drawing(ArmDrawing):
             self.axes.plot(
                 *np.stack([self.tip, point]).T, color=style.TARGET, linewidth=1.4, zorder=9
             )
+            self.covered.append(np.linspace(self.tip, point, 40))
 
     def _draw_triad(self, point: Vector, quaternion: Any, length: float) -> None:
         wanted = np.asarray(lie.rotation_from_quaternion(np.array(quaternion)))
@@ -386,6 +457,6 @@ class _Drawing(ArmDrawing):
         gravity = np.array(self.robot.description.gravity)
         if gravity.any():
             way = gravity / np.linalg.norm(gravity)
-            start = np.array([0.45, 0.45, 0.0]) * self.size
+            start = np.array([0.4, 0.3, 0.25]) * self.size
             self.draw_arrow(start, 0.18 * self.size * way, "#666666", 9)
-            self.axes.text(*start, "gravity ", color="#666666", fontsize=9, ha="right")
+            self.add_label(start, "gravity", "#666666")

@@ -41,6 +41,7 @@ DIRECTIONS = ("#c2571a", "#8c2d04", "#e0a100", "#b5547a")
 """Of the stiffnesses that a task names, in turn."""
 ELLIPSOID = "#6a3d9a"
 AT_LIMIT = "#f28e2b"
+LEAST_STIFF_TEXT = "#b35c00"
 WITHIN_LIMITS = "#4e79a7"
 RANGE = "#e9ecef"
 """Of what is allowed, or was recorded."""
@@ -100,6 +101,11 @@ def new_figure(width: float, height: float, **settings: Any) -> Figure:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), **settings)
+
+
+def add_space(figure: Figure, place: tuple[float, float, float, float]) -> Any:
+    """Return new axes in 3-D, in the right of a place of a figure: left, bottom, width, height."""
+    return figure.add_axes(place, projection="3d", computed_zorder=False, anchor="E")
 
 
 def stacked_panels(
@@ -182,6 +188,15 @@ def legend_beside(axes: Any, **settings: Any) -> None:
     axes.legend(
         loc="upper left", bbox_to_anchor=(1.01, 1.0), fontsize=9, frameon=False, borderaxespad=0.0,
         handlelength=1.6, **settings,
+    )  # fmt: skip
+
+
+def legend_in_corner(axes: Any, handles: Sequence[Any]) -> None:
+    """Put a legend into the upper left corner of axes in 3-D and of the place that they have."""
+    place = axes.get_position(original=True)
+    axes.get_figure().legend(
+        handles=handles, loc="upper left", bbox_to_anchor=(place.x0, place.y1), fontsize=9,
+        frameon=False,
     )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+from stiffopt.directions import direction_name
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.solution import PressureSolution
@@ -42,9 +43,21 @@ def gain_text(value: float, plain: float) -> str:
     return f"{(value / plain - 1) * 100:+.0f} %".replace("-0 %", "+0 %")
 
 
+def bar_text(pressure: float) -> str:
+    """Return a pressure in Pa as a number in bar, with three decimals."""
+    return f"{pressure * BAR + 0.0:.3f}"
+
+
 def vector_text(values: Iterable[float]) -> str:
     """Return a vector with at most three decimals."""
     return f"({', '.join(f'{round(float(value), 3) + 0.0:g}' for value in values)})"
+
+
+def short_direction(measure: StiffnessMeasure) -> str:
+    """Return along or about which direction a stiffness is meant, as short as can be."""
+    way = "along" if measure.kind == "translation" else "about"
+    tip = "the tip's " if measure.frame == "tip" else ""
+    return f"{way} {tip}{direction_name(measure.direction)}"
 
 
 def direction_text(measure: Measure) -> str:

@@ -1,0 +1,153 @@
+"""Short texts in a picture of an arm, placed where they cover nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from matplotlib.text import Annotation
+from numpy.typing import NDArray
+
+from stiffopt.plots.style import literal
+from stiffopt.plots.view import box_corners, projected
+
+if TYPE_CHECKING:
+    from stiffopt.plots.arm import Label
+
+Vector = NDArray[np.float64]
+
+_SIZE = 8.5  # points, of letters
+_CELL = 3  # pixels, of the map of what is covered
+_WAYS = 24  # directions in which a place is looked for
+_DISTANCES = (7.0, 12.0, 19.0, 28.0, 40.0, 55.0, 75.0, 100.0)  # points, from what is labelled
+_LINED_FROM = 15.0  # points: further away a line leads to the text
+_GAP = 2.0  # points, around a text
+_MARK = 8.0  # points, around the target
+_COVERS, _COVERS_TEXT, _OUTSIDE, _FAR = 60.0, 120.0, 40.0, 0.05  # costs, the last per point
+
+
+class PlacedLabel(Annotation):
+    """A text that stays beside a point in space when the view changes."""
+
+    def __init__(self, label: Label) -> None:
+        text = "\n".join(map(literal, label.text.split("\n")))
+        super().__init__(
+            text, (0, 0), (0, 0), textcoords="offset points", fontsize=_SIZE, color=label.colour,
+            ha="center", va="center", zorder=20, annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": label.colour, "linewidth": 0.7, "shrinkA": 1},
+        )  # fmt: skip
+        self.point = label.point
+
+    def follow(self) -> None:
+        """Go to where the point is in the picture."""
+        x, y = projected(self.axes, self.point[None])
+        self.xy = (float(x[0]), float(y[0]))
+
+    def move(self, offset: Vector, *, with_line: bool) -> None:
+        """Put the middle of the text this far from its point (2,), in points."""
+        self.set_position((float(offset[0]), float(offset[1])))
+        if self.arrow_patch is not None:
+            self.arrow_patch.set_visible(with_line)
+
+    def draw(self, renderer: Any) -> None:
+        """See `matplotlib.artist.Artist.draw`."""
+        self.follow()
+        super().draw(renderer)
+
+
+def place_labels(axes: Any, labels: Sequence[Label], covered: Vector, marks: Vector) -> None:
+    """Put texts into axes in 3-D, whose limits and view are set.
+
+    Parameters
+    ----------
+    axes :
+    labels : sequence of Label
+        The most important first.
+    covered : (k, 3)
+        Points in mm, close together, of what no text should lie on.
+    marks : (j, 3)
+        Points with a marker.
+    """
+    if not labels:
+        return
+    axes.apply_aspect()
+    places = _CoveredCells(axes)
+    places.cover(covered, 0.0)
+    places.cover(marks, _MARK)
+    for label in labels:
+        placed = PlacedLabel(label)
+        axes.add_artist(placed)
+        placed.follow()
+        places.put(placed)
+
+
+class _TextPlace(NamedTuple):
+    """A place for a text: what it costs, how far away it is, in points, and its middle."""
+
+    cost: float
+    distance: float
+    middle: Vector
+
+
+class _CoveredCells:
+    """What is covered in axes, in cells of a few pixels."""
+
+    def __init__(self, axes: Any) -> None:
+        self.axes = axes
+        self.pixels = axes.get_figure(root=True).dpi / 72  # per point
+        self.start = np.array([axes.bbox.x0, axes.bbox.y0])
+        self.size = np.array([axes.bbox.width, axes.bbox.height])
+        self.cells = np.zeros(np.maximum(self.size // _CELL, 1).astype(int) + 1)
+        corners = self.at(box_corners(axes))
+        self.low, self.high = corners.min(axis=0), corners.max(axis=0)
+
+    def at(self, points: Vector) -> Vector:
+        """Where points (k, 3) are, in pixels (k, 2) from the lower left corner of the axes."""
+        plane = projected(self.axes, np.atleast_2d(points)).T
+        return np.asarray(self.axes.transData.transform(plane) - self.start)
+
+    def cover(self, points: Vector, radius: float) -> None:
+        """Note that squares around points (k, 3) are covered; the radius is in points."""
+        reach = round(radius * self.pixels / _CELL) + 1
+        most = np.array(self.cells.shape) - 1
+        cells = (self.at(points) // _CELL).astype(int)
+        for shift in np.ndindex(2 * reach + 1, 2 * reach + 1):
+            at = np.clip(cells + shift - reach, 0, most)
+            self.cells[at[:, 0], at[:, 1]] = 1.0
+
+    def put(self, label: PlacedLabel) -> None:
+        """Put a label to the best place near its point, and note that this is covered."""
+        box = label.get_window_extent()
+        half = np.array([box.width, box.height]) / 2 + _GAP * self.pixels
+        anchor = self.at(label.point)[0]
+        angles = np.linspace(0, 2 * np.pi, _WAYS, endpoint=False)
+        places = [
+            self._place(anchor, np.array([np.cos(angle), np.sin(angle)]), distance, half)
+            for distance in _DISTANCES
+            for angle in angles
+        ]
+        best = min(places, key=lambda place: place.cost)
+        offset = (best.middle - anchor) / self.pixels
+        label.move(offset, with_line=best.distance > _LINED_FROM)
+        self._of(best.middle - half, best.middle + half)[:] = _COVERS_TEXT / _COVERS
+
+    def _place(self, anchor: Vector, way: Vector, distance: float, half: Vector) -> _TextPlace:
+        """A place in a direction (2,) from an anchor, for a text with a frame of this size."""
+        edge = 1 / max(np.abs(way) / half)  # from the middle of the text to its frame
+        middle = anchor + way * (distance * self.pixels + edge)
+        low, high = middle - half, middle + half
+        outside = np.maximum(self.low - low, 0) + np.maximum(high - self.high, 0)
+        cost = (
+            _COVERS * self._of(low, high).mean()
+            + _OUTSIDE * float(np.sum(outside / self.size))
+            + _FAR * distance
+        )
+        return _TextPlace(cost, distance, middle)
+
+    def _of(self, low: Vector, high: Vector) -> Vector:
+        """The cells of a box in pixels, those at the edge of the axes if it is outside."""
+        most = np.array(self.cells.shape)
+        first = np.clip((low // _CELL).astype(int), 0, most - 1)
+        last = np.clip((high // _CELL).astype(int) + 1, first + 1, most)
+        return self.cells[first[0] : last[0], first[1] : last[1]]

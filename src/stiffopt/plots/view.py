@@ -1,0 +1,100 @@
+"""From where an arm in axes in 3-D is looked at, and how it comes to fill them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import degrees, radians
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.errors import InputError, shown
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.units import finite_number, parse_quantity
+
+Vector = NDArray[np.float64]
+View = Sequence[float | str]
+"""Elevation and azimuth: numbers in rad, or text with a unit, such as ``"20 deg"``."""
+
+_ELEVATION = radians(14.0)
+_AZIMUTH = radians(-66.0)  # x to the right, y away from the eye
+_ASIDE, _BELOW, _ABOVE = 0.1, 0.09, 0.01  # room for the numbers at the axes, shares of the panel
+
+
+class ViewAngles(NamedTuple):
+    """A view of a standing or a hanging arm, in rad.
+
+    Attributes
+    ----------
+    elevation : of the eye above the horizontal through the arm, as the page shows it.
+    azimuth : of the eye about the z axis of the base, from the x axis.
+    hangs : whether z points down on the page.
+    """
+
+    elevation: float
+    azimuth: float
+    hangs: bool
+
+    @classmethod
+    def of(cls, robot: Manipulator, view: View | None = None) -> ViewAngles:
+        """The view that is asked for, or the one of all figures: x to the right.
+
+        Raises
+        ------
+        InputError
+            If the view is not two angles, or its elevation above 90 deg.
+        """
+        hangs = robot.description.gravity[2] > 0
+        if view is None:
+            return cls(_ELEVATION, -_AZIMUTH if hangs else _AZIMUTH, hangs)
+        if isinstance(view, str) or len(view) != 2:
+            raise InputError(
+                f"view: expected an elevation and an azimuth, such as ('20 deg', '-60 deg'); "
+                f"got {shown(view)}"
+            )
+        elevation, azimuth = (_angle(angle) for angle in view)
+        if abs(elevation) > radians(90.0):
+            raise InputError(f"view: the elevation is above 90 deg; got {degrees(elevation):g} deg")
+        return cls(elevation, azimuth, hangs)
+
+    def set(self, axes: Any) -> None:
+        """Look at axes like this."""
+        axes.view_init(
+            elev=degrees(-self.elevation if self.hangs else self.elevation),
+            azim=degrees(self.azimuth),
+            roll=180 if self.hangs else 0,
+        )
+
+
+def _angle(angle: float | str) -> float:
+    if isinstance(angle, str):
+        return parse_quantity(angle, "rad", "angle of a view")
+    return finite_number(angle)
+
+
+def fill_panel(axes: Any) -> None:
+    """Make the box of axes in 3-D, whose limits and view are set, as large as they allow.
+
+    matplotlib leaves so much room around it that no view cuts off a corner.
+    """
+    x, y = projected(axes, box_corners(axes))
+    side = max(np.ptp(x) / (1 - 2 * _ASIDE), np.ptp(y) / (1 - _BELOW - _ABOVE))
+    left = (x.min() + x.max() - side) / 2
+    below = (y.min() + y.max() - side * (1 + _BELOW - _ABOVE)) / 2
+    axes.viewLim.intervalx = (left, left + side)
+    axes.viewLim.intervaly = (below, below + side)
+    axes.stale = True
+
+
+def box_corners(axes: Any) -> Vector:
+    """Corners (8, 3) of the box of axes in 3-D."""
+    limits = axes.get_xlim(), axes.get_ylim(), axes.get_zlim()
+    return np.stack(np.meshgrid(*limits, indexing="ij"), axis=-1).reshape(8, 3)
+
+
+def projected(axes: Any, points: Vector) -> Vector:
+    """Points (k, 3) in the plane of the picture (2, k), in data units of that plane."""
+    from mpl_toolkits.mplot3d import proj3d
+
+    return np.asarray(proj3d.proj_transform(*points.T, axes.get_proj())[:2])
