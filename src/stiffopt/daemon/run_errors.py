@@ -26,13 +26,13 @@ class ErrorStatistics(NamedTuple):
     Attributes
     ----------
     mean, p95, largest : the mean, the 95th percentile and the largest.
-    count : number of ticks.
+    ticks : how many there are.
     """
 
     mean: float
     p95: float
     largest: float
-    count: int
+    ticks: int
 
     @classmethod
     def of(cls, errors: Array) -> ErrorStatistics | None:

@@ -25,6 +25,7 @@ _LINED_FROM = 15.0  # points: further away a line leads to the text
 _GAP = 2.0  # points, around a text
 _MARK = 8.0  # points, around the target
 _COVERS, _COVERS_TEXT, _OUTSIDE, _FAR = 60.0, 120.0, 40.0, 0.05  # costs, the last per point
+_CUT = 500.0  # what leaves the axes
 
 
 class PlacedLabel(Annotation):
@@ -141,6 +142,7 @@ class _CoveredCells:
         cost = (
             _COVERS * self._of(low, high).mean()
             + _OUTSIDE * float(np.sum(outside / self.size))
+            + _CUT * float(np.sum(np.maximum(-low, 0) + np.maximum(high - self.size, 0)) > 0)
             + _FAR * distance
         )
         return _TextPlace(cost, distance, middle)

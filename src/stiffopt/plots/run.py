@@ -249,7 +249,10 @@ def error_lines(run: RecordedRun, stages: RunStages | None = None) -> list[str]:
     lines = [f"on the way to a target:   {_errors_text(run, approach)}"] if approach.any() else []
     if hold.any():
         return [*lines, f"at a target:   {_errors_text(run, hold)}"]
-    return [*lines, f"no target was reached to {ARRIVED * MM:g} mm and {degrees(ARRIVED_ANGLE):g} deg"]
+    return [
+        *lines,
+        f"no target was reached to {ARRIVED * MM:g} mm and {degrees(ARRIVED_ANGLE):g} deg",
+    ]
 
 
 def _errors_text(run: RecordedRun, ticks: NDArray[np.bool_]) -> str:
