@@ -223,8 +223,8 @@ def test_errors_on_the_way_and_at_the_target_are_told_apart(run_file: Path) -> N
     held = ErrorStatistics.of(run.position_error[hold])
     assert held == pytest.approx(((499 * 2e-4 + 3e-3) / 500, 2e-4, 3e-3, 500))
     assert error_lines(run) == [
-        "on the way to a target:   error mean 6 mm, 95 % below 8 mm, at most 8 mm",
-        "at a target:   error mean 0.206 mm, 95 % below 0.2 mm, at most 3 mm",
+        "on the way to a target:   error mean 6, 95 % below 8, at most 8 mm",
+        "at a target:   error mean 0.206, 95 % below 0.2, at most 3 mm",
     ]
 
 
@@ -242,7 +242,7 @@ def test_a_target_that_moves_on_slowly_is_held(run_file: Path) -> None:
     assert ErrorStatistics.of(unknown) is None
     angle = {"position_error": unknown, "angle_error": np.where(run.time < 1, 0.1, 0.01)}
     turned = replace(run, fields={**run.fields, **angle})
-    assert error_lines(turned)[1].startswith("at a target:   error mean 0.573 deg")
+    assert error_lines(turned)[1].startswith("at a target:   error mean 0.573, ")
 
 
 def test_nothing_leaves_the_page(run_file: Path) -> None:

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 
 _MOST_LABELS = 15  # pressures with a number on their bar
+_NEAR_BOUND = 0.06  # of all pressures: from there a number stands above the limit
 _BOLD_NUMBER = 3.4  # times the size of its letters: the width of "1.234"
 _ELLIPSOID_SHARE = 0.22  # of the arm's length: its largest semi-axis
 _ARROW_SHARE = 0.22
@@ -190,9 +191,10 @@ def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) ->
     if len(values) <= _MOST_LABELS:
         wide = axes.bbox.width / axes.get_figure(root=True).dpi * 72 / (np.ptp(places) + 1.5)
         size = min(9.0, wide / _BOLD_NUMBER)
-        for place, value, colour in zip(places, values, colours, strict=True):
+        for place, value, bound, colour in zip(places, values, upper, colours, strict=True):
+            above = bound if 0 < bound - value < _NEAR_BOUND * top else value
             axes.text(
-                place, max(value, 0.0) + 0.012 * top, bar_text(value / BAR), ha="center",
+                place, max(above, 0.0) + 0.012 * top, bar_text(value / BAR), ha="center",
                 va="bottom", fontsize=size, weight="bold", zorder=4,
                 color=colour if colour == style.AT_LIMIT else "#20394f",
             )  # fmt: skip
