@@ -83,6 +83,8 @@ sphinx_gallery_conf = {
 
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
+autodoc_default_options = {"exclude-members": "model_config, model_post_init"}
+default_role = "code"  # what docstrings have in single backticks
 for _name in stiffopt.__all__:  # as users do: autodoc would import with typing.TYPE_CHECKING set
     getattr(stiffopt, _name)
 numpydoc_show_class_members = False

@@ -46,8 +46,6 @@ def patient_rig(folder: Path, name: str = "sim", **blocks: Any) -> Path:
     content["safety"] = {**content.get("safety", {}), **_PATIENT}
     content["service"] = {"port": 0, "foxglove_port": 0}
     content["log"] = {"folder": str(folder / "runs")}
-    if "plant" in content:  # without inertia, which takes most of the simulator's time
-        content["plant"] = {**content["plant"], "dynamics": "quasi-static"}
     for key, block in blocks.items():
         content[key] = {**(content.get(key) or {}), **block}
     path = folder / f"{name}-patient.yaml"

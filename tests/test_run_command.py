@@ -222,7 +222,6 @@ def test_the_lab_is_driven_over_its_protocols_and_vented_whatever_happens(
         tmp_path,
         "virtual-lab",
         supply={"timeout": "3 s", "watchdog": {"address": 0x1120, "timeout": "10 s"}},
-        plant={"dynamics": "quasi-static"},
     )
     text = shipped.read_text().replace("port: 0\n  scale", f"port: {port}\n  scale")
     assert str(port) in text

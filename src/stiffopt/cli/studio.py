@@ -11,7 +11,8 @@ Open a page in the browser in which a robot and a task are seen and changed by h
 
 FILE is a built-in robot, or a robot, task or scene file: drag the target and the arm follows, with
 its pressures and its stiffness. A path file, a motion (.csv of 'stiffopt plan') and a recording
-(.csv, .mcap) play. The page is for this machine, and only the address that is printed opens it.
+(.csv, .mcap) play. A rig file shows the arm of its running daemon, and only with the daemon's token
+commands it. The page is for this machine, and only the address that is printed opens it.
 Needs the extra 'studio'.
 """
 
@@ -42,6 +43,12 @@ def studio(
             "--map", metavar="MAP.zarr", help="Show a workspace map, coloured by stiffness."
         ),
     ] = None,
+    token_file: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE", help="With a RIG: the daemon's token, to command; or STIFFOPT_TOKEN."
+        ),
+    ] = None,
     host: Annotated[
         str, typer.Option(metavar="HOST", help="Where to listen; other machines reach others.")
     ] = "127.0.0.1",
@@ -55,4 +62,12 @@ def studio(
     """Open the studio."""
     from stiffopt.cli.studio_run import run  # here, so that --help waits for no numerics
 
-    run(file, robot=robot, map_file=map_file, host=host, port=port, browser=not no_browser)
+    run(
+        file,
+        robot=robot,
+        map_file=map_file,
+        token_file=token_file,
+        host=host,
+        port=port,
+        browser=not no_browser,
+    )

@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import webbrowser
 from contextlib import closing
+from pathlib import Path
 
 from stiffopt.cli.console import report_note, write_line
 from stiffopt.cli.exits import ENDING_SIGNALS, handled
 from stiffopt.daemon.secret import is_loopback
 from stiffopt.errors import require_package
 
+_TOKEN = "STIFFOPT_TOKEN"  # which `stiffopt.Client` reads too
+
 
 def run(
-    file: str, *, robot: str | None, map_file: str | None, host: str, port: int, browser: bool
+    file: str,
+    *,
+    robot: str | None,
+    map_file: str | None,
+    token_file: str | None,
+    host: str,
+    port: int,
+    browser: bool,
 ) -> None:
     """Show a file in the studio until a signal ends it."""
     require_package("viser", "studio")
     from stiffopt.studio.opening import open_studio
 
+    token = Path(token_file) if token_file else os.environ.get(_TOKEN) or None
     over = threading.Event()
-    with (
-        handled(dict.fromkeys(ENDING_SIGNALS, lambda number, frame: over.set())),
-        closing(open_studio(file, robot=robot, map_file=map_file, host=host, port=port)) as shown,
-    ):
+    shown = open_studio(file, robot=robot, map_file=map_file, token=token, host=host, port=port)
+    with handled(dict.fromkeys(ENDING_SIGNALS, lambda number, frame: over.set())), closing(shown):
         write_line(f"the studio is open at {shown.url}")
         write_line("Ctrl-C ends it")
         if not is_loopback(host):

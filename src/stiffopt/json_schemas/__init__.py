@@ -112,5 +112,5 @@ def _attributes(model: type[BaseModel]) -> dict[str, str]:
 def write_schema_files() -> None:
     """Write the files that ship with the package anew; `make schemas` does."""
     for kind in MODELS:
-        text = json.dumps(json_schema(kind), indent=1, ensure_ascii=False)
+        text = json.dumps(json_schema(kind), ensure_ascii=False, separators=(",", ":"))
         write_whole(schema_file(kind), f"{text}\n".encode())

@@ -60,8 +60,14 @@ class Design:
 
     @classmethod
     def of_robot(cls, name_or_path: str | os.PathLike[str]) -> Design:
-        """A robot with a task that it can do: its tip, bent by a few channels, stiff along x."""
-        description = load_description(name_or_path)
+        """A robot with a task that it can do, see `of_description`."""
+        return cls.of_description(
+            load_description(name_or_path), robot_path(os.fspath(name_or_path), "")
+        )
+
+    @classmethod
+    def of_description(cls, description: RobotDescription, name: str) -> Design:
+        """A robot and its name, with a task: its tip, bent by a few channels, stiff along x."""
         robot = load_robot(description)
         low, high = robot.pressure_min, robot.pressure_max
         pressures, channel = low.copy(), 0
@@ -73,7 +79,7 @@ class Design:
             target=Target(position=tuple(position.round(4).tolist())),
             stiffness=StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0))),
         )
-        return cls(description, task, robot_path(os.fspath(name_or_path), ""), description)
+        return cls(description, task, name, description)
 
     @classmethod
     def of_task(cls, task: Task) -> Design:

@@ -18,6 +18,7 @@ Floats = NDArray[np.float32]
 _STATIONS = 16  # of the tube, per segment
 _SPOKES = 20  # of the tube, around
 _SOLID = 0.72  # opacity, through which the ellipsoid is seen
+_GHOST = 1.04  # times the radius, so that a ghost is seen about an arm in the same place
 _ANGLES = np.linspace(0, 2 * np.pi, _SPOKES, endpoint=False)
 KEPT = ("#8e5bb5", "#2a8a57", "#c99a0b", "#b5547a", "#4aa7b5", "#6b7a3a")
 """Colours of answers that were kept, in turn."""
@@ -74,6 +75,7 @@ class ArmTube:
         opacity: float | None = None,
     ) -> None:
         self._meshes = []
+        self._width = 1.0 if colour is None else _GHOST
         faces = tube_faces(_STATIONS)
         flat = np.zeros((_STATIONS * _SPOKES + 1, 3), dtype=np.float32)
         for number in range(description.n_segments):
@@ -91,7 +93,7 @@ class ArmTube:
         poses = segment_poses(robot, pressures, _STATIONS)
         pairs = zip(self._meshes, robot.description.segments, poses, strict=True)
         for mesh, segment, mine in pairs:
-            mesh.vertices = tube_vertices(mine, segment.outer_radius)
+            mesh.vertices = tube_vertices(mine, self._width * segment.outer_radius)
         self.visible = True
 
     @property

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
 from pathlib import Path as FilePath
 from typing import Any
 
+from stiffopt.daemon.secret import is_loopback
 from stiffopt.errors import InputError
 from stiffopt.studio.cloud import check_map
 from stiffopt.studio.page import StudioPage
+from stiffopt.studio.rig_view import RigView
+from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.sources import design_of, kind_of, timeline_of
 from stiffopt.studio.task_view import TaskView
 from stiffopt.studio.timeline_view import TimelineView
@@ -43,6 +48,7 @@ def open_studio(
     *,
     robot: str | None = None,
     map_file: str | None = None,
+    token: str | os.PathLike[str] | None = None,
     host: str = "127.0.0.1",
     port: int = 0,
 ) -> OpenStudio:
@@ -56,6 +62,8 @@ def open_studio(
         For a file that names none, by default `stiffopt.studio.sources.ROBOT`.
     map_file :
         A workspace map to show with a robot, a task or a scene.
+    token :
+        For a rig: that of its daemon, or the file that it is in; without it the rig is only read.
     host, port :
         Where to listen, see `StudioPage`.
 
@@ -67,9 +75,11 @@ def open_studio(
         viser, or what reads the file, is not installed.
     """
     kind = kind_of(file)
+    if map_file is not None and kind not in ("robot", "task", "scene"):
+        raise InputError("--map: a map is shown with a robot, a task or a scene only")
+    if kind == "rig":
+        return _open_rig(file, token, host, port)
     if kind in ("path", "recording"):
-        if map_file is not None:
-            raise InputError("--map: a map is shown with a robot, a task or a scene only")
         timeline = timeline_of(file, robot)
         page = StudioPage(host, port, f"stiffopt studio: {FilePath(file).name}")
         return OpenStudio(page, TimelineView(page.server, timeline))
@@ -79,3 +89,17 @@ def open_studio(
         check_map(found, design.description)
     page = StudioPage(host, port, f"stiffopt studio: {design.description.name}")
     return OpenStudio(page, TaskView(page.server, Workbench(design), found))
+
+
+def _open_rig(file: str, token: str | os.PathLike[str] | None, host: str, port: int) -> OpenStudio:
+    """Show a rig; what commands it is for this machine alone."""
+    if token is not None and not is_loopback(host):
+        raise InputError(
+            f"--host: other machines can reach {host}; a studio that commands a rig listens on "
+            "127.0.0.1 only"
+        )
+    clients: list[Callable[[], Any]] = []
+    watch = RigWatch(file, token, lambda: any(connected() for connected in clients))
+    page = StudioPage(host, port, f"stiffopt studio: {FilePath(file).name}")
+    clients.append(page.server.get_clients)
+    return OpenStudio(page, RigView(page.server, watch))

@@ -23,7 +23,7 @@ from stiffopt.studio.timeline import Timeline
 
 ROBOT = "stiff-flop-2"
 """The robot where none is named."""
-_KINDS = ("robot", "task", "scene", "path")
+_KINDS = ("robot", "task", "scene", "path", "rig")
 _MOTION = "position_error_m"  # a column that logs have not
 
 

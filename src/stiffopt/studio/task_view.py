@@ -44,6 +44,7 @@ _ANGULAR: dict[str, Angular] = {
     "full orientation": "orientation",
 }
 _MAXIMISE, _LEAST, _FILE = "stiff along a direction", "least pressure", "as in the file"
+_PREVIEW = "Preview (violet): the arm does not move until you send it."
 _NO_MAP = "do not show"
 _GRAVITY = {
     "none": (0.0, 0.0, 0.0),
@@ -62,10 +63,20 @@ class TaskView:
     bench : Workbench
     found : WorkspaceMap, optional
         To show as a cloud; of the same arm.
+    is_preview : bool
+        Whether the arm is drawn as a ghost, before another one.
     """
 
-    def __init__(self, server: Any, bench: Workbench, found: WorkspaceMap | None = None) -> None:
+    def __init__(
+        self,
+        server: Any,
+        bench: Workbench,
+        found: WorkspaceMap | None = None,
+        *,
+        is_preview: bool = False,
+    ) -> None:
         self.server, self.bench, self._map = server, bench, found
+        self._is_preview = is_preview
         self._length = bench.design.description.length
         self._dragged: Any = None
         self._kept: list[ArmTube] = []
@@ -96,7 +107,8 @@ class TaskView:
     def _add_scene(self) -> None:
         scene, length = self.server.scene, self._length
         description = self.bench.design.description
-        self._arm = ArmTube(self.server, "/arm", description)
+        look = (style.ELLIPSOID, 0.25) if self._is_preview else (None, None)
+        self._arm = ArmTube(self.server, "/arm", description, *look)
         self._plain = ArmTube(self.server, "/plain", description, style.GREY, 0.3)
         self._ellipsoid = scene.add_icosphere(
             "/ellipsoid", radius=1.0, subdivisions=3, color=rgb(style.ELLIPSOID), opacity=0.3,
@@ -130,6 +142,8 @@ class TaskView:
         gui = self.server.gui
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.set_width(400)
+        if self._is_preview:
+            gui.add_html(texts.note_html(_PREVIEW))
         self._words = gui.add_html("")
         undo = gui.add_button("undo", hint="Take the last change back.")
         undo.on_click(self._undo)

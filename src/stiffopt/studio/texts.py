@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stiffopt.control.state import Event, Snapshot
 from stiffopt.files import file_text
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.scene import Scene
@@ -22,6 +23,7 @@ from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
 from stiffopt.plots.wording import BAR, MM, direction_text, figures, gain_text, limit_of, unit_text
 from stiffopt.studio.design import Design
+from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.timeline import Timeline
 from stiffopt.studio.workbench import StudioAnswer, Workbench
 
@@ -316,3 +318,60 @@ def moment_html(timeline: Timeline, time: float) -> str:
     bars = pressures_html(description, moment.pressures, low, high, at_limit.tolist())
     headline = f"<div style='font-size:0.9em;margin:2px 0 4px'>{escape(timeline.headline)}</div>"
     return _padded(headline + _table(rows) + bars)
+
+
+# -- rigs -----------------------------------------------------------------------------------------
+
+BALLS = {"estimated": style.DARK, "seen": style.MEASURED, "target": style.TARGET}
+"""Balls of a rig's view, and their colours."""
+_STATES = {"active": "#2a7f3f", "holding": "#b35c00", "fault": "#b00020"}
+
+
+def rig_html(watch: RigWatch) -> str:
+    """Return the state of a rig as the panel shows it."""
+    said = f"<div style='font-size:0.85em;color:#666'>{escape(watch.said)}</div>"
+    if not watch.may_command:
+        said = "<div style='font-size:0.85em;color:#666'>read only: no token was given</div>"
+    state = watch.state
+    if state is None:
+        return _padded(_headline("failed", watch.trouble) + said)
+    colour = _STATES.get(state.state, style.GREY)
+    headline = (
+        f"<div style='font-weight:700;font-size:1.15em;color:{colour}'>{escape(state.state)}</div>"
+        f"<div style='font-size:0.85em'>{escape(state.reason)}</div>"
+    )
+    description = watch.design.description
+    measured = np.where(np.isfinite(state.measured), state.measured, 0.0)
+    low, high = (np.where(np.isfinite(b), b, 0.0) for b in (state.low, state.high))
+    bars = pressures_html(
+        description, measured, low, np.maximum(high, low + 1.0), state.saturated.tolist(),
+        np.where(np.isfinite(state.commanded), state.commanded, 0.0), "commanded",
+    )  # fmt: skip
+    return _padded(headline + said + _table(_rig_rows(state)) + bars + _events(watch.events))
+
+
+def _rig_rows(state: Snapshot) -> Iterable[tuple[str, str]]:
+    yield "doing", escape(state.task or "nothing")
+    places = (
+        ("tip estimated", "estimated", state.tip_position),
+        ("tip seen", "seen", state.seen_position),
+        ("target", "target", state.target_position),
+    )
+    for name, ball, position in places:
+        if position is not None and np.isfinite(position).any():
+            dot = f"<span style='color:{BALLS[ball]}'>&#9679;</span>"
+            yield name, f"{dot} {position_text(position)} mm".replace("nan", "free")
+    if np.isfinite(state.position_error):
+        yield "error", f"{state.position_error * MM:.2f} mm"
+    if np.isfinite(state.stiffness):
+        unit = unit_text(state.stiffness_unit)
+        yield "stiffness", f"{figures(state.stiffness)} of {figures(state.best_stiffness)} {unit}"
+    for alarm in state.alarms:
+        yield "alarm", f"<span style='color:#b35c00'>{escape(alarm.text)}</span>"
+
+
+def _events(events: Iterable[Event]) -> str:
+    lines = "".join(
+        f"<div>{event.time:.1f} s: {escape(event.text)}</div>" for event in reversed([*events])
+    )
+    return f"<div style='font-size:0.8em;color:#666;margin-top:6px'>{lines}</div>"

@@ -1,0 +1,192 @@
+"""A rig as the studio sees it: its daemon's state and events, and what is asked of it.
+
+Nothing is commanded but by `stiffopt.Client`, with its token and its lease. Only venting has a
+second way: if the daemon does not answer, the guard is asked, as ``stiffopt vent`` does.
+
+Control is renewed by `RigWatch.poll`, as long as somebody looks: when no browser is connected, or
+the studio hangs, the daemon hears nothing, takes control back and holds the arm.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.state import Event, Snapshot
+from stiffopt.daemon.client import Client
+from stiffopt.daemon.secret import bracketed
+from stiffopt.errors import CommandError, InputError, StiffoptError
+from stiffopt.model.robot_files import load_description, robot_path
+from stiffopt.optimise.task import PressureRange
+from stiffopt.rig.config import limits_of, load_rig_description
+from stiffopt.safety.vent import vent_rig
+from stiffopt.studio.design import Design
+from stiffopt.studio.workbench import Workbench
+
+Vector = NDArray[np.float64]
+
+NAME = "studio"
+"""That other clients see."""
+_EVENTS = 6  # that are shown
+_QUICK = 2.0  # s after which the daemon does not answer; the guard is asked to vent then
+
+
+class RigWatch:
+    """A running daemon, read and, with its token, commanded.
+
+    Parameters
+    ----------
+    file :
+        The rig file.
+    token :
+        The token or its file; None: only read.
+    is_watched :
+        Says whether somebody looks; else control is not renewed.
+
+    Attributes
+    ----------
+    design : the rig's robot, its scene and its limits, for a preview.
+    state : the latest state, or None.
+    events : the latest events, the newest last.
+    trouble : why there is no state, or an empty text.
+    said : what became of the last command.
+    """
+
+    def __init__(
+        self,
+        file: str | os.PathLike[str],
+        token: str | os.PathLike[str] | None = None,
+        is_watched: Callable[[], bool] = lambda: True,
+    ) -> None:
+        rig = load_rig_description(file)
+        if not rig.service.port:
+            raise InputError(f"{file}: service.port is 0, so that nobody knows where to ask")
+        self._file, self._is_watched = file, is_watched
+        robot = load_description(rig.robot, base=Path(file).parent)
+        design = Design.of_description(robot, robot_path(rig.robot, Path(file).parent))
+        self.design = design.with_task(
+            scene=rig.scene, pressure=PressureRange(max=tuple(limits_of(rig, robot).high.tolist()))
+        )
+        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(rig.service.host, rig.service.host)
+        url = f"http://{bracketed(host)}:{rig.service.port}"
+        self.may_command = token is not None
+        given = "" if token is None else token  # empty: nor that of the environment
+        self._client = Client(url, given, name=NAME, heartbeat="manual")
+        self._quick = Client(url, given, name=NAME, heartbeat="manual", timeout=_QUICK)
+        self.state: Snapshot | None = None
+        self.events: deque[Event] = deque(maxlen=_EVENTS)
+        self.trouble, self.said = "asking the daemon ...", ""
+        self._next = 0
+        self._is_known = False
+        self._lock = threading.Lock()  # one command at a time; venting waits for none
+
+    def close(self) -> None:
+        """Give control back, if the studio has it; the arm goes on with what it does."""
+        for client in (self._client, self._quick):
+            with suppress(StiffoptError):
+                client.close()
+
+    @property
+    def in_control(self) -> bool:
+        """Whether the studio has control of the arm."""
+        return self._client.in_control
+
+    def poll(self) -> None:
+        """Read the state and what has happened; keep control while somebody looks."""
+        try:
+            if not self._is_known:
+                self._check_robot()
+            if self.in_control and self._is_watched():
+                self._client.renew()
+            self.state = self._quick.state()
+            events, self._next = self._quick.events(self._next)
+            self.events.extend(events)
+            self.trouble = ""
+        except CommandError as error:
+            self.said = str(error)  # control was lost
+        except StiffoptError as error:
+            self.state, self.trouble = None, str(error)
+
+    def _check_robot(self) -> None:
+        report, own = self._quick.robot(), self.design.description
+        if (report.name, report.n) != (own.name, own.n_pressures):
+            raise InputError(f"the daemon has the robot '{report.name}', not '{own.name}'")
+        self._is_known = True
+
+    # -- commands -----------------------------------------------------------------------------
+
+    def take_control(self) -> None:
+        """Take control of the arm, see `Client.take_control`."""
+        self._do("you have control", self._client.take_control)
+
+    def release(self) -> None:
+        """Give control back; the arm goes on with what it does."""
+        self._do("control is given back", self._client.release)
+
+    def arm(self) -> None:
+        """Check everything and steer from now on."""
+        self._do("armed", self._client.arm)
+
+    def hold(self) -> None:
+        """Keep the pressures as they are."""
+        self._do("held", lambda: self._client.hold("asked for in the studio"))
+
+    def disarm(self) -> None:
+        """Let the pressures down slowly, then vent."""
+        self._do("let down", self._client.disarm)
+
+    def reset(self) -> None:
+        """Leave the state fault; the arm stays vented."""
+        self._do("reset", self._client.reset)
+
+    def go(self, bench: Workbench) -> None:
+        """Pursue the task of the preview, if its answer is there and holds."""
+        answer, design = bench.answer, bench.design
+        if design.has_own_robot:
+            self.said = "not sent: gravity or tip mass of the preview are not those of the rig"
+        elif answer is None or answer.design != design or bench.trouble:
+            self.said = "not sent: wait until the preview is solved"
+        elif not answer.solution.found:
+            self.said = f"not sent: the preview is {answer.solution.status}"
+        else:
+            task = design.task.model_copy(update={"robot": None, "scene": None, "source": None})
+            self._do("going to the target", lambda: self._client.set_task(task))
+
+    def vent(self) -> None:
+        """Let all pressure out at once: by the daemon, and by the guard if that does not answer."""
+        if not self.may_command:
+            self.said = "venting needs the token; 'stiffopt vent RIG' needs none"
+            return
+        try:
+            self._quick.vent()
+            self.said = "vented"
+        except StiffoptError as error:
+            self.said = f"the daemon did not vent ({error}); asking the guard ..."
+            try:
+                self.said = vent_rig(self._file)
+            except StiffoptError as failed:
+                self.said = f"THE ARM MAY BE UNDER PRESSURE: {failed}"
+
+    def _do(self, done: str, command: Callable[[], None]) -> None:
+        if not self.may_command:
+            self.said = "this needs the token: start the studio with --token-file"
+            return
+        with self._lock:
+            try:
+                command()
+                self.said = done
+            except StiffoptError as error:
+                self.said = str(error)
+
+
+def pressures_now(state: Snapshot) -> Vector | None:
+    """Return measured pressures (n,) in Pa, commanded ones where none are known; None: neither."""
+    found = np.where(np.isfinite(state.measured), state.measured, state.commanded)
+    return found if np.isfinite(found).all() else None
