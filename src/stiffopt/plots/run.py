@@ -261,7 +261,8 @@ def _errors_text(run: RecordedRun, ticks: NDArray[np.bool_]) -> str:
         (ErrorStatistics.of(np.degrees(run.angle_error[ticks])), "deg"),
     )
     return "      ".join(
-        f"error mean {found.mean:.3g}, 95 % below {found.p95:.3g}, at most {found.largest:.3g} {unit}"
+        f"error mean {found.mean:.3g}, 95 % below {found.p95:.3g}, "
+        f"at most {found.largest:.3g} {unit}"
         for found, unit in known
         if found is not None
     )

@@ -19,7 +19,7 @@ View = Sequence[float | str]
 
 _ELEVATION = radians(14.0)
 _AZIMUTH = radians(-66.0)  # x to the right, y away from the eye
-_ASIDE, _BELOW, _ABOVE = 36.0, 37.0, 4.0  # points, for the numbers at the axes
+_ASIDE, _BELOW, _ABOVE = 40.0, 37.0, 4.0  # points, for the numbers at the axes
 
 
 class ViewAngles(NamedTuple):
