@@ -14,8 +14,10 @@ import pytest
 from made_runs import BEGIN, PERIOD, FakeLoop, N, event, samples_between, snapshot, ticks, tip_at
 from stiffopt.cli.main import main
 from stiffopt.control.state import Alarm, Severity, State
-from stiffopt.daemon.run_log import RecordedRun, read_run
+from stiffopt.daemon.run_errors import ErrorStatistics, RunStages
+from stiffopt.daemon.run_log import RecordedRun, RunSpan, read_run
 from stiffopt.logs import LogLayout, LogRow, McapLogWriter, read_log
+from stiffopt.plots.run import error_lines
 from test_telemetry import recorded
 
 pytest.importorskip("foxglove")
@@ -193,6 +195,54 @@ def test_the_page_shows_what_happened(run_file: Path) -> None:
     assert "a rig" in texts
     assert "The arm is armed." in texts
     assert r"The tracker sees nothing: \$x\$ [1]." in texts
+
+
+def stepped(run: RecordedRun) -> RecordedRun:
+    """A run of 10 s: two targets, of which the first is reached after 1 s, and a pause."""
+    time = np.arange(1000) * 0.01
+    target = np.tile([0.02, np.nan, 0.19], (1000, 1))
+    target[600:, 0] += 0.01
+    error = np.full(1000, 8e-3)
+    error[100:600] = 2e-4
+    error[200] = 3e-3  # pushed: it is held all the same
+    error[600:] = 5e-3
+    nothing = np.full((1000, 4), np.nan)
+    fields = {
+        "position_error": error, "angle_error": np.full(1000, np.nan), "target_position": target,
+        "target_pointing": nothing[:, :3], "target_quaternion": nothing,
+    }  # fmt: skip
+    states = (RunSpan(0.0, 8.0, "active", ""), RunSpan(8.0, 10.0, "holding", ""))
+    return replace(run, time=time, fields=fields, states=states)
+
+
+def test_errors_on_the_way_and_at_the_target_are_told_apart(run_file: Path) -> None:
+    run = stepped(read_run(run_file))
+    approach, hold = RunStages.of(run)
+    assert np.flatnonzero(hold).tolist() == list(range(100, 600))
+    assert np.flatnonzero(approach).tolist() == [*range(100), *range(600, 800)]
+    held = ErrorStatistics.of(run.position_error[hold])
+    assert held == pytest.approx(((499 * 2e-4 + 3e-3) / 500, 2e-4, 3e-3, 500))
+    assert error_lines(run) == [
+        "on the way to a target:   error mean 6, 95 % below 8, at most 8 mm",
+        "at a target:   error mean 0.206, 95 % below 0.2, at most 3 mm",
+    ]
+
+
+def test_a_target_that_moves_on_slowly_is_held(run_file: Path) -> None:
+    run = stepped(read_run(run_file))
+    moving = np.tile([0.02, np.nan, 0.19], (1000, 1))
+    moving[:, 0] += np.linspace(0, 0.03, 1000)  # 3 mm/s
+    run = replace(run, fields={**run.fields, "target_position": moving})
+    assert np.flatnonzero(RunStages.of(run).hold).tolist() == list(range(100, 800))
+    far = replace(run, fields={**run.fields, "position_error": np.full(1000, 4e-3)})
+    assert error_lines(far)[1] == "no target was reached to 1 mm and 1 deg"
+    unknown = np.full(1000, np.nan)
+    none = replace(run, fields={**run.fields, "position_error": unknown})
+    assert error_lines(none) == ["no target was set"]
+    assert ErrorStatistics.of(unknown) is None
+    angle = {"position_error": unknown, "angle_error": np.where(run.time < 1, 0.1, 0.01)}
+    turned = replace(run, fields={**run.fields, **angle})
+    assert error_lines(turned)[1].startswith("at a target:   error mean 0.573, ")
 
 
 def test_nothing_leaves_the_page(run_file: Path) -> None:

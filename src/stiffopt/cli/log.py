@@ -40,6 +40,9 @@ Examples:
 PLOT_HELP = """\
 Draw a run on a page: target and tip, error, pressures, stiffness, states, alarms and events.
 
+Errors are told apart on the way to a target, and at it: from when the tip first is within 1 mm and
+1 deg.
+
 RUN is a recording (.mcap) of 'stiffopt run', whole or cut short.
 """
 
@@ -104,7 +107,7 @@ def plot(
     with interruptible() as check:
         from stiffopt.daemon.run_log import read_run
         from stiffopt.plots import save_figure
-        from stiffopt.plots.run import plot_run
+        from stiffopt.plots.run import error_lines, plot_run
 
         path = str(Path(run).with_suffix(".png")) if out is None else out
         check_picture(path)
@@ -114,4 +117,6 @@ def plot(
         save_figure(plot_run(recorded), path)
         check()
     if not quiet:
+        for line in error_lines(recorded):
+            write_line(line)
         write_line(path)

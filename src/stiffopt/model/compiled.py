@@ -112,6 +112,7 @@ _begun: dict[tuple[Path, str], float] = {}  # when a process was started to make
 _BEGUN_AGAIN_AFTER = 30.0  # s: such a process takes a second to start before it takes the lock
 _notified: set[str] = set()
 _in_foreground: ContextVar[bool] = ContextVar("in_foreground", default=False)
+_only_cached: ContextVar[bool] = ContextVar("only_cached", default=False)
 _watch: ContextVar[Callable[[], None] | None] = ContextVar("watch", default=None)
 
 
@@ -130,6 +131,16 @@ def compiling_at_once() -> Iterator[None]:
         yield
     finally:
         _in_foreground.reset(token)
+
+
+@contextmanager
+def compiling_nothing() -> Iterator[None]:
+    """While this context lasts, `library` only looks into the cache."""
+    token = _only_cached.set(True)
+    try:
+        yield
+    finally:
+        _only_cached.reset(token)
 
 
 @contextmanager
@@ -198,6 +209,7 @@ def library(
         `SlowWarning` says why.
     """
     text = content if isinstance(content, str) else repr(tuple(content))
+    build_missing = build_missing and not _only_cached.get()
     wanted = _Wanted(text, make, tuple(sources), daqp)
     request = (text, wanted.sources, daqp, *map(os.environ.get, _ENVIRONMENT))
     with _lock:

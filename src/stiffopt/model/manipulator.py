@@ -29,6 +29,7 @@ from stiffopt.model.scene import Scene
 from stiffopt.model.screws import Twist, Wrench, checked_wrench
 from stiffopt.model.shape import Shape, stiffness_along
 from stiffopt.model.uncertainty import TipUncertainty, Uncertainty
+from stiffopt.notebook import ShownInNotebook
 
 Vector = NDArray[np.float64]
 Method = Literal["equilibrium", "first-order", "elementwise"]
@@ -36,7 +37,7 @@ Method = Literal["equilibrium", "first-order", "elementwise"]
 _ELEMENTS_PER_SEGMENT = 64  # of eq. 19
 
 
-class Manipulator(Arm):
+class Manipulator(Arm, ShownInNotebook):
     """An arm as functions of its channel pressures, in SI units.
 
     Pressures p are (n,) or, for a batch, (N, n) gauge pressures in Pa, proximal segment first;

@@ -15,6 +15,7 @@ from stiffopt.errors import DerivativeError
 from stiffopt.model.arm import Evaluator
 from stiffopt.model.arm_clearance import Clearances
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.notebook import ShownInNotebook
 from stiffopt.optimise.functions import functions
 from stiffopt.optimise.obstacles import CLEARANCE_OF
 from stiffopt.optimise.program import Program
@@ -138,7 +139,7 @@ class Explanation(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PressureSolution:
+class PressureSolution(ShownInNotebook):
     """Answer to a task.  Errors and stiffness are computed from the model at `pressures`.
 
     Attributes

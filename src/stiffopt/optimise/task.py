@@ -25,6 +25,7 @@ from stiffopt.files import SourceFile, line_of, read_file
 from stiffopt.model.description import RobotDescription, one_or_list
 from stiffopt.model.robot_files import load_description
 from stiffopt.model.scene import SceneOrFile
+from stiffopt.notebook import ShownInNotebook
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.schema import BadKeyError, Items, Schema, Vector
@@ -71,7 +72,7 @@ def _robot_name(value: Any, info: ValidationInfo) -> Any:
     return os.fspath(value) if isinstance(value, Path) else value
 
 
-class ForRobot(Schema):
+class ForRobot(Schema, ShownInNotebook):
     """What tasks and paths have in common: the robot, its load and limits, and what is around it.
 
     Attributes

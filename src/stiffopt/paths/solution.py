@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.notebook import ShownInNotebook
 from stiffopt.optimise.target import Target
 from stiffopt.paths.trajectory import (
     CLOSEST,
@@ -24,7 +25,7 @@ Status = Literal["solved", "unreachable", "failed"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PathSolution:
+class PathSolution(ShownInNotebook):
     """Pressures over time; between two times they are interpolated linearly.
 
     Errors, stiffness and clearance are computed from the model at `pressures`.

@@ -7,6 +7,7 @@ names begin with ``draw_`` draw into axes that the caller gives.
 
 from stiffopt.plots.arm import draw_arm
 from stiffopt.plots.path import (
+    draw_asked_path,
     draw_clearance_along,
     draw_path,
     draw_pressures_along,
@@ -18,6 +19,7 @@ from stiffopt.plots.solution import (
     draw_pareto,
     draw_pressures,
     draw_solution,
+    draw_task,
     plot_pareto,
     plot_solution,
 )
@@ -25,6 +27,7 @@ from stiffopt.plots.style import require_matplotlib, save_figure
 
 __all__ = [
     "draw_arm",
+    "draw_asked_path",
     "draw_clearance_along",
     "draw_pareto",
     "draw_path",
@@ -32,6 +35,7 @@ __all__ = [
     "draw_pressures_along",
     "draw_solution",
     "draw_stiffness_along",
+    "draw_task",
     "plot_motion",
     "plot_pareto",
     "plot_path",

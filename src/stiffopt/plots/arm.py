@@ -218,8 +218,9 @@ class ArmDrawing:
             axis = getattr(self.axes, f"{name}axis")
             prune = None if name == "z" else "both"  # two axes meet in a corner
             axis.set_major_locator(MaxNLocator(max(3, round(7 * side / sides.max())), prune=prune))
-            axis.labelpad = 3 if name == "z" else -2
+            axis.labelpad = 8 if name == "z" else -2
         self.axes.tick_params(labelsize=8, pad=0)
+        self.axes.tick_params(axis="z", pad=3)
         self.axes.set_box_aspect(sides)
         self.axes.patch.set_visible(False)
         ViewAngles.of(self.robot, view).set(self.axes)

@@ -23,8 +23,10 @@ _WAYS = 24  # directions in which a place is looked for
 _DISTANCES = (7.0, 12.0, 19.0, 28.0, 40.0, 55.0, 75.0, 100.0)  # points, from what is labelled
 _LINED_FROM = 15.0  # points: further away a line leads to the text
 _GAP = 2.0  # points, around a text
+_NUMBERS = 10.0  # points, of the numbers at an axis within the box
 _MARK = 8.0  # points, around the target
 _COVERS, _COVERS_TEXT, _OUTSIDE, _FAR = 60.0, 120.0, 40.0, 0.05  # costs, the last per point
+_CUT = 500.0  # what leaves the axes
 
 
 class PlacedLabel(Annotation):
@@ -100,7 +102,8 @@ class _CoveredCells:
         self.size = np.array([axes.bbox.width, axes.bbox.height])
         self.cells = np.zeros(np.maximum(self.size // _CELL, 1).astype(int) + 1)
         corners = self.at(box_corners(axes))
-        self.low, self.high = corners.min(axis=0), corners.max(axis=0)
+        edge = np.array([_NUMBERS * self.pixels, 0.0])
+        self.low, self.high = corners.min(axis=0) + edge, corners.max(axis=0) - edge
 
     def at(self, points: Vector) -> Vector:
         """Where points (k, 3) are, in pixels (k, 2) from the lower left corner of the axes."""
@@ -141,6 +144,7 @@ class _CoveredCells:
         cost = (
             _COVERS * self._of(low, high).mean()
             + _OUTSIDE * float(np.sum(outside / self.size))
+            + _CUT * float(np.sum(np.maximum(-low, 0) + np.maximum(high - self.size, 0)) > 0)
             + _FAR * distance
         )
         return _TextPlace(cost, distance, middle)

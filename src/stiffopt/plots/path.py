@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
+from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
@@ -201,10 +202,7 @@ def draw_path(
     drawing.explain_segments()
     tips = solution.tip_poses[:, :3, 3].T * MM
     if path is not None:
-        asked = path.points().positions * MM
-        axes.plot(*asked.T, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
-        drawing.add_line(style.TARGET, "path that is asked for", ":")
-        drawing.corners.append(asked)
+        _draw_asked(drawing, path)
     axes.plot(*tips, color=style.DARK, linewidth=2.2, zorder=8)
     drawing.add_line(style.DARK, "tip")
     drawing.add_body(tips.T)
@@ -222,6 +220,47 @@ def draw_path(
     if scene is not None:
         drawing.draw_objects(scene)
     return drawing.finish(view)
+
+
+def draw_asked_path(
+    axes: Any, robot: Manipulator, path: Path, *, view: View | None = None
+) -> list[Any]:
+    """Draw a path that is asked for, and the arm at its least pressures.
+
+    Parameters
+    ----------
+    axes :
+        In 3-D, as for `draw_arm`.
+    robot : Manipulator
+    path : Path
+    view : (elevation, azimuth), optional
+        See `draw_arm`.
+
+    Returns
+    -------
+    list
+        Handles for a legend.
+
+    Raises
+    ------
+    InputError
+        If the view cannot be had.
+    """
+    drawing = ArmDrawing(axes, robot)
+    drawing.draw_base()
+    drawing.draw_tube(robot.pressure_min)
+    drawing.explain_segments()
+    _draw_asked(drawing, path)
+    if path.scene is not None:
+        drawing.draw_objects(path.scene)
+    return drawing.finish(view)
+
+
+def _draw_asked(drawing: ArmDrawing, path: Path) -> None:
+    asked = path.points().positions * MM
+    drawing.axes.plot(*asked.T, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
+    drawing.add_line(style.TARGET, "path that is asked for", ":")
+    drawing.corners.append(asked)
 
 
 def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) -> None:
@@ -366,6 +405,6 @@ def _legend(axes: Any) -> None:
     order = sorted(range(len(labels)), key=lambda k: labels[k] == "at its rate")
     axes.legend(
         [handles[k] for k in order], [labels[k] for k in order], loc="lower right",
-        bbox_to_anchor=(1.0, 0.97), ncols=len(labels),
+        bbox_to_anchor=(1.0, 1.0), ncols=len(labels),
         fontsize=8, frameon=False, columnspacing=1.2, handlelength=1.4, borderaxespad=0.0,
     )  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from math import degrees
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.state import Event
+from stiffopt.daemon.run_errors import ARRIVED, ARRIVED_ANGLE, ErrorStatistics, RunStages
 from stiffopt.daemon.run_log import RecordedRun, RunSpan
 from stiffopt.errors import printable
 from stiffopt.plots.style import (
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _WIDE = 11.5  # inches
-_HEAD = 1.3
+_HEAD = 1.82  # title and four lines
 _PANEL, _GAP, _ROW, _LINE = 1.35, 0.16, 0.24, 0.2
 _FOOT = 0.62
 _MOST_EVENTS = 14  # in the list
@@ -71,7 +73,8 @@ def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
     rest = iter(panels)
     for axis in range(3):
         _draw_tip(next(rest), run, axis)
-    _draw_error(next(rest), run)
+    stages = RunStages.of(run)
+    _draw_error(next(rest), run, stages)
     if angles:
         _draw_angle(next(rest), run)
     first = 0
@@ -87,7 +90,10 @@ def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
     for axes in panels[:-1]:
         axes.yaxis.set_label_coords(-0.062, 0.5)
     _list_events(figure, listed, below)
-    draw_head(figure, title or run.about.get("rig", "run"), _what(run), _figures(run))
+    draw_head(
+        figure, title or run.about.get("rig", "run"), _what(run), *error_lines(run, stages),
+        *_stiffness_line(run, stages),
+    )  # fmt: skip
     return figure
 
 
@@ -116,9 +122,11 @@ def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
     legend_beside(axes)
 
 
-def _draw_error(axes: Any, run: RecordedRun) -> None:
+def _draw_error(axes: Any, run: RecordedRun, stages: RunStages) -> None:
     error = np.maximum(run.position_error, _FLOOR) * MM
-    axes.plot(*thinned(run.time, error), color=DARK, linewidth=1.2, label="position")
+    look = {"color": DARK, "linewidth": 1.2}
+    axes.plot(*thinned(run.time, error), **{**look, "alpha": 0.35}, label="approaching")
+    axes.plot(*thinned(run.time, np.where(stages.hold, error, np.nan)), **look, label="holding")
     axes.set_ylabel("error (mm)")
     known = error[np.isfinite(error)]
     if len(known):
@@ -233,21 +241,39 @@ def _what(run: RecordedRun) -> str:
     return "      ".join(parts)
 
 
-def _figures(run: RecordedRun) -> str:
-    """Median errors and stiffness while the loop was active."""
-    active = np.zeros(len(run), dtype=bool)
-    for span in run.states:
-        if span.kind == "active":
-            active |= (run.time >= span.begin) & (run.time < span.end)
-    parts = []
-    error = run.position_error[active & np.isfinite(run.position_error)] * MM
-    if len(error):
-        low, middle, high = np.quantile(error, (0.05, 0.5, 0.95))
-        parts.append(f"error: median {middle:.3g} mm, 90 % within {low:.3g} to {high:.3g} mm")
-    share = (run.stiffness / run.best_stiffness)[active]
-    if np.isfinite(share).any():
-        parts.append(f"stiffness: median {100 * np.nanmedian(share):.0f} % of the plan's")
-    return f"while active:   {'      '.join(parts)}" if parts else "no target was set"
+def error_lines(run: RecordedRun, stages: RunStages | None = None) -> list[str]:
+    """Return in words how far the tip was from its targets, on its way to them and at them."""
+    approach, hold = stages or RunStages.of(run)
+    if not (approach | hold).any():
+        return ["no target was set"]
+    lines = [f"on the way to a target:   {_errors_text(run, approach)}"] if approach.any() else []
+    if hold.any():
+        return [*lines, f"at a target:   {_errors_text(run, hold)}"]
+    return [
+        *lines,
+        f"no target was reached to {ARRIVED * MM:g} mm and {degrees(ARRIVED_ANGLE):g} deg",
+    ]
+
+
+def _errors_text(run: RecordedRun, ticks: NDArray[np.bool_]) -> str:
+    known = (
+        (ErrorStatistics.of(run.position_error[ticks] * MM), "mm"),
+        (ErrorStatistics.of(np.degrees(run.angle_error[ticks])), "deg"),
+    )
+    return "      ".join(
+        f"error mean {found.mean:.3g}, 95 % below {found.p95:.3g}, "
+        f"at most {found.largest:.3g} {unit}"
+        for found, unit in known
+        if found is not None
+    )
+
+
+def _stiffness_line(run: RecordedRun, stages: RunStages) -> list[str]:
+    """Median stiffness while the loop had a target."""
+    share = (run.stiffness / run.best_stiffness)[stages.approach | stages.hold]
+    if not np.isfinite(share).any():
+        return []
+    return [f"stiffness: median {100 * np.nanmedian(share):.0f} % of the plan's"]
 
 
 # -- states, alarms and events over time ----------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from math import degrees
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.task import Task
 from stiffopt.plots import style
 from stiffopt.plots.arm import ArmDrawing
 from stiffopt.plots.shapes import StiffnessEllipsoid
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 
 _MOST_LABELS = 15  # pressures with a number on their bar
+_NEAR_BOUND = 0.06  # of all pressures: from there a number stands above the limit
+_BOLD_NUMBER = 3.4  # times the size of its letters: the width of "1.234"
 _ELLIPSOID_SHARE = 0.22  # of the arm's length: its largest semi-axis
 _ARROW_SHARE = 0.22
 
@@ -185,10 +189,13 @@ def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) ->
     axes.bar(places, values, width=0.62, color=colours, zorder=3)
     top = max(upper.max(), 0.0) - min(lower.min(), 0.0)
     if len(values) <= _MOST_LABELS:
-        for place, value, colour in zip(places, values, colours, strict=True):
+        wide = axes.bbox.width / axes.get_figure(root=True).dpi * 72 / (np.ptp(places) + 1.5)
+        size = min(9.0, wide / _BOLD_NUMBER)
+        for place, value, bound, colour in zip(places, values, upper, colours, strict=True):
+            above = bound if 0 < bound - value < _NEAR_BOUND * top else value
             axes.text(
-                place, max(value, 0.0) + 0.012 * top, bar_text(value / BAR), ha="center",
-                va="bottom", fontsize=9 if len(values) < 10 else 6.5, weight="bold", zorder=4,
+                place, max(above, 0.0) + 0.012 * top, bar_text(value / BAR), ha="center",
+                va="bottom", fontsize=size, weight="bold", zorder=4,
                 color=colour if colour == style.AT_LIMIT else "#20394f",
             )  # fmt: skip
     _label_channels(axes, robot, places)
@@ -314,8 +321,7 @@ def draw_solution(
         If the solution has no pressures, or the view cannot be had.
     """
     _require_pressures(solution)
-    load = solution.task.load
-    arm = robot.with_load(load.force, load.moment, load.frame) if load else robot
+    arm = _loaded(robot, solution.task)
     drawing = _Drawing(axes, arm, solution)
     drawing.draw_base()
     drawing.draw_tube(np.asarray(solution.pressures))
@@ -328,6 +334,48 @@ def draw_solution(
     if scene is not None:
         drawing.draw_objects(scene)
     return drawing.finish(view)
+
+
+def draw_task(axes: Any, robot: Manipulator, task: Task, *, view: View | None = None) -> list[Any]:
+    """Draw a task in space: the arm at its least pressures, and what is asked of it.
+
+    Parameters
+    ----------
+    axes :
+        In 3-D, as for `draw_arm`.
+    robot : Manipulator
+        The arm; the load of the task is put on it.
+    task : Task
+    view : (elevation, azimuth), optional
+        See `draw_arm`.
+
+    Returns
+    -------
+    list
+        Handles for a legend.
+
+    Raises
+    ------
+    InputError
+        If the view cannot be had.
+    """
+    arm = _loaded(robot, task)
+    start = arm.pressure_min
+    drawing = _Drawing(axes, arm, PressureSolution("failed", "", task, start, arm.tip_pose(start)))
+    drawing.draw_base()
+    drawing.draw_tube(start)
+    drawing.explain_segments()
+    drawing.draw_directions()
+    drawing.draw_target()
+    drawing.draw_loads()
+    if task.scene is not None:
+        drawing.draw_objects(task.scene)
+    return drawing.finish(view)
+
+
+def _loaded(robot: Manipulator, task: Task) -> Manipulator:
+    load = task.load
+    return robot.with_load(load.force, load.moment, load.frame) if load else robot
 
 
 def _require_pressures(solution: PressureSolution) -> None:
@@ -379,7 +427,7 @@ class _Drawing(ArmDrawing):
 
     def draw_directions(self) -> None:
         """An arrow along each direction whose stiffness the task names."""
-        pairs = zip(self.solution.task.measures, self.solution.stiffnesses, strict=False)
+        pairs = zip_longest(self.solution.task.measures, self.solution.stiffnesses)
         for number, (measure, value) in enumerate(pairs):
             if not isinstance(measure, StiffnessMeasure):
                 continue
@@ -388,13 +436,10 @@ class _Drawing(ArmDrawing):
             way = self.rotation @ way if measure.frame == "tip" else way
             arrow = way * _ARROW_SHARE * self.size
             self.draw_arrow(self.tip, arrow, shade, 9)
-            named = f"{figures(value)} {unit_text(measure.unit)}\n{short_direction(measure)}"
-            self.add_label(self.tip + arrow, named, shade)
-            self.add_line(
-                shade,
-                f"{figures(value)} {unit_text(measure.unit)}\n{direction_text(measure)}\n"
-                f"{measure.frame} axes, {measure.boundary}",
-            )
+            amount = "" if value is None else f"{figures(value)} {unit_text(measure.unit)}\n"
+            self.add_label(self.tip + arrow, f"{amount}{short_direction(measure)}", shade)
+            words = f"{direction_text(measure)}\n{measure.frame} axes, {measure.boundary}"
+            self.add_line(shade, f"{amount}{words}")
 
     # -- target and loads -------------------------------------------------------------------
 

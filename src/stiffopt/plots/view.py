@@ -19,7 +19,7 @@ View = Sequence[float | str]
 
 _ELEVATION = radians(14.0)
 _AZIMUTH = radians(-66.0)  # x to the right, y away from the eye
-_ASIDE, _BELOW, _ABOVE = 0.1, 0.09, 0.01  # room for the numbers at the axes, shares of the panel
+_ASIDE, _BELOW, _ABOVE = 40.0, 37.0, 4.0  # points, for the numbers at the axes
 
 
 class ViewAngles(NamedTuple):
@@ -79,11 +79,14 @@ def fill_panel(axes: Any) -> None:
     matplotlib leaves so much room around it that no view cuts off a corner.
     """
     x, y = projected(axes, box_corners(axes))
-    side = max(np.ptp(x) / (1 - 2 * _ASIDE), np.ptp(y) / (1 - _BELOW - _ABOVE))
+    axes.apply_aspect()
+    size = axes.bbox.width / axes.get_figure(root=True).dpi * 72  # points
+    aside, below, above = (min(share / size, 0.3) for share in (_ASIDE, _BELOW, _ABOVE))
+    side = max(np.ptp(x) / (1 - 2 * aside), np.ptp(y) / (1 - below - above))
     left = (x.min() + x.max() - side) / 2
-    below = (y.min() + y.max() - side * (1 + _BELOW - _ABOVE)) / 2
+    low = (y.min() + y.max() - side * (1 + below - above)) / 2
     axes.viewLim.intervalx = (left, left + side)
-    axes.viewLim.intervaly = (below, below + side)
+    axes.viewLim.intervaly = (low, low + side)
     axes.stale = True
 
 

@@ -1,0 +1,230 @@
+"""What notebooks show of a robot, a task, a path and their answers: a figure and a small table.
+
+`stiffopt.notebook` asks for these pages.
+"""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import singledispatch
+from html import escape
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from stiffopt.errors import StiffoptError, printable
+from stiffopt.model.compiled import compiling_nothing
+from stiffopt.model.manipulator import Manipulator, load_robot
+from stiffopt.model.stopping import giving_up
+from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.task import ForRobot, Task
+from stiffopt.paths.path import Path
+from stiffopt.paths.solution import PathSolution
+from stiffopt.plots import style
+from stiffopt.plots.arm import draw_arm
+from stiffopt.plots.path import draw_asked_path, draw_path, draw_stiffness_along
+from stiffopt.plots.solution import draw_pressures, draw_solution, draw_task
+from stiffopt.plots.wording import BAR, MM, bar_text, figures, unit_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_LONGEST = 2.0  # s, for what a page computes
+_SIDE = 3.4  # inches, of the panel of an arm
+_DPI = 80
+_CELL = "text-align:left;vertical-align:top;padding:1px 10px 1px 0"
+
+Row = tuple[str, str]
+
+
+class _Page(NamedTuple):
+    """A title, a status, rows of a table, and what draws the figure."""
+
+    title: str
+    status: str
+    rows: Iterable[Row]
+    draw: Callable[[], Figure]
+
+
+def page(shown: object) -> str:
+    """Return HTML of an object: its table, and its figure if it can be drawn at once.
+
+    Raises
+    ------
+    TypeError
+        If there is no page for such an object.
+    """
+    with compiling_nothing(), giving_up(_LONGEST):
+        made = _page_of(shown)
+        rows, picture = "".join(map(_row, made.rows)), ""
+        with suppress(StiffoptError):
+            picture = _picture(made.draw())
+    colour = style.STATUS.get(made.status, style.DARK)
+    head = f"<b>{_escaped(made.title)}</b> <span style='color:{colour}'>{made.status}</span>"
+    return (
+        "<div style='display:flex;flex-wrap:wrap;align-items:flex-start;gap:16px'>"
+        f"<div>{head}<table>{rows}</table></div>{picture}</div>"
+    )
+
+
+def _escaped(text: str) -> str:
+    return "<br>".join(escape(printable(line)) for line in text.split("\n"))
+
+
+def _row(row: Row) -> str:
+    name, value = map(_escaped, row)
+    return f"<tr><th style='{_CELL}'>{name}</th><td style='{_CELL}'>{value}</td></tr>"
+
+
+def _picture(figure: Figure) -> str:
+    buffer = BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI)
+    return f"<img src='data:image/png;base64,{b64encode(buffer.getvalue()).decode()}'/>"
+
+
+@singledispatch
+def _page_of(shown: object) -> _Page:
+    raise TypeError(f"there is no page for a {type(shown).__name__}")
+
+
+# -- robots and what is asked of them -------------------------------------------------------------
+
+
+@_page_of.register
+def _(robot: Manipulator) -> _Page:
+    def draw() -> Figure:
+        return _in_space(lambda axes: draw_arm(axes, robot, robot.pressure_min))
+
+    return _Page(robot.description.name, "", _robot_rows(robot), draw)
+
+
+def _robot_rows(robot: Manipulator) -> Iterable[Row]:
+    lengths = ", ".join(f"{each.length * MM:g} mm" for each in robot.description.segments)
+    yield "segments", lengths
+    yield "length", f"{robot.length * MM:g} mm"
+    yield "channels", str(robot.n_pressures)
+    low, high = robot.pressure_min.min() * BAR, robot.pressure_max.max() * BAR
+    yield "pressures", f"{low:g} to {high:g} bar"
+    if robot.is_loaded:
+        yield "loaded", "in equilibrium under gravity or load"
+
+
+@_page_of.register
+def _(task: Task) -> _Page:
+    def draw() -> Figure:
+        robot = load_robot(task.resolve_robot())
+        return _in_space(lambda axes: draw_task(axes, robot, task))
+
+    return _Page(_title(task, "Task"), "", _task_rows(task), draw)
+
+
+def _title(asked: ForRobot, kind: str) -> str:
+    return kind if asked.source is None else asked.source.stem
+
+
+def _task_rows(task: Task) -> Iterable[Row]:
+    yield "robot", task.robot or "the one that the solver is given"
+    for term in task.target.terms:
+        yield term.key, term.asked()
+    if task.stiffness is not None:
+        yield "stiffness", repr(task.stiffness).partition("(")[2].removesuffix(")")
+    yield from _condition_rows(task)
+
+
+def _condition_rows(asked: ForRobot) -> Iterable[Row]:
+    if asked.load is not None:
+        force = np.linalg.norm(asked.load.force)
+        yield "load", f"{force:.3g} N, {asked.load.frame} axes"
+    if asked.scene is not None:
+        yield "scene", ", ".join(item.name for item in asked.scene.objects)
+
+
+@_page_of.register
+def _(path: Path) -> _Page:
+    def draw() -> Figure:
+        robot = load_robot(path.resolve_robot())
+        return _in_space(lambda axes: draw_asked_path(axes, robot, path))
+
+    return _Page(_title(path, "Path"), "", _path_rows(path), draw)
+
+
+def _path_rows(path: Path) -> Iterable[Row]:
+    points = path.points()
+    yield "robot", path.robot or "the one that the solver is given"
+    yield "path", f"{path.path.kind} of {points.curve.length * MM:.4g} mm, {len(points)} points"
+    if points.times is not None:
+        yield "time", f"{points.times[-1]:.4g} s"
+    yield "tolerance", f"{path.tolerance.position * MM:g} mm"
+    yield from _condition_rows(path)
+
+
+# -- answers --------------------------------------------------------------------------------------
+
+
+@_page_of.register
+def _(solution: PressureSolution) -> _Page:
+    def draw() -> Figure:
+        robot = solution.robot or load_robot(solution.task.resolve_robot())
+        figure = style.new_figure(2.1 * _SIDE, _SIDE)
+        draw_solution(style.add_space(figure, (0.0, 0.0, 0.5, 1.0)), robot, solution)
+        draw_pressures(figure.add_axes((0.6, 0.15, 0.39, 0.74)), robot, solution)
+        return figure
+
+    return _Page(_title(solution.task, "Solution"), solution.status, _answer_rows(solution), draw)
+
+
+def _answer_rows(solution: PressureSolution) -> Iterable[Row]:
+    if solution.message:
+        yield "note", solution.message
+    if solution.pressures is None or solution.tip_position is None:
+        return
+    yield "pressures", f"{', '.join(map(bar_text, solution.pressures))} bar"
+    yield "tip at", f"({', '.join(f'{x * MM + 0.0:.3f}' for x in solution.tip_position)}) mm"
+    for term in solution.task.target.terms:
+        if term.name in solution.errors:
+            yield f"error in {term.name}", term.words(solution.errors[term.name])
+    for number, (measure, value) in enumerate(
+        zip(solution.task.measures, solution.stiffnesses, strict=False)
+    ):
+        words = f"{figures(value)} {unit_text(measure.unit)}, {measure.words()}"
+        yield "" if number else "stiffness", words
+
+
+@_page_of.register
+def _(solution: PathSolution) -> _Page:
+    def draw() -> Figure:
+        if solution.stiffness is None:
+            return _in_space(lambda axes: draw_path(axes, solution))
+        figure = style.new_figure(2.1 * _SIDE, _SIDE)
+        draw_path(style.add_space(figure, (0.0, 0.0, 0.5, 1.0)), solution)
+        axes = figure.add_axes((0.62, 0.15, 0.36, 0.7))
+        draw_stiffness_along(axes, solution)
+        style.tidy(axes)
+        return figure
+
+    return _Page(solution.robot.description.name, solution.status, _points_rows(solution), draw)
+
+
+def _points_rows(solution: PathSolution) -> Iterable[Row]:
+    if solution.message:
+        yield "note", solution.message
+    if not len(solution.times):
+        return
+    yield "points", f"{len(solution.times)} in {solution.times[-1]:.4g} s"
+    if solution.position_errors is not None:
+        yield "tip error", f"at most {solution.position_errors.max() * MM:.3g} mm"
+    if solution.worst is not None:
+        unit = unit_text(solution.stiffness_unit)
+        yield "stiffness", f"at least {figures(solution.worst)} {unit}"
+    if solution.clearance is not None:
+        yield "clearance", f"at least {solution.clearance.min() * MM:.3g} mm"
+
+
+def _in_space(draw: Callable[[Any], object]) -> Figure:
+    """Draw into a figure of one panel in 3-D."""
+    figure = style.new_figure(_SIDE, _SIDE)
+    draw(style.add_space(figure, (0.0, 0.0, 1.0, 1.0)))
+    return figure
