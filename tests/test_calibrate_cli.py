@@ -565,10 +565,11 @@ def test_ctrl_c_keeps_the_best_model_so_far(
 
 
 def test_quick_fits_one_model_to_few_rows() -> None:
-    quick = CalibrationSettings().quick()
+    quick = CalibrationSettings().quick(is_loaded=False)
     assert (quick.structure, quick.strain_law, quick.rows) == ("hysteresis", "keep", 400)
-    chosen = CalibrationSettings(structure="lag", rows=100, trial_rows=80).quick()
+    chosen = CalibrationSettings(structure="lag", rows=100, trial_rows=80).quick(is_loaded=False)
     assert (chosen.structure, chosen.rows, chosen.trial_rows) == ("lag", 100, 80)
+    assert CalibrationSettings().quick(is_loaded=True).rows < quick.rows
 
 
 def test_the_command_is_quick(folder: Path, tmp_path: Path, capsys: Any) -> None:

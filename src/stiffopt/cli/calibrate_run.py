@@ -86,7 +86,7 @@ def run_calibrate(
             structure=model, strain_law=strain_law, fixed=fixed_keys(fix, robot), **counts
         )
         if quick:
-            settings = settings.quick()
+            settings = settings.quick(is_loaded=any(robot.gravity))
         stiffnesses = read_tables(tables, robot)
         logs = recordings.read(robot, progress)
         try:

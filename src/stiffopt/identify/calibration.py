@@ -262,7 +262,7 @@ def _is_worth_it(structure: ModelStructure, candidates: Sequence[Candidate]) -> 
 def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
     """Coordinates by name near the best of several starts, from few rows."""
     teller.begin("looking for a start")
-    problem = setup.problem(STRUCTURES[1], START.rows)
+    problem = setup.problem(STRUCTURES[1], setup.settings.start_rows)
     tolerances = setup.tolerances
     turns = START.turns if tolerances.base_turn > START.unknown_turn else (0.0,)
     starts = []

@@ -31,6 +31,7 @@ class CalibrationSettings(Schema):
         its zero) is estimated where the log is only predicted, in s.
     rows : number of rows that are fitted, of all logs together; chosen so as to cover them.
     trial_rows : the same, while models are compared.
+    start_rows : the same, while a start is chosen among several.
     """
 
     structure: str = "auto"
@@ -43,10 +44,19 @@ class CalibrationSettings(Schema):
     rows: Annotated[int, Field(ge=50, le=100_000)] = 2000
     trial_rows: Annotated[int, Field(ge=50, le=100_000)] = 600
 
-    def quick(self) -> CalibrationSettings:
-        """These settings for an answer within a minute: one model, its law kept, few rows."""
+    start_rows: Annotated[int, Field(ge=20, le=100_000)] = 150
+
+    def quick(self, *, is_loaded: bool) -> CalibrationSettings:
+        """These settings for a first answer: one model, its law kept, few rows.
+
+        Parameters
+        ----------
+        is_loaded : whether each pose is an equilibrium to be found, which takes longer.
+        """
         structure = "hysteresis" if self.structure == "auto" else self.structure
-        rows = {"rows": min(self.rows, 400), "trial_rows": min(self.trial_rows, 200)}
+        most = {"rows": 80, "trial_rows": 50, "start_rows": 40} if is_loaded else {
+            "rows": 400, "trial_rows": 200, "start_rows": 150}  # fmt: skip
+        rows = {name: min(getattr(self, name), count) for name, count in most.items()}
         return self.model_copy(update={"structure": structure, "strain_law": "keep", **rows})
 
 
@@ -162,7 +172,6 @@ class StartSettings:
     creep_times, creep_share : of its creep, in s.
     bending_radius : least bending radius, in lengths of the segment.
     dead_band : share of the highest recorded pressure.
-    rows : number of rows of the first fit, which chooses between several starts.
     turns, unknown_turn : turns of the base to begin with, in rad, where its tolerance is more than
         the latter.
     moduli : coordinates of the moduli to begin with, in prior deviations.
@@ -178,7 +187,6 @@ class StartSettings:
     creep_share: float = 0.02
     bending_radius: float = 0.6
     dead_band: float = 0.05
-    rows: int = 150
     turns: tuple[float, ...] = (0.0, 2 * np.pi / 3, -2 * np.pi / 3, np.pi)
     unknown_turn: float = 0.5
     moduli: tuple[float, ...] = (0.0, -1.0, 1.0)
