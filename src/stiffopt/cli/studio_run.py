@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import threading
 import webbrowser
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 
-from stiffopt.cli.console import report_note, write_line
+from stiffopt.cli.console import report_note, warnings_as_notes, write_line
 from stiffopt.cli.exits import ENDING_SIGNALS, handled
 from stiffopt.daemon.secret import is_loopback
 from stiffopt.errors import require_package
@@ -32,8 +32,11 @@ def run(
 
     token = Path(token_file) if token_file else os.environ.get(_TOKEN) or None
     over = threading.Event()
-    shown = open_studio(file, robot=robot, map_file=map_file, token=token, host=host, port=port)
-    with handled(dict.fromkeys(ENDING_SIGNALS, lambda number, frame: over.set())), closing(shown):
+    end = dict.fromkeys(ENDING_SIGNALS, lambda number, frame: over.set())
+    with warnings_as_notes(quiet=False), ExitStack() as stack:
+        shown = open_studio(file, robot=robot, map_file=map_file, token=token, host=host, port=port)
+        stack.enter_context(closing(shown))
+        stack.enter_context(handled(end))  # only now: what takes long before is ended by Ctrl-C
         write_line(f"the studio is open at {shown.url}")
         write_line("Ctrl-C ends it")
         if not is_loopback(host):

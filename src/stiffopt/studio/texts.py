@@ -21,7 +21,7 @@ from stiffopt.model.scene import Scene
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
-from stiffopt.plots.wording import BAR, MM, direction_text, figures, gain_text, limit_of, unit_text
+from stiffopt.plots.wording import BAR, MM, direction_text, figures, gain_text, unit_text
 from stiffopt.studio.design import Design
 from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.timeline import Timeline
@@ -46,7 +46,8 @@ def answer_html(bench: Workbench) -> str:
     if answer is None:
         return _padded(_headline("failed" if bench.trouble else "", bench.trouble or _SEARCHING))
     solution = answer.solution
-    message = bench.trouble or solution.message
+    is_told = answer.is_best or not solution.found  # what it says of an answer takes a while
+    message = bench.trouble or (solution.message if is_told else "")
     status = "failed" if bench.trouble else solution.status
     return _padded(
         _headline(status, message)
@@ -86,22 +87,26 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
         yield "angle error", f"{angle:.3g}&deg; (tolerance {degrees(tolerance.angle):.3g}&deg;)"
     if solution.tip_pose is not None:
         yield "tip", f"{position_text(solution.tip_pose[:3, 3])} mm"
-    if solution.active_bounds:
-        yield "at a limit", escape(_limits_text(solution.active_bounds))
+    limits = _limits_text(answer)
+    if limits:
+        yield "at a limit", limits
     if answer.design.task.scene is not None:
         clearance = answer.robot.clearance(answer.pressures, answer.design.task.scene)
         yield "clearance", f"{clearance * MM:.3g} mm"
     yield "answer", _BEST if answer.is_best else _LOCAL
 
 
-def _limits_text(bounds: Iterable[str]) -> str:
-    """Return limits such as ``segment 1 channel 2 min``, those of one segment together."""
-    found: dict[tuple[str, str], list[str]] = {}
-    for bound in bounds:
-        segment, _, rest = bound.partition(" channel ")
-        channel, _, side = rest.partition(" ")
-        found.setdefault((segment, side), []).append(channel)
-    return "; ".join(f"{segment}: {', '.join(c)} at {side}" for (segment, side), c in found.items())
+def _limits_text(answer: StudioAnswer) -> str:
+    """Return which channels are at which limits, by segments."""
+    parts, begin = [], 0
+    for number, segment in enumerate(answer.robot.description.segments, start=1):
+        for side, name in ((-1, "min"), (1, "max")):
+            mine = answer.at_limit[begin : begin + segment.n_channels] == side
+            if mine.any():
+                channels = ", ".join(str(k + 1) for k in np.flatnonzero(mine))
+                parts.append(f"segment {number}: {channels} at {name}")
+        begin += segment.n_channels
+    return "; ".join(parts)
 
 
 def position_text(position: ArrayLike) -> str:
@@ -119,14 +124,10 @@ def _table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def _bars(answer: StudioAnswer) -> tuple[Any, ...]:
-    solution, description = answer.solution, answer.robot.description
+    description = answer.robot.description
     low, high = answer.design.task.pressure_bounds(description)
-    at_limit = [
-        bool(limit_of(solution, description.channel_name(k)))
-        for k in range(description.n_pressures)
-    ]
     plain = None if answer.plain is None else answer.plain.pressures
-    return answer.pressures, low, high, at_limit, plain
+    return answer.pressures, low, high, (answer.at_limit != 0).tolist(), plain
 
 
 def pressures_html(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.stopping import Cancel
-from stiffopt.optimise.solution import PressureSolution
+from stiffopt.optimise.solution import PressureSolution, active_bounds
 from stiffopt.optimise.solver import PressureSolver, stiffness_blind
 from stiffopt.plots.wording import least_maximised
 from stiffopt.studio.design import Design
@@ -27,6 +27,7 @@ QUICK = 0.03
 REST = 0.25
 """Seconds without a change after which the best answer is searched for."""
 _BETTER = 1e-3  # relative, of a stiffness, for which an arm at rest may jump to another answer
+_CHEAP = 5e-3  # s that plain pressures may take while the arm is dragged
 _STEPS = 200  # that can be undone
 
 
@@ -60,6 +61,14 @@ class StudioAnswer:
         return self.solution.robot
 
     @property
+    def at_limit(self) -> NDArray[np.int_]:
+        """At which limit each pressure (n,) is: -1 at the lowest, 1 at the highest, else 0."""
+        found = np.zeros(len(self.pressures), dtype=int)
+        for channel, side in active_bounds(self.robot, self.design.task, self.pressures).values():
+            found[channel] = side
+        return found
+
+    @property
     def plain_stiffness(self) -> float | None:
         """What the plain pressures have of the first stiffness that the task names."""
         measures = self.design.task.measures
@@ -90,6 +99,8 @@ class Workbench:
         self.trouble = ""
         self._past: deque[Design] = deque(maxlen=_STEPS)
         self._step = ""
+        self._robot: Manipulator | None = None
+        self._plain_takes = float("inf")  # s
         self._lock = threading.RLock()
 
     def change(self, kind: str, change: Callable[[Design], Design]) -> bool:
@@ -137,7 +148,7 @@ class Workbench:
     def answer_quickly(self, cancel: Cancel) -> bool:
         """Look next to the previous answer; return whether there is an answer now."""
         design, before = self.design, self.answer
-        solver = _solver(design)
+        solver = self._solver(design)
         guess = None
         if before is not None and len(before.pressures) == solver.robot.n_pressures:
             guess = before.pressures
@@ -152,7 +163,7 @@ class Workbench:
     def answer_best(self, cancel: Cancel) -> bool:
         """Search everywhere; return whether there is another answer now."""
         design, before = self.design, self.answer
-        solver = _solver(design)
+        solver = self._solver(design)
         solution = solver.solve(cancel=cancel)
         if solution.pressures is None:
             if design == self.design and (before is None or before.design != design):
@@ -163,18 +174,22 @@ class Workbench:
         self._take(design, solver, solution, is_best=True)
         return True
 
+    def _solver(self, design: Design) -> PressureSolver:
+        """A solver on the robot of before, if it is the same: what was prepared for it is kept."""
+        if self._robot is None or self._robot.description != design.description:
+            self._robot = Manipulator(design.description)
+        return PressureSolver(self._robot, design.task)
+
     def _take(
         self, design: Design, solver: PressureSolver, solution: PressureSolution, *, is_best: bool
     ) -> None:
         plain = None
-        if solution.found and design.task.measures and (is_best or not solver.robot.is_loaded):
+        if solution.found and design.task.measures and (is_best or self._plain_takes < _CHEAP):
+            begin = perf_counter()
             plain = stiffness_blind(solver, solution)
+            self._plain_takes = perf_counter() - begin
         self.answer = StudioAnswer(design, solution, plain, is_best)
         self.trouble = ""
-
-
-def _solver(design: Design) -> PressureSolver:
-    return PressureSolver(Manipulator(design.description), design.task)
 
 
 def _is_better(solution: PressureSolution, before: StudioAnswer) -> bool:
