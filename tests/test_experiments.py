@@ -835,10 +835,10 @@ def test_the_figure_of_stiffness_shows_what_there_is(
     figure = plot_stiffness(result)
     assert len(figure.axes) == 3
     (bars,) = figure.axes[0].containers
-    assert bars.lines[0].get_ydata() == pytest.approx([0.3])  # N/cm
+    assert bars.lines[0].get_ydata() == pytest.approx([30.0])  # N/m
     assert bars.lines[0].get_xdata() == pytest.approx([levels[0] * 1e-5])
     assert not figure.axes[1].containers
-    assert figure.axes[1].lines[0].get_ydata()[0] == pytest.approx(0.1403, abs=1e-4)
+    assert figure.axes[1].lines[0].get_ydata()[0] == pytest.approx(14.03, abs=1e-2)
     figure.savefig(tmp_path / "figure.png")
     table = result.table()
     assert np.isnan(table.stiffness).sum() == len(table) - 1

@@ -392,6 +392,9 @@ def test_a_map_becomes_a_coloured_cloud() -> None:
     stiffest = int(np.argmax(found.best[1]))
     assert cloud.colours[stiffest].tolist() == [253, 231, 37]
     assert cloud.legend.startswith("stiffest along z: violet ")
+    assert len(StiffnessCloud.of(found, 1, 0.0).points) == (found.centres[:, 1] >= 0).sum()
+    with pytest.raises(InputError, match="no cells"):
+        StiffnessCloud.of(found, 1, 1.0)
     check_map(found, robot.description)
     with pytest.raises(InputError, match="another arm than 'stiff-flop-2'"):
         check_map(found, stiffopt.load_robot("stiff-flop-2").description)

@@ -23,7 +23,7 @@ from stiffopt.plots.style import (
     stacked_panels,
     tidy,
 )
-from stiffopt.plots.wording import BAR, MM, N_PER_CM
+from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -177,28 +177,28 @@ def _draw_stiffness(axes: Any, result: StiffnessResult, number: int) -> None:
     direction = result.settings.directions[number]
     cells = [cell for cell in result.along(direction) if cell.estimate is not None]
     axes.plot(
-        result.curve_pressures * BAR, result.curves[:, number] * N_PER_CM, color=MODEL,
+        result.curve_pressures * BAR, result.curves[:, number], color=MODEL,
         linewidth=1.6, label="model",
     )  # fmt: skip
     for cell in cells:
         x = np.full(len(cell.slopes), cell.pressure * BAR)
         axes.plot(
-            x, np.array(cell.slopes) * N_PER_CM, "o", color=MEASURED, alpha=0.35, markersize=3.5,
+            x, np.array(cell.slopes), "o", color=MEASURED, alpha=0.35, markersize=3.5,
             markeredgewidth=0, label="each repetition" if cell is cells[0] else None,
         )  # fmt: skip
     estimates = [cell.estimate for cell in cells if cell.estimate is not None]
     if estimates:
         axes.errorbar(
             [cell.pressure * BAR for cell in cells],
-            [each.value * N_PER_CM for each in estimates],
-            yerr=[each.half_width * N_PER_CM for each in estimates],
+            [each.value for each in estimates],
+            yerr=[each.half_width for each in estimates],
             color=MEASURED, marker="s", markersize=4.5, capsize=3, linestyle="none",
             label="measured",
         )  # fmt: skip
     axes.set_title(f"along {direction_name(direction)}", loc="left", fontsize=11, weight="bold")
     axes.set_xlabel("pressure (bar)")
-    axes.set_ylabel("stiffness (N/cm)")
-    shown = [*(each.value * N_PER_CM for each in estimates), *result.curves[:, number] * N_PER_CM]
+    axes.set_ylabel("stiffness (N/m)")
+    shown = [*(each.value for each in estimates), *result.curves[:, number]]
     if max(shown) > 8 * min(shown) > 0:
         make_logarithmic(axes)
     else:

@@ -20,7 +20,7 @@ from stiffopt.plots.style import (
     round_steps,
     tidy,
 )
-from stiffopt.plots.wording import BAR, MM, N_PER_CM, unit_text
+from stiffopt.plots.wording import BAR, MM, unit_text
 from stiffopt.workspace import WorkspaceMap
 
 if TYPE_CHECKING:
@@ -288,14 +288,14 @@ def _bending_plane(shapes: Vector) -> Vector:
 
 def _draw_along(axes: Any, found: ArmMap, row: int, column: int, colours: list[Any]) -> None:
     for level, colour in enumerate(colours):
-        values = found.stiffness[row, level, :, column] * N_PER_CM
+        values = found.stiffness[row, level, :, column]
         axes.plot(found.at * MM, values, color=colour, linewidth=1.7)
     axes.axvline(found.length / 2 * MM, color=ARM, linewidth=0.9, linestyle=":")
     name = direction_name(tuple(found.directions[column]))
     axes.set_title(f"along {name}", loc="left", fontsize=10.5)
     make_logarithmic(axes)
     axes.set_xlabel("distance from the base at rest (mm)", fontsize=9)
-    axes.set_ylabel("stiffness (N/cm)", fontsize=9)
+    axes.set_ylabel("stiffness (N/m)", fontsize=9)
     axes.set_xlim(found.at[0] * MM, found.at[-1] * MM)
     axes.grid(alpha=0.25, which="both")
     tidy(axes)
@@ -330,7 +330,7 @@ def plot_tip_map(found: TipMap) -> Figure:
 def _draw_heat(figure: Figure, axes: Any, found: TipMap, column: int) -> None:
     from matplotlib.colors import LogNorm
 
-    values = found.stiffness[:, :, column] * N_PER_CM
+    values = found.stiffness[:, :, column]
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     norm = LogNorm(low, high) if high > 5 * low > 0 else None
     first, second = found.first * BAR, found.second * BAR
@@ -348,7 +348,7 @@ def _draw_heat(figure: Figure, axes: Any, found: TipMap, column: int) -> None:
     axes.set_title(f"along {name}", loc="left", fontsize=11, weight="bold")
     axes.set_aspect("equal", adjustable="box")
     bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-    bar.set_label("stiffness (N/cm)", fontsize=9)
+    bar.set_label("stiffness (N/m)", fontsize=9)
     bar.ax.tick_params(labelsize=8)
     if norm is not None:
         label_logarithmic(bar.ax.yaxis, low, high)

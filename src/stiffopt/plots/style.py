@@ -256,7 +256,7 @@ def label_logarithmic(axis: Any, low: float, high: float, most: int = 8) -> None
 
     axis.set_major_locator(FixedLocator(list(round_steps(low, high, most))))
     axis.set_minor_locator(NullLocator())
-    axis.set_major_formatter(lambda value, _: f"{value:.3g}")
+    axis.set_major_formatter(lambda value, _: f"{value:.5g}")
 
 
 def thinned(time: Array, values: Array, most: int = 4000) -> tuple[Array, Array]:

@@ -11,8 +11,6 @@ MM = 1e3
 """Millimetres per metre."""
 BAR = 1e-5
 """Bar per pascal."""
-N_PER_CM = 0.01
-"""N/cm per N/m."""
 
 
 def least_maximised(solution: PressureSolution) -> float | None:

@@ -33,27 +33,26 @@ class StiffnessCloud(NamedTuple):
     size: float
 
     @classmethod
-    def of(cls, found: WorkspaceMap, direction: int) -> StiffnessCloud:
-        """The stiffest that each cell has in a direction of the map, counted from 0."""
+    def of(cls, found: WorkspaceMap, direction: int, cut: float = -np.inf) -> StiffnessCloud:
+        """The stiffest that each cell beyond y = `cut` (m) has in a direction, counted from 0."""
         best = found.best[direction]
-        kept = np.flatnonzero(np.isfinite(best))
+        low, high = np.log(np.nanpercentile(best, (2, 98)))
+        kept = np.flatnonzero(np.isfinite(best) & (found.centres[:, 1] >= cut))
         kept = kept[:: max(1, -(-len(kept) // _MOST))]
         values = best[kept]
         if not len(values):
-            raise InputError("the map has no cells to show")
-        low, high = np.percentile(values, (2, 98))
-        share = np.clip((values - low) / max(high - low, 1e-12), 0, 1) * (len(_SCALE) - 1)
+            raise InputError("the map has no cells to show there")
+        share = np.clip((np.log(values) - low) / max(high - low, 1e-12), 0, 1) * (len(_SCALE) - 1)
         colours = np.stack(
             [np.interp(share, np.arange(len(_SCALE)), column) for column in _SCALE.T], axis=1
         )
         unit = "N/m" if found.plan.measures[direction].kind == "translation" else "N m/rad"
-        legend = (
-            f"stiffest along {found.direction_names[direction]}: violet {figures(float(low))}, "
-            f"yellow {figures(float(high))} {unit}"
-        )
+        soft, stiff = figures(float(np.exp(low))), figures(float(np.exp(high)))
+        name = found.direction_names[direction]
+        legend = f"stiffest along {name}: violet {soft}, yellow {stiff} {unit}"
         return cls(
             found.centres[kept].astype(np.float32), colours.astype(np.uint8), legend,
-            0.35 * found.plan.cell,
+            0.12 * found.plan.cell,
         )  # fmt: skip
 
 

@@ -254,18 +254,26 @@ class TaskView:
     def _add_map_inputs(self, gui: Any, found: WorkspaceMap) -> None:
         names = tuple(f"along {name}" for name in found.direction_names)
         self._shown_map = gui.add_dropdown("stiffness", (*names, _NO_MAP))
+        low, high = (float(round(1e3 * each[1])) for each in (found.low, found.high))
+        self._cut = gui.add_slider("cells beyond y (mm)", low, high, 0.5, min(max(0.0, low), high))
         self._legend = gui.add_html("")
-        cloud = StiffnessCloud.of(found, 0)
+        cloud = StiffnessCloud.of(found, 0, self._cut.value / _MILLI)
         self._cloud = self.server.scene.add_point_cloud(
             "/map", cloud.points, cloud.colours, point_size=cloud.size, point_shape="circle"
         )
         self._legend.content = texts.note_html(cloud.legend)
-        self._shown_map.on_update(lambda event: self._show_map(found, event.target.value, names))
+        for each in (self._shown_map, self._cut):
+            each.on_update(lambda _: self._show_map(found, names))
 
-    def _show_map(self, found: WorkspaceMap, chosen: str, names: tuple[str, ...]) -> None:
+    def _show_map(self, found: WorkspaceMap, names: tuple[str, ...]) -> None:
+        chosen = self._shown_map.value
         self._cloud.visible = chosen in names
         if chosen in names:
-            cloud = StiffnessCloud.of(found, names.index(chosen))
+            try:
+                cloud = StiffnessCloud.of(found, names.index(chosen), self._cut.value / _MILLI)
+            except StiffoptError as error:
+                self._legend.content = texts.note_html(str(error))
+                return
             with self.server.atomic():
                 self._cloud.points, self._cloud.colors = cloud.points, cloud.colours
             self._legend.content = texts.note_html(cloud.legend)
