@@ -14,7 +14,7 @@ PICTURE := docs/images/two_segment_stiff_x.png
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test schemas mutate lint types format picture bench clean
+.PHONY: help demo docs test schemas mutate lint types format picture bench clean
 
 help:  ## say what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)

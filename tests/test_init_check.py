@@ -6,6 +6,7 @@ import json
 import os
 import pty
 import select
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -122,6 +123,26 @@ def test_wrong_answers_write_nothing(arguments: tuple[str, ...], message: str) -
     assert os.listdir() == []
 
 
+@pytest.mark.parametrize("stem", ["a #1", "a: b", "[x]", "it's", 'a "b"', "1e3", "free", "ä ö"])
+def test_names_that_yaml_would_read_as_something_else(stem: str) -> None:
+    robot = f"{stem}.yaml"
+    assert run("init", "robot", robot, "--segments", "1").exit_code == 0
+    assert stiffopt.load_robot(robot).description.name == stem
+    made = run("init", "task", "t.yaml", "--robot", robot)
+    assert made.exit_code == 0, made.output
+    assert stiffopt.load_task("t.yaml").robot == robot
+    command = next(line for line in made.stdout.splitlines() if "init path" in line)
+    assert shlex.split(command, comments=True)[-1] == robot
+
+
+def test_a_robot_in_another_folder() -> None:
+    os.mkdir("tasks")
+    assert run("init", "robot", "arm.yaml", "--segments", "1").exit_code == 0
+    made = run("init", "task", "tasks/t.yaml", "--robot", "arm.yaml")
+    assert "stiffopt init path --robot arm.yaml" in made.stdout  # as it is seen from here
+    assert stiffopt.load_task("tasks/t.yaml").resolve_robot().n_pressures == 3
+
+
 def test_a_file_that_is_there_stays() -> None:
     Path("my-task.yaml").write_text("mine", encoding="utf-8")
     made = run("init", "task")
@@ -141,6 +162,9 @@ def test_on_a_terminal_it_asks() -> None:
     with subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs) as process:
         os.close(theirs)
         seen = _until(mine, "stiff-flop-2]: ")
+        os.write(mine, b"stiff-flop-9\n")  # a wrong answer is asked for again
+        seen += _until(mine, "there is no robot 'stiff-flop-9'")
+        seen += _until(mine, "stiff-flop-2]: ")
         os.write(mine, b"stiff-flop-1\n")
         seen += _until(mine, "scene: my-scene.yaml")
         assert process.wait(timeout=60) == 0

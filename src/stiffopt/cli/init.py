@@ -46,11 +46,20 @@ def _write(kind: str, path: str, answers: dict[str, Any], yes: bool, force: bool
 
     asks = not yes and sys.stdin is not None and sys.stdin.isatty()
 
-    def ask(question: str, default: str) -> str:
-        return str(typer.prompt(question, default=default, err=True)) if asks else default
-
-    write_first_file(kind, path, answers, ask, force=force)
+    write_first_file(kind, path, answers, _Ask(asks), force=force)
     return 0
+
+
+class _Ask:
+    """Asks on a terminal; elsewhere the default is the answer."""
+
+    def __init__(self, is_terminal: bool) -> None:
+        self.is_terminal = is_terminal
+
+    def __call__(self, question: str, default: str) -> str:
+        if not self.is_terminal:
+            return default
+        return str(typer.prompt(question, default=default, err=True))
 
 
 @init_app.command("robot", epilog=_EPILOG)
@@ -128,7 +137,7 @@ def init_task(
     yes: Yes = False,
     force: Force = False,
 ) -> int:
-    """Write a task file: where the tip shall be, and in which direction it shall be stiff."""
+    """Write a task file: a target, and a direction to be stiff in."""
     answers = {"robot": robot, "position": position, "direction": direction}
     return _write("task", file, answers, yes, force)
 

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import os
+import shlex
 import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from stiffopt.cli.check_run import check_file
-from stiffopt.cli.console import write_line
+from stiffopt.cli.console import report_error, write_line
 from stiffopt.cli.outputs import check_ending, check_writable
 from stiffopt.cli.quantities import choice, quantity
-from stiffopt.documents import write_whole
-from stiffopt.errors import FileError, InputError
+from stiffopt.documents import to_yaml, write_whole
+from stiffopt.errors import FileError, InputError, printable, shown
 from stiffopt.files import format_of
 from stiffopt.json_schemas import schema_file
 from stiffopt.units import format_quantity
-
-Ask = Callable[[str, str], str]
-"""Takes a question and the default; returns the answer."""
 
 _CUSTOM = "(built-in, or a robot file)"
 
@@ -52,10 +50,11 @@ def write_first_file(
     if os.path.lexists(path) and not force:
         raise FileError(path, "exists; give another name, or --force to write in its place")
     body, advice = _TEXTS[kind](_Answers(given, ask, Path(path).parent), path)
+    typed = shlex.quote(path)
     head = (
         f"# yaml-language-server: $schema={schema_file(kind).as_uri()}\n"
         f"# Editors with a YAML language server complete and check this file by the line above.\n"
-        f"# All keys: docs/files.md. Check it: stiffopt check {path}\n"
+        f"# All keys: docs/files.md. Check it: stiffopt check {printable(typed)}\n"
         f"format: {format_of(kind)}\n"
     )
     _write_checked(path, head + textwrap.dedent(body).lstrip("\n"))
@@ -64,71 +63,128 @@ def write_first_file(
         write_line(f"  {line}")
 
 
+class Ask(Protocol):
+    """Asks a question that has a default, and returns the answer."""
+
+    is_terminal: bool
+
+    def __call__(self, question: str, default: str) -> str:
+        """Return the answer; the default where nobody can be asked."""
+
+
+class _Robot(NamedTuple):
+    """A robot: for a command line, in a file, and its model."""
+
+    typed: str
+    written: str
+    model: Any
+
+
 class _Answers:
     """Answers to questions: those that were given as options, and those that are asked for."""
 
     def __init__(self, given: Mapping[str, Any], ask: Ask, folder: Path) -> None:
         self._given, self._ask, self._folder = given, ask, folder
 
-    def text(self, name: str, question: str, default: object) -> str:
-        """Return an answer as text."""
+    def text(
+        self,
+        name: str,
+        question: str,
+        default: object,
+        check: Callable[[str], str] = lambda text: text,
+    ) -> str:
+        """Return an answer as text, after a check that returns it, or raises `InputError`."""
         given = self._given.get(name)
-        return self._ask(question, str(default)) if given is None else str(given)
+        if given is not None:
+            return check(str(given))
+        while True:
+            answer = self._ask(question, str(default))
+            try:
+                return check(answer)
+            except InputError as error:
+                if answer == str(default) or not self._ask.is_terminal:
+                    raise
+                report_error(str(error).removeprefix(f"{_option(name)}: "))
 
     def quantity(self, name: str, question: str, default: str, unit: str, what: str) -> str:
-        """Return a quantity as it was written, after a look at it."""
-        text = self.text(name, question, default)
-        quantity(_option(name), text, unit, what)
-        return text
+        """Return a quantity as it was written."""
+
+        def check(text: str) -> str:
+            quantity(_option(name), text, unit, what)
+            return text
+
+        return self.text(name, question, default, check)
 
     def count(self, name: str, question: str, default: int) -> int:
         """Return a number of things."""
-        text = self.text(name, question, default)
-        if not text.isdecimal() or int(text) < 1:
-            raise InputError(f"{_option(name)}: expected a number such as {default}, not '{text}'")
-        return int(text)
+
+        def check(text: str) -> str:
+            if not text.isdecimal() or int(text) < 1:
+                raise InputError(
+                    f"{_option(name)}: expected a number such as {default}, not {shown(text)}"
+                )
+            return text
+
+        return int(self.text(name, question, default, check))
 
     def choice(self, name: str, question: str, *allowed: str) -> str:
         """Return one of several words, the first by default."""
-        text = self.text(name, f"{question} ({', '.join(allowed)})", allowed[0])
-        choice(_option(name), text, allowed)
-        return text
+
+        def check(text: str) -> str:
+            choice(_option(name), text, allowed)
+            return text
+
+        return self.text(name, f"{question} ({', '.join(allowed)})", allowed[0], check)
 
     def vector(self, name: str, question: str, default: str) -> str:
         """Return three numbers without a unit."""
-        text = self.text(name, question, default).strip("[] ")
-        parts = text.replace(",", " ").split()
-        try:
-            if len(parts) != 3 or not np.linalg.norm([float(part) for part in parts]) > 0:
-                raise ValueError
-        except ValueError:
-            raise InputError(
-                f"{_option(name)}: expected a direction such as '{default}', not '{text}'"
-            ) from None
-        return f"[{', '.join(parts)}]"
+
+        def check(text: str) -> str:
+            parts = text.strip("[] ").replace(",", " ").split()
+            try:
+                if len(parts) != 3 or not np.linalg.norm([float(part) for part in parts]) > 0:
+                    raise ValueError
+            except ValueError:
+                raise InputError(
+                    f"{_option(name)}: expected a direction such as '{default}', not {shown(text)}"
+                ) from None
+            return f"[{', '.join(parts)}]"
+
+        return self.text(name, question, default, check)
 
     def position(self, name: str, question: str, default: str, *, free: bool = False) -> str:
         """Return three lengths, of which some may be free."""
-        text = self.text(name, question, default).strip("[] ")
-        parts = [part.strip() for part in text.split(",")]
-        known = [part for part in parts if not (free and part == "free")]
-        if len(parts) != 3:
-            raise InputError(f"{_option(name)}: expected a position such as '{default}'")
-        for value in known:
-            quantity(_option(name), value, "m", "length")
-        return f"[{', '.join(parts)}]"
 
-    def robot(self) -> tuple[str, Any]:
-        """Return the name of a robot as the file says it, and its model."""
+        def check(text: str) -> str:
+            parts = [part.strip() for part in text.strip("[] ").split(",")]
+            if len(parts) != 3:
+                raise InputError(f"{_option(name)}: expected a position such as '{default}'")
+            for value in parts:
+                if not (free and value == "free"):
+                    quantity(_option(name), value, "m", "length")
+            return f"[{', '.join(parts)}]"
+
+        return self.text(name, question, default, check)
+
+    def robot(self) -> _Robot:
+        """Return a robot."""
         from stiffopt.model.manipulator import Manipulator
         from stiffopt.model.robot_files import load_description
 
-        name = self.text("robot", f"Robot {_CUSTOM}", "stiff-flop-2")
-        robot = Manipulator(load_description(name))
-        if name.endswith((".yaml", ".yml")):
-            name = os.path.relpath(name, self._folder or ".")
-            name = name if os.sep in name else f"{name}"
-        return name, robot
+        def check(text: str) -> str:
+            load_description(text)
+            return text
+
+        given = self.text("robot", f"Robot {_CUSTOM}", "stiff-flop-2", check)
+        written = given
+        if given.endswith((".yaml", ".yml")) and not os.path.isabs(given):
+            written = os.path.relpath(given, self._folder)
+        return _Robot(shlex.quote(given), _scalar(written), Manipulator(load_description(given)))
+
+
+def _scalar(text: str) -> str:
+    """Return text as a YAML file says it, in quotes where it would mean something else."""
+    return to_yaml({"text": text}).removeprefix("text: ").rstrip("\n")
 
 
 def _option(name: str) -> str:
@@ -203,7 +259,7 @@ def _robot(answers: _Answers, path: str) -> tuple[str, list[str]]:
     material: {{youngs_modulus: {modulus}, poisson_ratio: 0.5, density: 1070 kg/m^3}}
 """
     text = (
-        f"name: {Path(path).stem}\n"
+        f"name: {_scalar(Path(path).stem)}\n"
         "# The base frame is at the middle of the arm's base; z points along the straight arm.\n"
         f"segments:                             # from the base to the tip\n{segment * segments}"
     )
@@ -215,21 +271,21 @@ def _robot(answers: _Answers, path: str) -> tuple[str, list[str]]:
         text += f"gravity: {vector}    # {words}\n# tip_mass: 20 g\n"
     text += f"pressure: {{min: 0 bar, max: {highest}, slew: 5 bar/s}}    # gauge; of the arm\n"
     return text, [
-        f"stiffopt init task --robot {path}     # a task for this arm",
-        f"stiffopt map arm {path}               # its stiffness along the arm",
+        f"stiffopt init task --robot {shlex.quote(path)}     # a task for this arm",
+        f"stiffopt map arm {shlex.quote(path)}               # its stiffness along the arm",
         "measure lengths and radii of your arm and correct them in the file;",
         "`stiffopt calibrate` finds the moduli from a recording (docs/calibration.md)",
     ]
 
 
 def _task(answers: _Answers, path: str) -> tuple[str, list[str]]:
-    name, robot = answers.robot()
+    name, written, robot = answers.robot()
     position = answers.position(
         "position", "Tip position in the base frame", _middle(robot), free=True
     )
     direction = answers.vector("direction", "Direction in which the tip shall be stiff", "1, 0, 0")
     text = f"""
-    robot: {name}
+    robot: {written}
     target:
       position: {position}    # of the tip, in the base frame; an axis may be `free`
       # pointing: [0, 0, 1]                # where the tip's axis shall point
@@ -237,19 +293,19 @@ def _task(answers: _Answers, path: str) -> tuple[str, list[str]]:
       maximise: {{direction: {direction}}}    # newtons for each metre of displacement that way
     """
     return text, [
-        f"solve-pressure {path} --plot {Path(path).stem}.png",
+        f"solve-pressure {shlex.quote(path)} --plot {shlex.quote(Path(path).stem)}.png",
         f"stiffopt init path --robot {name}    # a path for the tip",
     ]
 
 
 def _path(answers: _Answers, path: str) -> tuple[str, list[str]]:
-    name, robot = answers.robot()
+    _, written, robot = answers.robot()
     begin = answers.position("from", "Begin of the line", _middle(robot, -0.06))
     end = answers.position("to", "End of the line", _middle(robot, 0.06))
     speed = answers.quantity("speed", "Speed of the tip", "10 mm/s", "m/s", "speed")
     direction = answers.vector("direction", "Direction in which the tip shall be stiff", "1, 0, 0")
     text = f"""
-    robot: {name}
+    robot: {written}
     path:
       line: {{from: {begin}, to: {end}}}    # or arc, circle, spline, through, csv
     spacing: 1 mm
@@ -258,11 +314,11 @@ def _path(answers: _Answers, path: str) -> tuple[str, list[str]]:
     stiffness:
       maximise: {{direction: {direction}, over: worst}}    # or over: mean
     """
-    return text, [f"stiffopt path {path} --plot {Path(path).stem}.png"]
+    return text, [f"stiffopt path {shlex.quote(path)} --plot {shlex.quote(Path(path).stem)}.png"]
 
 
 def _scene(answers: _Answers, path: str) -> tuple[str, list[str]]:
-    _, robot = answers.robot()
+    *_, robot = answers.robot()
     clearance = answers.quantity(
         "clearance", "Distance that the whole arm keeps from objects", "2 mm", "m", "length"
     )
@@ -279,16 +335,16 @@ def _scene(answers: _Answers, path: str) -> tuple[str, list[str]]:
       # half_space {{point, normal}}, inside_tube {{points, radius}},
       # trocar {{centre, axis, radius}}
     """
-    return text, [f"name it in a task, path or rig file:  scene: {path}"]
+    return text, [f"name it in a task, path or rig file:  scene: {_scalar(path)}"]
 
 
 def _rig(answers: _Answers, path: str) -> tuple[str, list[str]]:
-    name, robot = answers.robot()
+    _, written, robot = answers.robot()
     supply = answers.choice("supply", "Regulators", "simulated", "modbus", "nidaq")
     devices = ["simulated"] if supply == "simulated" else ["aurora", "openigtlink"]
     tracker = answers.choice("tracker", "Tracker", *devices, "none")
     n = robot.n_pressures
-    text = f"robot: {name}\nrate: 100 Hz\nsupply:\n{_SUPPLIES[supply](n)}"
+    text = f"robot: {written}\nrate: 100 Hz\nsupply:\n{_SUPPLIES[supply](n)}"
     if tracker != "none":
         text += f"tracker:\n{_TRACKERS[tracker]}"
     text += "safety: {tracker_timeout: 0.5 s}    # what may happen, and what counts as a fault\n"
@@ -296,10 +352,10 @@ def _rig(answers: _Answers, path: str) -> tuple[str, list[str]]:
     if supply == "simulated":
         text += "# how the simulated arm differs from its robot file\n"
         text += "plant: {seed: 1, spread: {gain: 3 %, modulus: 5 %}}\n"
-        return text, [f"stiffopt run {path} --task my-task.yaml"]
+        return text, [f"stiffopt run {shlex.quote(path)} --task my-task.yaml"]
     return text, [
         "put in the addresses and ranges of your devices; rig/ has examples with their wiring",
-        f"stiffopt lab {path}     # rehearse with a virtual arm behind these devices",
+        f"stiffopt lab {shlex.quote(path)}     # rehearse with a virtual arm behind these devices",
     ]
 
 

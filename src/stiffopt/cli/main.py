@@ -53,7 +53,7 @@ app.command(
     help=PLAN_HELP,
     epilog=PLAN_EPILOG,
 )(plan)
-app.add_typer(init_app, name="init")
+app.add_typer(init_app, name="init", short_help="Write a minimal file to begin with.")
 app.command(
     "check",
     short_help="Check files: all their mistakes at once.",
@@ -66,7 +66,7 @@ app.command(
     help=STUDIO_HELP,
     epilog=STUDIO_EPILOG,
 )(studio)
-app.command("robots")(robots)
+app.command("robots", short_help="List the robots that come with stiffopt.")(robots)
 app.command(
     "run",
     short_help="Hold an arm at its task: run the daemon of a rig.",
@@ -76,7 +76,7 @@ app.command(
 app.command(
     "vent", short_help="Let all pressure out of an arm at once.", help=VENT_HELP, epilog=VENT_EPILOG
 )(vent)
-app.add_typer(map_app, name="map")
+app.add_typer(map_app, name="map", short_help="Map an arm: workspace and stiffness.")
 app.add_typer(experiment_app, name="experiment")
 app.add_typer(log_app, name="log")
 app.command(
