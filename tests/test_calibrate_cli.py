@@ -564,6 +564,21 @@ def test_ctrl_c_keeps_the_best_model_so_far(
         assert load_description(out).calibration is not None
 
 
+def test_ctrl_c_while_logs_are_read_is_an_interrupt(
+    folder: Path, tmp_path: Path, capsys: Any, monkeypatch: Any
+) -> None:
+    def read(path: str) -> Log:
+        signal.raise_signal(signal.SIGINT)
+        return read_log(path)
+
+    monkeypatch.setattr(calibrate_run, "_read", read)
+    logs = [folder / "monday.csv", folder / "tuesday.csv"]
+    command = ["calibrate", "--robot", "stiff-flop-1", *logs, "--out", tmp_path / "fitted.yaml"]
+    code, out, err = run(capsys, *command)
+    assert (code, out, err.splitlines()) == (130, "", ["interrupted"])
+    assert not list(tmp_path.iterdir())
+
+
 def test_quick_fits_one_model_to_few_rows() -> None:
     quick = CalibrationSettings().quick(is_loaded=False)
     assert (quick.structure, quick.strain_law, quick.rows) == ("hysteresis", "keep", 400)

@@ -123,7 +123,9 @@ def test_wrong_answers_write_nothing(arguments: tuple[str, ...], message: str) -
     assert os.listdir() == []
 
 
-@pytest.mark.parametrize("stem", ["a #1", "a: b", "[x]", "it's", 'a "b"', "1e3", "free", "ä ö"])
+@pytest.mark.parametrize(
+    "stem", ["a #1", "a: b", "[x]", "it's", 'a "b"', "1e3", "free", "ä ö", "long name " * 15 + "1"]
+)
 def test_names_that_yaml_would_read_as_something_else(stem: str) -> None:
     robot = f"{stem}.yaml"
     assert run("init", "robot", robot, "--segments", "1").exit_code == 0

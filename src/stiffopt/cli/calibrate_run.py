@@ -93,7 +93,7 @@ def run_calibrate(
             result = fit_robot(robot, logs, stiffnesses, settings, progress)
         except CancelledError as stop:
             if not isinstance(stop.found, CalibrationResult):
-                raise KeyboardInterrupt from None
+                raise
             result, code = stop.found, INTERRUPTED
         with new_folder(report) as folder:
             if folder is not None:

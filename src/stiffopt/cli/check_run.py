@@ -1,4 +1,4 @@
-"""What `stiffopt check` does with each kind of file."""
+"""The checks of `stiffopt check`, one for each kind of file."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from stiffopt.cli.console import write_json, write_line
 from stiffopt.cli.exits import BAD_INPUT, SOLVED
 from stiffopt.documents import read_document
 from stiffopt.errors import FileError, InputError, StiffoptError, shown
+from stiffopt.files import format_of
 
 _FORMAT = re.compile(r"stiffopt-([a-z]+)/\d+")
 
@@ -61,21 +62,19 @@ def _kind_of(path: str) -> str:
     ending = Path(path).suffix.lower()
     if ending in (".csv", ".mcap"):
         return "log"
-    given = read_document(path).data.get("format")
+    document = read_document(path)
+    given = document.data.get("format")
     match = _FORMAT.fullmatch(given) if isinstance(given, str) else None
     if match is not None and match[1] in _CHECKS:
         return match[1]
-    kinds = [kind for kind in _CHECKS if kind != "log"]
-    expected = f"expected one of {', '.join(f'stiffopt-{kind}/1' for kind in kinds)}"
+    formats = [format_of(kind) for kind in _CHECKS if kind != "log"]
+    expected = f"expected one of {', '.join(formats)}"
     if given is None:
         raise FileError(path, f"has no 'format'; {expected}")
-    near = difflib.get_close_matches(str(given), [f"stiffopt-{kind}/1" for kind in kinds], n=1)
+    near = difflib.get_close_matches(str(given), formats, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else f"; {expected}"
-    line = read_document(path).lines.get(("format",))
-    raise FileError(
-        path, f"{shown(given)} is no format of a file that people write{hint}",
-        line=line, key="format",
-    )  # fmt: skip
+    reason = f"{shown(given)} is no format of a file that people write{hint}"
+    raise document.error(("format",), reason)
 
 
 def _check_robot(path: str) -> None:

@@ -144,7 +144,8 @@ def interruptible_work(*, quiet: bool) -> Iterator[Progress]:
 def stoppable_work(*, quiet: bool) -> Iterator[Progress]:
     """Context of work that keeps what it has at the first Ctrl-C, and that a second one ends.
 
-    The function for progress raises `CancelledError` once after the first.
+    The function for progress raises `CancelledError` once after the first. Work that has nothing
+    to keep lets it pass, and ends as interrupted.
     """
     interrupt, is_told = InterruptBetweenSteps(), False
     with interrupt.handled(), ProgressBar(quiet=quiet) as bar, warnings_as_notes(quiet=quiet):
@@ -157,7 +158,10 @@ def stoppable_work(*, quiet: bool) -> Iterator[Progress]:
                 raise CancelledError("interrupted")
             bar.report(done, total, text)
 
-        yield progress
+        try:
+            yield progress
+        except CancelledError:
+            raise KeyboardInterrupt from None
 
 
 class InterruptBetweenSteps:
@@ -179,7 +183,7 @@ class InterruptBetweenSteps:
 
     @property
     def pressed(self) -> bool:
-        """Whether a signal has come."""
+        """Whether one of the signals has come."""
         return self._pressed
 
     def check(self) -> None:

@@ -46,20 +46,11 @@ def _write(kind: str, path: str, answers: dict[str, Any], yes: bool, force: bool
 
     asks = not yes and sys.stdin is not None and sys.stdin.isatty()
 
-    write_first_file(kind, path, answers, _Ask(asks), force=force)
-    return 0
-
-
-class _Ask:
-    """Asks on a terminal; elsewhere the default is the answer."""
-
-    def __init__(self, is_terminal: bool) -> None:
-        self.is_terminal = is_terminal
-
-    def __call__(self, question: str, default: str) -> str:
-        if not self.is_terminal:
-            return default
+    def ask(question: str, default: str) -> str:
         return str(typer.prompt(question, default=default, err=True))
+
+    write_first_file(kind, path, answers, ask if asks else None, force=force)
+    return 0
 
 
 @init_app.command("robot", epilog=_EPILOG)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import shlex
+import tempfile
 import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -21,11 +22,14 @@ from stiffopt.files import format_of
 from stiffopt.json_schemas import schema_file
 from stiffopt.units import format_quantity
 
+Ask = Callable[[str, str], str]
+"""Takes a question and the default; returns the answer."""
+
 _CUSTOM = "(built-in, or a robot file)"
 
 
 def write_first_file(
-    kind: str, path: str, given: Mapping[str, Any], ask: Ask, *, force: bool
+    kind: str, path: str, given: Mapping[str, Any], ask: Ask | None, *, force: bool
 ) -> None:
     """Write a minimal file of a kind and say what to do next.
 
@@ -38,7 +42,7 @@ def write_first_file(
     given :
         Answers by the names of the options; None: it is asked for.
     ask :
-        How to ask.
+        How to ask; None: nobody can be asked, and each answer is the default.
 
     Raises
     ------
@@ -63,15 +67,6 @@ def write_first_file(
         write_line(f"  {line}")
 
 
-class Ask(Protocol):
-    """Asks a question that has a default, and returns the answer."""
-
-    is_terminal: bool
-
-    def __call__(self, question: str, default: str) -> str:
-        """Return the answer; the default where nobody can be asked."""
-
-
 class _Robot(NamedTuple):
     """A robot: for a command line, in a file, and its model."""
 
@@ -83,7 +78,7 @@ class _Robot(NamedTuple):
 class _Answers:
     """Answers to questions: those that were given as options, and those that are asked for."""
 
-    def __init__(self, given: Mapping[str, Any], ask: Ask, folder: Path) -> None:
+    def __init__(self, given: Mapping[str, Any], ask: Ask | None, folder: Path) -> None:
         self._given, self._ask, self._folder = given, ask, folder
 
     def text(
@@ -95,14 +90,14 @@ class _Answers:
     ) -> str:
         """Return an answer as text, after a check that returns it, or raises `InputError`."""
         given = self._given.get(name)
-        if given is not None:
-            return check(str(given))
+        if given is not None or self._ask is None:
+            return check(str(default if given is None else given))
         while True:
             answer = self._ask(question, str(default))
             try:
                 return check(answer)
             except InputError as error:
-                if answer == str(default) or not self._ask.is_terminal:
+                if answer == str(default):
                     raise
                 report_error(str(error).removeprefix(f"{_option(name)}: "))
 
@@ -183,8 +178,9 @@ class _Answers:
 
 
 def _scalar(text: str) -> str:
-    """Return text as a YAML file says it, in quotes where it would mean something else."""
-    return to_yaml({"text": text}).removeprefix("text: ").rstrip("\n")
+    """Return text on one line as a YAML file says it, in quotes where YAML needs them."""
+    folded = to_yaml({"text": text}).removeprefix("text: ")
+    return " ".join(line.strip() for line in folded.splitlines())
 
 
 def _option(name: str) -> str:
@@ -193,12 +189,14 @@ def _option(name: str) -> str:
 
 def _write_checked(path: str, text: str) -> None:
     """Write a file after a check of its text; what was there stays if that is wrong."""
-    draft = Path(path).with_name(f".{Path(path).stem}.draft.yaml")
+    folder = Path(path).absolute().parent  # where the files that it names are looked for
+    handle, draft = tempfile.mkstemp(dir=folder, prefix=".", suffix=".yaml")
     try:
-        write_whole(draft, text.encode())
-        _, mistakes = check_file(str(draft))
+        with open(handle, "wb") as stream:
+            stream.write(text.encode())
+        _, mistakes = check_file(draft)
     finally:
-        draft.unlink(missing_ok=True)
+        os.unlink(draft)
     if mistakes:
         first = mistakes[0]
         raise InputError(f"{first.key or path}: {first.own_reason}; nothing was written")

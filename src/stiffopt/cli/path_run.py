@@ -108,7 +108,7 @@ class PathBatch(Batch[SolvedPath]):
 
 
 def is_csv(out: str) -> bool:
-    """Whether a file is to be CSV, by its name."""
+    """Say whether the name of a file ends as that of a CSV file."""
     return out.lower().endswith(".csv")
 
 
