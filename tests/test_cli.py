@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
+import pty
 import re
 import signal
+import struct
 import subprocess
 import sys
+import termios
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -122,8 +126,21 @@ def test_table_says_why_a_gain_is_small(write: Write) -> None:
     assert "gain " not in run(write("two.yaml", TWO)).stdout
 
 
-def test_table_fits_80_columns_and_has_no_colour_codes_in_a_file(write: Write) -> None:
-    done = process(write("one.yaml", ONE), write("far.yaml", FAR), "--pareto", "3")
+@pytest.fixture
+def wide_terminal() -> Iterator[int]:
+    """A terminal of 200 columns."""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 50, 200, 0, 0))
+    yield theirs
+    os.close(ours)
+    os.close(theirs)
+
+
+def test_table_fits_80_columns_and_has_no_colour_codes_in_a_file(
+    write: Write, wide_terminal: int
+) -> None:
+    files = write("one.yaml", ONE), write("far.yaml", FAR)
+    done = process(*files, "--pareto", "3", stdin=wide_terminal)
     assert done.returncode == 3
     assert "\x1b" not in done.stdout + done.stderr
     shown = [line for line in done.stdout.splitlines() if ".yaml" not in line]

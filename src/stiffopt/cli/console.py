@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 
+_FILE_WIDTH = 80  # columns of what does not go to a terminal
 _REFRESH = 0.1  # s, between two changes of a progress bar
 _FIRST_LINE, _LONGEST_SILENCE = 2.0, 30.0  # s, of progress without a terminal
 
@@ -32,10 +33,17 @@ class Closed(Exception):  # noqa: N818 - no error: `head`, for example, reads a 
 
 
 def console_on(*, stderr: bool = False) -> Console:
-    """Console on stdout or stderr that takes text as it is."""
+    """Console on stdout or stderr that takes text as it is.
+
+    What does not go to a terminal is 80 columns wide, or `COLUMNS`: rich would take the width of
+    the terminal that the command was started from, and a file would look different each time.
+    """
     from rich.console import Console
 
-    return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+    console = Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = _FILE_WIDTH
+    return console
 
 
 def show(renderable: RenderableType) -> None:
