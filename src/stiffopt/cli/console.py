@@ -102,7 +102,7 @@ def report_note(message: str) -> None:
 
 @contextmanager
 def showing_slow_warnings(show: Callable[[str], object]) -> Iterator[None]:
-    """Context in which the text of a `SlowWarning` or `UnfitWarning` is shown once by a function."""
+    """Context in which a function shows the text of each `SlowWarning` and `UnfitWarning` once."""
     show_other, told = warnings.showwarning, set[str]()
 
     def show_warning(
