@@ -594,7 +594,8 @@ def test_ctrl_c_keeps_the_best_model_so_far(
     if models:
         assert "the calibration was interrupted" in " ".join(text.split())
         assert "# Interrupted: not all models were compared" in out.read_text(encoding="utf-8")
-        assert load_description(out).calibration is not None
+        with pytest.warns(stiffopt.UnfitWarning):  # the simplest model of an arm that lags
+            assert load_description(out).calibration is not None
 
 
 def test_ctrl_c_while_logs_are_read_is_an_interrupt(
