@@ -495,6 +495,7 @@ def calibration_record(result: CalibrationResult, out: str, report: str | None) 
         "robot": result.robot.name,
         "out": out,
         "report": report,
+        "unfit": result.unfit,
         "model": result.structure.name,
         "strain_laws": [segment.strain_law for segment in result.robot.segments],
         "models": [

@@ -210,6 +210,33 @@ def _experiment(estimate: FittedEstimate) -> str:
     return next((text for name, text in _PLACED.items() if estimate.name.startswith(name)), "")
 
 
+def is_unfit(calibrated: Sequence[Comparison], length: float) -> bool:
+    """Whether a fit misses its own recordings by so much that it is of no use."""
+    return bool(calibrated) and together(calibrated).mean > REPORT.unfit * length
+
+
+def what_to_look_at(calibrated: Sequence[Comparison], length: float) -> str:
+    """Return the remark on a fit that misses its own recordings."""
+    errors = together(calibrated)
+    means = np.array([each.errors.mean for each in calibrated])
+    alone = [
+        f"{each.name} ({mean * 1e3:.0f} mm)"
+        for each, mean in zip(calibrated, means, strict=True)
+        if mean > REPORT.alone * np.median(means)
+    ]
+    text = (
+        f"UNFIT: the fit misses its own recordings by {errors.mean * 1e3:.1f} mm in the mean, "
+        f"{errors.mean / length * 100:.0f} % of the arm's length; look at "
+    )
+    if alone:
+        text += f"{', '.join(alone)}, far worse than the others, and then at "
+    return text + (
+        "the order of the channels (--channels), the body in whose frame poses are taken (--frame) "
+        "and its axes, the registration, lengths and chambers of the robot file, and whether the "
+        "pressures are those that the arm had"
+    )
+
+
 def outliers(found: Fit) -> list[str]:
     """Return a remark on each recording that has rows far from the model, which count less."""
     remarks = []
