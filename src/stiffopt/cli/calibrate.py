@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet
+from stiffopt.cli.options import Json, Quiet, Units
 
 CALIBRATE_HELP = """\
 Fit a robot file to recordings of the arm, and write how well each number in it is then known.
@@ -170,6 +170,7 @@ def calibrate(
     ] = None,
     report: Report = None,
     as_json: Json = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> int:
     """Fit a robot file."""
@@ -197,6 +198,7 @@ def validate(
     keep: Keep = None,
     report: Report = None,
     as_json: Json = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> None:
     """Compare a robot file with recordings."""

@@ -42,7 +42,6 @@ from stiffopt.logs import (
 )
 from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
-from stiffopt.plots.wording import MM
 
 _ENDINGS = (".yaml", ".yml")
 _SEGMENT = re.compile(r"segments\[\d+\]\.")
@@ -334,8 +333,8 @@ def _origin(
     if names:
         errors = together(result.calibrated)
         lines.append(
-            f"Error of the tip on these logs: mean {errors.mean * MM:.2f} mm, "
-            f"95 % below {errors.p95 * MM:.2f} mm."
+            f"Error of the tip on these logs: mean {1e3 * errors.mean:.2f} mm, "
+            f"95 % below {1e3 * errors.p95:.2f} mm."
         )
     words = ["the logs are a sequence"] * recordings.sequence
     words += ["each log has its own origin"] * recordings.rezero

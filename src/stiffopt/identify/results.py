@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.display import display_units
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.settings import REPORT
 from stiffopt.identify.unknowns import BASE, SENSOR
@@ -217,15 +218,15 @@ def is_unfit(calibrated: Sequence[Comparison], length: float) -> bool:
 
 def what_to_look_at(calibrated: Sequence[Comparison], length: float) -> str:
     """Return the remark on a fit that misses its own recordings."""
-    errors = together(calibrated)
+    errors, unit = together(calibrated), display_units().length
     means = np.array([each.errors.mean for each in calibrated])
     alone = [
-        f"{each.name} ({mean * 1e3:.0f} mm)"
+        f"{each.name} ({unit.text(mean, '.0f')})"
         for each, mean in zip(calibrated, means, strict=True)
         if mean > REPORT.alone * np.median(means)
     ]
     text = (
-        f"UNFIT: the fit misses its own recordings by {errors.mean * 1e3:.1f} mm in the mean, "
+        f"UNFIT: the fit misses its own recordings by {unit.text(errors.mean, '.1f')} in the mean, "
         f"{errors.mean / length * 100:.0f} % of the arm's length; look at "
     )
     if alone:
