@@ -300,7 +300,8 @@ class DetectionSettings:
     softness : factors on pressures, for arms softer or stiffer than the robot file says.
     unknown_turn : tolerance of the base's turn from which the turn is not known, in rad.
     few_channels : of how many channels all orders are tried.
-    off : mean error of a log, in lengths of the arm, from which its frame may be another.
+    off, frame : mean error of a log, in lengths of the arm, from which its frame may be another
+        than the one of the calibration; and the share of it that is left if it was.
     known_turn : spread of the tip, in lengths of the arm, that tells a turn.
     moved : how far the base may be from where the robot file has it, in lengths of the arm.
     clock_rows : rows of a regression for the clocks.
@@ -320,6 +321,7 @@ class DetectionSettings:
     moved: float = 0.25
     few_channels: int = 3
     off: float = 0.1
+    frame: float = 0.3
     known_turn: float = 0.02
     clock_rows: int = 600
     clock_lag: float = 0.3

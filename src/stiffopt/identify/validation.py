@@ -70,7 +70,9 @@ def validate(
         progress(1, 2, "comparing")
     setup = Setup.of(description, recordings, (), settings)
     found = compare(setup)
-    return found if "axes" in settings.keep else _with_frames_found(setup, found)
+    if description.calibration is None or "axes" in settings.keep:
+        return found
+    return _with_frames_found(setup, found)
 
 
 def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
@@ -85,7 +87,7 @@ def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Com
         return found
     again = list(compare(Setup.of(setup.description, recordings, (), setup.settings)))
     for i, (before, after) in enumerate(zip(found, again, strict=True)):
-        if not words[i] or after.errors.mean > DETECTION.overwhelming * before.errors.mean:
+        if not words[i] or after.errors.mean > DETECTION.frame * before.errors.mean:
             again[i] = before
             continue
         remark = (
