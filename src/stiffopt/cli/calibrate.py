@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet
+from stiffopt.cli.options import Json, Quiet, Units
 
 CALIBRATE_HELP = """\
 Fit a robot file to recordings of the arm, and write how well each number in it is then known.
@@ -29,6 +29,9 @@ Exit codes:
   0    done
   2    bad input, or a file cannot be written; nothing is written
 """
+_UNFIT = """\
+  4    the fit misses its own logs by more than 10 % of the arm; the file is marked as unfit
+"""
 
 CALIBRATE_EPILOG = f"""\
 \b
@@ -36,7 +39,7 @@ Examples:
   stiffopt calibrate --robot my-arm.yaml run/*.csv --out my-arm-calibrated.yaml
   stiffopt calibrate --robot my-arm.yaml monday.csv --stiffness run/stiffness.csv --out fitted.yaml
   stiffopt calibrate --robot asu-two-segment apr4_*.csv --sequence --out asu.yaml --report fit
-{_CODES}\
+{_CODES}{_UNFIT}\
   130  interrupted (Ctrl-C): the best model so far is written, if there is one; twice: nothing is
 """
 
@@ -87,6 +90,14 @@ Frame = Annotated[
         metavar="BODY",
         help="The tracked body that carries the base; poses are taken in its frame. By default as "
         "the robot file says, else the tracker itself.",
+    ),
+]
+Keep = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="WHAT",
+        help="units, clock, axes, channels or lines: take these as they were recorded, even where "
+        "they are clearly something else; may be repeated.",
     ),
 ]
 Report = Annotated[
@@ -150,6 +161,7 @@ def calibrate(
     pressures: Pressures = "commanded",
     channels: Channels = None,
     frame: Frame = None,
+    keep: Keep = None,
     rows: Annotated[
         int | None,
         typer.Option(
@@ -158,14 +170,16 @@ def calibrate(
     ] = None,
     report: Report = None,
     as_json: Json = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> int:
     """Fit a robot file."""
     from stiffopt.cli import calibrate_run  # here, so that --help waits for no numerics
 
     recordings = calibrate_run.RecordingOptions(
-        robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame
-    )
+        robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame,
+        tuple(keep or ()),
+    )  # fmt: skip
     return calibrate_run.run_calibrate(
         recordings, out, tables=stiffness or (), model=model, strain_law=strain_law, fix=fix or (),
         rows=rows, quick=quick, report=report, as_json=as_json, quiet=quiet,
@@ -181,14 +195,17 @@ def validate(
     pressures: Pressures = "commanded",
     channels: Channels = None,
     frame: Frame = None,
+    keep: Keep = None,
     report: Report = None,
     as_json: Json = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> None:
     """Compare a robot file with recordings."""
     from stiffopt.cli import calibrate_run
 
     recordings = calibrate_run.RecordingOptions(
-        robot, tuple(logs), sequence, rezero, pressures, channels, frame
-    )
+        robot, tuple(logs), sequence, rezero, pressures, channels, frame,
+        tuple(keep or ()),
+    )  # fmt: skip
     calibrate_run.run_validate(recordings, report, as_json=as_json, quiet=quiet)

@@ -10,12 +10,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import stiffopt
 from stiffopt.cli import quantities
-from stiffopt.cli.console import show, write_json
+from stiffopt.cli.console import report_error, show, write_json
 from stiffopt.cli.exits import (
+    FAILED,
     INTERRUPTED,
     SOLVED,
     Progress,
@@ -28,7 +29,7 @@ from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
 from stiffopt.identify.results import together
-from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.settings import CalibrationSettings, Finding
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.identify.unknowns import history_unknowns, shape_unknowns
 from stiffopt.identify.validation import validate as compare_robot
@@ -41,7 +42,6 @@ from stiffopt.logs import (
 )
 from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
-from stiffopt.plots.wording import MM
 
 _ENDINGS = (".yaml", ".yml")
 _SEGMENT = re.compile(r"segments\[\d+\]\.")
@@ -91,6 +91,7 @@ def run_calibrate(
         logs = recordings.read(robot, progress)
         try:
             result = fit_robot(robot, logs, stiffnesses, settings, progress)
+            code = FAILED if result.unfit else SOLVED
         except CancelledError as stop:
             if not isinstance(stop.found, CalibrationResult):
                 raise
@@ -102,6 +103,8 @@ def run_calibrate(
                 write_calibration(folder, result, out)
             origin = _origin(result, recordings, tables, fix, is_interrupted=code == INTERRUPTED)
             save_file(out, "robot", result.robot, origin)
+    if result.unfit:
+        report_error(f"the robot is of no use, and marked as unfit in {out}: {result.remarks[0]}")
     if quiet and not as_json:
         return code
     from stiffopt.cli.calibration_report import calibration, calibration_record
@@ -152,11 +155,15 @@ class RecordingOptions:
     pressures: str
     channels: str | None
     frame: str | None
+    keep: tuple[str, ...] = ()
 
     def settings(self, **others: Any) -> CalibrationSettings:
         """Return the settings of a calibration: of these options, and others."""
         quantities.choice("--pressures", self.pressures, ("commanded", "measured"))
-        given = {"sequence": self.sequence, "rezero": self.rezero, "pressures": self.pressures}
+        for each in self.keep:
+            quantities.choice("--keep", each, get_args(Finding))
+        given = {"sequence": self.sequence, "rezero": self.rezero, "pressures": self.pressures,
+                 "keep": self.keep}  # fmt: skip
         return CalibrationSettings(**given, **others)
 
     def description(self) -> RobotDescription:
@@ -319,13 +326,15 @@ def _origin(
         files = ", ".join(os.path.basename(path) for path in tables)
         lines.append(f"Tables of stiffness: {files}.")
     lines.append(f"Model: {result.structure.name}, {result.structure.words}.")
+    if result.unfit:
+        lines.append("UNFIT: it misses the logs below by more than 10 % of the arm's length.")
     if is_interrupted:
         lines.append("Interrupted: not all models were compared, and few rows were fitted.")
     if names:
         errors = together(result.calibrated)
         lines.append(
-            f"Error of the tip on these logs: mean {errors.mean * MM:.2f} mm, "
-            f"95 % below {errors.p95 * MM:.2f} mm."
+            f"Error of the tip on these logs: mean {1e3 * errors.mean:.2f} mm, "
+            f"95 % below {1e3 * errors.p95:.2f} mm."
         )
     words = ["the logs are a sequence"] * recordings.sequence
     words += ["each log has its own origin"] * recordings.rezero

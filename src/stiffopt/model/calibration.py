@@ -191,6 +191,8 @@ class Calibration(Schema):
     pressure_norm : largest recorded norm of each segment's pressures, in Pa.
         Where these three and `errors` are missing, all pressures count as recorded.
     errors : how far the tip may be from a prediction; None in files from before it was known.
+    unfit : whether the fit missed its own recordings by so much that nothing that is computed with
+        the robot can be relied on. Whoever reads such a file is warned.
     """
 
     logs: Items[str] = ()
@@ -203,6 +205,7 @@ class Calibration(Schema):
     pressure_max: Items[Pressure] = ()
     pressure_norm: Items[Pressure] = ()
     errors: ErrorModel | None = None
+    unfit: bool = False
 
     @property
     def covariance(self) -> Array:
