@@ -136,7 +136,7 @@ LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)
 
 
 @dataclass(frozen=True)
-class Coverage:
+class RegionCoverage:
     """Share of measured positions within the regions of `LEVELS`.
 
     Attributes
@@ -154,8 +154,8 @@ class Coverage:
         return dict(zip(LEVELS, self.shares, strict=True))
 
 
-def coverage(comparisons: Sequence[Comparison]) -> dict[str, Coverage]:
-    """Coverage of the regions about predictions, over the rows of all logs together.
+def coverage(comparisons: Sequence[Comparison]) -> dict[str, RegionCoverage]:
+    """RegionCoverage of the regions about predictions, over the rows of all logs together.
 
     Returns
     -------
@@ -183,7 +183,7 @@ def coverage(comparisons: Sequence[Comparison]) -> dict[str, Coverage]:
         levels = np.concatenate(parts)
         if len(levels):
             shares = tuple(float(np.mean(levels <= level)) for level in LEVELS)
-            answer[kind] = Coverage(len(levels), shares)
+            answer[kind] = RegionCoverage(len(levels), shares)
     return answer
 
 

@@ -113,7 +113,7 @@ class TipUncertainty:
 
 
 @dataclass(frozen=True, eq=False)
-class TipErrors:
+class PositionErrors:
     """Errors of predictions of the tip's position.
 
     Attributes
@@ -196,7 +196,7 @@ class Uncertainty:
         *,
         effective: Vector | None = None,
         moving: NDArray[np.bool_] | None = None,
-    ) -> TipErrors:
+    ) -> PositionErrors:
         """Errors of predictions.
 
         Parameters
@@ -215,7 +215,7 @@ class Uncertainty:
             acting = self._hysteresis(pressures, still)
         errors = self._calibration.errors
         residual = self._calibration.position_residual if errors is None else errors.residual
-        return TipErrors(
+        return PositionErrors(
             position=position,
             parameters=per_number @ self._covariance @ np.swapaxes(per_number, 1, 2),
             hysteresis=(per_pressure * acting[:, np.newaxis]) @ transposed,
