@@ -39,6 +39,7 @@ Examples:
   stiffopt calibrate --robot my-arm.yaml run/*.csv --out my-arm-calibrated.yaml
   stiffopt calibrate --robot my-arm.yaml monday.csv --stiffness run/stiffness.csv --out fitted.yaml
   stiffopt calibrate --robot asu-two-segment apr4_*.csv --sequence --out asu.yaml --report fit
+  stiffopt calibrate --robot arm.yaml run/*.csv --out fitted.yaml --suggest next.yaml --rig rig.yaml
 {_CODES}{_UNFIT}\
   130  interrupted (Ctrl-C): the best model so far is written, if there is one; twice: nothing is
 """
@@ -168,6 +169,18 @@ def calibrate(
             metavar="N", min=50, max=100_000, help="Of all logs that are fitted; by default 2000."
         ),
     ] = None,
+    suggest: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.yaml",
+            help="Write the poses to record next, by which the arm would be known best, as a file "
+            "for `stiffopt experiment poses`; with --rig.",
+        ),
+    ] = None,
+    rig: Annotated[
+        str | None,
+        typer.Option(metavar="RIG", help="The rig file of the poses that --suggest writes."),
+    ] = None,
     report: Report = None,
     as_json: Json = False,
     units: Units = None,
@@ -182,7 +195,8 @@ def calibrate(
     )  # fmt: skip
     return calibrate_run.run_calibrate(
         recordings, out, tables=stiffness or (), model=model, strain_law=strain_law, fix=fix or (),
-        rows=rows, quick=quick, report=report, as_json=as_json, quiet=quiet,
+        rows=rows, quick=quick, suggest=suggest, rig=rig, report=report, as_json=as_json,
+        quiet=quiet,
     )  # fmt: skip
 
 

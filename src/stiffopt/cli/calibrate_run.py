@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
 
 import stiffopt
 from stiffopt.cli import quantities
@@ -24,13 +27,16 @@ from stiffopt.cli.exits import (
     stoppable_work,
 )
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
+from stiffopt.display import display_units
 from stiffopt.errors import CancelledError, FileError, InputError, require_package, shown
+from stiffopt.experiments.poses import save_poses
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
 from stiffopt.identify.results import together
 from stiffopt.identify.settings import CalibrationSettings, Finding
 from stiffopt.identify.structures import STRUCTURES
+from stiffopt.identify.suggestion import Suggestion, suggest_poses
 from stiffopt.identify.unknowns import history_unknowns, shape_unknowns
 from stiffopt.identify.validation import validate as compare_robot
 from stiffopt.logs import (
@@ -57,6 +63,8 @@ def run_calibrate(
     fix: Sequence[str],
     rows: int | None,
     quick: bool,
+    suggest: str | None,
+    rig: str | None,
     report: str | None,
     as_json: bool,
     quiet: bool,
@@ -66,12 +74,17 @@ def run_calibrate(
     with stoppable_work(quiet=quiet) as progress:
         check_new_file(out, _ENDINGS)
         _check_report(report)
+        if (suggest is None) != (rig is None):
+            raise InputError("--suggest and --rig go together: the poses are for that rig")
+        if suggest is not None:
+            check_new_file(suggest, _ENDINGS)
         if report and Path(report).resolve() == Path(out).resolve():
             raise InputError(f"{out}: the robot file and the report cannot have one name")
         if not recordings.logs and not tables:
             raise InputError(
                 "there is nothing to fit to; expected a LOG or a table of stiffness (--stiffness)"
             )
+        limits = None if rig is None else _RigLimits.of(rig)
         names = ["auto", *(structure.name for structure in STRUCTURES)]
         if model not in names:
             raise InputError(
@@ -82,6 +95,10 @@ def run_calibrate(
         if rows is not None:
             counts = {"rows": rows, "trial_rows": min(rows, CalibrationSettings().trial_rows)}
         robot = recordings.description()
+        if limits is not None and limits.channels != robot.n_pressures:
+            raise InputError(
+                f"{rig}: has {limits.channels} channels; the robot has {robot.n_pressures}"
+            )
         settings = recordings.settings(
             structure=model, strain_law=strain_law, fixed=fixed_keys(fix, robot), **counts
         )
@@ -103,6 +120,12 @@ def run_calibrate(
                 write_calibration(folder, result, out)
             origin = _origin(result, recordings, tables, fix, is_interrupted=code == INTERRUPTED)
             save_file(out, "robot", result.robot, origin)
+        suggestion = None
+        if limits is not None and suggest is not None and result.robot.calibration is not None:
+            suggestion = suggest_poses(
+                result.robot, low=limits.low, high=limits.high, is_allowed=limits.allows
+            )
+            save_poses(suggest, str(rig), suggestion.pressures)
     if result.unfit:
         report_error(f"the robot is of no use, and marked as unfit in {out}: {result.remarks[0]}")
     if quiet and not as_json:
@@ -110,10 +133,54 @@ def run_calibrate(
     from stiffopt.cli.calibration_report import calibration, calibration_record
 
     if as_json:
-        write_json(calibration_record(result, out, report))
+        write_json({**calibration_record(result, out, report), **_record(suggestion, suggest)})
     else:
         show(calibration(result, out, report))
+        if suggestion is not None:
+            length = display_units().length
+            show(
+                f"  poses       {suggest}: {len(suggestion.pressures)} to record next, by which "
+                f"what is uncertain of the tip\n              is expected to fall from "
+                f"{length.text(suggestion.before, '.2f')} to {length.text(suggestion.after, '.2f')}"
+                " (root mean square over all pressures)"
+            )
     return code
+
+
+@dataclass(frozen=True, eq=False)
+class _RigLimits:
+    """What may be commanded on a rig."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    allows: Callable[[NDArray[np.float64]], bool]
+
+    @property
+    def channels(self) -> int:
+        return len(self.low)
+
+    @classmethod
+    def of(cls, path: str) -> _RigLimits:
+        from stiffopt.safety.rigs import open_rig
+
+        rig = open_rig(path)  # its devices are not opened
+        most = np.inf if rig.max_force is None else rig.max_force
+        limits = rig.supply.limits
+        return cls(limits.low, limits.high, lambda pressures: rig.force(pressures) <= most)
+
+
+def _record(suggestion: Suggestion | None, path: str | None) -> dict[str, Any]:
+    """Suggested poses for JSON, in SI units; nothing where none were asked for."""
+    if suggestion is None:
+        return {}
+    return {
+        "suggestion": {
+            "file": path,
+            "pressures_pa": suggestion.pressures,
+            "deviation_before_m": suggestion.before,
+            "deviation_after_m": suggestion.after,
+        }
+    }
 
 
 def run_validate(

@@ -128,6 +128,12 @@ def _check_rig(path: str) -> None:
     load_rig_description(path)
 
 
+def _check_experiment(path: str) -> None:
+    from stiffopt.experiments.poses import load_poses
+
+    load_poses(path)
+
+
 def _check_log(path: str) -> None:
     if path.lower().endswith(".mcap"):
         from stiffopt.logs import read_mcap_log
@@ -151,5 +157,6 @@ _CHECKS: dict[str, Callable[[str], None]] = {
     "path": _check_path,
     "scene": _check_scene,
     "rig": _check_rig,
+    "experiment": _check_experiment,
     "log": _check_log,
 }

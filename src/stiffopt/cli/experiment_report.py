@@ -15,6 +15,7 @@ from stiffopt.experiments import (
     CoverageResult,
     KinematicsResult,
     KinematicsSettings,
+    PosesSettings,
     StiffnessResult,
 )
 from stiffopt.experiments.slope import SlopeEstimate
@@ -103,6 +104,60 @@ def kinematics_report(
     )
 
 
+def poses_report(
+    found: CoverageResult, settings: PosesSettings, model: Manipulator
+) -> ExperimentReport:
+    """Return the report of an experiment of given poses."""
+    length = display_units().length
+    lines = [
+        ("model", f"{model.description.name}, {length.text(model.length, 'g')} long"),
+        ("poses", f"{len(found.errors)} of {settings.poses}, held for {settings.hold:g} s each"),
+        *(("DOUBT", doubt) for doubt in found.doubts),
+    ]
+    rows = (("mean", found.mean), ("95th percentile", found.p95), ("largest", found.worst))
+    return ExperimentReport(
+        title=f"{settings.rig}: poses",
+        lines=tuple(lines),
+        table=TextTable(
+            "",
+            ("tip error", length.name, "% of length"),
+            tuple(
+                (label, length.number(error, ".2f"), f"{error / found.length * 100:.1f}")
+                for label, error in rows
+            ),
+            "distance of the model's tip from the measured one at the end of each pose",
+        ),
+    )
+
+
+def poses_record(
+    found: CoverageResult, settings: PosesSettings, model: Manipulator
+) -> dict[str, Any]:
+    """Return the results of an experiment of given poses for JSON, in SI units."""
+    return {
+        "rig": settings.rig,
+        "model": model.description.name,
+        "length_m": model.length,
+        **_poses_record(found),
+    }
+
+
+def _poses_record(found: CoverageResult) -> dict[str, Any]:
+    return {
+        "poses": len(found.errors), **_errors_record(found),
+        "pressures_pa": found.pressures, "errors_m": found.errors,
+        "speeds_m_per_s": found.speed, "doubts": found.doubts,
+    }  # fmt: skip
+
+
+def _errors_record(found: KinematicsResult | CoverageResult) -> dict[str, float]:
+    return {
+        "mean_error_m": found.mean,
+        "p95_error_m": found.p95,
+        "max_error_m": found.worst,
+    }
+
+
 def kinematics_record(
     result: KinematicsResult,
     coverage: CoverageResult | None,
@@ -110,31 +165,16 @@ def kinematics_record(
     model: Manipulator,
 ) -> dict[str, Any]:
     """Return the results of a kinematics experiment for JSON, in SI units."""
-
-    def errors(found: KinematicsResult | CoverageResult) -> dict[str, float]:
-        return {
-            "mean_error_m": found.mean,
-            "p95_error_m": found.p95,
-            "max_error_m": found.worst,
-        }
-
-    combined: dict[str, Any] | None = None
-    if coverage is not None:
-        combined = {
-            "poses": len(coverage.errors), **errors(coverage),
-            "pressures_pa": coverage.pressures, "errors_m": coverage.errors,
-            "speeds_m_per_s": coverage.speed, "doubts": coverage.doubts,
-        }  # fmt: skip
     return {
         "rig": settings.rig,
         "model": model.description.name,
         "length_m": model.length,
         "repetitions": result.repetitions,
         "samples": len(result.errors),
-        **errors(result),
+        **_errors_record(result),
         "repeatability_m": result.repeatability if result.repetitions > 1 else None,
         "doubts": result.doubts,
-        "combined": combined,
+        "combined": None if coverage is None else _poses_record(coverage),
     }
 
 

@@ -25,11 +25,14 @@ from stiffopt.cli.exits import (
 from stiffopt.errors import DeviceError, InputError, StiffoptError, require_package
 from stiffopt.experiments import (
     KinematicsSettings,
+    PosesSettings,
     StiffnessSettings,
     evaluate_coverage,
     evaluate_kinematics,
     evaluate_stiffness,
+    load_poses,
     run_kinematics,
+    run_poses,
     run_stiffness,
 )
 from stiffopt.experiments.coverage import coverage_for, round_count
@@ -46,12 +49,16 @@ from stiffopt.experiments.kinematics import (
     sequence_for,
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
+from stiffopt.experiments.poses import poses_for
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
 from stiffopt.logs import write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
 
-Settings = KinematicsSettings | StiffnessSettings
+Settings = KinematicsSettings | PosesSettings | StiffnessSettings
+_SCHEMAS: dict[str, type[Settings]] = {
+    "kinematics": KinematicsSettings, "poses": PosesSettings, "stiffness": StiffnessSettings,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -73,6 +80,8 @@ class _Plan:
                 missing_repetitions(self.folder, self.settings)
                 or missing_rounds(self.folder, self.settings)
             )
+        if isinstance(self.settings, PosesSettings):
+            return not missing_rounds(self.folder, self.settings)
         return not missing_series(self.folder, self.settings)
 
 
@@ -87,10 +96,12 @@ def run(
     plot: bool,
     as_json: bool = False,
     quiet: bool,
+    source: str = "",
 ) -> None:
     """Do an experiment, or go on with one; report and draw.
 
     `given` are the options that are settings of the experiment, None where an option is absent.
+    `source` is the file that the command was given, if that was not the rig file.
     """
     if plot:
         from stiffopt.plots import require_matplotlib
@@ -109,19 +120,35 @@ def run(
                 settings = plan.settings
                 if isinstance(settings, KinematicsSettings):
                     _report_kinematics(plan, settings, plot=plot, as_json=as_json, quiet=quiet)
+                elif isinstance(settings, PosesSettings):
+                    _report_poses(plan, settings, plot=plot, as_json=as_json, quiet=quiet)
                 else:
                     _report_stiffness(plan, settings, plot=plot, quiet=quiet)
     except (KeyboardInterrupt, _StoppedError):
         if not quiet:
             report_note(
                 f"what was recorded is in {plan.folder}; go on with: "
-                f"stiffopt experiment {experiment} {rig} --resume {plan.folder}"
+                f"stiffopt experiment {experiment} {source or rig} --resume {plan.folder}"
             )
         raise
 
 
 class _StoppedError(RigFaultError):
     """Something went wrong after the rig was opened."""
+
+
+def run_poses_file(
+    path: str, *, out: str | None, resume: str | None, model: str | None, plot: bool,
+    as_json: bool, quiet: bool,
+) -> None:  # fmt: skip
+    """Hold the poses of a file on its rig."""
+    wanted = load_poses(path)
+    given = {} if resume else {"pressures": wanted.pressures, "hold": wanted.hold}
+    rig = str(Path(path).parent / wanted.rig)
+    run(
+        "poses", rig, given, out=out, resume=resume, model=model, plot=plot, as_json=as_json,
+        quiet=quiet, source=path,
+    )  # fmt: skip
 
 
 # -- before anything moves ------------------------------------------------------------------------
@@ -138,8 +165,7 @@ def _planned(
     rig, name, rate, log_folder = _rig(rig_file)
     if resume is None:
         about = {"rig": name, "robot": rig.robot.name, "channels": rig.supply.n}
-        schema = KinematicsSettings if experiment == "kinematics" else StiffnessSettings
-        settings: Settings = schema(
+        settings: Settings = _SCHEMAS[experiment](
             **about, **{key: _read(key, value) for key, value in given.items()}
         )
         folder = Path(log_folder) / _new_name(experiment, name) if out is None else Path(out)
@@ -160,6 +186,8 @@ def _planned(
     if isinstance(settings, KinematicsSettings):
         sequence_for(rig, settings)
         coverage_for(rig, settings.poses, settings.settle, settings.max)
+    elif isinstance(settings, PosesSettings):
+        poses_for(rig, settings)
     else:
         check_stiffness(rig, settings)
         by_hand = rig.probe is not None and rig.probe.needs_a_person
@@ -193,8 +221,8 @@ def _old_settings(experiment: str, folder: Path, given: Mapping[str, Any]) -> Se
             f"--{next(iter(given))} cannot be changed when an experiment is resumed; "
             f"{folder} says what is done"
         )
-    if experiment == "stiffness":
-        return open_folder(folder, StiffnessSettings)
+    if experiment != "kinematics":
+        return open_folder(folder, _SCHEMAS[experiment])
     settings = open_folder(folder, KinematicsSettings)
     # an old folder that does not mention combined poses has none
     begun_with = settings.poses if "poses" in settings.model_fields_set else 0
@@ -210,8 +238,8 @@ _QUANTITIES = {
 }
 
 
-def _read(key: str, value: str | int) -> Any:
-    """Value of an option."""
+def _read(key: str, value: Any) -> Any:
+    """Value of an option, or what a file had."""
     if not isinstance(value, str):
         return value
     option = f"--{key}"
@@ -245,6 +273,8 @@ def _do(plan: _Plan, *, quiet: bool) -> None:
         }  # fmt: skip
         if isinstance(settings, KinematicsSettings):
             return run_kinematics(rig, folder, settings, **common)
+        if isinstance(settings, PosesSettings):
+            return run_poses(rig, folder, settings, **common)
         return run_stiffness(
             rig, folder, settings, plan.model, aside=waiting_for_a_person, **common
         )
@@ -309,6 +339,27 @@ def _report_kinematics(
             save_figure(plot_coverage(coverage, title=title), folder / "poses.png")
     if as_json:
         record = experiment_report.kinematics_record(result, coverage, settings, model)
+        write_json({**record, "folder": str(folder)})
+    elif not quiet:
+        show(report.renderable(str(folder)))
+
+
+def _report_poses(
+    plan: _Plan, settings: PosesSettings, *, plot: bool, as_json: bool, quiet: bool
+) -> None:
+    folder, model = plan.folder, plan.model
+    found = evaluate_coverage(read_rounds(folder, round_count(settings.poses)), model)
+    if found is None:
+        raise InputError(f"the tip was seen in no pose; the recordings are in {folder}")
+    report = experiment_report.poses_report(found, settings, model)
+    report.write(folder)
+    if plot:
+        from stiffopt.plots import save_figure
+        from stiffopt.plots.experiments import plot_coverage
+
+        save_figure(plot_coverage(found, title=report.title), folder / "poses.png")
+    if as_json:
+        record = experiment_report.poses_record(found, settings, model)
         write_json({**record, "folder": str(folder)})
     elif not quiet:
         show(report.renderable(str(folder)))

@@ -17,6 +17,7 @@ from stiffopt.experiments.kinematics_result import (
     evaluate_coverage,
     evaluate_kinematics,
 )
+from stiffopt.experiments.poses import PosesSettings, load_poses, run_poses
 from stiffopt.experiments.stiffness import StiffnessSettings, run_stiffness
 from stiffopt.experiments.stiffness_result import StiffnessResult, evaluate_stiffness
 
@@ -25,6 +26,7 @@ __all__ = [
     "CoverageResult",
     "KinematicsResult",
     "KinematicsSettings",
+    "PosesSettings",
     "PressureSequence",
     "StiffnessResult",
     "StiffnessSettings",
@@ -32,8 +34,10 @@ __all__ = [
     "evaluate_coverage",
     "evaluate_kinematics",
     "evaluate_stiffness",
+    "load_poses",
     "map_arm",
     "map_tip",
     "run_kinematics",
+    "run_poses",
     "run_stiffness",
 ]

@@ -251,6 +251,22 @@ class ErrorSettings:
 
 
 @dataclass(frozen=True)
+class SuggestionSettings:
+    """Poses that a calibration suggests to record next (`stiffopt.identify.suggestion`).
+
+    Attributes
+    ----------
+    poses : how many, unless somebody says.
+    candidates : from which they are chosen, besides those of one channel and of all.
+    levels : of these, as shares of the range of pressures.
+    """
+
+    poses: int = 12
+    candidates: int = 200
+    levels: tuple[float, ...] = (0.5, 1.0)
+
+
+@dataclass(frozen=True)
 class ReportSettings:
     """What is remarked on in the result (`stiffopt.identify.results`).
 
@@ -330,6 +346,7 @@ FIT = FitSettings()
 CHOICE = ChoiceSettings()
 ERRORS = ErrorSettings()
 REPORT = ReportSettings()
+SUGGESTION = SuggestionSettings()
 DETECTION = DetectionSettings()
 
 

@@ -30,6 +30,7 @@ MODELS = {
     "path": "stiffopt.paths.path:Path",
     "scene": "stiffopt.model.scene:Scene",
     "rig": "stiffopt.rig.config:RigDescription",
+    "experiment": "stiffopt.experiments.poses:PosesFile",
 }
 """The kinds of files that people write, and the models that read them."""
 

@@ -1,0 +1,172 @@
+"""Which poses to record next, so that a calibrated arm is known best over all its pressures.
+
+Poses are chosen one after another from many candidates, each so that the mean variance of the tip
+over the arm's pressures becomes least (a greedy V-optimal design; Fedorov, Theory of Optimal
+Experiments, 1972).  The variance has the two parts that recordings can change:
+
+* the errors of the numbers with covariance C and slopes J of the tip, ``trace(J C J')``.  A pose
+  with slopes J_c that is read with a covariance R leaves
+  ``C - C J_c' (J_c C J_c' + R)^-1 J_c C``, so that the mean falls by
+  ``trace((J_c C J_c' + R)^-1 J_c C M C J_c')`` with the mean M of ``J' J``;
+* the discrepancy between model and arm, whose variance grows with the distance from what was
+  recorded (`stiffopt.model.calibration.ErrorModel`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stiffopt.errors import InputError
+from stiffopt.identify.settings import SUGGESTION
+from stiffopt.model.calibration import Calibration, ErrorModel
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.parameters import Parameter
+from stiffopt.model.uncertainty import ReadingSlopes
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Suggestion:
+    """Poses to record next.
+
+    Attributes
+    ----------
+    pressures : (m, n), in Pa, the most useful first.
+    before, after : standard deviation of the tip's position that recordings can change, root mean
+        square over the arm's pressures, in m: now, and expected with these poses.
+    """
+
+    pressures: Array
+    before: float
+    after: float
+
+
+def suggest_poses(
+    robot: RobotDescription,
+    count: int = SUGGESTION.poses,
+    low: ArrayLike | None = None,
+    high: ArrayLike | None = None,
+    is_allowed: Callable[[Array], bool] = lambda pressures: True,
+) -> Suggestion:
+    """Suggest poses.
+
+    Parameters
+    ----------
+    robot : calibrated.
+    count : of the poses.
+    low, high : (n,)
+        Limits of pressures in Pa; by default the robot's.
+    is_allowed : says whether pressures (n,) in Pa may be commanded.
+
+    Raises
+    ------
+    InputError
+        The robot's file does not tell its errors, or nothing is allowed.
+    """
+    calibration = robot.calibration
+    if calibration is None or calibration.errors is None:
+        raise InputError(
+            f"robot '{robot.name}' does not tell the errors of its predictions; fit it to "
+            "recordings with 'stiffopt calibrate'"
+        )
+    low = np.array(robot.pressure_min if low is None else low, dtype=float)
+    high = np.array(robot.pressure_max if high is None else high, dtype=float)
+    candidates = np.array([p for p in _candidates(low, high) if is_allowed(p)])
+    if len(candidates) < count:
+        raise InputError(f"there are only {len(candidates)} poses that the rig allows")
+    return _Design(robot, calibration, calibration.errors, candidates).chosen(count)
+
+
+def _candidates(low: Array, high: Array) -> Array:
+    """Pressures (N, n): each channel alone, all together, and spread evenly over the box."""
+    from scipy.stats.qmc import Halton  # a large library; only fits need it
+
+    base = np.clip(0.0, low, high)
+    alone = [base + level * np.diag(high - base) for level in SUGGESTION.levels]
+    together = [base + level * (high - base)[np.newaxis] for level in SUGGESTION.levels]
+    spread = Halton(len(low), scramble=False).random(SUGGESTION.candidates)
+    return np.round(np.vstack([*alone, *together, low + spread * (high - low)]), -2)
+
+
+class _Design:
+    """What is known before and after poses are recorded; candidates stand for all pressures too."""
+
+    def __init__(
+        self,
+        robot: RobotDescription,
+        calibration: Calibration,
+        errors: ErrorModel,
+        candidates: Array,
+    ) -> None:
+        self._errors, self._candidates = errors, candidates
+        self._channels = [segment.n_channels for segment in robot.segments]
+        keys = [Parameter(each.key) for each in calibration.parameters]
+        slopes = ReadingSlopes(robot, keys, len(calibration.frames))
+        _, self._slopes, self._acting = slopes.at(candidates)
+        self._covariance = calibration.covariance
+        self._mean = np.mean(np.swapaxes(self._slopes, 1, 2) @ self._slopes, axis=0)
+        # what a variance of a segment's effective pressures does to the tip, (N, segments)
+        squares = (self._acting**2).sum(axis=1)
+        ends = np.cumsum([0, *self._channels])
+        self._weights = np.add.reduceat(squares, ends[:-1], axis=1)
+        self._distances = errors.distances(self._channels, candidates)
+        self._between = np.stack(
+            [
+                np.linalg.norm(candidates[:, np.newaxis, a:b] - candidates[:, a:b], axis=2)
+                for a, b in pairwise(ends)
+            ],
+            axis=2,
+        )
+
+    def chosen(self, count: int) -> Suggestion:
+        """The best poses, one after another."""
+        before, chosen = self._deviation(), list[int]()
+        for _ in range(count):
+            gains = self._gains()
+            gains[chosen] = -np.inf
+            chosen.append(int(np.argmax(gains)))
+            self._record(chosen[-1])
+        return Suggestion(self._candidates[chosen], before, self._deviation())
+
+    def _variance(self, distances: Array) -> Array:
+        """Variance of a channel's discrepancy at distances from what was recorded, in Pa^2."""
+        known = self._errors
+        growth = -np.expm1(-2 * distances / known.reach)
+        return np.asarray(known.discrepancy**2 * growth + (known.gain * distances) ** 2)
+
+    def _reading(self, index: int) -> Array:
+        """Covariance (3, 3) of what a candidate's reading tells of the numbers, in m^2."""
+        variance = np.repeat(self._errors.discrepancy**2, self._acting.shape[2])
+        own = self._acting[index]
+        return np.asarray(self._errors.residual**2 * np.eye(3) + (own * variance) @ own.T)
+
+    def _gains(self) -> Array:
+        """By how much each candidate would lower the mean variance (N,), in m^2."""
+        now = self._variance(self._distances)
+        found = np.zeros(len(self._candidates))
+        for index, slope in enumerate(self._slopes):
+            seen = slope @ self._covariance
+            inverse = np.linalg.inv(seen @ slope.T + self._reading(index))
+            then = self._variance(np.minimum(self._distances, self._between[index]))
+            found[index] = np.trace(inverse @ seen @ self._mean @ seen.T)
+            found[index] += np.mean((self._weights * (now - then)).sum(axis=1))
+        return found
+
+    def _record(self, index: int) -> None:
+        """Take a candidate as recorded."""
+        slope = self._slopes[index]
+        seen = slope @ self._covariance
+        inverse = np.linalg.inv(seen @ slope.T + self._reading(index))
+        self._covariance = self._covariance - seen.T @ inverse @ seen
+        self._distances = np.minimum(self._distances, self._between[index])
+
+    def _deviation(self) -> float:
+        """Root mean square (over all pressures) of the tip's standard deviation, in m."""
+        discrepancy = np.mean((self._weights * self._variance(self._distances)).sum(axis=1))
+        return float(np.sqrt(np.trace(self._mean @ self._covariance) + discrepancy))
