@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 import stiffopt
 from stiffopt.cli import quantities
-from stiffopt.cli.console import report_error, show, write_json
+from stiffopt.cli.console import report_error, show, write_json, write_line
 from stiffopt.cli.exits import (
     FAILED,
     INTERRUPTED,
@@ -28,7 +28,7 @@ from stiffopt.cli.exits import (
 )
 from stiffopt.cli.outputs import check_new_file, check_new_folder, new_folder
 from stiffopt.display import display_units
-from stiffopt.errors import CancelledError, FileError, InputError, require_package, shown
+from stiffopt.errors import CancelledError, FileError, InputError, printable, require_package, shown
 from stiffopt.experiments.poses import save_poses
 from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
@@ -138,11 +138,11 @@ def run_calibrate(
         show(calibration(result, out, report))
         if suggestion is not None:
             length = display_units().length
-            show(
-                f"  poses       {suggest}: {len(suggestion.pressures)} to record next, by which "
-                f"what is uncertain of the tip\n              is expected to fall from "
-                f"{length.text(suggestion.before, '.2f')} to {length.text(suggestion.after, '.2f')}"
-                " (root mean square over all pressures)"
+            then, now = length.text(suggestion.after, ".2f"), length.text(suggestion.before, ".2f")
+            write_line(
+                f"  poses       {printable(suggest or '')}, {len(suggestion.pressures)} to record "
+                "next: the tip's uncertainty\n              (root mean square over all pressures) "
+                f"should fall from {now} to {then}"
             )
     return code
 

@@ -381,8 +381,9 @@ def _result(
 ) -> CalibrationResult:
     chosen = [each for each in candidates if each.structure is structure]
     errors = None
-    if chosen:
-        errors = error_model(chosen[0].fit, chosen[0].held_back, _recorded(setup))
+    if setup.recordings:
+        trial, parts = (chosen[0].fit, chosen[0].held_back) if chosen else (found, {})
+        errors = error_model(trial, parts, _recorded(setup))
         found = replace(found, covariance=covariance_with(found, errors))
     listed = estimates(found)
     robot = _robot(setup, found, errors)

@@ -54,7 +54,7 @@ def error_model(
     Parameters
     ----------
     found : fit to all rows.
-    held_back : of the same problem, by what was held back.
+    held_back : of the same problem, by what was held back; of nothing, what is expected stays.
     recorded : all recorded pressures (N, n), in Pa; by default those of the rows that are fitted.
     """
     pressures = commanded(found.problem.samples)
