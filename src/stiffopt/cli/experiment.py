@@ -134,42 +134,6 @@ def kinematics(
     )  # fmt: skip
 
 
-POSES_HELP = """\
-Hold given poses, one after another, and record the tip.
-
-FILE names a rig file and has the pressures of each pose, as `stiffopt calibrate --suggest` writes
-them. Recordings (log v1 as CSV, and MCAP), a report and a figure against the model go into a
-folder; after six poses the arm returns to no pressure.
-"""
-
-_POSES_EPILOG = f"""\
-\b
-Examples:
-  stiffopt experiment poses next.yaml --out second
-  stiffopt experiment poses next.yaml --resume second
-{_CODES}"""
-
-
-@experiment_app.command("poses", help=POSES_HELP, epilog=_POSES_EPILOG)
-@with_exit_code
-def poses(
-    file: Annotated[str, typer.Argument(metavar="FILE", show_default=False)],
-    out: Out = None,
-    resume: Resume = None,
-    model: Model = None,
-    no_plot: NoPlot = False,
-    as_json: Json = False,
-    units: Units = None,
-    quiet: Quiet = False,
-) -> None:
-    """Hold the poses of a file."""
-    from stiffopt.cli import experiment_run
-
-    experiment_run.run_poses_file(
-        file, out=out, resume=resume, model=model, plot=not no_plot, as_json=as_json, quiet=quiet
-    )
-
-
 @experiment_app.command("stiffness", help=STIFFNESS_HELP, epilog=_STIFFNESS_EPILOG)
 @with_exit_code
 def stiffness(
@@ -227,3 +191,32 @@ def stiffness(
     experiment_run.run(
         "stiffness", rig, given, out=out, resume=resume, model=model, plot=not no_plot, quiet=quiet
     )
+
+
+POSES_HELP = """\
+Go through the pressures of a file on a rig, hold each, and record the tip.
+
+FILE (format: stiffopt-experiment/1) has the keys rig, a rig file relative to it; hold, a time; and
+pressures, one value a channel for each pose. The arm goes there gently, through the safety gate,
+begins and ends at nothing, and the recording (log v1 as CSV, and MCAP) can be calibrated with.
+"""
+
+_POSES_EPILOG = f"""\
+\b
+Examples:
+  stiffopt experiment poses next.yaml
+  stiffopt experiment poses next.yaml --out more
+{_CODES}"""
+
+
+@experiment_app.command("poses", help=POSES_HELP, epilog=_POSES_EPILOG)
+@with_exit_code
+def poses(
+    file: Annotated[str, typer.Argument(metavar="FILE", show_default=False)],
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """Go through poses."""
+    from stiffopt.cli import experiment_run
+
+    experiment_run.run_poses_file(file, out=out, quiet=quiet)

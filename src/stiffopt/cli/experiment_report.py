@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
@@ -15,31 +16,38 @@ from stiffopt.experiments import (
     CoverageResult,
     KinematicsResult,
     KinematicsSettings,
-    PosesSettings,
     StiffnessResult,
 )
 from stiffopt.experiments.slope import SlopeEstimate
+from stiffopt.logs import StiffnessTable
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.rig.settings import Published
 
 
 @dataclass(frozen=True)
 class ExperimentReport:
-    """What an experiment found: a title, lines with a label each, and a table."""
+    """What an experiment found: a title, labelled lines, and tables; one beside the published."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
     table: TextTable
+    published: TextTable | None = None
 
     def renderable(self, folder: str) -> RenderableType:
         """Return the report for the terminal."""
         lines = [(label, printable(text)) for label, text in (*self.lines, ("folder", folder))]
-        return Group(title(self.title), labelled(lines), Text(""), self.table.renderable())
+        blocks = [title(self.title), labelled(lines), Text(""), self.table.renderable()]
+        if self.published is not None:
+            blocks += [Text(""), self.published.renderable()]
+        return Group(*blocks)
 
     def write(self, folder: Path) -> None:
         """Write the report as a Markdown page into a folder."""
         page = MarkdownPage(folder, self.title)
         page.bullets([f"{label}: {text}" for label, text in self.lines])
         page.table(self.table)
+        if self.published is not None:
+            page.table(self.published)
         page.write()
 
 
@@ -48,6 +56,7 @@ def kinematics_report(
     coverage: CoverageResult | None,
     settings: KinematicsSettings,
     model: Manipulator,
+    published: Published | None = None,
 ) -> ExperimentReport:
     """Return the report of a kinematics experiment, and of its combined poses if there are any."""
     found: list[KinematicsResult | CoverageResult] = [result]
@@ -101,61 +110,39 @@ def kinematics_report(
             ),
             remark,
         ),
+        published=_errors_beside(result, published) if published is not None else None,
     )
 
 
-def poses_report(
-    found: CoverageResult, settings: PosesSettings, model: Manipulator
-) -> ExperimentReport:
-    """Return the report of an experiment of given poses."""
+def _errors_beside(result: KinematicsResult, published: Published) -> TextTable | None:
+    """Errors along each axis beside what was published of them."""
+    if published.tip_error is None:
+        return None
     length = display_units().length
-    lines = [
-        ("model", f"{model.description.name}, {length.text(model.length, 'g')} long"),
-        ("poses", f"{len(found.errors)} of {settings.poses}, held for {settings.hold:g} s each"),
-        *(("DOUBT", doubt) for doubt in found.doubts),
-    ]
-    rows = (("mean", found.mean), ("95th percentile", found.p95), ("largest", found.worst))
-    return ExperimentReport(
-        title=f"{settings.rig}: poses",
-        lines=tuple(lines),
-        table=TextTable(
-            "",
-            ("tip error", length.name, "% of length"),
-            tuple(
-                (label, length.number(error, ".2f"), f"{error / found.length * 100:.1f}")
-                for label, error in rows
-            ),
-            "distance of the model's tip from the measured one at the end of each pose",
-        ),
+    within = published.tip_error
+    most = "-"
+    if published.largest_tip_error is not None:
+        most = length.number(published.largest_tip_error, "g")
+    rows = []
+    for axis, name in enumerate("xyz"):
+        errors = np.abs(result.component_error[:, axis])
+        errors = errors[np.isfinite(errors)]
+        rows.append(
+            (
+                name,
+                length.number(float(np.quantile(errors, 0.95)), ".2f"),
+                length.number(float(errors.max()), ".2f"),
+                f"{np.mean(errors <= within) * 100:.0f} %",
+                length.number(within, "g"),
+                most,
+            )
+        )
+    return TextTable(
+        f"Error of the model's tip along each axis in {length}, beside what was published",
+        ("axis", "95 % below", "largest", "within", "published: mostly", "at most"),
+        tuple(rows),
+        "within: share of the time in which the error is not above what was mostly published",
     )
-
-
-def poses_record(
-    found: CoverageResult, settings: PosesSettings, model: Manipulator
-) -> dict[str, Any]:
-    """Return the results of an experiment of given poses for JSON, in SI units."""
-    return {
-        "rig": settings.rig,
-        "model": model.description.name,
-        "length_m": model.length,
-        **_poses_record(found),
-    }
-
-
-def _poses_record(found: CoverageResult) -> dict[str, Any]:
-    return {
-        "poses": len(found.errors), **_errors_record(found),
-        "pressures_pa": found.pressures, "errors_m": found.errors,
-        "speeds_m_per_s": found.speed, "doubts": found.doubts,
-    }  # fmt: skip
-
-
-def _errors_record(found: KinematicsResult | CoverageResult) -> dict[str, float]:
-    return {
-        "mean_error_m": found.mean,
-        "p95_error_m": found.p95,
-        "max_error_m": found.worst,
-    }
 
 
 def kinematics_record(
@@ -165,21 +152,38 @@ def kinematics_record(
     model: Manipulator,
 ) -> dict[str, Any]:
     """Return the results of a kinematics experiment for JSON, in SI units."""
+
+    def errors(found: KinematicsResult | CoverageResult) -> dict[str, float]:
+        return {
+            "mean_error_m": found.mean,
+            "p95_error_m": found.p95,
+            "max_error_m": found.worst,
+        }
+
+    combined: dict[str, Any] | None = None
+    if coverage is not None:
+        combined = {
+            "poses": len(coverage.errors), **errors(coverage),
+            "pressures_pa": coverage.pressures, "errors_m": coverage.errors,
+            "speeds_m_per_s": coverage.speed, "doubts": coverage.doubts,
+        }  # fmt: skip
     return {
         "rig": settings.rig,
         "model": model.description.name,
         "length_m": model.length,
         "repetitions": result.repetitions,
         "samples": len(result.errors),
-        **_errors_record(result),
+        **errors(result),
         "repeatability_m": result.repeatability if result.repetitions > 1 else None,
         "doubts": result.doubts,
-        "combined": None if coverage is None else _poses_record(coverage),
+        "combined": combined,
     }
 
 
-def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentReport:
-    """Return the report of a stiffness experiment."""
+def stiffness_report(
+    result: StiffnessResult, model: Manipulator, published: StiffnessTable | None = None
+) -> ExperimentReport:
+    """Return the report of a stiffness experiment, beside a table that was published of the arm."""
     settings = result.settings
     names = [direction_name(direction) for direction in settings.directions]
     unit, pressure_unit = display_units().stiffness, display_units().pressure
@@ -206,6 +210,42 @@ def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentR
             tuple(rows),
             "+-: 95 % confidence interval of the mean over the repetitions",
         ),
+        published=_stiffness_beside(result, published) if published is not None else None,
+    )
+
+
+def _stiffness_beside(result: StiffnessResult, published: StiffnessTable) -> TextTable | None:
+    """Stiffness that was measured and modelled beside what was published."""
+    rows = []
+    units = display_units()
+    spread = published.others.get("repeatability_n_per_m", published.sigma)
+    for row, cell in result.beside(published):
+        known = float(published.stiffness[row])
+
+        def off(value: float, known: float = known) -> str:
+            return f"{(value / known - 1) * 100:+.0f} %"
+
+        here = ("no contact", "-")
+        if cell.estimate is not None:
+            here = (_estimate(cell.estimate), off(cell.estimate.value))
+        rows.append(
+            (
+                units.pressure.number(cell.pressure, "g"),
+                direction_name(tuple(published.directions[row])),
+                f"{units.stiffness.number(known)} +- {units.stiffness.number(float(spread[row]))}",
+                *here,
+                units.stiffness.number(cell.model, FIGURES),
+                off(cell.model),
+            )
+        )
+    if not rows:
+        return None
+    return TextTable(
+        f"Stiffness in {units.stiffness}, beside what was published",
+        (f"{units.pressure}", "along", "published", "measured here", "off by", "model", "off by"),
+        tuple(rows),
+        "off by: relative to the published value",
+        words=("along",),
     )
 
 

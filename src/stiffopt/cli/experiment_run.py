@@ -1,5 +1,7 @@
 """Run `stiffopt experiment`: check all files and options, move the arm, vent it, report."""
 
+from __future__ import annotations
+
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -25,14 +27,11 @@ from stiffopt.cli.exits import (
 from stiffopt.errors import DeviceError, InputError, StiffoptError, require_package
 from stiffopt.experiments import (
     KinematicsSettings,
-    PosesSettings,
     StiffnessSettings,
     evaluate_coverage,
     evaluate_kinematics,
     evaluate_stiffness,
-    load_poses,
     run_kinematics,
-    run_poses,
     run_stiffness,
 )
 from stiffopt.experiments.coverage import coverage_for, round_count
@@ -49,16 +48,15 @@ from stiffopt.experiments.kinematics import (
     sequence_for,
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
-from stiffopt.experiments.poses import poses_for
+from stiffopt.experiments.poses import POSES, PosesFile, poses_for, run_poses
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
-from stiffopt.logs import write_stiffness_table
+from stiffopt.files import read_file
+from stiffopt.logs import StiffnessTable, read_stiffness_table, write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
+from stiffopt.rig.settings import Published
 
-Settings = KinematicsSettings | PosesSettings | StiffnessSettings
-_SCHEMAS: dict[str, type[Settings]] = {
-    "kinematics": KinematicsSettings, "poses": PosesSettings, "stiffness": StiffnessSettings,
-}  # fmt: skip
+Settings = KinematicsSettings | StiffnessSettings
 
 
 @dataclass(frozen=True)
@@ -71,6 +69,8 @@ class _Plan:
     settings: Settings
     model: Manipulator
     is_new: bool
+    published: Published | None
+    table: StiffnessTable | None
 
     @property
     def is_complete(self) -> bool:
@@ -80,8 +80,6 @@ class _Plan:
                 missing_repetitions(self.folder, self.settings)
                 or missing_rounds(self.folder, self.settings)
             )
-        if isinstance(self.settings, PosesSettings):
-            return not missing_rounds(self.folder, self.settings)
         return not missing_series(self.folder, self.settings)
 
 
@@ -96,12 +94,10 @@ def run(
     plot: bool,
     as_json: bool = False,
     quiet: bool,
-    source: str = "",
 ) -> None:
     """Do an experiment, or go on with one; report and draw.
 
     `given` are the options that are settings of the experiment, None where an option is absent.
-    `source` is the file that the command was given, if that was not the rig file.
     """
     if plot:
         from stiffopt.plots import require_matplotlib
@@ -120,35 +116,44 @@ def run(
                 settings = plan.settings
                 if isinstance(settings, KinematicsSettings):
                     _report_kinematics(plan, settings, plot=plot, as_json=as_json, quiet=quiet)
-                elif isinstance(settings, PosesSettings):
-                    _report_poses(plan, settings, plot=plot, as_json=as_json, quiet=quiet)
                 else:
                     _report_stiffness(plan, settings, plot=plot, quiet=quiet)
     except (KeyboardInterrupt, _StoppedError):
         if not quiet:
             report_note(
                 f"what was recorded is in {plan.folder}; go on with: "
-                f"stiffopt experiment {experiment} {source or rig} --resume {plan.folder}"
+                f"stiffopt experiment {experiment} {rig} --resume {plan.folder}"
             )
         raise
 
 
+def run_poses_file(file: str, *, out: str | None, quiet: bool) -> None:
+    """Go through the poses of a file on the rig that it names, and record it."""
+    require_package("foxglove-sdk", "log", "foxglove")
+    settings = read_file(file, "experiment", PosesFile)
+    with interruptible(), warnings_as_notes(quiet=quiet):
+        rig, name, rate, log_folder = _rig(str(Path(file).parent / settings.rig))
+        if rig.tracker is None:
+            raise InputError("this rig has no tracker; the experiments need one")
+        rig.supply.check_arming()
+        poses_for(rig, settings)
+        folder = Path(log_folder) / _new_name("poses", name) if out is None else Path(out)
+        create_folder(folder, settings)
+    interrupt, bar = InterruptBetweenSteps(), ProgressBar(quiet=quiet)
+
+    def work() -> list[str]:
+        run_poses(rig, folder, settings, rate=rate, progress=bar.report, check=interrupt.check)
+        return []
+
+    with warnings_as_notes(quiet=quiet), alone_in(folder), interrupt.handled(), bar:
+        _open(rig, folder)
+        _on_rig(rig, work, interrupt)
+    if not quiet:
+        report_note(f"{len(settings.pressures)} poses are recorded in {folder / POSES}.csv")
+
+
 class _StoppedError(RigFaultError):
     """Something went wrong after the rig was opened."""
-
-
-def run_poses_file(
-    path: str, *, out: str | None, resume: str | None, model: str | None, plot: bool,
-    as_json: bool, quiet: bool,
-) -> None:  # fmt: skip
-    """Hold the poses of a file on its rig."""
-    wanted = load_poses(path)
-    given = {} if resume else {"pressures": wanted.pressures, "hold": wanted.hold}
-    rig = str(Path(path).parent / wanted.rig)
-    run(
-        "poses", rig, given, out=out, resume=resume, model=model, plot=plot, as_json=as_json,
-        quiet=quiet, source=path,
-    )  # fmt: skip
 
 
 # -- before anything moves ------------------------------------------------------------------------
@@ -163,9 +168,11 @@ def _planned(
     model_name: str | None,
 ) -> _Plan:
     rig, name, rate, log_folder = _rig(rig_file)
+    published, table = _published(rig, rig_file)
     if resume is None:
         about = {"rig": name, "robot": rig.robot.name, "channels": rig.supply.n}
-        settings: Settings = _SCHEMAS[experiment](
+        schema = KinematicsSettings if experiment == "kinematics" else StiffnessSettings
+        settings: Settings = schema(
             **about, **{key: _read(key, value) for key, value in given.items()}
         )
         folder = Path(log_folder) / _new_name(experiment, name) if out is None else Path(out)
@@ -186,8 +193,6 @@ def _planned(
     if isinstance(settings, KinematicsSettings):
         sequence_for(rig, settings)
         coverage_for(rig, settings.poses, settings.settle, settings.max)
-    elif isinstance(settings, PosesSettings):
-        poses_for(rig, settings)
     else:
         check_stiffness(rig, settings)
         by_hand = rig.probe is not None and rig.probe.needs_a_person
@@ -195,7 +200,9 @@ def _planned(
             raise InputError("this probe is mounted by hand; run the experiment at a terminal")
     if resume is None:
         create_folder(folder, settings)
-    return _Plan(rig, rate, folder, settings, model, is_new=resume is None)
+    return _Plan(
+        rig, rate, folder, settings, model, is_new=resume is None, published=published, table=table
+    )
 
 
 def _rig(path: str) -> tuple[Rig, str, float, str]:
@@ -205,6 +212,14 @@ def _rig(path: str) -> tuple[Rig, str, float, str]:
 
     description = load_rig_description(path)
     return open_rig(path), description.name, description.rate, description.log.folder
+
+
+def _published(rig: Rig, path: str) -> tuple[Published | None, StiffnessTable | None]:
+    """What a rig file says was published of its arm, with the table of stiffness that it names."""
+    published = None if rig.settings is None else rig.settings.published
+    if published is None or published.stiffness is None:
+        return published, None
+    return published, read_stiffness_table(Path(path).parent / published.stiffness)
 
 
 def _new_name(experiment: str, rig: str) -> str:
@@ -221,8 +236,8 @@ def _old_settings(experiment: str, folder: Path, given: Mapping[str, Any]) -> Se
             f"--{next(iter(given))} cannot be changed when an experiment is resumed; "
             f"{folder} says what is done"
         )
-    if experiment != "kinematics":
-        return open_folder(folder, _SCHEMAS[experiment])
+    if experiment == "stiffness":
+        return open_folder(folder, StiffnessSettings)
     settings = open_folder(folder, KinematicsSettings)
     # an old folder that does not mention combined poses has none
     begun_with = settings.poses if "poses" in settings.model_fields_set else 0
@@ -238,8 +253,8 @@ _QUANTITIES = {
 }
 
 
-def _read(key: str, value: Any) -> Any:
-    """Value of an option, or what a file had."""
+def _read(key: str, value: str | int) -> Any:
+    """Value of an option."""
     if not isinstance(value, str):
         return value
     option = f"--{key}"
@@ -273,27 +288,25 @@ def _do(plan: _Plan, *, quiet: bool) -> None:
         }  # fmt: skip
         if isinstance(settings, KinematicsSettings):
             return run_kinematics(rig, folder, settings, **common)
-        if isinstance(settings, PosesSettings):
-            return run_poses(rig, folder, settings, **common)
         return run_stiffness(
             rig, folder, settings, plan.model, aside=waiting_for_a_person, **common
         )
 
     with alone_in(plan.folder), interrupt.handled(), bar:
-        _open(plan)
+        _open(plan.rig, plan.folder if plan.is_new else None)
         notes = _on_rig(plan.rig, work, interrupt)
     if not quiet:
         for note in notes:
             report_note(note)
 
 
-def _open(plan: _Plan) -> None:
-    """Open the rig; leave no folder behind if there is none."""
+def _open(rig: Rig, new: Path | None) -> None:
+    """Open the rig; leave no new folder behind if there is none."""
     try:
-        plan.rig.open()
+        rig.open()
     except StiffoptError as error:
-        if plan.is_new:
-            remove_folder(plan.folder)
+        if new is not None:
+            remove_folder(new)
         raise RigFaultError(str(error)) if isinstance(error, DeviceError) else error from error
 
 
@@ -327,13 +340,15 @@ def _report_kinematics(
     folder, model = plan.folder, plan.model
     result = evaluate_kinematics(read_recordings(folder, settings), model)
     coverage = evaluate_coverage(read_rounds(folder, round_count(settings.poses)), model)
-    report = experiment_report.kinematics_report(result, coverage, settings, model)
+    report = experiment_report.kinematics_report(result, coverage, settings, model, plan.published)
     report.write(folder)
     if plot:
         from stiffopt.plots import save_figure
         from stiffopt.plots.experiments import plot_coverage, plot_kinematics
 
-        save_figure(plot_kinematics(result, title=report.title), folder / "figure.png")
+        within = None if plan.published is None else plan.published.tip_error
+        figure = plot_kinematics(result, title=report.title, published=within)
+        save_figure(figure, folder / "figure.png")
         if coverage is not None:
             title = f"{report.title}, combined poses"
             save_figure(plot_coverage(coverage, title=title), folder / "poses.png")
@@ -344,37 +359,17 @@ def _report_kinematics(
         show(report.renderable(str(folder)))
 
 
-def _report_poses(
-    plan: _Plan, settings: PosesSettings, *, plot: bool, as_json: bool, quiet: bool
-) -> None:
-    folder, model = plan.folder, plan.model
-    found = evaluate_coverage(read_rounds(folder, round_count(settings.poses)), model)
-    if found is None:
-        raise InputError(f"the tip was seen in no pose; the recordings are in {folder}")
-    report = experiment_report.poses_report(found, settings, model)
-    report.write(folder)
-    if plot:
-        from stiffopt.plots import save_figure
-        from stiffopt.plots.experiments import plot_coverage
-
-        save_figure(plot_coverage(found, title=report.title), folder / "poses.png")
-    if as_json:
-        record = experiment_report.poses_record(found, settings, model)
-        write_json({**record, "folder": str(folder)})
-    elif not quiet:
-        show(report.renderable(str(folder)))
-
-
 def _report_stiffness(plan: _Plan, settings: StiffnessSettings, *, plot: bool, quiet: bool) -> None:
     folder, model = plan.folder, plan.model
     result = evaluate_stiffness(folder, settings, model)
     write_stiffness_table(folder / "stiffness.csv", result.table())
-    report = experiment_report.stiffness_report(result, model)
+    report = experiment_report.stiffness_report(result, model, plan.table)
     report.write(folder)
     if plot:
         from stiffopt.plots import save_figure
         from stiffopt.plots.experiments import plot_stiffness
 
-        save_figure(plot_stiffness(result, title=report.title), folder / "figure.png")
+        figure = plot_stiffness(result, title=report.title, published=plan.table)
+        save_figure(figure, folder / "figure.png")
     if not quiet:
         show(report.renderable(str(folder)))

@@ -17,7 +17,6 @@ from stiffopt.experiments.kinematics_result import (
     evaluate_coverage,
     evaluate_kinematics,
 )
-from stiffopt.experiments.poses import PosesSettings, load_poses, run_poses
 from stiffopt.experiments.stiffness import StiffnessSettings, run_stiffness
 from stiffopt.experiments.stiffness_result import StiffnessResult, evaluate_stiffness
 
@@ -26,7 +25,6 @@ __all__ = [
     "CoverageResult",
     "KinematicsResult",
     "KinematicsSettings",
-    "PosesSettings",
     "PressureSequence",
     "StiffnessResult",
     "StiffnessSettings",
@@ -34,10 +32,8 @@ __all__ = [
     "evaluate_coverage",
     "evaluate_kinematics",
     "evaluate_stiffness",
-    "load_poses",
     "map_arm",
     "map_tip",
     "run_kinematics",
-    "run_poses",
     "run_stiffness",
 ]

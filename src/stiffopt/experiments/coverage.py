@@ -6,7 +6,7 @@ what happens above its peaks; a model fitted to it alone would have to extrapola
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stiffopt.errors import InputError
-from stiffopt.experiments.conductor import CONDUCTOR, Array, Conductor, TrackedFrame, at_rest
+from stiffopt.experiments.conductor import CONDUCTOR, Array, Conductor, at_rest
 from stiffopt.experiments.folder import recorded
 from stiffopt.rig.interface import Rig
 from stiffopt.safety.gate import effective_slew
@@ -60,7 +60,6 @@ class Coverage:
     poses: Array  # pressures (N, n), in Pa
     speed: Array  # rates (n,) at which pressures change, in Pa/s
     settle: float  # time that the arm may take to come to rest in a pose, in s
-    held: bool = False  # whether each pose is held for all of that time, at rest or not
 
     @property
     def rounds(self) -> list[Array]:
@@ -114,9 +113,8 @@ class Coverage:
                     f"combined pose {count} of {len(self.poses)}",
                 )
                 conductor.ramp(pose)
-                held = self.held and index < len(poses)
-                rested = conductor.settle(pose, _never if held else at_rest, self.settle)
-                restless += not (rested or held) and index < len(poses)
+                rested = conductor.settle(pose, at_rest, self.settle)
+                restless += not rested and index < len(poses)
         return restless
 
 
@@ -139,11 +137,6 @@ def coverage_for(rig: Rig, count: int, settle: float, highest: float | None = No
         speed=np.minimum(effective_slew(rig), CONDUCTOR.gentle),
         settle=settle,
     )
-
-
-def _never(rows: Sequence[TrackedFrame]) -> bool:
-    """No frames end a pose that is held."""
-    return False
 
 
 def _shortened(rig: Rig, pose: Array) -> Array:

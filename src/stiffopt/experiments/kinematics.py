@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -131,16 +131,8 @@ def missing_repetitions(folder: Path, settings: KinematicsSettings) -> list[int]
     return [k for k in numbers if not _is_whole(folder, recording_name(k))]
 
 
-class HasPoses(Protocol):
-    """Settings of an experiment with poses."""
-
-    @property
-    def poses(self) -> int:
-        """Number of them."""
-
-
-def missing_rounds(folder: Path, settings: HasPoses) -> list[int]:
-    """Return the rounds of poses, counted from 1, that are missing in a folder."""
+def missing_rounds(folder: Path, settings: KinematicsSettings) -> list[int]:
+    """Return the rounds of combined poses, counted from 1, that are missing in a folder."""
     numbers = range(1, round_count(settings.poses) + 1)
     return [k for k in numbers if not _is_whole(folder, round_name(k))]
 
