@@ -144,13 +144,37 @@ def _reweighted(
     if not problem.samples:
         return problem, 1.0
     predicted = problem.predict(x)
-    position = _spread(np.concatenate(predicted.errors), FIT.least_position)
+    left = [_left(problem, errors) for errors in predicted.errors]
+    position = _spread(np.concatenate([each[0] for each in left]), FIT.least_position)
     turns = [read.turn for read in predicted.read if read.turn is not None]
     angle = _spread(np.concatenate(turns), FIT.least_angle) if turns else problem.noise.angle
-    found = _rows_per_independent(problem, predicted)
+    found = _rows_per_independent(problem, left[0][0])
     factor = np.sqrt(independent / found)
     samples = [replace(sample, weight=sample.weight * factor) for sample in problem.samples]
-    return problem.with_samples(samples, Noise(position, angle)), found
+    noise = Noise(position, angle, FIT.systematic * problem.description.length, FIT.drift * problem.description.length)
+    import os
+    if os.environ.get("TELL"): print(f"      noise {1e3*position:.2f} independent {found:.1f} systematic ({1e3*left[0][1]:.2f}) drift {1e3*left[0][2]:.2f} centres {[f.shape[1] for f in problem.functions]}")
+    return problem.with_samples(samples, noise), found
+
+
+def _left(problem: CalibrationProblem, errors: Array) -> tuple[Array, float, float]:
+    """What systematic errors and drift leave of errors (M, 3), and deviations of these two."""
+    noise = problem.noise
+    if not noise.systematic:
+        return errors, 0.0, 0.0
+    known = ~np.isnan(errors.sum(axis=1))
+    shared = problem.shared(known)
+    weight = (np.where(known, problem._weights, 0.0) / noise.position)[:, np.newaxis]
+    bounded = np.clip(np.where(known[:, np.newaxis], errors, 0.0), -4*noise.position-4*noise.systematic, 4*noise.position+4*noise.systematic)
+    b, variance = shared.coefficients(bounded * weight)
+    squared = (b**2).mean(axis=1) + variance
+    m = problem.functions[0].shape[1]
+    z = [noise.systematic * problem.functions[0]] + ([noise.drift * problem.functions[1]] if noise.drift else [])
+    return (
+        errors - np.hstack(z) @ b,
+        noise.systematic * float(np.sqrt(squared[:m].mean())),
+        noise.drift * float(np.sqrt(squared[m:].mean())) if noise.drift else 0.0,
+    )
 
 
 def _spread(errors: Array, least: float) -> float:
@@ -163,13 +187,13 @@ def _spread(errors: Array, least: float) -> float:
     return max(float(np.sqrt(np.mean(kept**2))), least)
 
 
-def _rows_per_independent(problem: CalibrationProblem, predicted: Predicted) -> float:
+def _rows_per_independent(problem: CalibrationProblem, left: Array) -> float:
     """Integrated autocorrelation of the tip's errors along the rows, at least 1."""
     starts = problem.starts
     longest = max(1, max(len(sample.rows) for sample in problem.samples) // 3)
     total: Array = np.zeros(longest)
     for begin, end in pairwise(starts):
-        errors = predicted.errors[0][begin:end]
+        errors = left[begin:end]
         known = np.where(np.isfinite(errors), errors, 0.0)
         size = len(known) + longest  # so that nothing comes round
         spectrum = np.abs(np.fft.rfft(known, size, axis=0)) ** 2

@@ -16,7 +16,9 @@ from typing import Literal, cast
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
+from stiffopt.identify.discrepancy import Shared, basis
 from stiffopt.identify.past import Past, Start
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.sensing import Readings, readings
@@ -77,10 +79,19 @@ class TrackedPoint:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of the residuals: of each axis of a position in m, of an angle in rad."""
+    """Standard deviations of the residuals: of each axis of a position in m, of an angle in rad.
+
+    Attributes
+    ----------
+    position, angle : of single rows.
+    systematic : of errors that rows at nearby pressures share, in m.
+    drift : of errors that change slowly in a log, in m.
+    """
 
     position: float
     angle: float
+    systematic: float = 0.0
+    drift: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +152,7 @@ class CalibrationProblem:
         self._index = {parameter.key: i for i, parameter in enumerate(self._parameters)}
         self._measured = [self._measurements(point) for point in self.points]
         self._weights = np.concatenate([sample.weight for sample in self.samples] or [np.zeros(0)])
+        self._shared: dict[bytes, Shared] = {}
 
     @property
     def size(self) -> int:
@@ -175,6 +187,7 @@ class CalibrationProblem:
         other = copy(self)
         other.samples, other.noise = tuple(samples), noise
         other._weights = np.concatenate([sample.weight for sample in samples])
+        other._shared = {}
         return other
 
     def robot(self, x: Array) -> RobotDescription:
@@ -199,10 +212,10 @@ class CalibrationProblem:
         for error, read, (moved, turned) in zip(
             predicted.errors, predicted.read, slopes, strict=True
         ):
-            self._append(values, jacobians, error, -moved, self.noise.position)
+            self._append(values, jacobians, error, -moved, 1.0)
             turn = read.turn
             if turn is not None and turned is not None:
-                self._append(values, jacobians, -turn, -turned, self.noise.angle)
+                self._append(values, jacobians, -turn, -turned, self.noise.angle/self.noise.position)
         for table in self.tables:
             value, jacobian = self.of_table(table, x)
             values.append(value)
@@ -248,12 +261,44 @@ class CalibrationProblem:
     def _append(
         self, values: list[Array], jacobians: list[Array], error: Array, slope: Array, scale: float
     ) -> None:
-        """Add weighted residuals (M, 3) and their slopes (M, 3, d) by unscaled coordinates."""
+        """Add weighted residuals (M, 3) and their slopes (M, 3, d) by unscaled coordinates.
+
+        They are divided by the noise times `scale`.
+        """
         known = ~np.isnan(error.sum(axis=1))
-        weight = (np.where(known, self._weights, 0.0) / scale)[:, np.newaxis]
-        values.append((np.where(known[:, np.newaxis], error, 0.0) * weight).ravel())
+        weight = (np.where(known, self._weights, 0.0) / (scale * self.noise.position))
+        value = np.where(known[:, np.newaxis], error, 0.0) * weight[:, np.newaxis]
         slope = np.where(known[:, np.newaxis, np.newaxis], slope, 0.0)
-        jacobians.append((slope * weight[..., np.newaxis]).reshape(-1, self.size))
+        slope = slope * weight[:, np.newaxis, np.newaxis]
+        if self.noise.systematic > 0 and len(error):
+            shared = self.shared(known)
+            value = shared.left(value)
+            slope = shared.left(slope.reshape(len(slope), -1)).reshape(len(value), 3, self.size)
+        values.append(value.ravel())
+        jacobians.append(slope.reshape(-1, self.size))
+
+    def shared(self, known: NDArray[np.bool_]) -> Shared:
+        """Systematic errors of positions over their noise, of the rows (M,) that are known."""
+        key = known.tobytes()
+        if key not in self._shared:
+            weight = np.where(known, self._weights, 0.0) / self.noise.position
+            functions = np.hstack([
+                self.noise.systematic * self.functions[0],
+                *([self.noise.drift * self.functions[1]] if self.noise.drift else []),
+            ])
+            self._shared[key] = Shared.of(functions * weight[:, np.newaxis])
+        return self._shared[key]
+
+    @cached_property
+    def functions(self) -> tuple[Array, Array]:
+        """Of pressure (M, m) and of time (M, k): what systematic errors and drift are made of."""
+        span = np.subtract(self.description.pressure_max, self.description.pressure_min)
+        pressures = np.concatenate([s.recording.pressures[s.rows] for s in self.samples])
+        highest = np.abs(pressures).max()
+        by_pressure = basis(pressures / (FIT.near * highest), FIT.most_centres)
+        times = [s.recording.time[s.rows][:, np.newaxis] / FIT.drift_time for s in self.samples]
+        drifts = block_diag(*[basis(t, FIT.most_centres) for t in times])
+        return by_pressure, np.asarray(drifts)
 
     def _predict(self, x: Array) -> tuple[Predicted, list[tuple[Array, Array | None]]]:
         """Prediction, and the slopes (M, 3, d) of each point's position and turn."""

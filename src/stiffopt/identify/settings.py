@@ -158,7 +158,7 @@ class SamplingSettings:
     loaded_fit_rows: int = 300
     loaded_rows: int = 400
     rows: int = 50_000
-    dead_time_step: float = 0.1
+    dead_time_step: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -227,6 +227,12 @@ class FitSettings:
     modulus_slack: float = 0.005
     side: float = 0.6
     between_logs: float = 60.0
+    systematic: float = 0.02
+    drift: float = 0.0
+    near: float = 0.3
+    centres_apart: float = 0.7
+    most_centres: int = 80
+    drift_time: float = 100.0
 
 
 @dataclass(frozen=True)
