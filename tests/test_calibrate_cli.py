@@ -129,6 +129,39 @@ def test_the_calibrated_file_says_what_it_came_from(folder: Path) -> None:
     assert robot.calibration.logs == ("monday.csv", "tuesday.csv")
 
 
+def test_a_fit_that_misses_its_own_logs_is_unfit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = recorded(0)
+    write_log(tmp_path / "wrong.csv", replace(log, tip_position=log.tip_position[::-1].copy()))
+    fitted = tmp_path / "fitted.yaml"
+    calibrating = ("calibrate", "--robot", "stiff-flop-1", tmp_path / "wrong.csv", *FAST)
+    code, out, err = run(capsys, *calibrating, "--out", fitted, "--json")
+    assert code == 4
+    assert json.loads(out)["unfit"] is True
+    assert "look at the order of the channels" in json.loads(out)["remarks"][0]
+    assert "marked as unfit" in err
+    assert "# UNFIT" in fitted.read_text(encoding="utf-8")
+    with pytest.warns(stiffopt.UnfitWarning, match="marked as unfit"):
+        robot = load_description(fitted)
+    assert robot.calibration is not None
+    assert robot.calibration.unfit
+    task = tmp_path / "task.yaml"
+    task.write_text(
+        "format: stiffopt-task/1\nrobot: fitted.yaml\ntarget: {position: [0 mm, 0 mm, free]}\n",
+        encoding="utf-8",
+    )
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(
+        "format: stiffopt-rig/1\nname: a rig\nrobot: fitted.yaml\nrate: 50 Hz\n"
+        "supply: {driver: simulated}\ntracker: {driver: simulated}\n",
+        encoding="utf-8",
+    )
+    for command in (("solve", task), ("check", rig)):
+        err = run(capsys, *command)[2]
+        assert err.count("is marked as unfit") == 1, err
+
+
 def test_the_same_command_writes_the_same_file(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -561,7 +594,8 @@ def test_ctrl_c_keeps_the_best_model_so_far(
     if models:
         assert "the calibration was interrupted" in " ".join(text.split())
         assert "# Interrupted: not all models were compared" in out.read_text(encoding="utf-8")
-        assert load_description(out).calibration is not None
+        with pytest.warns(stiffopt.UnfitWarning):  # the simplest model of an arm that lags
+            assert load_description(out).calibration is not None
 
 
 def test_ctrl_c_while_logs_are_read_is_an_interrupt(

@@ -16,6 +16,7 @@ from matplotlib.text import Text
 import stiffopt
 from examples import run_examples
 from stiffopt import plots
+from stiffopt.display import display_units
 from stiffopt.model.obstacles import OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
 
@@ -254,13 +255,11 @@ def test_labels_cover_neither_each_other_nor_the_arm(kind: str, bend: tuple[floa
 
 
 def test_numbers_on_bars_are_those_of_the_table() -> None:
-    from stiffopt.plots.wording import bar_text
-
     arm, solution = solved()
     assert solution.pressures is not None
     text = texts(plots.plot_solution(arm, solution))
     for pressure in solution.pressures:
-        assert bar_text(pressure) in text
+        assert display_units().pressure.number(pressure, ".3f") in text
 
 
 @pytest.mark.parametrize("name", ["stiff-flop-1", "stiff-flop-3"])

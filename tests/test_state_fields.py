@@ -52,7 +52,7 @@ there = Path(stiffopt.control.__path__[0], "state.py").read_text()
 last = "    samples: tuple[PoseSample, ...] = ()\\n"
 assert there.count(last) == 1
 line = '''    mood: Annotated[float, Shown("how it feels", "m", topic="/tip", metric="mood_meters",
-        row="mood", row_unit="mm", armed_only=False, line=True)] = 0.25\\n'''
+        row="mood", armed_only=False, line=True)] = 0.25\\n'''
 (folder / "state.py").write_text(there.replace(last, line + last))
 spec = importlib.util.spec_from_file_location("stiffopt.control.state", folder / "state.py")
 module = sys.modules[spec.name] = importlib.util.module_from_spec(spec)

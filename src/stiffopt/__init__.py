@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from stiffopt.errors import SlowWarning as SlowWarning
     from stiffopt.errors import StiffoptError as StiffoptError
     from stiffopt.errors import StoppedError as StoppedError
+    from stiffopt.errors import UnfitWarning as UnfitWarning
     from stiffopt.identify.calibration import CalibrationResult as CalibrationResult
     from stiffopt.identify.calibration import calibrate as calibrate
     from stiffopt.identify.results import Comparison as Comparison
@@ -98,7 +99,7 @@ _NAMES = {
             "OutOfTimeError",
             "PressureError",
         ),
-        *("ServiceError", "SlowWarning", "StiffoptError", "StoppedError"),
+        *("ServiceError", "SlowWarning", "StiffoptError", "StoppedError", "UnfitWarning"),
     ),
     "stiffopt.identify.calibration": ("CalibrationResult", "calibrate"),
     "stiffopt.identify.results": ("Comparison",),

@@ -182,6 +182,10 @@ class SlowWarning(UserWarning):
     """Machine code cannot be made or kept here; the same results come more slowly."""
 
 
+class UnfitWarning(UserWarning):
+    """A robot file was read whose calibration missed its own recordings widely."""
+
+
 def os_reason(error: OSError | ValueError) -> str:
     """Return why the operating system refused a file, as the end of a sentence."""
     return (error.strerror or str(error)).lower() if isinstance(error, OSError) else str(error)

@@ -51,6 +51,7 @@ __all__ = [
     "parse_quantity",
     "quantity_schema",
     "read_from_file",
+    "unit_size",
     "unit_suffix",
     "within",
 ]
@@ -222,6 +223,12 @@ def quantity_schema(what: str, *examples: str) -> dict[str, Any]:
         "description": f"{what} with its unit, such as {' or '.join(examples)}",
         "examples": list(examples),
     }
+
+
+def unit_size(text: str, unit: str) -> Decimal | None:
+    """Return how many `unit`, an SI unit, one `text` is; None if it is no unit of that."""
+    factor = _factor(text, unit)
+    return None if isinstance(factor, str) else factor
 
 
 def unit_suffix(unit: str) -> str:

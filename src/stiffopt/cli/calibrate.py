@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet
+from stiffopt.cli.options import Json, Quiet, Units
 
 CALIBRATE_HELP = """\
 Fit a robot file to recordings of the arm, and write how well each number in it is then known.
@@ -29,6 +29,9 @@ Exit codes:
   0    done
   2    bad input, or a file cannot be written; nothing is written
 """
+_UNFIT = """\
+  4    the fit misses its own logs by more than 10 % of the arm; the file is marked as unfit
+"""
 
 CALIBRATE_EPILOG = f"""\
 \b
@@ -36,7 +39,7 @@ Examples:
   stiffopt calibrate --robot my-arm.yaml run/*.csv --out my-arm-calibrated.yaml
   stiffopt calibrate --robot my-arm.yaml monday.csv --stiffness run/stiffness.csv --out fitted.yaml
   stiffopt calibrate --robot asu-two-segment apr4_*.csv --sequence --out asu.yaml --report fit
-{_CODES}\
+{_CODES}{_UNFIT}\
   130  interrupted (Ctrl-C): the best model so far is written, if there is one; twice: nothing is
 """
 
@@ -158,6 +161,7 @@ def calibrate(
     ] = None,
     report: Report = None,
     as_json: Json = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> int:
     """Fit a robot file."""
@@ -183,6 +187,7 @@ def validate(
     frame: Frame = None,
     report: Report = None,
     as_json: Json = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> None:
     """Compare a robot file with recordings."""

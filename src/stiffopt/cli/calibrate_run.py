@@ -14,8 +14,9 @@ from typing import Any
 
 import stiffopt
 from stiffopt.cli import quantities
-from stiffopt.cli.console import show, write_json
+from stiffopt.cli.console import report_error, show, write_json
 from stiffopt.cli.exits import (
+    FAILED,
     INTERRUPTED,
     SOLVED,
     Progress,
@@ -41,7 +42,6 @@ from stiffopt.logs import (
 )
 from stiffopt.model.description import Recordings, RobotDescription, Tolerances
 from stiffopt.model.robot_files import load_description
-from stiffopt.plots.wording import MM
 
 _ENDINGS = (".yaml", ".yml")
 _SEGMENT = re.compile(r"segments\[\d+\]\.")
@@ -91,6 +91,7 @@ def run_calibrate(
         logs = recordings.read(robot, progress)
         try:
             result = fit_robot(robot, logs, stiffnesses, settings, progress)
+            code = FAILED if result.unfit else SOLVED
         except CancelledError as stop:
             if not isinstance(stop.found, CalibrationResult):
                 raise
@@ -102,6 +103,8 @@ def run_calibrate(
                 write_calibration(folder, result, out)
             origin = _origin(result, recordings, tables, fix, is_interrupted=code == INTERRUPTED)
             save_file(out, "robot", result.robot, origin)
+    if result.unfit:
+        report_error(f"the robot is of no use, and marked as unfit in {out}: {result.remarks[0]}")
     if quiet and not as_json:
         return code
     from stiffopt.cli.calibration_report import calibration, calibration_record
@@ -319,13 +322,15 @@ def _origin(
         files = ", ".join(os.path.basename(path) for path in tables)
         lines.append(f"Tables of stiffness: {files}.")
     lines.append(f"Model: {result.structure.name}, {result.structure.words}.")
+    if result.unfit:
+        lines.append("UNFIT: it misses the logs below by more than 10 % of the arm's length.")
     if is_interrupted:
         lines.append("Interrupted: not all models were compared, and few rows were fitted.")
     if names:
         errors = together(result.calibrated)
         lines.append(
-            f"Error of the tip on these logs: mean {errors.mean * MM:.2f} mm, "
-            f"95 % below {errors.p95 * MM:.2f} mm."
+            f"Error of the tip on these logs: mean {1e3 * errors.mean:.2f} mm, "
+            f"95 % below {1e3 * errors.p95:.2f} mm."
         )
     words = ["the logs are a sequence"] * recordings.sequence
     words += ["each log has its own origin"] * recordings.rezero

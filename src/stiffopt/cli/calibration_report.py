@@ -17,6 +17,7 @@ from rich.text import Text
 
 from stiffopt.cli.tables import MarkdownPage, TextTable, title
 from stiffopt.directions import direction_name
+from stiffopt.display import FIGURES, DisplayUnit, display_units
 from stiffopt.errors import printable
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.results import TIED, Comparison, Errors, FittedEstimate, together
@@ -25,13 +26,12 @@ from stiffopt.identify.validation import StiffnessComparison, compare_stiffness
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.parameters import Parameter
 from stiffopt.plots import calibration as plots
-from stiffopt.plots.wording import BAR, MM, figures, vector_text
+from stiffopt.plots.wording import vector_text
 
 _MOST_REMARKS = 8  # of the logs, at the terminal; the page has all
 _MOST_STIFFNESSES = 30
 _MOST_PAIRS = 3
 _MOST_DRAWN = 60  # measured stiffnesses
-_UNITS = {"Pa": ("kPa", 1e-3), "m": ("mm", 1e3), "rad": ("deg", 180 / np.pi), "s": ("s", 1.0)}
 _ALL = "all"
 _NORMAL = 1.96  # standard deviations of a 95 % interval
 _OTHERS = "base in the tracker's frame, and sensors (moves from the robot file)"
@@ -225,13 +225,14 @@ def _remarks(page: MarkdownPage, remarks: Sequence[str]) -> None:
 
 def errors_before_and_after(result: CalibrationResult) -> TextTable:
     """Errors of the tip in each log, before and after calibration."""
+    units = display_units()
     turns = any(each.angle is not None for each in (*result.nominal, *result.calibrated))
     heading = ("log", "before", "95 %", "after", "95 %", "max", "%", *(("axis",) * turns))
 
     def row(name: str, before: Errors, after: Errors) -> tuple[str, ...]:
         cells = [before.mean, before.p95, after.mean, after.p95, after.max]
         share = after.mean / result.robot.length * 100
-        numbers = [*(_millimetres(each) for each in cells), _decimals(share, 2)]
+        numbers = [*(_length(each) for each in cells), _decimals(share, 2)]
         return (name, *numbers, *((_angle(after),) * turns))
 
     rows = [
@@ -241,23 +242,24 @@ def errors_before_and_after(result: CalibrationResult) -> TextTable:
     if len(rows) > 1:
         rows.append(row(_ALL, together(result.nominal), together(result.calibrated)))
     return TextTable(
-        "Error of the tip in mm, before and after",
+        f"Error of the tip in {units.length}, before and after",
         heading,
         tuple(rows),
         "before, after: mean distance from the measured tip in the logs that were fitted; %: mean "
-        "after, of the arm's length" + "; axis: mean angle in deg" * turns,
+        "after, of the arm's length" + f"; axis: mean angle in {units.angle}" * turns,
     )
 
 
 def errors_of_logs(robot: RobotDescription, found: Sequence[Comparison]) -> TextTable:
     """Errors of the tip in each log, and the share of rows outside the range that was seen."""
+    units = display_units()
     turns = any(each.angle is not None for each in found)
     known = robot.calibration is not None
     heading = ("log", "rows", "mean", "median", "95 %", "max", "%")
     further = ("axis",) * turns + ("outside",) * known
 
     def row(name: str, e: Errors, inside: float) -> tuple[str, ...]:
-        numbers = [_millimetres(each) for each in (e.mean, e.median, e.p95, e.max)]
+        numbers = [_length(each) for each in (e.mean, e.median, e.p95, e.max)]
         share = _decimals(e.mean / robot.length * 100, 2)
         return (
             name, f"{e.n}", *numbers, share, *((_angle(e),) * turns),
@@ -269,10 +271,12 @@ def errors_of_logs(robot: RobotDescription, found: Sequence[Comparison]) -> Text
         inside = np.concatenate([each.inside for each in found])
         rows.append(row(_ALL, together(found), float(inside.mean())))
     remark = "distance of the predicted from the measured tip; %: mean, of the arm's length"
-    remark += "; axis: mean angle in deg" * turns
+    remark += f"; axis: mean angle in {units.angle}" * turns
     if known:
         remark += "; outside: rows with pressures that the calibration had not seen"
-    return TextTable("Error of the tip in mm", (*heading, *further), tuple(rows), remark)
+    return TextTable(
+        f"Error of the tip in {units.length}", (*heading, *further), tuple(rows), remark
+    )
 
 
 def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[str]:
@@ -282,7 +286,7 @@ def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[
             f"the robot '{robot.name}' was not calibrated: there is no recorded range that these "
             "logs could leave"
         ]
-    lines = []
+    lines, unit = [], display_units().length
     for each in found:
         if each.inside.all():
             continue
@@ -291,10 +295,10 @@ def range_remarks(robot: RobotDescription, found: Sequence[Comparison]) -> list[
         text = (
             f"{each.name}: {_percent(1 - float(each.inside.mean()))} of the rows lie outside "
             f"what the calibration has seen{what}; the mean error there is "
-            f"{_millimetres(beyond.mean)} mm"
+            f"{_length(beyond.mean)} {unit}"
         )
         if within.n:
-            text += f", elsewhere {_millimetres(within.mean)} mm"
+            text += f", elsewhere {_length(within.mean)} {unit}"
         lines.append(text)
     return lines or ["all pressures lie within what the calibration has seen"]
 
@@ -309,9 +313,10 @@ def _beyond(robot: RobotDescription, found: Comparison) -> str:
     over = highest - seen
     worst = int(np.argmax(over))
     if over[worst] > 0.02 * seen.max():
+        unit = display_units().pressure
         return (
-            f" ({robot.channel_name(worst)} goes to {highest[worst] * BAR:.2f} bar, it was "
-            f"recorded to {seen[worst] * BAR:.2f} bar)"
+            f" ({robot.channel_name(worst)} goes to {unit.text(highest[worst], '.2f')}, it was "
+            f"recorded to {unit.text(seen[worst], '.2f')})"
         )
     return " (combinations of pressures that are higher together, or below what was recorded)"
 
@@ -330,13 +335,13 @@ def models_compared(result: CalibrationResult) -> TextTable:
             (
                 each.structure.name + mark,
                 each.structure.words,
-                _millimetres(each.score),
-                f"{_millimetres(each.folds[worst].mean)} ({worst})",
+                _length(each.score),
+                f"{_length(each.folds[worst].mean)} ({worst})",
             )
         )
     return TextTable(
         "Models, by their error in what was held back",
-        ("model", "it has", "mean mm", "worst"),
+        ("model", "it has", f"mean {display_units().length}", "worst"),
         tuple(rows),
         "the simplest of those that predict about as well as the best is chosen",
         words=("it has", "worst"),
@@ -347,9 +352,9 @@ def errors_held_back(result: CalibrationResult) -> TextTable:
     """Errors in what the chosen model was not fitted to."""
     return TextTable(
         "Error of the tip in what was held back (the others are fitted)",
-        ("held back", "mean mm", "95 %", "max"),
+        ("held back", f"mean {display_units().length}", "95 %", "max"),
         tuple(
-            (name, _millimetres(e.mean), _millimetres(e.p95), _millimetres(e.max))
+            (name, _length(e.mean), _length(e.p95), _length(e.max))
             for name, e in result.held_back.items()
         ),
     )
@@ -385,19 +390,29 @@ def _place(estimate: FittedEstimate) -> tuple[str, str]:
 
 
 def _number_row(estimate: FittedEstimate, words: str) -> tuple[str, ...]:
-    unit, factor = _UNITS.get(estimate.unit, ("", 1.0))
-    if estimate.key.endswith(".share"):
-        unit, factor = "%", 100.0
-    low, value, high = (each * factor for each in (estimate.low, estimate.value, estimate.high))
+    unit = _unit(estimate)
+    low, value, high = (unit.of(x) for x in (estimate.low, estimate.value, estimate.high))
     half = max(high - low, 0.0) / 2
     places = 1 - floor(log10(half)) if half > 0 and isfinite(half) else 3
     places = min(max(places, 0), 5)
-    before = _plain(estimate.before * factor, places) if estimate.key else "-"
+    before = _plain(unit.of(estimate.before), places) if estimate.key else "-"
     learnt = f"{estimate.learnt * 100:.0f} %"
     return (
         words, before, _decimals(value, places),
-        f"{_decimals(low, places)} to {_decimals(high, places)}", unit, learnt,
+        f"{_decimals(low, places)} to {_decimals(high, places)}", unit.name, learnt,
     )  # fmt: skip
+
+
+def _unit(estimate: FittedEstimate) -> DisplayUnit:
+    """The unit of a fitted number: moduli are in kPa, whatever pressures are shown in."""
+    if estimate.key.endswith(".share"):
+        return DisplayUnit("%", 100.0)
+    return {
+        "Pa": DisplayUnit("kPa", 1e-3),
+        "m": display_units().length,
+        "rad": display_units().angle,
+        "s": DisplayUnit("s"),
+    }.get(estimate.unit, DisplayUnit(""))
 
 
 def _plain(value: float, places: int) -> str:
@@ -410,18 +425,19 @@ def _plain(value: float, places: int) -> str:
 
 def stiffnesses_compared(rows: Sequence[StiffnessComparison]) -> TextTable:
     """Stiffness, measured and predicted."""
+    unit, pressure = display_units().stiffness, display_units().pressure
 
     def text(value: float | None) -> str:
-        return "-" if value is None else figures(value)
+        return "-" if value is None else unit.number(value, FIGURES)
 
     return TextTable(
-        "Stiffness in N/m, measured and predicted",
-        ("pressures (bar)", "direction", "measured", "before", "after", "off by"),
+        f"Stiffness in {unit}, measured and predicted",
+        (f"pressures ({pressure})", "direction", "measured", "before", "after", "off by"),
         tuple(
             (
-                vector_text(pressure * BAR for pressure in row.pressures),
+                vector_text(row.pressures, pressure),
                 f"{direction_name(row.direction)}, {row.boundary}",
-                f"{figures(row.measured)} +- {_two(_NORMAL * row.sigma)}",
+                f"{text(row.measured)} +- {_two(unit.of(_NORMAL * row.sigma))}",
                 text(row.before),
                 text(row.after),
                 "-" if row.after is None else f"{(row.after / row.measured - 1) * 100:+.0f} %",
@@ -436,8 +452,9 @@ def stiffnesses_compared(rows: Sequence[StiffnessComparison]) -> TextTable:
 # -- words ----------------------------------------------------------------------------------------
 
 
-def _millimetres(value: float) -> str:
-    return _decimals(value * MM, 2)
+def _length(value: float) -> str:
+    unit = display_units().length
+    return _decimals(unit.of(value), max(0, 2 + unit.more_decimals))
 
 
 def _decimals(value: float, places: int) -> str:
@@ -451,7 +468,7 @@ def _two(value: float) -> str:
 
 
 def _angle(errors: Errors) -> str:
-    return "-" if errors.angle is None else f"{degrees(errors.angle):.1f}"
+    return "-" if errors.angle is None else display_units().angle.number(errors.angle, ".1f")
 
 
 def _percent(share: float) -> str:
@@ -478,12 +495,13 @@ def calibration_record(result: CalibrationResult, out: str, report: str | None) 
         "robot": result.robot.name,
         "out": out,
         "report": report,
+        "unfit": result.unfit,
         "model": result.structure.name,
         "strain_laws": [segment.strain_law for segment in result.robot.segments],
         "models": [
             {
                 "name": each.structure.name,
-                "held_back_mean_mm": each.score * MM,
+                "held_back_mean_mm": 1e3 * each.score,
                 "held_back": {name: _errors_record(e, length) for name, e in each.folds.items()},
             }
             for each in result.candidates
@@ -532,7 +550,7 @@ def _errors_record(errors: Errors, length: float) -> dict[str, Any]:
     names = ("mean", "median", "p95", "max")
     return {
         "n": errors.n,
-        "position_error_mm": {name: getattr(errors, name) * MM for name in names},
+        "position_error_mm": {name: 1e3 * getattr(errors, name) for name in names},
         "position_error_percent_of_length": errors.mean / length * 100,
         "angle_error_deg": None if errors.angle is None else degrees(errors.angle),
     }

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager, contextmanager
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Self
 
-from stiffopt.errors import SlowWarning, printable
+from stiffopt.errors import SlowWarning, UnfitWarning, printable
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -102,25 +102,28 @@ def report_note(message: str) -> None:
 
 @contextmanager
 def showing_slow_warnings(show: Callable[[str], object]) -> Iterator[None]:
-    """Context in which the text of each `SlowWarning` is shown by a function."""
-    show_other = warnings.showwarning
+    """Context in which a function shows the text of each `SlowWarning` and `UnfitWarning` once."""
+    show_other, told = warnings.showwarning, set[str]()
 
     def show_warning(
         message: Warning | str, category: type[Warning], *rest: Any, **more: Any
     ) -> None:
-        if issubclass(category, SlowWarning):
-            show(str(message))
+        if issubclass(category, SlowWarning | UnfitWarning):
+            if str(message) not in told:
+                told.add(str(message))
+                show(str(message))
         else:
             show_other(message, category, *rest, **more)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", SlowWarning)
+        warnings.simplefilter("always", UnfitWarning)
         warnings.showwarning = show_warning
         yield
 
 
 def warnings_as_notes(*, quiet: bool) -> AbstractContextManager[None]:
-    """Context in which a `SlowWarning` is shown as a note, or not at all."""
+    """Context in which such a warning is shown as a note, or not at all."""
     return showing_slow_warnings(lambda text: None if quiet else report_note(text))
 
 

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, RigArgument, command_group
+from stiffopt.cli.options import Json, Quiet, RigArgument, Units, command_group
 
 experiment_app = command_group(help="Do the paper's experiments on a rig, real or simulated.")
 
@@ -118,6 +118,7 @@ def kinematics(
     model: Model = None,
     no_plot: NoPlot = False,
     as_json: Json = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> None:
     """Do Experiment 1."""
@@ -176,6 +177,7 @@ def stiffness(
     resume: Resume = None,
     model: Model = None,
     no_plot: NoPlot = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> None:
     """Do Experiment 2."""

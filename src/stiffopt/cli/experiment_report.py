@@ -9,6 +9,7 @@ from rich.text import Text
 
 from stiffopt.cli.tables import MarkdownPage, TextTable, labelled, title
 from stiffopt.directions import direction_name
+from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import printable
 from stiffopt.experiments import (
     CoverageResult,
@@ -18,7 +19,6 @@ from stiffopt.experiments import (
 )
 from stiffopt.experiments.slope import SlopeEstimate
 from stiffopt.model.manipulator import Manipulator
-from stiffopt.plots.wording import BAR, MM, figures
 
 
 @dataclass(frozen=True)
@@ -50,40 +50,41 @@ def kinematics_report(
 ) -> ExperimentReport:
     """Return the report of a kinematics experiment, and of its combined poses if there are any."""
     found: list[KinematicsResult | CoverageResult] = [result]
+    length, pressure = display_units().length, display_units().pressure
+    peaks = ", ".join(pressure.number(p, "g") for p in settings.pressures)
     lines = [
-        ("model", f"{model.description.name}, {model.length * MM:g} mm long"),
+        ("model", f"{model.description.name}, {length.text(model.length, 'g')} long"),
         (
             "sequence",
-            f"each of {settings.channels} channels to "
-            f"{', '.join(f'{p * BAR:g}' for p in settings.pressures)} bar, {result.time[-1]:.0f} s",
+            f"each of {settings.channels} channels to {peaks} {pressure}, {result.time[-1]:.0f} s",
         ),
         ("recordings", f"{result.repetitions}, {len(result.errors):,} samples compared"),
     ]
     doubts = list(result.doubts)
-    heading: tuple[str, ...] = ("tip error", "mm", "% of length")
+    heading: tuple[str, ...] = ("tip error", length.name, "% of length")
     remark = "distance of the model's tip from the measured one, at the measured pressures"
     if coverage is not None:
         found.append(coverage)
         low, high = (
-            f"{round(p * BAR, 2) + 0.0:g}"
+            f"{round(pressure.of(p), 2 + pressure.more_decimals) + 0.0:g}"
             for p in (coverage.pressures.min(), coverage.pressures.max())
         )
         text = (
-            f"{len(coverage.errors)} of {settings.poses}, all channels, {low} to {high} bar; the "
-            f"tip moved by {coverage.speed.mean() * MM:.2f} mm in the last second"
+            f"{len(coverage.errors)} of {settings.poses}, all channels, {low} to {high} {pressure}"
+            f"; the tip moved by {length.text(coverage.speed.mean(), '.2f')} in the last second"
         )
         lines.append(("combined poses", text))
         doubts += [f"combined poses: {doubt}" for doubt in coverage.doubts]
-        heading += ("combined: mm", "% of length")
+        heading += (f"combined: {length}", "% of length")
         remark += "; combined: at the end of each pose"
     elif settings.poses:
         doubts.append("no combined pose was held with the tip in sight")
     if result.repetitions > 1:
-        text = f"differ by {result.repeatability * MM:.2f} mm in the mean"
+        text = f"differ by {length.text(result.repeatability, '.2f')} in the mean"
         lines.append(("repetitions", text))
 
     def row(label: str, errors: list[float]) -> tuple[str, ...]:
-        cells = [(f"{e * MM:.2f}", f"{e / result.length * 100:.1f}") for e in errors]
+        cells = [(length.number(e, ".2f"), f"{e / result.length * 100:.1f}") for e in errors]
         return label, *(text for cell in cells for text in cell)
 
     return ExperimentReport(
@@ -141,15 +142,16 @@ def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentR
     """Return the report of a stiffness experiment."""
     settings = result.settings
     names = [direction_name(direction) for direction in settings.directions]
-    heading = ["bar"]
+    unit, pressure_unit = display_units().stiffness, display_units().pressure
+    heading = [pressure_unit.name]
     for name in names:
-        heading += [f"{name} (N/m)", "model"]
+        heading += [f"{name} ({unit})", "model"]
     rows = []
     for pressure in settings.pressures:
-        row = [f"{pressure * BAR:g}"]
+        row = [pressure_unit.number(pressure, "g")]
         for direction in settings.directions:
             cell = next(c for c in result.along(direction) if c.pressure == pressure)
-            row += [_estimate(cell.estimate), figures(cell.model)]
+            row += [_estimate(cell.estimate), unit.number(cell.model, FIGURES)]
         rows.append(tuple(row))
     return ExperimentReport(
         title=f"{settings.rig}: stiffness",
@@ -170,4 +172,5 @@ def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentR
 def _estimate(estimate: SlopeEstimate | None) -> str:
     if estimate is None:
         return "no contact"
-    return f"{figures(estimate.value)} +- {estimate.half_width:.2g}"
+    unit = display_units().stiffness
+    return f"{unit.number(estimate.value, FIGURES)} +- {unit.number(estimate.half_width, '.2g')}"

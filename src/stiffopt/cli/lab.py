@@ -15,6 +15,7 @@ import typer
 
 from stiffopt.cli.console import report_error, report_note, warnings_as_notes, write_line
 from stiffopt.cli.exits import FAULT, SOLVED, with_exit_code
+from stiffopt.cli.options import Units
 from stiffopt.errors import InputError
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ def lab(
             help="In place of a simulated tracker: aurora, openigtlink or that of a package.",
         ),
     ] = "aurora",
+    units: Units = None,
     quiet: Annotated[
         bool, typer.Option("--quiet", "-q", help="Print no notes; the rig file and errors only.")
     ] = False,
@@ -144,11 +146,14 @@ def _obey(lab: VirtualLab, words: list[str]) -> str:
         lab.bench.mount(_direction(words[1:]))
         return f"the probe's rail is along {' '.join(words[1:])}"
     if words == ["status"]:
-        bars = ", ".join(f"{p * 1e-5:.3f}" for p in lab.world.pressures)
-        tip = ", ".join(f"{x * 1e3:.1f}" for x in lab.world.plant.tip_pose()[:3, 3])
+        from stiffopt.display import display_units
+
+        pressure, length = display_units().pressure, display_units().length
+        pressures = ", ".join(pressure.number(p, ".3f") for p in lab.world.pressures)
+        tip = ", ".join(length.number(x, ".1f") for x in lab.world.plant.tip_pose()[:3, 3])
         faults = {device: fault for device, fault in lab.world.faults.items() if fault != "ok"}
         told = ", ".join(f"{device} {fault}" for device, fault in faults.items()) or "none"
-        return f"pressures {bars} bar; tip at {tip} mm; faults: {told}"
+        return f"pressures {pressures} {pressure}; tip at {tip} {length}; faults: {told}"
     raise InputError(
         f"'{' '.join(words)}' is no command; there are: fault DEVICE NAME [CHANNEL], "
         "mount X Y Z, status, quit"

@@ -7,7 +7,7 @@ import typer
 
 from stiffopt.cli.console import report_note, write_line
 from stiffopt.cli.exits import interruptible, with_exit_code
-from stiffopt.cli.options import command_group
+from stiffopt.cli.options import Units, command_group
 from stiffopt.cli.outputs import check_new_file, check_picture
 from stiffopt.errors import FileError
 
@@ -101,6 +101,7 @@ def plot(
             help="Draw into this file (.png, .pdf, .svg); by default beside the recording.",
         ),
     ] = None,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> None:
     """Draw a recording."""

@@ -16,7 +16,7 @@ from stiffopt.cli.calibrate import (
     validate,
 )
 from stiffopt.cli.check import CHECK_EPILOG, CHECK_HELP, check
-from stiffopt.cli.console import Closed, report_error
+from stiffopt.cli.console import Closed, report_error, warnings_as_notes
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
 from stiffopt.cli.experiment import experiment_app
 from stiffopt.cli.init import init_app
@@ -127,7 +127,8 @@ def _run(application: typer.Typer, name: str, arguments: Sequence[str] | None) -
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     given = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        application(given, prog_name=name)
+        with warnings_as_notes(quiet=False):
+            application(given, prog_name=name)
     except SystemExit as stop:
         if stop.code == INTERRUPTED:
             report_error("interrupted", label="")

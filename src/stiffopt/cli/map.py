@@ -19,6 +19,7 @@ from stiffopt.cli.options import (
     Json,
     Quiet,
     RobotArgument,
+    Units,
     command_group,
 )
 from stiffopt.cli.outputs import check_ending, check_picture, check_writable
@@ -111,6 +112,7 @@ def workspace(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a map that is in the folder of --out.")
     ] = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> int:
     """Make a map of a workspace, or continue one; print and draw it."""
@@ -226,6 +228,7 @@ def arm(
         str | None, typer.Option(metavar="FILE.csv", help="Write the map as a table, in SI units.")
     ] = None,
     as_json: Json = False,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> None:
     """Map the stiffness along an arm, or of its tip over two pressures; print, write, draw it."""

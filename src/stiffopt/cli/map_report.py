@@ -11,10 +11,11 @@ from rich.text import Text
 
 from stiffopt.cli.tables import TextTable, labelled, title
 from stiffopt.directions import direction_name
+from stiffopt.display import FIGURES, display_units
 from stiffopt.documents import write_whole
 from stiffopt.errors import printable
 from stiffopt.experiments.arm_map import ArmMap, TipMap
-from stiffopt.plots.wording import BAR, MM, figures, unit_text, vector_text
+from stiffopt.plots.wording import vector_text
 from stiffopt.workspace import Extreme, WorkspaceMap
 
 # -- workspaces -----------------------------------------------------------------------------------
@@ -48,13 +49,14 @@ def _facts(found: WorkspaceMap, seconds: float) -> list[tuple[str, RenderableTyp
         facts.append(("lost", f"{found.lost:,} samples: the arm has no stable equilibrium there"))
     if not len(found.table):
         return facts
+    unit = display_units().length
     extent = ", ".join(
-        f"{axis} {low * MM:.0f} to {high * MM:.0f} mm"
+        f"{axis} {unit.number(low, '.0f')} to {unit.text(high, '.0f')}"
         for axis, low, high in zip("xyz", found.low, found.high, strict=True)
     )
     facts += [
         ("reach", f"{found.volume * 1e6:,.0f} cm^3: {len(found.table):,} cells of "
-         f"{plan.cell * MM:g} mm, {np.median(found.count):g} samples in the median cell"),
+         f"{unit.text(plan.cell, 'g')}, {np.median(found.count):g} samples in the median cell"),
         ("tip", extent),
     ]  # fmt: skip
     return facts
@@ -62,6 +64,8 @@ def _facts(found: WorkspaceMap, seconds: float) -> list[tuple[str, RenderableTyp
 
 def _stiffnesses(found: WorkspaceMap) -> RenderableType:
     first = found.plan.measures[0]
+    unit, length = display_units().of_si(found.plan.unit), display_units().length
+    at = f"at ({length})"
     rows = []
     for number, name in enumerate(found.direction_names):
         best, worst = found.best_in(number), found.worst_in(number)
@@ -69,12 +73,13 @@ def _stiffnesses(found: WorkspaceMap) -> RenderableType:
             continue
         cells = []
         for extreme in (best, worst):
-            cells += [figures(extreme.stiffness), vector_text(extreme.cell_centre * MM)]
+            place = vector_text(extreme.cell_centre, length)
+            cells += [unit.number(extreme.stiffness, FIGURES), place]
         rows.append((name, *cells, f"{np.median(found.ratio[number]):.2f}"))
     way = "along" if first.kind == "translation" else "about"
     return TextTable(
         "",
-        (unit_text(found.plan.unit), "stiffest", "at (mm)", "softest", "at (mm)", "ratio"),
+        (unit.name, "stiffest", at, "softest", at, "ratio"),
         tuple(rows),
         f"{first.kind} {way} {first.frame} axes, {first.boundary}; ratio: in the median cell",
     ).renderable()
@@ -133,32 +138,39 @@ def summary(found: ArmMap | TipMap) -> RenderableType:
 def _arm_summary(found: ArmMap) -> RenderableType:
     names = [direction_name(tuple(direction)) for direction in found.directions]
     headings = [f"{name}: {what}" for name in names for what in ("tip", "middle")]
-    middle = found.middle
+    middle, units = found.middle, display_units()
     rows = []
     for group, stiffness in zip(found.groups, found.stiffness, strict=True):
         for level, values in zip(found.pressures, stiffness, strict=True):
-            cells = [figures(values[place, k]) for k in range(len(names)) for place in (-1, middle)]
-            rows.append((",".join(map(str, group)), f"{level * BAR:.3g}", *cells))
+            cells = [
+                units.stiffness.number(values[place, k], FIGURES)
+                for k in range(len(names))
+                for place in (-1, middle)
+            ]
+            pressure = units.pressure.number(level, ".3g")
+            rows.append((",".join(map(str, group)), pressure, *cells))
     note = (
-        f"N/m, {found.boundary}, axes of the {found.frame}; middle: at {found.at[middle] * MM:g} mm"
+        f"{units.stiffness}, {found.boundary}, axes of the {found.frame}; middle: at "
+        f"{units.length.text(found.at[middle], 'g')}"
     )
-    table = TextTable("", ("channels", "bar", *headings), tuple(rows), note)
+    table = TextTable("", ("channels", units.pressure.name, *headings), tuple(rows), note)
     return Group(title(f"{found.robot}: stiffness along the arm"), table.renderable())
 
 
 def _tip_summary(found: TipMap) -> RenderableType:
     a, b = found.channels
-    at = f"at p{a}, p{b} (bar)"
+    unit, pressure = display_units().stiffness, display_units().pressure
+    at = f"at p{a}, p{b} ({pressure})"
     rows = []
     for k, direction in enumerate(found.directions):
         values = found.stiffness[:, :, k]
         cells = []
         for place in (np.argmin(values), np.argmax(values)):
             i, j = np.unravel_index(place, values.shape)
-            pressures = f"{found.first[i] * BAR:.3g}, {found.second[j] * BAR:.3g}"
-            cells += [figures(values[i, j]), pressures]
+            pair = (pressure.number(p, ".3g") for p in (found.first[i], found.second[j]))
+            cells += [unit.number(values[i, j], FIGURES), ", ".join(pair)]
         rows.append((direction_name(tuple(direction)), *cells))
-    note = f"N/m, {found.boundary}, axes of the {found.frame}"
+    note = f"{unit}, {found.boundary}, axes of the {found.frame}"
     table = TextTable("", ("direction", "least", at, "greatest", at), tuple(rows), note)
     heading = title(f"{found.robot}: stiffness of the tip over channels {a} and {b}")
     return Group(heading, table.renderable())

@@ -4,6 +4,10 @@ from typing import Annotated, Any
 
 import typer
 
+from stiffopt.cli.console import report_error
+from stiffopt.cli.exits import BAD_INPUT
+from stiffopt.errors import InputError
+
 
 def command_group(**settings: Any) -> typer.Typer:
     """Return an application to which commands are added.
@@ -23,6 +27,19 @@ def print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def show_in_units(text: str | None) -> str | None:
+    """Show tables, figures and messages in the units that an option, or the environment, names."""
+    from stiffopt.display import choose_units, display_units  # here: --help waits for no numbers
+
+    try:
+        choose_units(text)
+        display_units()
+    except InputError as error:
+        report_error(str(error) if text is None else f"--units: {error}")
+        raise typer.Exit(BAD_INPUT) from None
+    return text
+
+
 Version = Annotated[
     bool,
     typer.Option(
@@ -39,6 +56,15 @@ RobotArgument = Annotated[
     str, typer.Argument(metavar="ROBOT", help="A built-in robot, or a robot file (.yaml).")
 ]
 RigArgument = Annotated[str, typer.Argument(metavar="RIG", help="A rig file (.yaml).")]
+Units = Annotated[
+    str | None,
+    typer.Option(
+        "--units",
+        metavar="UNITS",
+        callback=show_in_units,
+        help="Of what is shown, such as 'mm, kPa, N/mm', as STIFFOPT_UNITS too; JSON stays SI.",
+    ),
+]
 BoundaryOption = Annotated[
     str, typer.Option(metavar="BOUNDARY", help="free, guided or clamped: how the tip is held.")
 ]

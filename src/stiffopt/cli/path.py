@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Quiet, ViewOption
+from stiffopt.cli.options import Quiet, Units, ViewOption
 
 PATH_HELP = """\
 Find the pressures with which the tip follows a path, as stiff as possible along it.
@@ -74,6 +74,7 @@ def path(
             metavar="N", min=0, help="Of the global search: the same seed, the same answer."
         ),
     ] = 0,
+    units: Units = None,
     quiet: Quiet = False,
 ) -> int:
     """Solve path files."""

@@ -13,7 +13,6 @@ from stiffopt.logs.table import read_bytes
 from stiffopt.paths.path import Path
 from stiffopt.paths.rates import step_limits
 from stiffopt.paths.solution import PathSolution, Vector
-from stiffopt.plots.wording import BAR, MM
 from stiffopt.units import unit_suffix
 
 _ERROR = "position_error_m"
@@ -113,20 +112,21 @@ def solution_quantities(solution: PathSolution) -> dict[str, Any]:
         "confidence": solution.confidence or None,
         "worst_index": solution.worst_index,
         "first_failure": solution.first_failure,
-        "slew": _quantities(solution.slew, "bar/s", BAR),
+        "slew": _quantities(solution.slew, "bar/s", 1e-5),
         "times": _quantities(solution.times, "s"),
         "pressures": {
-            description.channel_name(k): _quantities(solution.pressures[:, k], "bar", BAR)
+            description.channel_name(k): _quantities(solution.pressures[:, k], "bar", 1e-5)
             for k in channels
         },
         "tip": {
-            axis: _quantities(solution.tip_poses[:, k, 3], "mm", MM) for k, axis in enumerate("xyz")
+            axis: _quantities(solution.tip_poses[:, k, 3], "mm", 1e3)
+            for k, axis in enumerate("xyz")
         },
-        "position_error": _quantities(solution.position_errors, "mm", MM),
+        "position_error": _quantities(solution.position_errors, "mm", 1e3),
         "angle_error": _quantities(solution.angle_errors, "deg", degrees(1)),
         "stiffness": _quantities(solution.stiffness, unit),
         "stiffness_alone": _quantities(solution.alone, unit),
-        "clearance": _quantities(solution.clearance, "mm", MM),
+        "clearance": _quantities(solution.clearance, "mm", 1e3),
         "solve_time": f"{solution.timings.get('total', 0.0):.4g} s",
     }
     return {key: value for key, value in record.items() if value not in (None, [], {})}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import degrees
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -12,10 +11,11 @@ from rich.text import Text
 
 from stiffopt.cli.path_records import SolvedPath, rate_margins
 from stiffopt.cli.tables import STATUS_COLOURS, block_title, labelled, number_table
+from stiffopt.display import FIGURES, PLAIN, display_units
 from stiffopt.errors import printable
 from stiffopt.model.scene import Scene
 from stiffopt.paths.solution import PathSolution
-from stiffopt.plots.wording import BAR, MM, figures, unit_text
+from stiffopt.plots.wording import stiffness_text
 
 _ROWS = 10  # of the table, about
 
@@ -48,12 +48,12 @@ def _lines(solved: SolvedPath) -> Iterable[tuple[str, RenderableType]]:
     yield "robot", Text(f"{printable(robot.description.name)}, {robot.n_pressures} channels")
     if not len(solution.times):
         return
-    length = path.points().curve.length * MM
+    length = display_units().length.text(path.points().curve.length)
     closed = "closed " if path.closed else ""
     yield (
         "path",
         Text(
-            f"{closed}{path.path.kind} of {length:.4g} mm, {len(solution.times)} points "
+            f"{closed}{path.path.kind} of {length}, {len(solution.times)} points "
             f"in {solution.times[-1]:.4g} s"
         ),
     )
@@ -98,11 +98,12 @@ def rate_lines(solution: PathSolution) -> Iterable[tuple[str, RenderableType]]:
     step = np.abs(solution.pressures[index] - solution.pressures[index - 1])
     channel = int(np.argmax(step / solution.slew))
     rate = step[channel] / (solution.times[index] - solution.times[index - 1])
-    name = solution.robot.description.channel_name(channel)
+    name, unit = solution.robot.description.channel_name(channel), display_units().pressure
+    fastest = solution.slew[channel]
     yield (
         "rates",
         Text.assemble(
-            (f"{rate * BAR:.3g} of {solution.slew[channel] * BAR:.3g} bar/s", "bold"),
+            (f"{unit.number(rate, '.3g')} of {unit.text(fastest, '.3g')}/s", "bold"),
             f" at most, by {name} on the way to point {index + 1}",
         ),
     )
@@ -114,12 +115,12 @@ def clearance_lines(
     """Where the body is nearest to the scene."""
     if solution.clearance is None or scene is None:
         return
-    index = int(np.argmin(solution.clearance))
+    index, unit = int(np.argmin(solution.clearance)), display_units().length
     yield (
         "clearance",
         Text.assemble(
-            (f"{solution.clearance[index] * MM:.3f} mm", "bold"),
-            f" at point {index + 1}, required: at least {scene.clearance * MM:g} mm",
+            (unit.text(solution.clearance[index], ".3f"), "bold"),
+            f" at point {index + 1}, required: at least {unit.text(scene.clearance, 'g')}",
         ),
     )
 
@@ -150,18 +151,20 @@ def _columns(solution: PathSolution) -> dict[str, list[str]]:
     alone = solution.alone
     share = None if solution.stiffness is None or alone is None else solution.stiffness / alone
     digits = 2 if solution.times[-1] >= 1 else 4
+    length, angle = display_units().length, display_units().angle
+    unit = display_units().of_si(solution.stiffness_unit)
     found = (
-        ("time s", solution.times, lambda value: f"{value:.{digits}f}"),
-        ("error mm", solution.position_errors, lambda value: f"{value * MM:.3f}"),
-        ("deg", solution.angle_errors, lambda value: f"{degrees(value):.2f}"),
-        (unit_text(solution.stiffness_unit), solution.stiffness, figures),
-        ("of alone", share, lambda value: f"{value:.1%}"),
-        ("clear mm", solution.clearance, lambda value: f"{value * MM:.2f}"),
-        ("rate left", margins, lambda value: f"{value:.0%}".replace("-0%", "0%")),
+        ("time s", solution.times, PLAIN, f".{digits}f"),
+        (f"error {length}", solution.position_errors, length, ".3f"),
+        (angle.name, solution.angle_errors, angle, ".2f"),
+        (unit.name, solution.stiffness, unit, FIGURES),
+        ("of alone", share, PLAIN, ".1%"),
+        (f"clear {length}", solution.clearance, length, ".2f"),
+        ("rate left", margins, PLAIN, ".0%"),
     )
     cells = {
-        heading: [shown(value) for value in values.tolist()]
-        for heading, values, shown in found
+        heading: [unit.number(value, form).replace("-0%", "0%") for value in values.tolist()]
+        for heading, values, unit, form in found
         if values is not None
     }
     if margins is not None:
@@ -180,4 +183,4 @@ def _explained(table: Table, solution: PathSolution) -> RenderableType:
 
 
 def _stiffness(value: float, solution: PathSolution) -> str:
-    return f"{figures(value)} {unit_text(solution.stiffness_unit)}"
+    return stiffness_text(value, solution.stiffness_unit)

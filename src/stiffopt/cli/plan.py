@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Json, Quiet, ViewOption
+from stiffopt.cli.options import Json, Quiet, Units, ViewOption
 
 PLAN_HELP = """\
 Find a motion from one configuration to another with the whole body clear of a scene all the way.
@@ -80,6 +80,7 @@ def plan(
         typer.Option(metavar="N", min=0, help="Of the search: the same seed, the same motion."),
     ] = 0,
     timeout: Annotated[str, typer.Option(metavar="TIME", help="After which to give up.")] = "10 s",
+    units: Units = None,
     quiet: Quiet = False,
 ) -> int:
     """Plan a motion."""

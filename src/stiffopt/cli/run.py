@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
+from stiffopt.cli.options import Units
 
 RUN_HELP = """\
 Hold an arm at its task in closed loop: run the daemon of a rig in the foreground.
@@ -58,6 +59,7 @@ def run(
     plain: Annotated[
         bool, typer.Option("--plain", help="Print lines for people, no live status.")
     ] = False,
+    units: Units = None,
     json_lines: Annotated[
         bool, typer.Option("--json-lines", help="Print JSON lines on a terminal too.")
     ] = False,

@@ -25,6 +25,7 @@ from stiffopt.cli.tables import labelled
 from stiffopt.control.state import Event, Severity, Snapshot, State
 from stiffopt.control.state_fields import Entry, Kind, entries
 from stiffopt.daemon.state_json import plain
+from stiffopt.display import DisplayUnit, display_units
 from stiffopt.errors import printable
 from stiffopt.safety.messages import json_line
 
@@ -43,7 +44,7 @@ _LEVELS = {Severity.INFO: "dim", Severity.WARNING: "yellow", Severity.ERROR: "bo
 _BAR = 24  # characters of a pressure's bar
 _EVENTS = 6
 _UNKNOWN = "-"
-_FACTORS = {"": (1.0, 3), "mm": (1e3, 1), "deg": (180 / math.pi, 1)}  # and decimals of a vector
+_DECIMALS = {"m": 1, "rad": 1}  # of a vector, in the usual units
 
 
 def write_at_once(stream: TextIO, line: str) -> None:
@@ -230,30 +231,30 @@ def _fields(now: Snapshot, armed: bool) -> list[tuple[str, RenderableType]]:
 
 
 def _shown(value: Any, entry: Entry) -> str:
-    """Return a value in the unit of its row."""
-    unit = entry.shown.row_unit
-    factor, decimals = _FACTORS[unit]
+    """Return a value in the unit in which it is shown."""
+    if entry.kind not in (Kind.NUMBERS, Kind.NUMBER):
+        return printable(str(value))
+    si = entry.shown.unit if isinstance(entry.shown.unit, str) else entry.shown.unit[0]
+    unit, decimals = display_units().of_si(si), _DECIMALS.get(si, 3)
     if entry.kind is Kind.NUMBERS:
-        text = _triple(value, factor, f"{{:.{decimals}f}}", entry.shown.unknown)
-    elif entry.kind is Kind.NUMBER:
-        if not math.isfinite(value):
-            return entry.shown.unknown
-        text = f"{value * factor:.{decimals + 1}f}"
+        text = _triple(value, unit, f".{decimals}f", entry.shown.unknown)
+    elif math.isfinite(value):
+        text = unit.number(value, f".{decimals + 1}f")
     else:
-        text = printable(str(value))
+        return entry.shown.unknown
     return f"{text} {unit}".rstrip()
 
 
 def _pressures(now: Snapshot, channels: Sequence[str]) -> Table:
-    table = Table.grid(padding=(0, 2, 0, 0))
+    table, unit = Table.grid(padding=(0, 2, 0, 0)), display_units().pressure
     for k, name in enumerate(channels):
         commanded, high = float(now.commanded[k]), float(now.high[k])
         measured = float(now.measured[k])
         table.add_row(
             f"  {name}",
             _bar(measured if math.isfinite(measured) else commanded, commanded, high),
-            f"{commanded * 1e-5:.3f} bar",
-            "not measured" if math.isnan(measured) else f"is {measured * 1e-5:.3f}",
+            unit.text(commanded, ".3f"),
+            "not measured" if math.isnan(measured) else f"is {unit.number(measured, '.3f')}",
             Text("saturated" if now.saturated[k] else "", "yellow"),
         )
     return table
@@ -275,14 +276,17 @@ def _bar(measured: float, commanded: float, high: float) -> Text:
 def _stiffness(now: Snapshot) -> list[tuple[str, RenderableType]]:
     rows: list[tuple[str, RenderableType]] = []
     if math.isfinite(now.stiffness):
-        text = f"{now.stiffness:.3g} {now.stiffness_unit}"
+        unit = display_units().of_si(now.stiffness_unit)
+        text = unit.text(now.stiffness, ".3g")
         if math.isfinite(now.best_stiffness) and now.best_stiffness > 0:
             share = now.stiffness / now.best_stiffness
-            text += f" of {now.best_stiffness:.3g} ({share:.0%})"
+            text += f" of {unit.number(now.best_stiffness, '.3g')} ({share:.0%})"
         rows.append(("stiffness", text))
     force, moment = now.wrench[:3], now.wrench[3:]
     if all(map(math.isfinite, now.wrench.tolist())):
-        rows.append(("wrench", f"{_triple(force, 1e3)} mN, {_triple(moment, 1e3, '{:.2f}')} mN m"))
+        milli = DisplayUnit("", 1e3)
+        forces, moments = _triple(force, milli, ".1f"), _triple(moment, milli, ".2f")
+        rows.append(("wrench", f"{forces} mN, {moments} mN m"))
     return rows
 
 
@@ -321,8 +325,6 @@ def _places(daemon: Daemon) -> list[tuple[str, RenderableType]]:
     return rows
 
 
-def _triple(
-    values: Iterable[float], factor: float, form: str = "{:.1f}", unknown: str = _UNKNOWN
-) -> str:
-    numbers = [float(v) * factor for v in values]
-    return f"({', '.join(form.format(x) if math.isfinite(x) else unknown for x in numbers)})"
+def _triple(values: Iterable[float], unit: DisplayUnit, form: str, unknown: str = _UNKNOWN) -> str:
+    numbers = [float(value) for value in values]
+    return f"({', '.join(unit.number(x, form) if math.isfinite(x) else unknown for x in numbers)})"

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
-from stiffopt.cli.options import Quiet, Version, ViewOption
+from stiffopt.cli.options import Quiet, Units, Version, ViewOption
 
 HELP = """\
 Find the chamber pressures that reach a tip pose and do best by its stiffness.
@@ -84,6 +84,7 @@ def solve(
             metavar="N", min=0, help="Of the global search: the same seed, the same answer."
         ),
     ] = 0,
+    units: Units = None,
     quiet: Quiet = False,
     version: Version = False,
 ) -> int:

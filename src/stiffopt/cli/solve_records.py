@@ -13,6 +13,9 @@ from stiffopt.units import format_quantity
 
 Record = dict[str, Any]
 
+_WRITTEN = {"m": "mm", "rad": "deg"}
+"""Units of errors in result files, whatever people read."""
+
 _BLOCKS = {
     "translation_per_force": (slice(0, 3), slice(0, 3), "m/N"),
     "translation_per_moment": (slice(0, 3), slice(3, 6), "m/(N*m)"),
@@ -136,7 +139,7 @@ def result_record(solved: SolvedTask) -> Record:
         "uncertainty": _uncertainty(solved),
         **{
             term.result_name: _quantity(
-                solution.errors.get(term.name), term.unit, term.shown(0.0)[1]
+                solution.errors.get(term.name), term.unit, _WRITTEN.get(term.unit, term.unit)
             )
             for term in solution.task.target.terms
         },

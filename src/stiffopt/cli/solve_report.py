@@ -1,7 +1,6 @@
 """Solved tasks as text for the terminal: a block for each task, and a summary of several."""
 
 from collections.abc import Iterable
-from math import degrees
 from typing import Any
 
 from numpy.typing import NDArray
@@ -12,21 +11,17 @@ from rich.text import Text
 from stiffopt.cli.solve_records import priced
 from stiffopt.cli.solved_task import SolvedTask
 from stiffopt.cli.tables import STATUS_COLOURS, block_title, labelled
+from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import printable
 from stiffopt.optimise.goal import MatchMatrix, StiffnessMeasure
-from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.settings import OBSTACLES
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.term import Term
 from stiffopt.plots.wording import (
-    BAR,
-    MM,
-    bar_text,
-    figures,
     gain_text,
     least_maximised,
     limit_of,
-    unit_text,
+    stiffness_text,
     vector_text,
 )
 
@@ -76,12 +71,13 @@ def _robot(solved: SolvedTask) -> str:
     segments = "1 segment" if robot.n_segments == 1 else f"{robot.n_segments} segments"
     loaded = ", in equilibrium under gravity or load" if robot.is_loaded else ""
     name = printable(robot.description.name)
-    return f"{name}, {segments}, {robot.length * MM:g} mm, {robot.n_pressures} channels{loaded}"
+    length = display_units().length.text(robot.length, "g")
+    return f"{name}, {segments}, {length}, {robot.n_pressures} channels{loaded}"
 
 
 def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
-    """Pressures in bar, a row for each segment; those at a limit say so."""
-    description = solved.robot.description
+    """Pressures, a row for each segment; those at a limit say so."""
+    description, unit = solved.robot.description, display_units().pressure
     table = Table.grid(padding=(0, 2), pad_edge=False)
     widest = max(segment.n_channels for segment in description.segments)
     table.add_row("", *(Text(f"channel {k + 1}", "dim") for k in range(widest)))
@@ -92,7 +88,7 @@ def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
             limit = limit_of(solved.solution, description.channel_name(index))
             cells.append(
                 Text.assemble(
-                    (f"{bar_text(pressures[index])} bar", "bold"),
+                    (unit.text(pressures[index], ".3f"), "bold"),
                     (f" {limit}".rstrip(), "yellow"),
                 )
             )
@@ -102,8 +98,9 @@ def _pressures(solved: SolvedTask, pressures: Vector) -> RenderableType:
 
 
 def _tip(solution: PressureSolution, pose: Vector) -> Iterable[Line]:
-    x, y, z = (f"{value * MM + 0.0:.3f}" for value in pose[:3, 3])
-    yield "tip at", Text(f"({x}, {y}, {z}) mm, pointing {vector_text(pose[:3, 2])}")
+    unit = display_units().length
+    x, y, z = (unit.number(value, ".3f") for value in pose[:3, 3])
+    yield "tip at", Text(f"({x}, {y}, {z}) {unit}, pointing {vector_text(pose[:3, 2])}")
     for number, term in enumerate(solution.task.target.terms):
         yield "" if number else "tip error", _error(term, solution.errors[term.name])
 
@@ -113,17 +110,18 @@ def _clearance(solution: PressureSolution) -> Iterable[Line]:
     scene, distance = solution.task.scene, solution.clearance
     if scene is None or distance is None:
         return
-    short = distance < scene.clearance - OBSTACLES.allowed
+    short, unit = distance < scene.clearance - OBSTACLES.allowed, display_units().length
     yield (
         "clearance",
         Text.assemble(
-            (f"{distance * MM:.3f} mm", "bold yellow" if short else "bold"),
+            (unit.text(distance, ".3f"), "bold yellow" if short else "bold"),
             f" from '{printable(solution.nearest_object or '')}', required: at least "
-            f"{scene.clearance * MM:g} mm",
+            f"{unit.text(scene.clearance, 'g')}",
         ),
     )
     if solution.mesh_error is not None:
-        note = f"up to {solution.mesh_error * MM:.2g} mm too small: the grid of its mesh is coarse"
+        error = unit.text(solution.mesh_error, ".2g")
+        note = f"up to {error} too small: the grid of its mesh is coarse"
         yield "", f"{note}, see 'resolution'"
 
 
@@ -131,14 +129,13 @@ def _error(term: Term, value: float) -> Text:
     """By how much a term of the target is missed, or by which margin it holds."""
     if term.is_inequality:
         return Text(term.words(value), "bold" if term.holds(value) else "bold yellow")
-    (shown, unit), (tolerance, _) = term.shown(value), term.shown(term.radius)
+    unit = display_units().of_si(term.unit)
     over = value > term.radius * (1 + 1e-9)
+    shown = unit.text(value, FIGURES if over else ".3f")
+    tolerance = unit.text(term.radius, "g")
     return Text.assemble(
-        (
-            f"{figures(shown)} {unit}" if over else f"{shown:.3f} {unit}",
-            "bold yellow" if over else "bold",
-        ),
-        f" in {term.name}, {'more than the ' if over else ''}tolerance {tolerance:g} {unit}",
+        (shown, "bold yellow" if over else "bold"),
+        f" in {term.name}, {'more than the ' if over else ''}tolerance {tolerance}",
     )
 
 
@@ -153,11 +150,12 @@ def _uncertainty(solved: SolvedTask) -> Iterable[Line]:
             Text("the calibration saw no positions, so that the tip's error is unknown"),
         )
         return
-    axes = " x ".join(f"{value * MM:.2f}" for value in known.semi_axes)
+    unit = display_units().length
+    axes = " x ".join(unit.number(value, ".2f") for value in known.semi_axes)
     yield (
         "known to",
         Text.assemble(
-            (f"{axes} mm", "bold"),
+            (f"{axes} {unit}", "bold"),
             f", semi-axes of the tip's 95 % ellipsoid\nmostly for {_PARTS[known.largest_part]}",
         ),
     )
@@ -218,27 +216,30 @@ def _stiffness(
     plain: float | None,
     interval: tuple[float, float] | None,
 ) -> Text:
+    unit = display_units().of_si(measure.unit)
     remarks = [_condition(measure)]
     if interval is not None:
-        remarks.append("95 %: {} to {}".format(*map(figures, interval)))
+        low, high = (unit.number(end, FIGURES) for end in interval)
+        remarks.append(f"95 %: {low} to {high}")
     if plain is not None:
-        remarks.append(f"plain: {figures(plain)}, {gain_text(value, plain)}")
+        remarks.append(f"plain: {unit.number(plain, FIGURES)}, {gain_text(value, plain)}")
     remark = ", ".join(filter(None, remarks))
     return Text.assemble(
-        (f"{figures(value)} {unit_text(measure.unit)}", "bold"),
+        (unit.text(value, FIGURES), "bold"),
         f"  ({remark})" if remark else "",
         f"\n{measure.words()}",
     )
 
 
-def _condition(measure: Measure) -> str:
+def _condition(measure: StiffnessMeasure) -> str:
     """What the task says that the value must be."""
     value, tolerance = (getattr(measure, key, None) for key in ("value", "tolerance"))
     if value is None:
         return ""
+    asked = display_units().of_si(measure.unit).number(value, FIGURES)
     if tolerance is None:
-        return f"required: at least {figures(value)}"
-    return f"required: {figures(value)} to {tolerance * 100:g} %"
+        return f"required: at least {asked}"
+    return f"required: {asked} to {tolerance * 100:g} %"
 
 
 def _worth(solution: PressureSolution) -> Iterable[Line]:
@@ -246,8 +247,9 @@ def _worth(solution: PressureSolution) -> Iterable[Line]:
     given = priced(solution)
     if given is None:
         return
-    unit = unit_text(given.objective_unit)
-    offers = []
+    units = display_units()
+    unit, pressure, length = units.of_si(given.objective_unit), units.pressure, units.length
+    offers = []  # in SI for one of a unit
     for term in solution.task.target.terms:
         price = given.per_tolerance.get(term.name)
         factor, unit_of_term = term.shown(1.0)
@@ -259,12 +261,13 @@ def _worth(solution: PressureSolution) -> Iterable[Line]:
     for name, value in sorted(given.per_bound.items(), key=lambda item: -item[1]):
         moved = "raised" if name.endswith("max") else "lowered"
         if value:
-            offers.append((value / BAR, f"bar by which {name} is {moved}"))
+            offers.append((pressure.to_si(value), f"{pressure} by which {name} is {moved}"))
     for name, price in given.per_clearance.items():
         if price:
-            offers.append((price * 1e-3, f"mm less clearance of '{printable(name)}'"))
+            less = f"{length} less clearance of '{printable(name)}'"
+            offers.append((length.to_si(price), less))
     for number, (value, per) in enumerate(offers):
-        text = Text.assemble((f"{value:+.3g} {unit}", "bold"), f" per {per}")
+        text = Text.assemble((unit.text(value, "+.3g"), "bold"), f" per {per}")
         yield "" if number else "worth", text
 
 
@@ -272,11 +275,10 @@ def _front(solved: SolvedTask) -> RenderableType:
     front = solved.front or ()
     if not front:
         return Text("none: the target is out of reach at every tolerance that was tried")
-    unit = unit_text(front[0].stiffness_unit)
     table = Table.grid(padding=(0, 2), pad_edge=False)
     headings = ["error"] if front[0].position_error is not None else []
     headings += ["angle"] if front[0].angle_error is not None else []
-    headings += ["stiffness", "gain", "pressures in bar"]
+    headings += ["stiffness", "gain", f"pressures in {display_units().pressure}"]
     for heading in headings:
         left = heading.startswith("pressures")
         table.add_column(justify="left" if left else "right", no_wrap=not left)
@@ -286,7 +288,7 @@ def _front(solved: SolvedTask) -> RenderableType:
         value = least_maximised(point) or 0.0
         table.add_row(
             *_errors(point),
-            f"{figures(value)} {unit}",
+            stiffness_text(value, front[0].stiffness_unit),
             gain_text(value, first),
             _list(solved, point),
         )
@@ -294,21 +296,21 @@ def _front(solved: SolvedTask) -> RenderableType:
 
 
 def _errors(solution: PressureSolution) -> list[str]:
-    cells = []
+    cells, units = [], display_units()
     if solution.position_error is not None:
-        cells.append(f"{solution.position_error * MM:.2f} mm")
+        cells.append(units.length.text(solution.position_error, ".2f"))
     if solution.angle_error is not None:
-        cells.append(f"{degrees(solution.angle_error):.2f} deg")
+        cells.append(units.angle.text(solution.angle_error, ".2f"))
     return cells
 
 
 def _list(solved: SolvedTask, solution: PressureSolution) -> str:
     """All pressures on one line, segments apart."""
     values = [] if solution.pressures is None else list(solution.pressures)
-    groups = []
+    groups, unit = [], display_units().pressure
     for segment in solved.robot.description.segments:
         mine, values = values[: segment.n_channels], values[segment.n_channels :]
-        groups.append(" ".join(f"{value * BAR + 0.0:.2f}" for value in mine))
+        groups.append(" ".join(unit.number(value, ".2f") for value in mine))
     return " | ".join(groups)
 
 
@@ -316,13 +318,13 @@ def summary_row(solved: SolvedTask, seconds: float) -> tuple[str, ...]:
     """Return the line of the summary for a task that took this time altogether."""
     solution = solved.solution
     position, angle = solution.position_error, solution.angle_error
-    unit = unit_text(solution.stiffness_unit)
+    units, stiffness = display_units(), solution.stiffness
     return (
         solved.file,
         solution.status,
-        "" if position is None else f"{position * MM:.3f}",
-        "" if angle is None else f"{degrees(angle):.2f}",
-        "" if solution.stiffness is None else f"{figures(solution.stiffness)} {unit}",
+        "" if position is None else units.length.number(position, ".3f"),
+        "" if angle is None else units.angle.number(angle, ".2f"),
+        "" if stiffness is None else stiffness_text(stiffness, solution.stiffness_unit),
         gain_text(solution.stiffnesses[0], solved.plain[0]) if solved.plain else "",
         f"{seconds:.1f}",
     )

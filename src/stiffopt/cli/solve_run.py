@@ -12,6 +12,7 @@ from stiffopt.cli.batch import Batch
 from stiffopt.cli.console import report_error, report_note, show, warnings_as_notes, write_json
 from stiffopt.cli.exits import interruptible
 from stiffopt.cli.solved_task import SolvedTask, solve_file
+from stiffopt.display import display_units
 
 
 class TaskBatch(Batch[SolvedTask]):
@@ -44,7 +45,9 @@ class TaskBatch(Batch[SolvedTask]):
             for note in found.skipped if not self.quiet else ():
                 report_note(note)
             self.answer_all(files, pictures, check)
-            self.summarise("task", "status", "error mm", "deg", "stiffness", "gain", "time s")
+            units = display_units()
+            errors = f"error {units.length}", units.angle.name
+            self.summarise("task", "status", *errors, "stiffness", "gain", "time s")
         if out is not None:
             self.write(lambda: solve_files.write_results(out, self.answers))
         return self.exit_code

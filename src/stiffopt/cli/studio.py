@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from stiffopt.cli.exits import with_exit_code
+from stiffopt.cli.options import Units
 
 STUDIO_HELP = """\
 Open a page in the browser in which a robot and a task are seen and changed by hand.
@@ -49,6 +50,7 @@ def studio(
             metavar="FILE", help="With a RIG: the daemon's token, to command; or STIFFOPT_TOKEN."
         ),
     ] = None,
+    units: Units = None,
     host: Annotated[
         str, typer.Option(metavar="HOST", help="Where to listen; other machines reach others.")
     ] = "127.0.0.1",

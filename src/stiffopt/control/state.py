@@ -137,7 +137,6 @@ class ControllerStatus:
             size=3,
             key="position_m",
             row="tip",
-            row_unit="mm",
             armed_only=False,
         ),
     ] = field(default_factory=_nan3)
@@ -163,7 +162,6 @@ class ControllerStatus:
             "m",
             size=3,
             row="target",
-            row_unit="mm",
             unknown="free",
         ),
     ] = None
@@ -180,7 +178,6 @@ class ControllerStatus:
             "m",
             metric="position_error_meters",
             row="error",
-            row_unit="mm",
         ),
     ] = math.nan
     angle_error: Annotated[
@@ -190,7 +187,6 @@ class ControllerStatus:
             "rad",
             metric="angle_error_radians",
             row="error",
-            row_unit="deg",
         ),
     ] = math.nan
     stiffness: Annotated[

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,6 @@ class Shown:
     # value of the metric's label ``kind``, which tells fields that share a metric apart
     label: str = ""
     row: str = ""  # of the status on the terminal in which it is shown
-    row_unit: Literal["", "mm", "deg"] = ""  # in which that row shows it
     armed_only: bool = True  # whether that row is left out while the arm is vented
     unknown: str = "-"  # what the row says for NaN
     line: bool = False  # whether a change of it makes a line of ``stiffopt run --json``

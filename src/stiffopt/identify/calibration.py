@@ -22,7 +22,9 @@ from stiffopt.identify.results import (
     FittedEstimate,
     doubts,
     estimates,
+    is_unfit,
     outliers,
+    what_to_look_at,
 )
 from stiffopt.identify.settings import REPORT, START, CalibrationSettings
 from stiffopt.identify.setup import (
@@ -90,6 +92,11 @@ class CalibrationResult:
     held_back: dict[str, Errors]
     tables: tuple[StiffnessTable, ...]
     remarks: tuple[str, ...]
+
+    @property
+    def unfit(self) -> bool:
+        """Whether the fit misses its own recordings by more than 10 % of the arm's length."""
+        return self.robot.calibration is not None and self.robot.calibration.unfit
 
 
 def calibrate(
@@ -344,6 +351,11 @@ def _result(
         if known is not None and recording.name in known.logs
     ]
     folds = [each.folds for each in candidates if each.structure is structure]
+    calibrated = compared(robot, found.problem.named(found.x)) if setup.recordings else ()
+    if is_unfit(calibrated, robot.length) and robot.calibration is not None:
+        known = robot.calibration.model_copy(update={"unfit": True})
+        robot = robot.model_copy(update={"calibration": known})
+        remarks.insert(0, what_to_look_at(calibrated, robot.length))
     return CalibrationResult(
         before=setup.description,
         robot=robot,
@@ -351,7 +363,7 @@ def _result(
         candidates=tuple(candidates),
         estimates=listed,
         nominal=compared(setup.description, {}) if setup.recordings else (),
-        calibrated=compared(robot, found.problem.named(found.x)) if setup.recordings else (),
+        calibrated=calibrated,
         held_back=folds[0] if folds else {},
         tables=setup.tables,
         remarks=(*remarks, *outliers(found), *doubts(found, listed)),

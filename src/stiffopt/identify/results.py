@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.display import display_units
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.settings import REPORT
 from stiffopt.identify.unknowns import BASE, SENSOR
@@ -208,6 +209,33 @@ def _experiment(estimate: FittedEstimate) -> str:
     if estimate.key:
         return Parameter(estimate.key).number.experiment
     return next((text for name, text in _PLACED.items() if estimate.name.startswith(name)), "")
+
+
+def is_unfit(calibrated: Sequence[Comparison], length: float) -> bool:
+    """Whether a fit misses its own recordings by so much that it is of no use."""
+    return bool(calibrated) and together(calibrated).mean > REPORT.unfit * length
+
+
+def what_to_look_at(calibrated: Sequence[Comparison], length: float) -> str:
+    """Return the remark on a fit that misses its own recordings."""
+    errors, unit = together(calibrated), display_units().length
+    means = np.array([each.errors.mean for each in calibrated])
+    alone = [
+        f"{each.name} ({unit.text(mean, '.0f')})"
+        for each, mean in zip(calibrated, means, strict=True)
+        if mean > REPORT.alone * np.median(means)
+    ]
+    text = (
+        f"UNFIT: the fit misses its own recordings by {unit.text(errors.mean, '.1f')} in the mean, "
+        f"{errors.mean / length * 100:.0f} % of the arm's length; look at "
+    )
+    if alone:
+        text += f"{', '.join(alone)}, far worse than the others, and then at "
+    return text + (
+        "the order of the channels (--channels), the body in whose frame poses are taken (--frame) "
+        "and its axes, the registration, lengths and chambers of the robot file, and whether the "
+        "pressures are those that the arm had"
+    )
 
 
 def outliers(found: Fit) -> list[str]:

@@ -271,6 +271,8 @@ class ReportSettings:
     far : distance from the robot file, in prior deviations.
     tilt : of base or sensor that is doubted whatever the tolerance, in rad.
     outlier : distance of a row from the model, in deviations.
+    unfit, alone : mean error in what was fitted, in lengths of the arm, above which a robot is
+        unfit; and how many times the median of all logs the error of one is that is to blame.
     correlation_digits : decimals of correlations in the robot file.
     """
 
@@ -279,6 +281,8 @@ class ReportSettings:
     far: float = 3.0
     tilt: float = float(np.radians(8.0))
     outlier: float = 4.0
+    unfit: float = 0.1
+    alone: float = 3.0
     correlation_digits: int = 4
 
 

@@ -80,6 +80,8 @@ class Calibration(Schema):
     pressure_min, pressure_max : lowest and highest recorded pressure of each channel, in Pa.
     pressure_norm : largest recorded norm of each segment's pressures, in Pa.
         Where these three are missing, all pressures count as recorded.
+    unfit : whether the fit missed its own recordings by so much that nothing that is computed with
+        the robot can be relied on. Whoever reads such a file is warned.
     """
 
     logs: Items[str] = ()
@@ -90,6 +92,7 @@ class Calibration(Schema):
     pressure_min: Items[Pressure] = ()
     pressure_max: Items[Pressure] = ()
     pressure_norm: Items[Pressure] = ()
+    unfit: bool = False
 
     @property
     def covariance(self) -> Array:

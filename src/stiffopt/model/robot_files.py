@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import difflib
 import os
+import warnings
 from functools import cache
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from stiffopt.errors import InputError, shown
+from stiffopt.errors import InputError, UnfitWarning, printable, shown
 from stiffopt.files import read_file, save_file
 from stiffopt.model.description import RobotDescription
 
@@ -40,12 +41,25 @@ def load_description(
         There is no such built-in robot.
     FileError
         The file cannot be read or is wrong.
+
+    Warns
+    -----
+    UnfitWarning
+        The calibration missed its own recordings widely.
     """
     if not isinstance(name_or_path, str | os.PathLike):
         raise InputError(f"expected a robot's name or path, not {shown(name_or_path)}")
     text = os.fspath(name_or_path)
     if not isinstance(name_or_path, str) or _is_path(text):
-        return read_file(Path(base or "") / text, "robot", RobotDescription)
+        robot = read_file(Path(base or "") / text, "robot", RobotDescription)
+        if robot.calibration is not None and robot.calibration.unfit:
+            warnings.warn(
+                f"the robot file {printable(text)} is marked as unfit: its calibration missed its "
+                "own recordings by more than 10 % of the arm's length; calibrate it anew",
+                UnfitWarning,
+                stacklevel=2,
+            )
+        return robot
     if text not in builtin_robots():
         near = difflib.get_close_matches(text, builtin_robots(), n=1)
         hint = f"did you mean '{near[0]}'? " if near else ""

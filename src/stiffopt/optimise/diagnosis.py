@@ -6,6 +6,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.display import display_units
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.local import LocalResult
@@ -81,14 +82,14 @@ def no_freedom_message(task: Task, n_pressures: int, sensitivities: Sensitivitie
     )
     if sensitivities is None or sensitivities.objective_unit not in ("N/m", "N*m/rad"):
         return text
-    unit = sensitivities.objective_unit.replace("*", " ")
+    unit = display_units().of_si(sensitivities.objective_unit)
     offers = []
     for term in task.target.terms:
         price = sensitivities.per_tolerance.get(term.name)
         if price and not term.is_inequality:
             factor, shown = term.shown(1.0)
             per = "degree" if shown == "deg" else shown
-            offers.append(f"{price / factor:.3g} {unit} per {per}")
+            offers.append(f"{unit.text(price / factor, '.3g')} per {per}")
     return f"{text}; a larger tolerance would buy {' and '.join(offers)}" if offers else text
 
 
@@ -144,8 +145,8 @@ def coarse_meshes(robot: Manipulator, scene: Scene | None, names: Iterable[str])
     """Say which of the objects that hold an arm back may do so since their grids are coarse."""
     errors = {name: mesh_error(robot, scene, name) for name in names} if scene is not None else {}
     return "".join(
-        f"; distances from '{name}' are up to {error * 1e3:.2g} mm too small: a finer 'resolution' "
-        "of its mesh would leave more room"
+        f"; distances from '{name}' are up to {display_units().length.text(error, '.2g')} too "
+        "small: a finer 'resolution' of its mesh would leave more room"
         for name, error in errors.items()
         if error
     )
@@ -155,7 +156,7 @@ def _intrusions(scene: Scene, missing: dict[str, float]) -> list[str]:
     """Say by how much (m) the body lacks the clearance of each object that it is too near."""
     shapes = {item.name: item.shape for item in scene.objects}
     return [
-        f"{lack * 1e3:.3g} mm {shapes[name].amiss} '{name}'"
+        f"{display_units().length.text(lack, '.3g')} {shapes[name].amiss} '{name}'"
         for name, lack in missing.items()
         if lack > OBSTACLES.allowed
     ]

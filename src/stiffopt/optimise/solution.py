@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.display import display_units
 from stiffopt.errors import DerivativeError
 from stiffopt.model.arm import Evaluator
 from stiffopt.model.arm_clearance import Clearances
@@ -236,14 +237,17 @@ class PressureSolution(ShownInNotebook):
     def __repr__(self) -> str:
         if self.pressures is None or self.tip_position is None:
             return f"PressureSolution({self.status}: {self.message})"
+        units = display_units()
+        pressure, length = units.pressure, units.length
         parts = [
-            f"{self.status}: ({', '.join(f'{p / 1e5:.3g}' for p in self.pressures)}) bar",
-            f"tip at ({', '.join(f'{1e3 * x + 0.0:.4g}' for x in self.tip_position)}) mm",
+            f"{self.status}: ({', '.join(pressure.number(p, '.3g') for p in self.pressures)}) "
+            f"{pressure}",
+            f"tip at ({', '.join(map(length.number, self.tip_position))}) {length}",
         ]
         if self.position_error is not None:
-            parts.append(f"{1e3 * self.position_error:.3g} mm off")
+            parts.append(f"{length.text(self.position_error, '.3g')} off")
         if self.stiffness is not None:
-            parts.append(f"{self.stiffness:.4g} {(self.stiffness_unit or '').replace('*', ' ')}")
+            parts.append(units.of_si(self.stiffness_unit).text(self.stiffness))
         return f"PressureSolution({', '.join(parts)})"
 
     def gradient(

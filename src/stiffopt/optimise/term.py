@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from stiffopt.display import PLAIN, DisplayUnit, display_units
 from stiffopt.schema import Schema
 from stiffopt.units import Angle, Length
 
 Vector = NDArray[np.float64]
 
-_SHOWN = {"m": ("mm", 1e3, 4), "rad": ("deg", 180 / math.pi, 3)}
 """Units in which people read lengths and angles, factors to them, and digits."""
 
 
@@ -176,8 +176,8 @@ class Term(ABC):
 
     def shown(self, value: float) -> tuple[float, str]:
         """A value in the unit in which people read it, and that unit."""
-        unit, factor, _ = _SHOWN.get(self.unit, (self.unit, 1.0, 4))
-        return value * factor, unit
+        unit = display_units().of_si(self.unit)
+        return unit.of(value), unit.name
 
     def asked(self) -> str:
         """What is asked for, as people read it: ``(-30, free, 190) mm within 0.1 mm``."""
@@ -185,13 +185,13 @@ class Term(ABC):
 
     def words(self, value: float) -> str:
         """An error or margin as people read it: ``0.35 mm``."""
-        unit, factor, digits = _SHOWN.get(self.unit, (self.unit, 1.0, 4))
-        return f"{value * factor:.{digits}g} {unit}"
+        return display_units().of_si(self.unit).text(value, ".3g" if self.unit == "rad" else ".4g")
 
 
-def numbers_shown(values: Any) -> str:
-    """Some numbers as people read them: ``(-30, free, 190)``; None is free."""
-    shown = ("free" if value is None else f"{round(value, 3) + 0.0:g}" for value in values)
+def numbers_shown(values: Any, unit: DisplayUnit = PLAIN) -> str:
+    """Some numbers in a unit, as people read them: ``(-30, free, 190)``; None is free."""
+    digits = 3 + unit.more_decimals
+    shown = ("free" if x is None else f"{round(unit.of(x), digits) + 0.0:g}" for x in values)
     return f"({', '.join(shown)})"
 
 

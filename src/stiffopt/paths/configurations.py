@@ -9,6 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.display import display_units
 from stiffopt.errors import InputError, StoppedError
 from stiffopt.model.arguments import checked_vector
 from stiffopt.model.manipulator import Manipulator
@@ -64,10 +65,10 @@ def checked_pressures(name: str, robot: Manipulator, pressures: ArrayLike) -> Ve
     p = checked_vector(f"the {name}'s pressures", pressures, robot.n_pressures)
     low, high = robot.pressure_min, robot.pressure_max
     for index in np.flatnonzero((p < low) | (p > high)):
-        channel = robot.description.channel_name(int(index))
+        channel, unit = robot.description.channel_name(int(index)), display_units().pressure
         raise InputError(
-            f"{name}: {channel} is at {p[index] * 1e-5:g} bar, outside of its limits "
-            f"{low[index] * 1e-5:g} to {high[index] * 1e-5:g} bar"
+            f"{name}: {channel} is at {unit.text(p[index], 'g')}, outside of its limits "
+            f"{unit.number(low[index], 'g')} to {unit.text(high[index], 'g')}"
         )
     return p
 

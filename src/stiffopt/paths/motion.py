@@ -9,6 +9,7 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, StoppedError
 from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
@@ -207,11 +208,14 @@ class _Planner:
         index = int(np.argmin(near.distances))
         distance, name = float(near.distances[index]), near.names[index]
         shape = next(item.shape for item in request.scene.objects if item.name == name)
-        text = f"the body is {(request.asked - distance) * 1e3:.3g} mm {shape.amiss} '{name}'"
+        unit = display_units().length
+        missing = unit.text(request.asked - distance, ".3g")
+        text = f"the body is {missing} {shape.amiss} '{name}'"
         if request.asked:
-            text += f", where {request.asked * 1e3:.3g} mm of clearance are asked"
+            text += f", where {unit.text(request.asked, '.3g')} of clearance are asked"
         if request.margin:
-            text += f", {request.margin * 1e3:.3g} mm of them for what the calibration leaves open"
+            kept = unit.text(request.margin, ".3g")
+            text += f", {kept} of them for what the calibration leaves open"
         return text
 
     # -- ways -------------------------------------------------------------------------------
@@ -312,20 +316,22 @@ class _Planner:
     def _message(self, clearance: Vector | None) -> str:
         if clearance is None:
             return ""
-        margin = self.request.margin
+        margin, unit = self.request.margin, display_units().length
         counted = (
             "this counts no error of the model, as the robot is not calibrated"
             if margin is None
-            else f"{margin * 1e3:.3g} mm of it are kept for what the calibration leaves open (95 %)"
+            else f"{unit.text(margin, '.3g')} of it are kept for what the calibration leaves open "
+            "(95 %)"
         )
-        return f"the body is at least {clearance.min() * 1e3:.3g} mm clear of the scene; {counted}"
+        least = unit.text(clearance.min(), ".3g")
+        return f"the body is at least {least} clear of the scene; {counted}"
 
     def _confidence(self) -> str:
         if self.motions is None:
             return "a straight way in pressures; there is no scene"
         goals = "" if self.known == 1 else f" to one of {self.known} goal configurations"
         how = "RRTConnect" if self.searched else "a straight way in pressures"
-        kept = f"the way between them is clear to {MOTION_ERROR * 1e3:g} mm"
+        kept = f"the way between them is clear to {display_units().length.text(MOTION_ERROR, 'g')}"
         return f"{how}{goals}, {self.poses} poses looked at; {kept}"
 
 

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.notebook import ShownInNotebook
@@ -138,8 +139,8 @@ class PathSolution(ShownInNotebook):
             return f"PathSolution({self.status}: {self.message})"
         parts = [f"{self.status}: {len(self.times)} points in {self.times[-1]:.4g} s"]
         if self.worst is not None:
-            unit = (self.stiffness_unit or "").replace("*", " ")
-            parts.append(f"at least {self.worst:.4g} {unit}")
+            unit = display_units().of_si(self.stiffness_unit)
+            parts.append(f"at least {unit.text(self.worst)}")
         if self.clearance is not None:
-            parts.append(f"{1e3 * self.clearance.min():.3g} mm clear")
+            parts.append(f"{display_units().length.text(self.clearance.min(), '.3g')} clear")
         return f"PathSolution({', '.join(parts)})"

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.display import display_units
 from stiffopt.errors import EquilibriumError, InputError, StoppedError, shown
 from stiffopt.model.compiled import Stopwatch
 from stiffopt.model.manipulator import Manipulator
@@ -334,27 +335,28 @@ class _PathSolver:
             off = np.linalg.norm(tips - self._points.at(lengths), axis=1)
             index, allowed = int(off.argmax()), self._path.tolerance.position
             if off[index] > 2 * allowed:
+                error = display_units().length.text(off[index], ".2g")
                 notes.append(
-                    f"Between points {index + 1} and {index + 2} the tip is up to "
-                    f"{1e3 * off[index]:.2g} mm off the path; with more points, or lower rates, "
-                    "it stays nearer."
+                    f"Between points {index + 1} and {index + 2} the tip is up to {error} off the "
+                    "path; with more points, or lower rates, it stays nearer."
                 )
         scene = self._path.scene
         if len(middle) and scene is not None:
             clear = solution.robot.clearance(middle, scene)
             index = int(clear.argmin())
             if clear[index] < scene.clearance - RATES.clearance_between:
+                distance = display_units().length.text(clear[index], ".3g")
                 notes.append(
-                    f"Between points {index + 1} and {index + 2} the body is only "
-                    f"{1e3 * clear[index]:.3g} mm clear of the scene; with more points, or lower "
-                    "rates, it keeps further away."
+                    f"Between points {index + 1} and {index + 2} the body is only {distance} clear "
+                    "of the scene; with more points, or lower rates, it keeps further away."
                 )
         return " ".join(notes)
 
     def _too_fast(self, solution: PathSolution, index: int, slowed: float) -> PathSolution:
+        along = display_units().length.text(self._points.lengths[index])
         message = (
             f"The path is too fast for the rates: beyond point {index + 1} of {len(self._tasks)} "
-            f"({1e3 * self._points.lengths[index]:.4g} mm along it) no pressures keep them"
+            f"({along} along it) no pressures keep them"
             f"{self._binding(solution)}.  It can be followed {slowed:.3g} times slower, as given."
         )
         if solution.status != "solved":
@@ -371,7 +373,8 @@ class _PathSolver:
         share = rates / self._slew
         channel = int(np.unravel_index(share.argmax(), share.shape)[1])
         name = self._robot.description.channel_name(channel)
-        return f"; {name} with {self._slew[channel] * 1e-5:g} bar/s holds it back most"
+        rate = display_units().pressure.text(self._slew[channel], "g")
+        return f"; {name} with {rate}/s holds it back most"
 
     def _without_route(
         self, tasks: PathTasks, layers: Sequence[Sequence[PathCandidate]], steps: Vector
@@ -407,8 +410,8 @@ class _PathSolver:
         return f"{self._name(index)} cannot be reached: {why.removeprefix('unreachable: ')}"
 
     def _name(self, index: int) -> str:
-        length = 1e3 * self._points.lengths[index]
-        return f"point {index + 1} of {len(self._tasks)} ({length:.4g} mm along the path)"
+        along = display_units().length.text(self._points.lengths[index])
+        return f"point {index + 1} of {len(self._tasks)} ({along} along the path)"
 
 
 def _at_tip(task: Task, solution: PressureSolution) -> Task:
@@ -436,7 +439,7 @@ def _errors(judgements: Sequence[Judgement], name: str) -> Vector | None:
 def _what_is_wrong(judgement: Judgement) -> str:
     if not judgement.is_clear:
         name, missing = max(judgement.intruders.items(), key=lambda item: item[1])
-        return f"the body is {1e3 * missing:.3g} mm too near to '{name}'"
+        return f"the body is {display_units().length.text(missing, '.3g')} too near to '{name}'"
     if not judgement.limits_hold:
         return "a pressure is beyond its limits"
     return "the tip is off its target"

@@ -1,4 +1,7 @@
-"""An arm in axes in 3-D, in mm: its base, its tube, the scene around it, labels and the view."""
+"""An arm in axes in 3-D, in the unit in which lengths are shown.
+
+Its base, its tube, the scene around it, labels and the view.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.display import DisplayUnit, display_units
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.plots import style
 from stiffopt.plots.scene import draw_objects
 from stiffopt.plots.shapes import segment_poses
 from stiffopt.plots.view import View, ViewAngles, fill_panel
-from stiffopt.plots.wording import MM
 
 Vector = NDArray[np.float64]
 
@@ -32,7 +35,7 @@ def draw_arm(
     scene: Scene | None = None,
     view: View | None = None,
 ) -> list[Any]:
-    """Draw an arm in space, in mm.
+    """Draw an arm in space, in the unit in which lengths are shown.
 
     Parameters
     ----------
@@ -69,7 +72,7 @@ def draw_arm(
 
 
 class Label(NamedTuple):
-    """A text for a point (3,) in mm."""
+    """A text for a point (3,) of the axes."""
 
     point: Vector
     text: str
@@ -78,7 +81,7 @@ class Label(NamedTuple):
 
 @dataclass
 class ArmDrawing:
-    """Axes in 3-D and what has been drawn in them, in mm.
+    """Axes in 3-D and what has been drawn in them, in the unit of lengths.
 
     Attributes
     ----------
@@ -101,12 +104,17 @@ class ArmDrawing:
 
     @property
     def size(self) -> float:
-        """Length of the arm in mm."""
-        return self.robot.length * MM
+        """Length of the arm in the unit of the axes."""
+        return float(self.unit.of(self.robot.length))
+
+    @property
+    def unit(self) -> DisplayUnit:
+        """Unit of the axes."""
+        return display_units().length
 
     def draw_base(self) -> None:
         """Base plate: a disc on which the arm stands."""
-        radius = 1.7 * self.robot.description.segments[0].outer_radius * MM
+        radius = self.unit.of(1.7 * self.robot.description.segments[0].outer_radius)
         angle, share = np.meshgrid(np.linspace(0, 2 * np.pi, 49), [0.0, 1.0])
         x, y = radius * share * np.cos(angle), radius * share * np.sin(angle)
         self.axes.plot_surface(x, y, 0 * x, color="#8d99a6", alpha=0.55, linewidth=0, zorder=1)
@@ -122,7 +130,7 @@ class ArmDrawing:
         for number, segment in enumerate(description.segments):
             mine = poses[number]
             ring = segment.outer_radius * np.stack([np.cos(angle), np.sin(angle), 0 * angle])
-            tube = (mine[:, :3, 3, None] + mine[:, :3, :3] @ ring) * MM  # (k, 3, spokes)
+            tube = self.unit.of(mine[:, :3, 3, None] + mine[:, :3, :3] @ ring)  # (k, 3, spokes)
             x, y, z = tube.transpose(1, 0, 2)
             self.axes.plot_surface(
                 x, y, z, color=style.segment_colour(number), alpha=shade, linewidth=0, rstride=1,
@@ -132,7 +140,7 @@ class ArmDrawing:
                 self.axes.plot(
                     *end, color=style.segment_text_colour(number), linewidth=1.0, zorder=3
                 )
-            line = mine[:, :3, 3].T * MM
+            line = self.unit.of(mine[:, :3, 3].T)
             self.axes.plot(*line, color=style.segment_text_colour(number), linewidth=2.2, zorder=4)
             self.add_body(tube.transpose(0, 2, 1).reshape(-1, 3))
 
@@ -181,16 +189,16 @@ class ArmDrawing:
         self.handles.append(Line2D([], [], label=label, **look))
 
     def add_label(self, point: Vector, text: str, colour: str) -> None:
-        """Ask for a text beside a point, in mm; those that are asked for first come first."""
+        """Ask for a text beside a point of the axes; those that are asked for first come first."""
         self.labels.append(Label(np.asarray(point), text, colour))
 
     def add_body(self, points: Vector) -> None:
-        """Show points (k, 3) in mm, on which no text should lie."""
+        """Show points (k, 3) of the axes, on which no text should lie."""
         self.corners.append(points)
         self.covered.append(points)
 
     def add_mark(self, point: Vector) -> None:
-        """Show a point with a marker, in mm."""
+        """Show a point of the axes with a marker."""
         self.corners.append(point[None])
         self.marks.append(point)
 
@@ -214,7 +222,7 @@ class ArmDrawing:
         )  # room for the labels of a slender arm
         for name, start, side in zip("xyz", (low + high - sides) / 2, sides, strict=True):
             self.axes.set(**{f"{name}lim": (start, start + side)})
-            self.axes.set(**{f"{name}label": f"{name} (mm)"})
+            self.axes.set(**{f"{name}label": f"{name} ({self.unit})"})
             axis = getattr(self.axes, f"{name}axis")
             prune = None if name == "z" else "both"  # two axes meet in a corner
             axis.set_major_locator(MaxNLocator(max(3, round(7 * side / sides.max())), prune=prune))

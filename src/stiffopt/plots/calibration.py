@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.directions import direction_name
+from stiffopt.display import display_units
 from stiffopt.identify.results import Comparison
 from stiffopt.identify.structures import Candidate
 from stiffopt.identify.validation import StiffnessComparison
@@ -28,7 +29,7 @@ from stiffopt.plots.style import (
     stacked_panels,
     thinned,
 )
-from stiffopt.plots.wording import BAR, MM, vector_text
+from stiffopt.plots.wording import vector_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,6 +51,7 @@ _FEW = 30  # different pressures
 _ASIDE = 0.015  # of their range: by how much logs of a few pressures stand side by side
 _PAUSE_STEPS = 5.0  # median steps of time that are a pause in a recording, if they are also ...
 _PAUSE = 1.0  # ... so many seconds
+_LEAST_RANGE = 1e-3  # m, of an axis of the tip
 _FLAT = 0.25  # an axis shows at least this share of what the widest of x, y and z does
 
 
@@ -65,13 +67,13 @@ def plot_errors_over_time(
     """
     shown = _worst(found)
     figure, panels = _rows(len(shown), _ROW if len(shown) > 2 else 2 * _ROW)
-    logarithmic = bool(before)
+    logarithmic, unit = bool(before), display_units().length
     for axes, i in zip(panels[:, 0], shown, strict=True):
         each = found[i]
         _shade_outside(axes, each)
         if before:
-            _line(axes, each.time, before[i].distance * MM, BEFORE, 0.9, "robot file before")
-        _line(axes, each.time, each.distance * MM, MEASURED, 1.0, "this robot file")
+            _line(axes, each.time, unit.of(before[i].distance), BEFORE, 0.9, "robot file before")
+        _line(axes, each.time, unit.of(each.distance), MEASURED, 1.0, "this robot file")
         _panel_title(axes, each)
         axes.set_xlim(each.time[0], each.time[-1])
         if logarithmic:
@@ -80,7 +82,7 @@ def plot_errors_over_time(
             make_logarithmic(axes)
         else:
             axes.set_ylim(bottom=0)
-        axes.set_ylabel("error (mm)")
+        axes.set_ylabel(f"error ({unit})")
     panels[-1, 0].set_xlabel("time (s)")
     _key(figure, panels[0, 0], found)
     draw_head(figure, title, _note("distance of the predicted from the measured tip", found, shown))
@@ -92,23 +94,24 @@ def plot_tip_over_time(
 ) -> Figure:
     """Draw the measured and the predicted tip over time: x, y and z of each log."""
     shown = _worst(found)
-    alone = len(shown) == 1
+    alone, unit = len(shown) == 1, display_units().length
     rows, columns = (3, 1) if alone else (len(shown), 3)
     figure, panels = _rows(rows, 1.7, columns=columns)
     for row, i in enumerate(shown):
         each = found[i]
-        both = np.concatenate([each.measured, each.predicted]) * MM
+        measured, predicted = unit.of(each.measured), unit.of(each.predicted)
+        both = np.concatenate([measured, predicted])
         widest = float(np.nanmax(np.nanmax(both, axis=0) - np.nanmin(both, axis=0)))
         for axis in range(3):
             axes = panels[axis, 0] if alone else panels[row, axis]
             _shade_outside(axes, each)
-            _line(axes, each.time, each.measured[:, axis] * MM, MEASURED, 1.6, "measured")
-            _line(axes, each.time, each.predicted[:, axis] * MM, MODEL, 0.9, "predicted")
+            _line(axes, each.time, measured[:, axis], MEASURED, 1.6, "measured")
+            _line(axes, each.time, predicted[:, axis], MODEL, 0.9, "predicted")
             axes.set_xlim(each.time[0], each.time[-1])
-            axes.set_ylabel(f"{'xyz'[axis]} (mm)")
+            axes.set_ylabel(f"{'xyz'[axis]} ({unit})")
             if axis == 0:
                 _panel_title(axes, each)
-            _room(axes, both[:, axis], _FLAT * widest)
+            _room(axes, both[:, axis], max(_FLAT * widest, unit.of(_LEAST_RANGE)))
     for axes in panels[-1]:
         axes.set_xlabel("time (s)")
     _key(figure, panels[0, 0], found)
@@ -120,13 +123,13 @@ def plot_paths(
     found: Sequence[Comparison], *, title: str = "paths", frame: str = "the tracker's frame"
 ) -> Figure:
     """Draw the measured and the predicted path of the tip in three views, a row for each log."""
-    shown = _worst(found, _MOST_PATHS)
+    shown, unit = _worst(found, _MOST_PATHS), display_units().length
     figure, panels = _rows(len(shown), 3.3 if len(shown) == 1 else 2.6, columns=3)
     for row, i in enumerate(shown):
         each = found[i]
         rows = _evenly(len(each.time), _DRAWN)
-        measured = _path(each.time[rows], each.measured[rows] * MM)
-        predicted = _path(each.time[rows], each.predicted[rows] * MM)
+        measured = _path(each.time[rows], unit.of(each.measured[rows]))
+        predicted = _path(each.time[rows], unit.of(each.predicted[rows]))
         for axes, (a, b) in zip(panels[row], ((0, 1), (0, 2), (1, 2)), strict=True):
             axes.plot(
                 measured[:, a], measured[:, b], "-", color=MEASURED, linewidth=0.9, alpha=0.75,
@@ -136,8 +139,8 @@ def plot_paths(
                 predicted[:, a], predicted[:, b], "-", color=MODEL, linewidth=0.7, alpha=0.75,
                 label="predicted",
             )  # fmt: skip
-            axes.set_xlabel(f"{'xyz'[a]} (mm)", labelpad=1)
-            axes.set_ylabel(f"{'xyz'[b]} (mm)", labelpad=1)
+            axes.set_xlabel(f"{'xyz'[a]} ({unit})", labelpad=1)
+            axes.set_ylabel(f"{'xyz'[b]} ({unit})", labelpad=1)
             axes.set_aspect("equal", adjustable="datalim")
             axes.grid(alpha=0.2)
         _panel_title(panels[row, 0], each)
@@ -157,6 +160,7 @@ def plot_errors_over_pressure(
     Last in a row is the norm of the segment's pressures; what the calibration has seen is shaded.
     """
     last = max(segment.n_channels for segment in robot.segments)
+    length, pressure = display_units().length, display_units().pressure
     shown = [found[i] for i in _worst(found)]
     labels = [literal(each.name) for each in shown]
     seen = robot.calibration
@@ -177,18 +181,18 @@ def plot_errors_over_pressure(
             pressures = [each.pressures[:, channel] for each in shown]
             limits = (seen.pressure_min[channel], seen.pressure_max[channel]) if seen else None
             are_moved |= _draw_clouds(axes, shown, pressures, limits)
-            axes.set_xlabel(f"{robot.channel_name(channel)} (bar)")
+            axes.set_xlabel(f"{robot.channel_name(channel)} ({pressure})")
         for axes in panels[s, end - begin : last]:
             axes.set_visible(False)
         norms = [np.linalg.norm(each.pressures[:, begin:end], axis=1) for each in shown]
         limits = (0.0, seen.pressure_norm[s]) if seen else None
         are_moved |= _draw_clouds(panels[s, last], shown, norms, limits)
-        panels[s, last].set_xlabel(f"norm of segment {s + 1} (bar)")
+        panels[s, last].set_xlabel(f"norm of segment {s + 1} ({pressure})")
         begin = end
     for axes in panels[:, 0]:
-        axes.set_ylabel("error (mm)")
+        axes.set_ylabel(f"error ({length})")
     highest = max((float(np.nanmax(each.distance, initial=0.0)) for each in shown), default=1.0)
-    panels[0, 0].set_ylim(0, 1.05 * highest * MM)
+    panels[0, 0].set_ylim(0, 1.05 * length.of(highest))
     handles = list(panels[0, 0].lines)
     if seen:
         from matplotlib.patches import Patch
@@ -215,18 +219,20 @@ def _draw_clouds(
 
     Logs of a few pressures are moved apart so that they do not hide each other; return whether.
     """
+    length, pressure = display_units().length, display_units().pressure
     every = np.concatenate(pressures)
     moves = np.arange(len(logs), dtype=float) - (len(logs) - 1) / 2
     few = len(np.unique(every)) <= _FEW
     moves *= _ASIDE * float(np.ptp(every)) if few else 0.0
     if limits is not None:
         margin = float(moves.max(initial=0.0))
-        axes.axvspan((limits[0] - margin) * BAR, (limits[1] + margin) * BAR, color=RANGE, zorder=0)
+        low, high = pressure.of(limits[0] - margin), pressure.of(limits[1] + margin)
+        axes.axvspan(low, high, color=RANGE, zorder=0)
     for number, (log, p) in enumerate(zip(logs, pressures, strict=True)):
         rows = _evenly(len(p), _SCATTERED)
         axes.plot(
-            (p[rows] + moves[number]) * BAR, log.distance[rows] * MM, ".", markersize=3.0,
-            alpha=0.5, markeredgewidth=0, color=channel_colour(number),
+            pressure.of(p[rows] + moves[number]), length.of(log.distance[rows]), ".",
+            markersize=3.0, alpha=0.5, markeredgewidth=0, color=channel_colour(number),
         )  # fmt: skip
     return bool(moves.any())
 
@@ -240,16 +246,16 @@ def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "m
         [0.5 * len(candidates)], left=1.76, right=2.86, head=1.13, foot=0.62
     )
     axes = panels[0, 0]
-    folds = list(candidates[0].folds)
+    folds, unit = list(candidates[0].folds), display_units().length
     for row, each in enumerate(candidates):
         is_chosen = each.structure.name == chosen
         axes.barh(
-            row, each.score * MM, height=0.62, zorder=1,
+            row, unit.of(each.score), height=0.62, zorder=1,
             color="#b9cfe6" if is_chosen else "#e3e6e9",
         )  # fmt: skip
         for number, fold in enumerate(folds):
             axes.plot(
-                each.folds[fold].mean * MM, row, "o", markersize=5,
+                unit.of(each.folds[fold].mean), row, "o", markersize=5,
                 color=channel_colour(number), markeredgewidth=0,
                 label=literal(fold) if row == 0 else None,
             )  # fmt: skip
@@ -258,7 +264,7 @@ def plot_models(candidates: Sequence[Candidate], chosen: str, *, title: str = "m
         tick.set_fontweight("bold" if each.structure.name == chosen else "normal")
     axes.invert_yaxis()
     axes.set_xlim(left=0)
-    axes.set_xlabel("mean error of the tip (mm)")
+    axes.set_xlabel(f"mean error of the tip ({unit})")
     legend_beside(axes, title="held back", alignment="left")
     draw_head(figure, title, f"bars: mean over what was held back      chosen: {chosen}")
     return figure
@@ -269,17 +275,18 @@ def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiff
     figure, panels = stacked_panels([0.27 * len(rows)], left=2.64, right=2.2, head=1.13, foot=0.62)
     axes = panels[0, 0]
     places = np.arange(len(rows))
-    measured = np.array([row.measured for row in rows])
+    unit = display_units().stiffness
+    measured = unit.of(np.array([row.measured for row in rows]))
     axes.errorbar(
-        measured, places, xerr=[1.96 * row.sigma for row in rows], fmt="s", markersize=5, capsize=3,
-        color=MEASURED, label="measured, 95 %",
+        measured, places, xerr=[unit.of(1.96 * row.sigma) for row in rows], fmt="s", markersize=5,
+        capsize=3, color=MEASURED, label="measured, 95 %",
     )  # fmt: skip
     shown = [measured]
     for values, colour, mark, label in (
         ([row.before for row in rows], BEFORE, "D", "robot file before"),
         ([row.after for row in rows], MODEL, "o", "this robot file"),
     ):
-        x = np.array([np.nan if value is None else value for value in values])
+        x = unit.of(np.array([np.nan if value is None else value for value in values]))
         shown.append(x)
         axes.plot(
             x, places, mark, markersize=5.5, markerfacecolor="none", markeredgewidth=1.4,
@@ -287,7 +294,7 @@ def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiff
         )  # fmt: skip
     axes.set_yticks(places, [_label(row) for row in rows], fontsize=8.5)
     axes.invert_yaxis()
-    axes.set_xlabel("stiffness (N/m)")
+    axes.set_xlabel(f"stiffness ({unit})")
     known = np.concatenate(shown)
     known = known[np.isfinite(known) & (known > 0)]
     if len(known) and known.max() > 8 * known.min():
@@ -302,8 +309,9 @@ def plot_stiffnesses(rows: Sequence[StiffnessComparison], *, title: str = "stiff
 
 
 def _label(row: StiffnessComparison) -> str:
-    pressures = vector_text(pressure * BAR for pressure in row.pressures)
-    label = f"{direction_name(row.direction)} at {pressures} bar"
+    unit = display_units().pressure
+    pressures = vector_text(row.pressures, unit)
+    label = f"{direction_name(row.direction)} at {pressures} {unit}"
     return label if row.boundary == "free" else f"{label}, {row.boundary}"
 
 
@@ -335,7 +343,10 @@ def _panel_title(axes: Any, found: Comparison) -> None:
     errors = found.errors
     text = f"{found.name}"
     if errors.n:
-        text += f"   mean {errors.mean * MM:.2f} mm, 95 % below {errors.p95 * MM:.2f} mm"
+        unit = display_units().length
+        text += (
+            f"   mean {unit.text(errors.mean, '.2f')}, 95 % below {unit.text(errors.p95, '.2f')}"
+        )
     axes.set_title(literal(text), loc="left", fontsize=9.5, pad=3)
 
 
@@ -372,7 +383,8 @@ def _shade_outside(axes: Any, found: Comparison) -> None:
 
 
 def _limit_decades(axes: Any, found: Sequence[Comparison], before: Sequence[Comparison]) -> None:
-    distances = np.concatenate([each.distance for each in (*found, *before)]) * MM
+    unit = display_units().length
+    distances = unit.of(np.concatenate([each.distance for each in (*found, *before)]))
     known = distances[np.isfinite(distances) & (distances > 0)]
     if len(known):
         axes.set_ylim(np.quantile(known, 0.002) * 0.8, known.max() * 1.2)
@@ -383,7 +395,7 @@ def _room(axes: Any, values: Array, least: float) -> None:
     known = values[np.isfinite(values)]
     if len(known):
         middle, half = (known.max() + known.min()) / 2, (known.max() - known.min()) / 2
-        half = max(1.08 * half, least / 2, 0.5)
+        half = max(1.08 * half, least / 2)
         axes.set_ylim(middle - half, middle + half)
 
 

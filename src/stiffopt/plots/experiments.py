@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stiffopt.directions import direction_name
+from stiffopt.display import display_units
 from stiffopt.experiments.kinematics_result import CoverageResult, KinematicsResult
 from stiffopt.experiments.stiffness_result import StiffnessResult
 from stiffopt.plots.style import (
@@ -23,7 +24,6 @@ from stiffopt.plots.style import (
     stacked_panels,
     tidy,
 )
-from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,9 +53,10 @@ def plot_kinematics(result: KinematicsResult, *, title: str = "kinematics") -> F
 
 
 def _error_text(result: KinematicsResult | CoverageResult) -> str:
-    """Mean, 95th percentile and largest error, each in mm and in per cent of the arm's length."""
+    """Mean, 95th percentile and largest error, each also in per cent of the arm's length."""
+    unit = display_units().length
     mean, p95, worst = (
-        f"{error * MM:.2f} mm ({error / result.length * 100:.1f} %{of})"
+        f"{unit.text(error, '.2f')} ({error / result.length * 100:.1f} %{of})"
         for error, of in ((result.mean, " of length"), (result.p95, ""), (result.worst, ""))
     )
     return f"mean {mean}, 95 % below {p95}, at most {worst}"
@@ -66,10 +67,11 @@ def _counted(count: int, what: str) -> str:
 
 
 def _draw_pressures(axes: Any, result: KinematicsResult) -> None:
+    unit = display_units().pressure
     for channel, p in enumerate(result.pressures.T):
         colour = channel_colour(channel)
-        axes.plot(result.time, p * BAR, color=colour, linewidth=1.4, label=f"p{channel + 1}")
-    axes.set_ylabel("pressure (bar)")
+        axes.plot(result.time, unit.of(p), color=colour, linewidth=1.4, label=f"p{channel + 1}")
+    axes.set_ylabel(f"pressure ({unit})")
     axes.set_ylim(bottom=min(0.0, axes.get_ylim()[0]))
     columns = 1 if result.pressures.shape[1] <= 5 else 2
     legend_beside(axes, ncols=columns)
@@ -79,34 +81,36 @@ def _draw_pressures(axes: Any, result: KinematicsResult) -> None:
 def _draw_tip(axes: Any, result: KinematicsResult, axis: int) -> None:
     from matplotlib.patches import Patch
 
-    low, high = result.low[:, axis] * MM, result.high[:, axis] * MM
-    model = result.model[:, axis] * MM
+    unit = display_units().length
+    low, high = unit.of(result.low[:, axis]), unit.of(result.high[:, axis])
+    model = unit.of(result.model[:, axis])
     axes.fill_between(result.time, low, high, color=AXES[axis], alpha=_BAND, linewidth=_BAND_EDGE)
     axes.plot(result.time, model, color=MODEL, linewidth=1.1, label="model")
-    axes.set_ylabel(f"tip {'xyz'[axis]} (mm)")
+    axes.set_ylabel(f"tip {'xyz'[axis]} ({unit})")
     what = "measured, range\nof repetitions" if result.repetitions > 1 else "measured"
     legend_beside(axes, handles=[Patch(color=AXES[axis], alpha=_BAND, label=what), *axes.lines])
     tidy(axes)
 
 
 def _draw_error(axes: Any, result: KinematicsResult) -> None:
+    unit = display_units().length
     for axis in range(3):
         axes.plot(
-            result.time, result.component_error[:, axis] * MM, color=AXES[axis], linewidth=1.1,
+            result.time, unit.of(result.component_error[:, axis]), color=AXES[axis], linewidth=1.1,
             label=f"in {'xyz'[axis]} (mean)",
         )  # fmt: skip
     axes.plot(
-        result.time, result.error * MM, color=DARK, linewidth=1.4, label="distance\n(largest)"
+        result.time, unit.of(result.error), color=DARK, linewidth=1.4, label="distance\n(largest)"
     )
     axes.axhline(0, color=GREY, linewidth=0.7)
-    axes.set_ylabel("model - measured (mm)")
+    axes.set_ylabel(f"model - measured ({unit})")
     legend_beside(axes)
     tidy(axes)
 
 
 def plot_coverage(result: CoverageResult, *, title: str = "combined poses") -> Figure:
     """Draw the pressures of each combined pose, and how far the model's tip is off there."""
-    count, n = result.pressures.shape
+    (count, n), units = result.pressures.shape, display_units()
     height = 4.6 + 0.32 * n
     figure = new_figure(11, height)
     from matplotlib.ticker import MaxNLocator
@@ -117,9 +121,9 @@ def plot_coverage(result: CoverageResult, *, title: str = "combined poses") -> F
     )  # fmt: skip
     top = figure.add_subplot(grid[0, 0])
     below = figure.add_subplot(grid[1, 0], sharex=top)
-    edges = np.arange(count + 1) + 0.5
+    edges, length, pressure = np.arange(count + 1) + 0.5, units.length, units.pressure
     shades = top.pcolormesh(
-        edges, np.arange(n + 1) + 0.5, result.pressures.T * BAR, cmap="viridis",
+        edges, np.arange(n + 1) + 0.5, pressure.of(result.pressures.T), cmap="viridis",
         edgecolors="white", linewidth=0.6,
     )  # fmt: skip
     top.set_yticks(range(1, n + 1), [f"p{channel}" for channel in range(1, n + 1)])
@@ -127,15 +131,15 @@ def plot_coverage(result: CoverageResult, *, title: str = "combined poses") -> F
     top.tick_params(labelbottom=False, labelsize=9)
     top.spines[:].set_visible(False)
     scale = figure.colorbar(shades, cax=figure.add_subplot(grid[0, 1]))
-    scale.set_label("bar")
+    scale.set_label(pressure.name)
     scale.ax.tick_params(labelsize=9)
-    below.bar(np.arange(1, count + 1), result.errors * MM, width=0.7, color=MEASURED)
+    below.bar(np.arange(1, count + 1), length.of(result.errors), width=0.7, color=MEASURED)
     for value, style, label in ((result.mean, "-", "mean"), (result.p95, "--", "95 %")):
-        below.axhline(value * MM, color=MODEL, linewidth=1.2, linestyle=style, label=label)
+        below.axhline(length.of(value), color=MODEL, linewidth=1.2, linestyle=style, label=label)
     below.set_xlim(edges[0], edges[-1])
     below.set_ylim(bottom=0)
     below.set_xlabel("pose, in the order in which they were taken")
-    below.set_ylabel("error of the model's tip (mm)")
+    below.set_ylabel(f"error of the model's tip ({length})")
     below.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend_beside(below)
     tidy(below)
@@ -176,29 +180,28 @@ def plot_stiffness(result: StiffnessResult, *, title: str = "stiffness") -> Figu
 def _draw_stiffness(axes: Any, result: StiffnessResult, number: int) -> None:
     direction = result.settings.directions[number]
     cells = [cell for cell in result.along(direction) if cell.estimate is not None]
-    axes.plot(
-        result.curve_pressures * BAR, result.curves[:, number], color=MODEL,
-        linewidth=1.6, label="model",
-    )  # fmt: skip
+    unit, pressure = display_units().stiffness, display_units().pressure
+    curve = unit.of(result.curves[:, number])
+    axes.plot(pressure.of(result.curve_pressures), curve, color=MODEL, linewidth=1.6, label="model")
     for cell in cells:
-        x = np.full(len(cell.slopes), cell.pressure * BAR)
+        x = np.full(len(cell.slopes), pressure.of(cell.pressure))
         axes.plot(
-            x, np.array(cell.slopes), "o", color=MEASURED, alpha=0.35, markersize=3.5,
+            x, unit.of(np.array(cell.slopes)), "o", color=MEASURED, alpha=0.35, markersize=3.5,
             markeredgewidth=0, label="each repetition" if cell is cells[0] else None,
         )  # fmt: skip
     estimates = [cell.estimate for cell in cells if cell.estimate is not None]
     if estimates:
         axes.errorbar(
-            [cell.pressure * BAR for cell in cells],
-            [each.value for each in estimates],
-            yerr=[each.half_width for each in estimates],
+            [pressure.of(cell.pressure) for cell in cells],
+            [unit.of(each.value) for each in estimates],
+            yerr=[unit.of(each.half_width) for each in estimates],
             color=MEASURED, marker="s", markersize=4.5, capsize=3, linestyle="none",
             label="measured",
         )  # fmt: skip
     axes.set_title(f"along {direction_name(direction)}", loc="left", fontsize=11, weight="bold")
-    axes.set_xlabel("pressure (bar)")
-    axes.set_ylabel("stiffness (N/m)")
-    shown = [*(each.value for each in estimates), *result.curves[:, number]]
+    axes.set_xlabel(f"pressure ({pressure})")
+    axes.set_ylabel(f"stiffness ({unit})")
+    shown = [*(unit.of(each.value) for each in estimates), *curve]
     if max(shown) > 8 * min(shown) > 0:
         make_logarithmic(axes)
     else:

@@ -67,7 +67,7 @@ def place_labels(axes: Any, labels: Sequence[Label], covered: Vector, marks: Vec
     labels : sequence of Label
         The most important first.
     covered : (k, 3)
-        Points in mm, close together, of what no text should lie on.
+        Points of the axes, close together, of what no text should lie on.
     marks : (j, 3)
         Points with a marker.
     """

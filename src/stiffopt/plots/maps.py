@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.directions import direction_name
+from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.experiments.arm_map import ArmMap, TipMap
 from stiffopt.plots.style import (
@@ -20,7 +21,6 @@ from stiffopt.plots.style import (
     round_steps,
     tidy,
 )
-from stiffopt.plots.wording import BAR, MM, unit_text
 from stiffopt.workspace import WorkspaceMap
 
 if TYPE_CHECKING:
@@ -60,11 +60,11 @@ def plot_workspace(found: WorkspaceMap, *, title: str | None = None) -> Figure:
         rows, 7, width_ratios=(1, 1, 0.05, 0.2, 1, 1, 0.05), left=0.055, right=0.945,
         top=1 - _HEAD / height, bottom=_FOOT / height, wspace=0.36, hspace=0.32,
     )  # fmt: skip
-    unit = unit_text(found.plan.unit)
+    unit = display_units().of_si(found.plan.unit)
     for row, name in enumerate(found.direction_names):
         ratio = np.where(found.count >= _ENOUGH, found.ratio[row], np.inf)  # inf: unknown
         for first, values, colours, label in (
-            (0, found.best[row], _BEST, f"greatest stiffness ({unit})"),
+            (0, unit.of(found.best[row]), _BEST, f"greatest stiffness ({unit})"),
             (4, ratio, _CHOICE, "greatest / least"),
         ):
             panels = [figure.add_subplot(grid[row, first + k]) for k in range(2)]
@@ -112,7 +112,7 @@ class _Section:
     @property
     def name(self) -> str:
         """Where the section is."""
-        return f"at {'xyz'[self.normal]} = {self.place * MM + 0.0:g} mm"
+        return f"at {'xyz'[self.normal]} = {display_units().length.text(self.place, 'g')}"
 
     def image(self, values: Vector) -> Vector:
         """Values (M,) of cells as an image, row by row from below."""
@@ -122,9 +122,10 @@ class _Section:
 
     @property
     def extent(self) -> tuple[float, float, float, float]:
-        """Edges left, right, bottom, top in mm."""
-        low = (self._first - 0.5) * self._size * MM
-        high = low + np.array(self._shape) * self._size * MM
+        """Edges left, right, bottom, top in the unit of lengths."""
+        size = display_units().length.of(self._size)
+        low = (self._first - 0.5) * size
+        high = low + np.array(self._shape) * size
         return (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
 
 
@@ -157,20 +158,21 @@ def _draw_sections(
 
 
 def _frame(axes: Any, section: _Section, other: _Section) -> None:
-    """Axes in mm, the arm at rest, and where the other section cuts this one."""
+    """Axes in the unit of lengths, the arm at rest, and where the other section cuts this one."""
     left, right, bottom, top = section.extent
+    unit = display_units().length
     if section.normal == 1:
         bottom = min(bottom, 0.0)
-        top = max(top, section.length * MM)
-        side = section.radius * MM
+        length, side = unit.of(section.length), unit.of(section.radius)
+        top = max(top, length)
         axes.fill(
-            [-side, side, side, -side], [0, 0, section.length * MM, section.length * MM],
+            [-side, side, side, -side], [0, 0, length, length],
             facecolor="none", edgecolor=ARM, linewidth=1.1, linestyle="--", zorder=4,
         )  # fmt: skip
         axes.plot([-2.2 * side, 2.2 * side], [0, 0], color=ARM, linewidth=3.0, zorder=4)
     else:
         axes.plot(0, 0, marker="+", color=ARM, markersize=9, markeredgewidth=1.4, zorder=4)
-    line = axes.axhline(other.place * MM, color=ARM, linewidth=0.9, linestyle=":", zorder=3)
+    line = axes.axhline(unit.of(other.place), color=ARM, linewidth=0.9, linestyle=":", zorder=3)
     line.set_dash_capstyle("round")
     room = 0.04 * max(right - left, top - bottom)
     axes.set_xlim(left - room, right + room)
@@ -179,8 +181,8 @@ def _frame(axes: Any, section: _Section, other: _Section) -> None:
     axes.set_aspect("equal")
     axes.set_facecolor("white")
     across, up = ("xyz"[axis] for axis in section.axes)
-    axes.set_xlabel(f"{across} (mm)   {section.name}", fontsize=9, labelpad=1)
-    axes.set_ylabel(f"{up} (mm)", fontsize=9, labelpad=1)
+    axes.set_xlabel(f"{across} ({unit})   {section.name}", fontsize=9, labelpad=1)
+    axes.set_ylabel(f"{up} ({unit})", fontsize=9, labelpad=1)
     tidy(axes)
 
 
@@ -192,12 +194,13 @@ def _way(found: WorkspaceMap, row: int) -> str:
 
 def _write_head(figure: Figure, found: WorkspaceMap, title: str, height: float) -> None:
     plan, first = found.plan, found.plan.measures[0]
+    cell = display_units().length.text(plan.cell, "g")
     draw_head(
         figure,
         f"{title}: the workspace of the tip",
         f"{found.volume * 1e6:,.0f} cm³ reached      "
         f"{found.samples:,} samples, {np.median(found.count):g} in the median cell of "
-        f"{plan.cell * MM:g} mm      stiffness of {first.kind}, {first.boundary}",
+        f"{cell}      stiffness of {first.kind}, {first.boundary}",
     )
     for x, text in (
         (0.055, "How stiff can the tip be made at a place?"),
@@ -261,15 +264,16 @@ def plot_arm_map(found: ArmMap) -> Figure:
 
 
 def _draw_shapes(axes: Any, found: ArmMap, row: int, colours: list[Any]) -> None:
-    shapes = found.backbones[row] * MM
-    flat = _bending_plane(shapes)
+    unit = display_units().length
+    flat = _bending_plane(found.backbones[row])
+    shapes, foot = unit.of(found.backbones[row]), unit.of(0.1 * found.length)
     for shape, colour in zip(shapes, colours, strict=True):
         axes.plot(shape[:, :2] @ flat, shape[:, 2], color=colour, linewidth=2.2)
-    axes.plot([-0.1 * found.length * MM, 0.1 * found.length * MM], [0, 0], color=ARM, lw=3)
+    axes.plot([-foot, foot], [0, 0], color=ARM, lw=3)
     across = "x" if abs(flat[0]) > 0.999 else "in the plane of bending"
     sign = "-" if flat[0] < -0.999 else ""
-    axes.set_xlabel(f"{sign}{across} (mm)", fontsize=9)
-    axes.set_ylabel("z (mm)", fontsize=9)
+    axes.set_xlabel(f"{sign}{across} ({unit})", fontsize=9)
+    axes.set_ylabel(f"z ({unit})", fontsize=9)
     axes.set_aspect("equal", adjustable="datalim")
     if found.hangs:
         axes.invert_yaxis()
@@ -281,22 +285,24 @@ def _bending_plane(shapes: Vector) -> Vector:
     tips = shapes[:, -1, :2] - shapes[0, -1, :2]
     farthest: Vector = tips[np.argmax(np.linalg.norm(tips, axis=1))]
     size = float(np.linalg.norm(farthest))
-    if size < 1.0 or abs(farthest[0]) > 0.999 * size:
+    if size < 1e-3 or abs(farthest[0]) > 0.999 * size:
         return np.array([1.0, 0.0])
     return farthest / size
 
 
 def _draw_along(axes: Any, found: ArmMap, row: int, column: int, colours: list[Any]) -> None:
+    length, unit = display_units().length, display_units().stiffness
+    at = length.of(found.at)
     for level, colour in enumerate(colours):
-        values = found.stiffness[row, level, :, column]
-        axes.plot(found.at * MM, values, color=colour, linewidth=1.7)
-    axes.axvline(found.length / 2 * MM, color=ARM, linewidth=0.9, linestyle=":")
+        values = unit.of(found.stiffness[row, level, :, column])
+        axes.plot(at, values, color=colour, linewidth=1.7)
+    axes.axvline(length.of(found.length / 2), color=ARM, linewidth=0.9, linestyle=":")
     name = direction_name(tuple(found.directions[column]))
     axes.set_title(f"along {name}", loc="left", fontsize=10.5)
     make_logarithmic(axes)
-    axes.set_xlabel("distance from the base at rest (mm)", fontsize=9)
-    axes.set_ylabel("stiffness (N/m)", fontsize=9)
-    axes.set_xlim(found.at[0] * MM, found.at[-1] * MM)
+    axes.set_xlabel(f"distance from the base at rest ({length})", fontsize=9)
+    axes.set_ylabel(f"stiffness ({unit})", fontsize=9)
+    axes.set_xlim(at[0], at[-1])
     axes.grid(alpha=0.25, which="both")
     tidy(axes)
 
@@ -314,7 +320,7 @@ def plot_tip_map(found: TipMap) -> Figure:
         _draw_heat(figure, figure.add_subplot(grid[0, column]), found, column)
     a, b = found.channels
     rest = [
-        f"p{k + 1} {p * BAR:g} bar"
+        f"p{k + 1} {display_units().pressure.text(p, 'g')}"
         for k, p in enumerate(found.others)
         if k + 1 not in found.channels
     ]
@@ -330,10 +336,11 @@ def plot_tip_map(found: TipMap) -> Figure:
 def _draw_heat(figure: Figure, axes: Any, found: TipMap, column: int) -> None:
     from matplotlib.colors import LogNorm
 
-    values = found.stiffness[:, :, column]
+    unit, pressure = display_units().stiffness, display_units().pressure
+    values = unit.of(found.stiffness[:, :, column])
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
     norm = LogNorm(low, high) if high > 5 * low > 0 else None
-    first, second = found.first * BAR, found.second * BAR
+    first, second = pressure.of(found.first), pressure.of(found.second)
     drawn = axes.pcolormesh(
         first, second, values.T, cmap=_BEST, norm=norm, shading="gouraud", rasterized=True
     )
@@ -342,13 +349,13 @@ def _draw_heat(figure: Figure, axes: Any, found: TipMap, column: int) -> None:
     )
     axes.clabel(lines, fmt=lambda value: f"{value:.3g}", fontsize=8)
     a, b = found.channels
-    axes.set_xlabel(f"pressure of channel {a} (bar)")
-    axes.set_ylabel(f"pressure of channel {b} (bar)")
+    axes.set_xlabel(f"pressure of channel {a} ({pressure})")
+    axes.set_ylabel(f"pressure of channel {b} ({pressure})")
     name = direction_name(tuple(found.directions[column]))
     axes.set_title(f"along {name}", loc="left", fontsize=11, weight="bold")
     axes.set_aspect("equal", adjustable="box")
     bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-    bar.set_label("stiffness (N/m)", fontsize=9)
+    bar.set_label(f"stiffness ({unit})", fontsize=9)
     bar.ax.tick_params(labelsize=8)
     if norm is not None:
         label_logarithmic(bar.ax.yaxis, low, high)
@@ -377,8 +384,9 @@ def _pressure_bar(figure: Figure, axes: Any, pressures: Vector) -> None:
     norm = BoundaryNorm(np.arange(count + 1) - 0.5, count)
     drawn = ScalarMappable(norm=norm, cmap=ListedColormap(_colours(count)))
     bar = figure.colorbar(drawn, cax=axes, ticks=range(count))
-    bar.ax.set_yticklabels([f"{p * BAR:.3g}" for p in pressures], fontsize=9)
-    bar.set_label("pressure (bar)", fontsize=9.5)
+    unit = display_units().pressure
+    bar.ax.set_yticklabels([unit.number(p, ".3g") for p in pressures], fontsize=9)
+    bar.set_label(f"pressure ({unit})", fontsize=9.5)
 
 
 def _named(group: tuple[int, ...]) -> str:

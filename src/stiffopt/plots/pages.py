@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from stiffopt.display import display_units
 from stiffopt.errors import StiffoptError, printable
 from stiffopt.model.compiled import compiling_nothing
 from stiffopt.model.manipulator import Manipulator, load_robot
@@ -27,7 +28,7 @@ from stiffopt.plots import style
 from stiffopt.plots.arm import draw_arm
 from stiffopt.plots.path import draw_asked_path, draw_path, draw_stiffness_along
 from stiffopt.plots.solution import draw_pressures, draw_solution, draw_task
-from stiffopt.plots.wording import BAR, MM, bar_text, figures, unit_text
+from stiffopt.plots.wording import stiffness_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -102,12 +103,13 @@ def _(robot: Manipulator) -> _Page:
 
 
 def _robot_rows(robot: Manipulator) -> Iterable[Row]:
-    lengths = ", ".join(f"{each.length * MM:g} mm" for each in robot.description.segments)
+    length, pressure = display_units().length, display_units().pressure
+    lengths = ", ".join(length.text(each.length, "g") for each in robot.description.segments)
     yield "segments", lengths
-    yield "length", f"{robot.length * MM:g} mm"
+    yield "length", length.text(robot.length, "g")
     yield "channels", str(robot.n_pressures)
-    low, high = robot.pressure_min.min() * BAR, robot.pressure_max.max() * BAR
-    yield "pressures", f"{low:g} to {high:g} bar"
+    low, high = robot.pressure_min.min(), robot.pressure_max.max()
+    yield "pressures", f"{pressure.number(low, 'g')} to {pressure.text(high, 'g')}"
     if robot.is_loaded:
         yield "loaded", "in equilibrium under gravity or load"
 
@@ -136,8 +138,8 @@ def _task_rows(task: Task) -> Iterable[Row]:
 
 def _condition_rows(asked: ForRobot) -> Iterable[Row]:
     if asked.load is not None:
-        force = np.linalg.norm(asked.load.force)
-        yield "load", f"{force:.3g} N, {asked.load.frame} axes"
+        force = display_units().force.text(float(np.linalg.norm(asked.load.force)), ".3g")
+        yield "load", f"{force}, {asked.load.frame} axes"
     if asked.scene is not None:
         yield "scene", ", ".join(item.name for item in asked.scene.objects)
 
@@ -152,12 +154,12 @@ def _(path: Path) -> _Page:
 
 
 def _path_rows(path: Path) -> Iterable[Row]:
-    points = path.points()
+    points, unit = path.points(), display_units().length
     yield "robot", path.robot or "the one that the solver is given"
-    yield "path", f"{path.path.kind} of {points.curve.length * MM:.4g} mm, {len(points)} points"
+    yield "path", f"{path.path.kind} of {unit.text(points.curve.length)}, {len(points)} points"
     if points.times is not None:
         yield "time", f"{points.times[-1]:.4g} s"
-    yield "tolerance", f"{path.tolerance.position * MM:g} mm"
+    yield "tolerance", unit.text(path.tolerance.position, "g")
     yield from _condition_rows(path)
 
 
@@ -181,15 +183,20 @@ def _answer_rows(solution: PressureSolution) -> Iterable[Row]:
         yield "note", solution.message
     if solution.pressures is None or solution.tip_position is None:
         return
-    yield "pressures", f"{', '.join(map(bar_text, solution.pressures))} bar"
-    yield "tip at", f"({', '.join(f'{x * MM + 0.0:.3f}' for x in solution.tip_position)}) mm"
+    length, pressure = display_units().length, display_units().pressure
+    pressures = ", ".join(pressure.number(p, ".3f") for p in solution.pressures)
+    yield "pressures", f"{pressures} {pressure}"
+    yield (
+        "tip at",
+        f"({', '.join(length.number(x, '.3f') for x in solution.tip_position)}) {length}",
+    )
     for term in solution.task.target.terms:
         if term.name in solution.errors:
             yield f"error in {term.name}", term.words(solution.errors[term.name])
     for number, (measure, value) in enumerate(
         zip(solution.task.measures, solution.stiffnesses, strict=False)
     ):
-        words = f"{figures(value)} {unit_text(measure.unit)}, {measure.words()}"
+        words = f"{stiffness_text(value, measure.unit)}, {measure.words()}"
         yield "" if number else "stiffness", words
 
 
@@ -213,14 +220,14 @@ def _points_rows(solution: PathSolution) -> Iterable[Row]:
         yield "note", solution.message
     if not len(solution.times):
         return
+    unit = display_units().length
     yield "points", f"{len(solution.times)} in {solution.times[-1]:.4g} s"
     if solution.position_errors is not None:
-        yield "tip error", f"at most {solution.position_errors.max() * MM:.3g} mm"
+        yield "tip error", f"at most {unit.text(solution.position_errors.max(), '.3g')}"
     if solution.worst is not None:
-        unit = unit_text(solution.stiffness_unit)
-        yield "stiffness", f"at least {figures(solution.worst)} {unit}"
+        yield "stiffness", f"at least {stiffness_text(solution.worst, solution.stiffness_unit)}"
     if solution.clearance is not None:
-        yield "clearance", f"at least {solution.clearance.min() * MM:.3g} mm"
+        yield "clearance", f"at least {unit.text(solution.clearance.min(), '.3g')}"
 
 
 def _in_space(draw: Callable[[Any], object]) -> Figure:

@@ -6,12 +6,12 @@ Each panel is a function that draws into axes of the caller.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import degrees
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -21,7 +21,7 @@ from stiffopt.paths.solution import PathSolution
 from stiffopt.plots import style
 from stiffopt.plots.arm import ArmDrawing
 from stiffopt.plots.view import View
-from stiffopt.plots.wording import BAR, MM, figures, unit_text
+from stiffopt.plots.wording import stiffness_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -144,20 +144,21 @@ def _duration(solution: PathSolution) -> str:
 
 
 def _key_numbers(path: Path, solution: PathSolution) -> str:
-    parts = [_duration(solution)]
+    parts, units = [_duration(solution)], display_units()
     if solution.position_errors is not None:
         parts.append(
-            f"tip error at most {solution.position_errors.max() * MM:.3g} mm "
-            f"(tolerance {path.tolerance.position * MM:g} mm)"
+            f"tip error at most {units.length.text(solution.position_errors.max(), '.3g')} "
+            f"(tolerance {units.length.text(path.tolerance.position, 'g')})"
         )
     if solution.angle_errors is not None:
-        parts.append(f"{degrees(solution.angle_errors.max()):.3g} deg")
+        parts.append(units.angle.text(solution.angle_errors.max(), ".3g"))
     if solution.stiffness is not None and path.stiffness is not None:
-        unit, index = unit_text(solution.stiffness_unit), int(np.argmin(solution.stiffness))
+        index = int(np.argmin(solution.stiffness))
         share = ""
         if solution.alone is not None:
             share = f" ({solution.stiffness[index] / solution.alone[index]:.0%} of that alone)"
-        parts.append(f"worst stiffness {figures(solution.stiffness[index])} {unit}{share}")
+        worst = stiffness_text(solution.stiffness[index], solution.stiffness_unit)
+        parts.append(f"worst stiffness {worst}{share}")
     return "      ".join(parts)
 
 
@@ -200,7 +201,7 @@ def draw_path(
     for index in np.unique(np.linspace(0, last, _POSES).astype(int)):
         drawing.draw_tube(solution.pressures[index], 0.3 if index in (0, last) else 0.1)
     drawing.explain_segments()
-    tips = solution.tip_poses[:, :3, 3].T * MM
+    tips = drawing.unit.of(solution.tip_poses[:, :3, 3].T)
     if path is not None:
         _draw_asked(drawing, path)
     axes.plot(*tips, color=style.DARK, linewidth=2.2, zorder=8)
@@ -257,7 +258,7 @@ def draw_asked_path(
 
 
 def _draw_asked(drawing: ArmDrawing, path: Path) -> None:
-    asked = path.points().positions * MM
+    asked = drawing.unit.of(path.points().positions)
     drawing.axes.plot(*asked.T, color=style.TARGET, linewidth=1.4, linestyle=":", zorder=9)
     drawing.add_line(style.TARGET, "path that is asked for", ":")
     drawing.corners.append(asked)
@@ -266,7 +267,7 @@ def _draw_asked(drawing: ArmDrawing, path: Path) -> None:
 def _label_stiffness(drawing: ArmDrawing, solution: PathSolution, tips: Vector) -> None:
     """Write the least stiffness to where the tip has it."""
     if solution.worst is not None:
-        text = f"least stiff:\n{figures(solution.worst)} {unit_text(solution.stiffness_unit)}"
+        text = f"least stiff:\n{stiffness_text(solution.worst, solution.stiffness_unit)}"
         drawing.add_label(tips[:, solution.worst_index], text, style.LEAST_STIFF_TEXT)
 
 
@@ -287,21 +288,22 @@ def draw_stiffness_along(axes: Any, solution: PathSolution) -> None:
     index = solution.worst_index
     if solution.stiffness is None or index is None:
         raise InputError("there is nothing to draw: the solution has no stiffness")
+    unit = display_units().of_si(solution.stiffness_unit)
+    values = unit.of(solution.stiffness)
     if solution.alone is not None:
         axes.plot(
-            solution.times, solution.alone, color=style.GREY, linewidth=5, alpha=0.35,
+            solution.times, unit.of(solution.alone), color=style.GREY, linewidth=5, alpha=0.35,
             label="each point alone",
         )  # fmt: skip
     axes.plot(
-        solution.times, solution.stiffness, color=style.WITHIN_LIMITS, linewidth=2,
-        label="on the path",
+        solution.times, values, color=style.WITHIN_LIMITS, linewidth=2, label="on the path"
     )  # fmt: skip
     axes.plot(
-        solution.times[index], solution.stiffness[index], "D", color=style.AT_LIMIT, markersize=7,
+        solution.times[index], values[index], "D", color=style.AT_LIMIT, markersize=7,
         markeredgecolor="white", label="least stiff",
     )  # fmt: skip
-    axes.set_ylim(bottom=0.85 * solution.stiffness[index])
-    axes.set_ylabel(f"stiffness\n({unit_text(solution.stiffness_unit)})")
+    axes.set_ylim(bottom=0.85 * values[index])
+    axes.set_ylabel(f"stiffness\n({unit})")
     axes.set_xlabel("time (s)")
     _legend(axes)
 
@@ -324,12 +326,14 @@ def draw_clearance_along(axes: Any, solution: PathSolution, required: float | No
     """
     if solution.clearance is None or not len(solution.times):
         raise InputError("there is nothing to draw: the solution has no clearance")
-    axes.plot(solution.times, solution.clearance * MM, color=style.OBSTACLE, linewidth=2)
+    unit = display_units().length
+    clearance = unit.of(solution.clearance)
+    axes.plot(solution.times, clearance, color=style.OBSTACLE, linewidth=2)
     if required is not None:
-        axes.axhline(required * MM, color=style.BOUND, linestyle=":", label="required")
+        axes.axhline(unit.of(required), color=style.BOUND, linestyle=":", label="required")
         _legend(axes)
-    axes.set_ylim(bottom=min(0.0, solution.clearance.min() * MM))
-    axes.set_ylabel("clearance\n(mm)")
+    axes.set_ylim(bottom=min(0.0, clearance.min()))
+    axes.set_ylabel(f"clearance\n({unit})")
     axes.set_xlabel("time (s)")
 
 
@@ -357,22 +361,23 @@ def draw_pressures_along(
     segments = solution.robot.description.segments
     if not 1 <= segment <= len(segments):
         raise InputError(f"segment: the arm has segments 1 to {len(segments)}; got {segment}")
-    low, high = limits or (solution.robot.pressure_min, solution.robot.pressure_max)
+    unit = display_units().pressure
+    low, high = map(unit.of, limits or (solution.robot.pressure_min, solution.robot.pressure_max))
     before = sum(each.n_channels for each in segments[: segment - 1])
     channels = slice(before, before + segments[segment - 1].n_channels)
-    values, fast = solution.pressures[:, channels] * BAR, _fast_steps(solution)[:, channels]
+    values, fast = unit.of(solution.pressures[:, channels]), _fast_steps(solution)[:, channels]
     for channel in range(values.shape[1]):
         axes.plot(
             solution.times, values[:, channel], color=style.channel_colour(channel), linewidth=1.8,
             label=f"channel {channel + 1}", zorder=3,
         )  # fmt: skip
     _mark_fast_steps(axes, solution.times, values, fast)
-    for value in np.unique([low[channels] * BAR, high[channels] * BAR]):
+    for value in np.unique([low[channels], high[channels]]):
         axes.axhline(value, color=style.BOUND, linestyle=":", linewidth=1.2, zorder=1)
-    bottom, top = low[channels].min() * BAR, high[channels].max() * BAR
+    bottom, top = low[channels].min(), high[channels].max()
     axes.set_ylim(bottom - 0.05 * (top - bottom), top + 0.05 * (top - bottom))
     axes.set_ylabel(
-        f"segment {segment}\n(bar)", color=style.segment_text_colour(segment - 1), weight="bold"
+        f"segment {segment}\n({unit})", color=style.segment_text_colour(segment - 1), weight="bold"
     )
     axes.set_xlabel("time (s)")
     _legend(axes)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from math import degrees
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from stiffopt.control.state import Event
 from stiffopt.daemon.run_errors import ARRIVED, ARRIVED_ANGLE, ErrorStatistics, RunStages
 from stiffopt.daemon.run_log import RecordedRun, RunSpan
+from stiffopt.display import display_units
 from stiffopt.errors import printable
 from stiffopt.plots.style import (
     AXES,
@@ -28,7 +28,6 @@ from stiffopt.plots.style import (
     stacked_panels,
     thinned,
 )
-from stiffopt.plots.wording import BAR, MM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,7 +40,8 @@ _PANEL, _GAP, _ROW, _LINE = 1.35, 0.16, 0.24, 0.2
 _FOOT = 0.62
 _MOST_EVENTS = 14  # in the list
 _FLOOR = 1e-5  # m; errors below are drawn there
-_SMALLEST_RANGE = 2.0  # mm, of an axis of the tip
+_SMALLEST_RANGE = 2e-3  # m, of an axis of the tip
+_BELOW_ZERO = 3e3  # Pa, that an axis of pressures shows
 _STATES = {
     "unconfigured": "#c9cdd2",
     "inactive": "#c9cdd2",
@@ -98,36 +98,39 @@ def plot_run(run: RecordedRun, *, title: str | None = None) -> Figure:
 
 
 def _draw_tip(axes: Any, run: RecordedRun, axis: int) -> None:
-    seen = run.seen_position[:, axis] * MM
+    unit = display_units().length
+    seen = unit.of(run.seen_position[:, axis])
     if np.isfinite(seen).any():
         axes.plot(
             *thinned(run.captured, seen), "o", color=AXES[axis], alpha=0.3, markersize=4.5,
             markeredgewidth=0, label="tracker",
         )  # fmt: skip
     axes.plot(
-        *thinned(run.time, run.tip_position[:, axis] * MM), color=AXES[axis], linewidth=1.3,
+        *thinned(run.time, unit.of(run.tip_position[:, axis])), color=AXES[axis], linewidth=1.3,
         label="estimate",
     )  # fmt: skip
-    target = run.target_position[:, axis] * MM
+    target = unit.of(run.target_position[:, axis])
     if np.isfinite(target).any():
         axes.plot(
             *thinned(run.time, target), color=TARGET, linewidth=1.3, linestyle=(0, (4, 2)),
             label="target",
         )  # fmt: skip
     low, high = axes.get_ylim()
-    if high - low < _SMALLEST_RANGE:  # noise is not to look like motion
+    least = unit.of(_SMALLEST_RANGE)
+    if high - low < least:  # noise is not to look like motion
         middle = (low + high) / 2
-        axes.set_ylim(middle - _SMALLEST_RANGE / 2, middle + _SMALLEST_RANGE / 2)
-    axes.set_ylabel(f"tip {'xyz'[axis]} (mm)")
+        axes.set_ylim(middle - least / 2, middle + least / 2)
+    axes.set_ylabel(f"tip {'xyz'[axis]} ({unit})")
     legend_beside(axes)
 
 
 def _draw_error(axes: Any, run: RecordedRun, stages: RunStages) -> None:
-    error = np.maximum(run.position_error, _FLOOR) * MM
+    unit = display_units().length
+    error = unit.of(np.maximum(run.position_error, _FLOOR))
     look = {"color": DARK, "linewidth": 1.2}
     axes.plot(*thinned(run.time, error), **{**look, "alpha": 0.35}, label="approaching")
     axes.plot(*thinned(run.time, np.where(stages.hold, error, np.nan)), **look, label="holding")
-    axes.set_ylabel("error (mm)")
+    axes.set_ylabel(f"error ({unit})")
     known = error[np.isfinite(error)]
     if len(known):
         axes.set_ylim(0.8 * known.min(), 1.3 * max(known.max(), 2 * known.min()))
@@ -140,11 +143,12 @@ def _draw_error(axes: Any, run: RecordedRun, stages: RunStages) -> None:
 
 
 def _draw_angle(axes: Any, run: RecordedRun) -> None:
+    unit = display_units().angle
     axes.plot(
-        *thinned(run.time, np.degrees(run.angle_error)), color=DARK, linewidth=1.2,
+        *thinned(run.time, unit.of(run.angle_error)), color=DARK, linewidth=1.2,
         label="angle",
     )  # fmt: skip
-    axes.set_ylabel("error (deg)")
+    axes.set_ylabel(f"error ({unit})")
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.25, axis="y")
     legend_beside(axes)
@@ -153,17 +157,18 @@ def _draw_angle(axes: Any, run: RecordedRun) -> None:
 def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) -> None:
     from matplotlib.lines import Line2D
 
+    unit = display_units().pressure
     for channel in channels:
         colour = channel_colour(channel - channels[0])
         axes.plot(
-            *thinned(run.time, run.measured[:, channel] * BAR), color=colour, linewidth=2.6,
+            *thinned(run.time, unit.of(run.measured[:, channel])), color=colour, linewidth=2.6,
             alpha=0.3,
         )  # fmt: skip
         axes.plot(
-            *thinned(run.time, run.commanded[:, channel] * BAR), color=colour, linewidth=1.1,
+            *thinned(run.time, unit.of(run.commanded[:, channel])), color=colour, linewidth=1.1,
             label=f"p{channel + 1}",
         )  # fmt: skip
-    limits = np.unique(np.stack([run.low, run.high])[:, :, list(channels)] * BAR)
+    limits = np.unique(unit.of(np.stack([run.low, run.high])[:, :, list(channels)]))
     for limit in limits[np.isfinite(limits)]:
         axes.axhline(limit, color=GREY, linewidth=0.9, linestyle=(0, (1, 2)), zorder=1)
     handles = [*axes.get_legend_handles_labels()[0]]
@@ -173,9 +178,9 @@ def _draw_pressures(axes: Any, run: RecordedRun, segment: int, channels: range) 
             Line2D([], [], color=GREY, linewidth=1.1, label="commanded"),
             Line2D([], [], color=GREY, linewidth=0.9, linestyle=(0, (1, 2)), label="limits"),
         ]
-    axes.set_ylabel(f"segment {segment + 1}\n(bar)")
+    axes.set_ylabel(f"segment {segment + 1}\n({unit})")
     low, high = axes.get_ylim()
-    axes.set_ylim(min(low, -0.03), high + 0.02 * (high - low))
+    axes.set_ylim(min(low, -unit.of(_BELOW_ZERO)), high + 0.02 * (high - low))
     legend_beside(axes, handles=handles)
 
 
@@ -244,6 +249,7 @@ def _what(run: RecordedRun) -> str:
 def error_lines(run: RecordedRun, stages: RunStages | None = None) -> list[str]:
     """Return in words how far the tip was from its targets, on its way to them and at them."""
     approach, hold = stages or RunStages.of(run)
+    units = display_units()
     if not (approach | hold).any():
         return ["no target was set"]
     lines = [f"on the way to a target:   {_errors_text(run, approach)}"] if approach.any() else []
@@ -251,14 +257,16 @@ def error_lines(run: RecordedRun, stages: RunStages | None = None) -> list[str]:
         return [*lines, f"at a target:   {_errors_text(run, hold)}"]
     return [
         *lines,
-        f"no target was reached to {ARRIVED * MM:g} mm and {degrees(ARRIVED_ANGLE):g} deg",
+        f"no target was reached to {units.length.text(ARRIVED, 'g')} and "
+        f"{units.angle.text(ARRIVED_ANGLE, 'g')}",
     ]
 
 
 def _errors_text(run: RecordedRun, ticks: NDArray[np.bool_]) -> str:
+    length, angle = display_units().length, display_units().angle
     known = (
-        (ErrorStatistics.of(run.position_error[ticks] * MM), "mm"),
-        (ErrorStatistics.of(np.degrees(run.angle_error[ticks])), "deg"),
+        (ErrorStatistics.of(length.of(run.position_error[ticks])), length),
+        (ErrorStatistics.of(angle.of(run.angle_error[ticks])), angle),
     )
     return "      ".join(
         f"error mean {found.mean:.3g}, 95 % below {found.p95:.3g}, "

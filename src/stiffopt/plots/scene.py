@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.display import display_units
 from stiffopt.model.scene import Scene
 from stiffopt.plots import style
-from stiffopt.plots.wording import MM
 
 Vector = NDArray[np.float64]
 
@@ -18,7 +18,7 @@ _SHADE = 0.45
 
 
 def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> tuple[Vector, list[Vector]]:
-    """Draw a scene's objects, in mm.
+    """Draw a scene's objects, in the unit in which lengths are shown.
 
     Parameters
     ----------
@@ -27,9 +27,9 @@ def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> tuple[Ve
     scene :
         What is around the arm.
     size :
-        Length of the arm, in mm: what has no end is cut off at about it.
+        Length of the arm, in that unit: what has no end is cut off at about it.
     seen : (k, 3)
-        What the figure shows anyway, in mm.
+        What the figure shows anyway, in that unit.
 
     Returns
     -------
@@ -38,13 +38,13 @@ def draw_objects(axes: Any, scene: Scene, size: float, seen: Vector) -> tuple[Ve
     middles : list of (3,)
         For each object a point where its name belongs.
     """
-    near, middles = [seen], []
+    near, middles, unit = [seen], [], display_units().length
     low, high = seen.min(axis=0) - 0.6 * size, seen.max(axis=0) + 0.6 * size
     for item in scene.objects:
         shade = _SHADES.get(item.shape.key, _SHADE)
-        for surface in item.shape.outline(size / MM):
-            _draw_surface(axes, surface * MM, shade, item.shape.key == "mesh")
-            points = surface.reshape(3, -1).T * MM
+        for surface in item.shape.outline(unit.to_si(size)):
+            _draw_surface(axes, unit.of(surface), shade, item.shape.key == "mesh")
+            points = unit.of(surface.reshape(3, -1).T)
             near.append(points[((points > low) & (points < high)).all(axis=1)])
             middle = np.clip(points.mean(axis=0), low, high)
         middles.append(middle)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from math import degrees
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt import lie
+from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
@@ -24,16 +24,12 @@ from stiffopt.plots.shapes import StiffnessEllipsoid
 from stiffopt.plots.style import literal, new_figure, tidy
 from stiffopt.plots.view import View
 from stiffopt.plots.wording import (
-    BAR,
-    MM,
-    bar_text,
     direction_text,
-    figures,
     gain_text,
     least_maximised,
     limit_of,
     short_direction,
-    unit_text,
+    stiffness_text,
 )
 
 if TYPE_CHECKING:
@@ -128,27 +124,26 @@ def plot_pareto(
 
 
 def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
-    tolerance = solution.task.target.tolerance
+    tolerance, units = solution.task.target.tolerance, display_units()
     parts = []
     if solution.position_error is not None:
         parts.append(
-            f"tip error {solution.position_error * MM:.3g} mm "
-            f"(tolerance {tolerance.position * MM:g} mm)"
+            f"tip error {units.length.text(solution.position_error, '.3g')} "
+            f"(tolerance {units.length.text(tolerance.position, 'g')})"
         )
     if solution.angle_error is not None:
         parts.append(
-            f"{degrees(solution.angle_error):.3g} deg "
-            f"(tolerance {degrees(tolerance.angle):.4g} deg)"
+            f"{units.angle.text(solution.angle_error, '.3g')} "
+            f"(tolerance {units.angle.text(tolerance.angle)})"
         )
     if solution.stiffness is not None:
         measure = solution.task.measures[0]
-        compared = (
-            ""
-            if plain is None
-            else f" (plain: {figures(plain)}, {gain_text(solution.stiffness, plain)})"
-        )
+        unit, compared = units.of_si(measure.unit), ""
+        if plain is not None:
+            gain = gain_text(solution.stiffness, plain)
+            compared = f" (plain: {unit.number(plain, FIGURES)}, {gain})"
         parts.append(
-            f"stiffness {figures(solution.stiffness)} {unit_text(measure.unit)}{compared} "
+            f"stiffness {unit.text(solution.stiffness, FIGURES)}{compared} "
             f"{direction_text(measure)}"
         )
     if solution.matrix_distance is not None:
@@ -157,7 +152,7 @@ def _key_numbers(solution: PressureSolution, plain: float | None) -> str:
 
 
 def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) -> None:
-    """Draw bars of the pressures in bar against the limits that hold; those at a limit stand out.
+    """Draw bars of the pressures against the limits that hold; those at a limit stand out.
 
     Parameters
     ----------
@@ -172,9 +167,9 @@ def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) ->
         If the solution has no pressures.
     """
     _require_pressures(solution)
-    description = robot.description
-    lower, upper = (bound * BAR for bound in solution.task.pressure_bounds(description))
-    values = np.asarray(solution.pressures) * BAR
+    description, unit = robot.description, display_units().pressure
+    lower, upper = map(unit.of, solution.task.pressure_bounds(description))
+    values = unit.of(np.asarray(solution.pressures))
     at_limit = [limit_of(solution, description.channel_name(k)) for k in range(len(values))]
     places = _places(robot)
     axes.bar(places, upper - lower, bottom=lower, width=0.8, color=style.RANGE, zorder=1)
@@ -193,13 +188,14 @@ def draw_pressures(axes: Any, robot: Manipulator, solution: PressureSolution) ->
         size = min(9.0, wide / _BOLD_NUMBER)
         for place, value, bound, colour in zip(places, values, upper, colours, strict=True):
             above = bound if 0 < bound - value < _NEAR_BOUND * top else value
+            number = unit.number(unit.to_si(value), ".3f")
             axes.text(
-                place, max(above, 0.0) + 0.012 * top, bar_text(value / BAR), ha="center",
-                va="bottom", fontsize=size, weight="bold", zorder=4,
+                place, max(above, 0.0) + 0.012 * top, number, ha="center", va="bottom",
+                fontsize=size, weight="bold", zorder=4,
                 color=colour if colour == style.AT_LIMIT else "#20394f",
             )  # fmt: skip
     _label_channels(axes, robot, places)
-    axes.set_ylabel("pressure (bar)")
+    axes.set_ylabel(f"pressure ({unit})")
     axes.set_ylim(min(lower.min(), 0.0), max(upper.max(), 0.0) + 0.2 * top)
     _pressure_legend(axes, any(at_limit))
     tidy(axes)
@@ -227,20 +223,24 @@ def draw_pareto(
         )
         return
     by_position = front[0].position_error is not None
+    of_error = display_units().length if by_position else display_units().angle
     errors = [
-        (point.position_error or 0.0) * MM if by_position else degrees(point.angle_error or 0.0)
+        of_error.of((point.position_error if by_position else point.angle_error) or 0.0)
         for point in front
     ]
-    values = [least_maximised(point) or 0.0 for point in front]
+    unit = display_units().of_si(front[0].stiffness_unit)
+    values = [unit.of(least_maximised(point) or 0.0) for point in front]
     axes.plot(errors, values, "o-", color=style.WITHIN_LIMITS, markersize=5, label="stiffest found")
     axes.plot(errors[:1], values[:1], "o", color=style.TARGET, markersize=8, label="this task")
     if plain is not None:
-        axes.axhline(plain, color=style.GREY, linestyle="--", linewidth=1.2, label="plain solution")
+        axes.axhline(
+            unit.of(plain), color=style.GREY, linestyle="--", linewidth=1.2, label="plain solution"
+        )
     if min(errors) > 0:
         axes.set_xscale("log")
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.set_xlabel(f"tip error ({'mm' if by_position else 'deg'})")
-    axes.set_ylabel(f"stiffness ({unit_text(front[0].stiffness_unit)})")
+    axes.set_xlabel(f"tip error ({of_error})")
+    axes.set_ylabel(f"stiffness ({unit})")
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", fontsize=9, frameon=False)
 
@@ -391,8 +391,8 @@ class _Drawing(ArmDrawing):
 
     @property
     def tip(self) -> Vector:
-        """Position of the tip in mm."""
-        return np.asarray(self.solution.tip_pose)[:3, 3] * MM
+        """Position of the tip in the axes."""
+        return np.asarray(self.unit.of(np.asarray(self.solution.tip_pose)[:3, 3]))
 
     @property
     def rotation(self) -> Vector:
@@ -419,10 +419,12 @@ class _Drawing(ArmDrawing):
             self.axes.plot(*ends.T, color=style.ELLIPSOID, linewidth=1.3, zorder=6)
         self.add_body(np.stack([x, y, z], axis=-1).reshape(-1, 3))
         longest = ways[:, -1] * np.copysign(radii[-1], self.rotation[:, 2] @ ways[:, -1])
-        self.add_label(self.tip + longest, f"ellipsoid\n{figures(values[-1])} N/m", style.ELLIPSOID)
-        listed = ", ".join(figures(value) for value in values[::-1])
+        unit = display_units().stiffness
+        most = unit.text(values[-1], FIGURES)
+        self.add_label(self.tip + longest, f"ellipsoid\n{most}", style.ELLIPSOID)
+        listed = ", ".join(unit.number(value, FIGURES) for value in values[::-1])
         self.add_patch(
-            style.ELLIPSOID, f"stiffness ellipsoid, radius² ∝ k:\n{listed} N/m\nalong its axes"
+            style.ELLIPSOID, f"stiffness ellipsoid, radius² ∝ k:\n{listed} {unit}\nalong its axes"
         )
 
     def draw_directions(self) -> None:
@@ -436,7 +438,7 @@ class _Drawing(ArmDrawing):
             way = self.rotation @ way if measure.frame == "tip" else way
             arrow = way * _ARROW_SHARE * self.size
             self.draw_arrow(self.tip, arrow, shade, 9)
-            amount = "" if value is None else f"{figures(value)} {unit_text(measure.unit)}\n"
+            amount = "" if value is None else f"{stiffness_text(value, measure.unit)}\n"
             self.add_label(self.tip + arrow, f"{amount}{short_direction(measure)}", shade)
             words = f"{direction_text(measure)}\n{measure.frame} axes, {measure.boundary}"
             self.add_line(shade, f"{amount}{words}")
@@ -450,7 +452,8 @@ class _Drawing(ArmDrawing):
         if target.position is not None:
             free = [k for k in range(3) if target.position[k] is None]
             for k in range(3):
-                point[k] = self.tip[k] if k in free else (target.position[k] or 0.0) * MM
+                asked = self.unit.of(target.position[k] or 0.0)
+                point[k] = self.tip[k] if k in free else asked
             self._draw_point(point, free)
         length = 0.2 * self.size
         if target.pointing is not None:
@@ -498,7 +501,8 @@ class _Drawing(ArmDrawing):
             force = np.array(load.force)
             way = (self.rotation @ force if load.frame == "tip" else force) / np.linalg.norm(force)
             self.draw_arrow(self.tip - 0.2 * self.size * way, 0.2 * self.size * way, style.LOAD, 9)
-            self.add_line(style.LOAD, f"load {np.linalg.norm(force):.3g} N")
+            size = display_units().force.text(float(np.linalg.norm(force)), ".3g")
+            self.add_line(style.LOAD, f"load {size}")
         gravity = np.array(self.robot.description.gravity)
         if gravity.any():
             way = gravity / np.linalg.norm(gravity)

@@ -3,14 +3,10 @@
 from collections.abc import Iterable
 
 from stiffopt.directions import direction_name
+from stiffopt.display import FIGURES, PLAIN, DisplayUnit, display_units
 from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.measure import Measure
 from stiffopt.optimise.solution import PressureSolution
-
-MM = 1e3
-"""Millimetres per metre."""
-BAR = 1e-5
-"""Bar per pascal."""
 
 
 def least_maximised(solution: PressureSolution) -> float | None:
@@ -27,13 +23,13 @@ def limit_of(solution: PressureSolution, channel: str) -> str:
 
 
 def unit_text(unit: str | None) -> str:
-    """Return a unit as people write it."""
-    return (unit or "").replace("*", " ")
+    """Return the unit in which values of an SI unit are shown."""
+    return display_units().of_si(unit).name
 
 
-def figures(value: float) -> str:
-    """Return a number with four significant figures."""
-    return f"{value:#.4g}".removesuffix(".")
+def stiffness_text(value: float, unit: str | None) -> str:
+    """Return a stiffness, in its SI unit, as people read it: with four significant figures."""
+    return display_units().of_si(unit).text(value, FIGURES)
 
 
 def gain_text(value: float, plain: float) -> str:
@@ -41,14 +37,10 @@ def gain_text(value: float, plain: float) -> str:
     return f"{(value / plain - 1) * 100:+.0f} %".replace("-0 %", "+0 %")
 
 
-def bar_text(pressure: float) -> str:
-    """Return a pressure in Pa as a number in bar, with three decimals."""
-    return f"{pressure * BAR + 0.0:.3f}"
-
-
-def vector_text(values: Iterable[float]) -> str:
-    """Return a vector with at most three decimals."""
-    return f"({', '.join(f'{round(float(value), 3) + 0.0:g}' for value in values)})"
+def vector_text(values: Iterable[float], unit: DisplayUnit = PLAIN) -> str:
+    """Return a vector as numbers of a unit, with at most three decimals of the usual one."""
+    digits = 3 + unit.more_decimals
+    return f"({', '.join(f'{round(unit.of(float(x)), digits) + 0.0:g}' for x in values)})"
 
 
 def short_direction(measure: StiffnessMeasure) -> str:

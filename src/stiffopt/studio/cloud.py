@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.display import FIGURES, display_units
 from stiffopt.errors import InputError
 from stiffopt.model.description import RobotDescription
-from stiffopt.plots.wording import figures
 from stiffopt.workspace.map import WorkspaceMap
 
 _MOST = 30_000  # points that are sent to the browser
@@ -46,8 +46,8 @@ class StiffnessCloud(NamedTuple):
         colours = np.stack(
             [np.interp(share, np.arange(len(_SCALE)), column) for column in _SCALE.T], axis=1
         )
-        unit = "N/m" if found.plan.measures[direction].kind == "translation" else "N m/rad"
-        soft, stiff = figures(float(np.exp(low))), figures(float(np.exp(high)))
+        unit = display_units().of_si(found.plan.unit)
+        soft, stiff = (unit.number(float(np.exp(end)), FIGURES) for end in (low, high))
         name = found.direction_names[direction]
         legend = f"stiffest along {name}: violet {soft}, yellow {stiff} {unit}"
         return cls(

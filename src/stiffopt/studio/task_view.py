@@ -15,7 +15,7 @@ from stiffopt.model.stopping import Cancel
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.plots import style
 from stiffopt.plots.shapes import StiffnessEllipsoid
-from stiffopt.plots.wording import BAR, figures, unit_text
+from stiffopt.plots.wording import stiffness_text
 from stiffopt.studio import texts
 from stiffopt.studio.cloud import StiffnessCloud
 from stiffopt.studio.design import Angular, Design
@@ -222,11 +222,11 @@ class TaskView:
         for each in self._force:
             each.on_update(self._on("force", lambda d, _: d.with_force(
                 [slider.value / _MILLI for slider in self._force])))  # fmt: skip
-        highest = max(description.pressure_max) * BAR
+        highest = max(description.pressure_max) * 1e-5
         self._highest = gui.add_slider(
             "most pressure (bar)", 0.05 * highest, highest, 0.01, highest
         )
-        self._highest.on_update(self._on("highest", lambda d, v: d.with_highest(v / BAR)))
+        self._highest.on_update(self._on("highest", lambda d, v: d.with_highest(v * 1e5)))
 
     def _add_compare_inputs(self, gui: Any) -> None:
         keep = gui.add_button("keep this answer", hint="Compare it with others.")
@@ -432,7 +432,7 @@ class TaskView:
         force = design.task.load.force if design.task.load is not None else (0.0, 0.0, 0.0)
         for slider, value in zip(self._force, force, strict=True):
             _set(slider, min(200.0, max(-200.0, value * _MILLI)))
-        _set(self._highest, float(design.task.pressure_bounds(design.description)[1].max()) * BAR)
+        _set(self._highest, float(design.task.pressure_bounds(design.description)[1].max()) * 1e-5)
 
     def _show_answer(self) -> None:
         """Draw the answer: the arm, its stiffness, what it misses, and the panel."""
@@ -476,9 +476,9 @@ class TaskView:
         reach = _ARROW_SHARE * self._length
         self._arrows.points = _arrows([(tip, tip + reach * way) for way in ways])
         self._label.visible = bool(ways)
-        if ways and answer.solution.stiffness is not None:
-            unit = unit_text(answer.solution.stiffness_unit)
-            self._label.text = f"{figures(answer.solution.stiffness)} {unit}"
+        value, unit = answer.solution.stiffness, answer.solution.stiffness_unit
+        if ways and value is not None:
+            self._label.text = stiffness_text(value, unit)
             place(self._label, tip + 1.25 * reach * ways[0])
             if self._dragged is not self._pull:
                 place(self._pull, tip + reach * ways[0])

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from math import degrees
 from pprint import pformat
 from typing import Any
 
@@ -15,13 +14,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stiffopt.control.state import Event, Snapshot
+from stiffopt.display import FIGURES, display_units
 from stiffopt.files import file_text
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.measures.directional import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.plots import style
-from stiffopt.plots.wording import BAR, MM, direction_text, figures, gain_text, unit_text
+from stiffopt.plots.wording import direction_text, gain_text, stiffness_text
 from stiffopt.studio.design import Design
 from stiffopt.studio.rig_watch import RigWatch
 from stiffopt.studio.timeline import Timeline
@@ -69,30 +69,31 @@ def _headline(status: str, message: str) -> str:
 
 def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
     solution, tolerance = answer.solution, answer.design.task.target.tolerance
+    units = display_units()
     plain = answer.plain_stiffness
     for number, (measure, value) in enumerate(
         zip(answer.design.task.measures, solution.stiffnesses, strict=False)
     ):
-        text = f"<b>{figures(value)} {unit_text(measure.unit)}</b> {direction_text(measure)}"
+        unit = units.of_si(measure.unit)
+        text = f"<b>{unit.text(value, FIGURES)}</b> {direction_text(measure)}"
         if number == 0 and plain is not None:
-            text += f"<br>plain pressures: {figures(plain)} ({gain_text(value, plain)})"
+            gain = gain_text(value, plain)
+            text += f"<br>plain pressures: {unit.number(plain, FIGURES)} ({gain})"
         yield "stiffness", text
     if solution.position_error is not None:
-        yield (
-            "tip error",
-            f"{solution.position_error * MM:.3g} mm (tolerance {tolerance.position * MM:.3g} mm)",
-        )
+        error = units.length.text(solution.position_error, ".3g")
+        yield "tip error", f"{error} (tolerance {units.length.text(tolerance.position, '.3g')})"
     if solution.angle_error is not None:
-        angle = degrees(solution.angle_error)
-        yield "angle error", f"{angle:.3g}&deg; (tolerance {degrees(tolerance.angle):.3g}&deg;)"
+        error = units.angle.text(solution.angle_error, ".3g")
+        yield "angle error", f"{error} (tolerance {units.angle.text(tolerance.angle, '.3g')})"
     if solution.tip_pose is not None:
-        yield "tip", f"{position_text(solution.tip_pose[:3, 3])} mm"
+        yield "tip", f"{position_text(solution.tip_pose[:3, 3])} {units.length}"
     limits = _limits_text(answer)
     if limits:
         yield "at a limit", limits
     if answer.design.task.scene is not None:
         clearance = answer.robot.clearance(answer.pressures, answer.design.task.scene)
-        yield "clearance", f"{clearance * MM:.3g} mm"
+        yield "clearance", units.length.text(clearance, ".3g")
     yield "answer", _BEST if answer.is_best else _LOCAL
 
 
@@ -110,8 +111,10 @@ def _limits_text(answer: StudioAnswer) -> str:
 
 
 def position_text(position: ArrayLike) -> str:
-    """Return a position in mm, to a tenth."""
-    return f"({', '.join(f'{round(float(x), 1) + 0.0:.1f}' for x in np.asarray(position) * MM)})"
+    """Return a position in the unit of lengths, to a tenth of a millimetre or about that."""
+    unit = display_units().length
+    numbers = (unit.number(float(x), ".1f").replace("-0.0", "0.0") for x in np.asarray(position))
+    return f"({', '.join(numbers)})"
 
 
 def _table(rows: Iterable[tuple[str, str]]) -> str:
@@ -154,7 +157,7 @@ def pressures_html(
     """
     p, low, high = (np.asarray(each, dtype=float) for each in (pressures, low, high))
     top, bottom = max(high.max(), p.max()), min(low.min(), 0.0)
-    rows, index = [], 0
+    rows, index, unit = [], 0, display_units().pressure
 
     def share(value: float) -> str:
         return f"{np.clip(100 * (value - bottom) / (top - bottom), 0, 100):.1f}%"
@@ -176,7 +179,7 @@ def pressures_html(
                 f"<span style='position:absolute;left:0;top:0;bottom:0;"
                 f"width:{share(p[index])};background:{colour}'></span>"
                 f"{_line(share(high[index]), style.BOUND, 2)}{tick}</span>"
-                f"<span style='width:4.6em;text-align:right'>{p[index] * BAR + 0.0:.2f} bar</span>"
+                f"<span style='width:4.6em;text-align:right'>{unit.text(p[index], '.2f')}</span>"
                 "</div>"
             )
             index += 1
@@ -208,13 +211,14 @@ def compared_html(bench: Workbench, colours: Sequence[str]) -> str:
     kept = [(colours[k % len(colours)], str(k + 1), answer) for k, answer in enumerate(bench.kept)]
     if not kept:
         return _padded("<div style='font-size:0.85em'>Keep an answer to compare others.</div>")
-    head = "".join(f"<th style='text-align:left;padding-right:8px'>{t}</th>" for t in
-                   ("", "stiffness", "tip (mm)", "pressures (bar)"))  # fmt: skip
+    units = display_units()
+    titles = ("", "stiffness", f"tip ({units.length})", f"pressures ({units.pressure})")
+    head = "".join(f"<th style='text-align:left;padding-right:8px'>{each}</th>" for each in titles)
     rows = "".join(
         f"<tr><td style='color:{colour};font-weight:700;padding-right:8px'>{name}</td>"
         f"<td style='padding-right:8px'>{_stiffness_text(answer.solution)}</td>"
         f"<td style='padding-right:8px'>{position_text(answer.solution.tip_pose[:3, 3])}</td>"
-        f"<td>{_in_bar(answer.pressures)}</td></tr>"
+        f"<td>{_pressures_text(answer.pressures)}</td></tr>"
         for colour, name, answer in now + kept
         if answer.solution.tip_pose is not None
     )
@@ -226,13 +230,14 @@ def _stiffness_text(solution: PressureSolution) -> str:
     measures = solution.task.measures
     if solution.stiffness is None or not measures:
         return "-"
-    text = f"{figures(solution.stiffness)} {unit_text(solution.stiffness_unit)}"
+    text = stiffness_text(solution.stiffness, solution.stiffness_unit)
     text += f" {direction_text(measures[0])}" if isinstance(measures[0], StiffnessMeasure) else ""
     return text if solution.found else f"{text} ({STATUS_WORDS[solution.status]})"
 
 
-def _in_bar(pressures: ArrayLike) -> str:
-    return " ".join(f"{value * BAR + 0.0:.2f}" for value in np.asarray(pressures))
+def _pressures_text(pressures: ArrayLike) -> str:
+    unit = display_units().pressure
+    return " ".join(unit.number(value, ".2f") for value in np.asarray(pressures))
 
 
 # -- copies ---------------------------------------------------------------------------------------
@@ -301,17 +306,17 @@ def copy_html(title: str, text: str) -> str:
 
 def moment_html(timeline: Timeline, time: float) -> str:
     """Return one moment of a timeline as the panel shows it."""
-    moment = timeline.at(time)
+    moment, length = timeline.at(time), display_units().length
     description = timeline.robot.description
     tip = timeline.robot.tip_pose(moment.pressures)[:3, 3]
     rows = [("time", f"{time:.2f} of {timeline.duration:.2f} s")]
     for chart in timeline.charts:
-        if "pressure (bar)" not in chart.title:
+        if not chart.shows_pressures:
             values = ", ".join(f"{value:.3g}" for value in chart.values[moment.row][:1])
             rows.append((escape(chart.title), values))
-    rows.append(("tip of the model", f"{position_text(tip)} mm"))
+    rows.append(("tip of the model", f"{position_text(tip)} {length}"))
     if moment.seen is not None:
-        rows.append(("tip seen (blue)", f"{position_text(moment.seen)} mm"))
+        rows.append(("tip seen (blue)", f"{position_text(moment.seen)} {length}"))
     for when, text in timeline.events_until(time):
         rows.append((f"{when:.1f} s", escape(text)))
     low, high = timeline.robot.pressure_min, timeline.robot.pressure_max
@@ -353,6 +358,7 @@ def rig_html(watch: RigWatch) -> str:
 
 def _rig_rows(state: Snapshot) -> Iterable[tuple[str, str]]:
     yield "doing", escape(state.task or "nothing")
+    length, unit = display_units().length, display_units().of_si(state.stiffness_unit)
     places = (
         ("tip estimated", "estimated", state.tip_position),
         ("tip seen", "seen", state.seen_position),
@@ -361,12 +367,12 @@ def _rig_rows(state: Snapshot) -> Iterable[tuple[str, str]]:
     for name, ball, position in places:
         if position is not None and np.isfinite(position).any():
             dot = f"<span style='color:{BALLS[ball]}'>&#9679;</span>"
-            yield name, f"{dot} {position_text(position)} mm".replace("nan", "free")
+            yield name, f"{dot} {position_text(position)} {length}".replace("nan", "free")
     if np.isfinite(state.position_error):
-        yield "error", f"{state.position_error * MM:.2f} mm"
+        yield "error", length.text(state.position_error, ".2f")
     if np.isfinite(state.stiffness):
-        unit = unit_text(state.stiffness_unit)
-        yield "stiffness", f"{figures(state.stiffness)} of {figures(state.best_stiffness)} {unit}"
+        now = unit.number(state.stiffness, FIGURES)
+        yield "stiffness", f"{now} of {unit.text(state.best_stiffness, FIGURES)}"
     for alarm in state.alarms:
         yield "alarm", f"<span style='color:#b35c00'>{escape(alarm.text)}</span>"
 

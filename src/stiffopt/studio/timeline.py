@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.daemon.run_log import RecordedRun, log_of_run
+from stiffopt.display import display_units
 from stiffopt.errors import FileError, InputError
 from stiffopt.logs.log import Log
 from stiffopt.model.description import RobotDescription
@@ -19,7 +20,7 @@ from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.scene import Scene
 from stiffopt.paths.path import Path
 from stiffopt.paths.solution import PathSolution
-from stiffopt.plots.wording import BAR, MM, figures, unit_text
+from stiffopt.plots.wording import stiffness_text
 
 Vector = NDArray[np.float64]
 
@@ -34,11 +35,13 @@ class TimelineChart(NamedTuple):
     title : with the unit.
     names : of the k lines.
     values : (N, k).
+    shows_pressures : whether they are pressures of channels.
     """
 
     title: str
     names: tuple[str, ...]
     values: Vector
+    shows_pressures: bool = False
 
 
 class TimelineMoment(NamedTuple):
@@ -126,18 +129,19 @@ class Timeline:
         charts = []
         headline = f"{solution.status}. {solution.message}".strip()
         if solution.stiffness is not None:
-            unit = unit_text(solution.stiffness_unit)
+            unit = display_units().of_si(solution.stiffness_unit)
             lines, names = [solution.stiffness], ["on the path"]
             if solution.alone is not None:
                 lines, names = [*lines, solution.alone], [*names, "each point alone"]
             charts.append(
-                TimelineChart(f"stiffness ({unit})", tuple(names), np.stack(lines, axis=1))
+                TimelineChart(f"stiffness ({unit})", tuple(names), unit.of(np.stack(lines, axis=1)))
             )
-            headline += f" Least stiffness {figures(float(solution.stiffness.min()))} {unit}."
+            least = stiffness_text(float(solution.stiffness.min()), solution.stiffness_unit)
+            headline += f" Least stiffness {least}."
         if solution.clearance is not None:
-            charts.append(
-                TimelineChart("clearance (mm)", ("body",), MM * solution.clearance[:, None])
-            )
+            length = display_units().length
+            clearance = length.of(solution.clearance[:, None])
+            charts.append(TimelineChart(f"clearance ({length})", ("body",), clearance))
         description = solution.robot.description
         asked = path.points().positions
         return cls(
@@ -202,12 +206,12 @@ class Timeline:
                 )[0]
                 for k, place in enumerate(seen)
             ])  # fmt: skip
-        robot, begin = load_robot(description), times[0]
-        offset = MM * np.linalg.norm(seen - robot.tip_pose(pressures)[:, :3, 3], axis=1)
+        robot, begin, unit = load_robot(description), times[0], display_units().length
+        offset = unit.of(np.linalg.norm(seen - robot.tip_pose(pressures)[:, :3, 3], axis=1))
         return cls(
             robot, times - begin, pressures,
             (
-                TimelineChart("tip seen from the model's (mm)", ("",), offset[:, None]),
+                TimelineChart(f"tip seen from the model's ({unit})", ("",), offset[:, None]),
                 *_pressure_charts(description, pressures),
             ),
             FilePath(file).name, seen=seen,
@@ -231,12 +235,14 @@ def _check_rows(file: str | os.PathLike[str], times: Vector, pressures: Vector) 
 
 
 def _pressure_charts(description: RobotDescription, pressures: Vector) -> tuple[TimelineChart, ...]:
-    """A chart of the pressures of each segment, in bar."""
-    charts, begin = [], 0
+    """A chart of the pressures of each segment."""
+    charts, begin, unit = [], 0, display_units().pressure
     for number, segment in enumerate(description.segments):
         mine = slice(begin, begin + segment.n_channels)
         names = tuple(f"channel {k + 1}" for k in range(segment.n_channels))
-        title = f"segment {number + 1}: pressure (bar)"
-        charts.append(TimelineChart(title, names, BAR * pressures[:, mine]))
+        title = f"segment {number + 1}: pressure ({unit})"
+        charts.append(
+            TimelineChart(title, names, unit.of(pressures[:, mine]), shows_pressures=True)
+        )
         begin += segment.n_channels
     return tuple(charts)

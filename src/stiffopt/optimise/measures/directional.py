@@ -10,6 +10,7 @@ from pydantic import Field, ValidationInfo, field_serializer, field_validator
 
 from stiffopt import lie
 from stiffopt.directions import Direction, Frame
+from stiffopt.display import display_units
 from stiffopt.model.compliance import held_stiffness
 from stiffopt.model.shape import FreeShape, stiffness_along
 from stiffopt.optimise.measure import Measure, Role, Vector
@@ -134,8 +135,8 @@ class AtLeast(_ValuedMeasure):
 
     def shortfall(self, value: float) -> str:
         """See `Measure.shortfall`."""
-        unit = self.unit.replace("*", " ")
-        return f"at least {self.value:.4g} {unit} asked for, {value:.4g} is the most"
+        unit = display_units().of_si(self.unit)
+        return f"at least {unit.text(self.value)} asked for, {unit.number(value)} is the most"
 
 
 class MatchValue(_ValuedMeasure):
@@ -170,5 +171,5 @@ class MatchValue(_ValuedMeasure):
 
     def shortfall(self, value: float) -> str:
         """See `Measure.shortfall`."""
-        unit = self.unit.replace("*", " ")
-        return f"{self.value:.4g} {unit} asked for, {value:.4g} is nearest"
+        unit = display_units().of_si(self.unit)
+        return f"{unit.text(self.value)} asked for, {unit.number(value)} is nearest"

@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar
 import casadi as ca
 
 from stiffopt.directions import Direction
+from stiffopt.display import display_units
 from stiffopt.optimise.term import Nearness, Term, Vector, numbers_shown
 from stiffopt.schema import Schema
 from stiffopt.schema import Vector as Three
@@ -53,12 +54,14 @@ class AboveTerm(Term):
 
     def words(self, value: float) -> str:
         """Height above or depth below the plane."""
-        return f"{abs(value) * 1e3:.4g} mm {'above' if value >= 0 else 'below'} the plane"
+        height = display_units().length.text(abs(value))
+        return f"{height} {'above' if value >= 0 else 'below'} the plane"
 
     def asked(self) -> str:
         """See `Term.asked`."""
-        point = numbers_shown([1e3 * x for x in self.value.point])
-        return f"{point} mm, normal {numbers_shown(self.value.normal)}"
+        unit = display_units().length
+        point = numbers_shown(self.value.point, unit)
+        return f"{point} {unit}, normal {numbers_shown(self.value.normal)}"
 
     @classmethod
     def moved_back(cls, value: Any, offset: Vector) -> Any:

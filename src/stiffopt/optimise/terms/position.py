@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, PlainSerializer
 
+from stiffopt.display import display_units
 from stiffopt.optimise.term import Nearness, Term, Tolerance, numbers_shown
 from stiffopt.optimise.term import Vector as Numbers
 from stiffopt.schema import JsonSchemaOfFile, Vector
@@ -74,8 +75,8 @@ class PositionTerm(Term):
 
     def asked(self) -> str:
         """See `Term.asked`."""
-        value = [None if x is None else 1e3 * x for x in self.value]
-        return f"{numbers_shown(value)} mm within {self.words(self.radius)}"
+        unit = display_units().length
+        return f"{numbers_shown(self.value, unit)} {unit} within {self.words(self.radius)}"
 
     @classmethod
     def moved_back(cls, value: Any, offset: Numbers) -> Any:

@@ -1,0 +1,215 @@
+"""In which units people read answers: tables, figures and messages.
+
+One choice holds for all that is shown, so that a table and its figure agree. It is made once, by
+``--units`` of the commands, by the environment variable ``STIFFOPT_UNITS``, or in Python by
+`choose_units`. Files that stiffopt writes and JSON do not follow it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from decimal import Decimal
+from functools import lru_cache
+from math import log10
+from typing import Any
+
+from stiffopt.errors import InputError, shown
+from stiffopt.units import unit_size
+
+__all__ = [
+    "FIGURES",
+    "PLAIN",
+    "VARIABLE",
+    "DisplayUnit",
+    "DisplayUnits",
+    "choose_units",
+    "display_units",
+]
+
+VARIABLE = "STIFFOPT_UNITS"
+"""Environment variable that names units, as ``--units`` does."""
+
+FIGURES = "#.4g"
+"""Format of a number with four significant figures, zeros at its end included."""
+
+_USUAL = {
+    "length": ("m", "mm"),
+    "pressure": ("Pa", "bar"),
+    "force": ("N", "N"),
+    "stiffness": ("N/m", "N/m"),
+    "rotational_stiffness": ("N*m/rad", "N*m/rad"),
+    "angle": ("rad", "deg"),
+}
+"""Of each dimension its SI unit, and the unit that is shown unless another one is asked for."""
+_EXAMPLE = "'mm, bar, N/mm'"
+
+
+@dataclass(frozen=True)
+class DisplayUnit:
+    """A unit in which numbers are shown.
+
+    Attributes
+    ----------
+    name : str
+        As people write it: ``mm``, ``N mm/rad``.
+    per_si : float
+        How many of it are one SI unit.
+    more_decimals : int
+        How many decimals numbers have more than in the usual unit, for the same resolution.
+    """
+
+    name: str
+    per_si: float = 1.0
+    more_decimals: int = 0
+
+    def of(self, value: Any) -> Any:
+        """Return an SI number or array in this unit."""
+        return value * self.per_si
+
+    def to_si(self, value: Any) -> Any:
+        """Return a number or array of this unit in SI."""
+        return value / self.per_si
+
+    def number(self, value: float, form: str = ".4g") -> str:
+        """Return an SI number in this unit as text.
+
+        Parameters
+        ----------
+        value : float
+        form : str
+            How it is formatted; decimals, such as ``.3f``, are those in the usual unit.
+        """
+        if form.endswith("f"):
+            form = f".{max(0, int(form[1:-1]) + self.more_decimals)}f"
+        text = f"{self.of(value) + 0.0:{form}}".removesuffix(".")
+        return f"{Decimal(text):f}" if "e+" in text else text
+
+    def text(self, value: float, form: str = ".4g") -> str:
+        """Return an SI number in this unit, with the unit; see `number`."""
+        return f"{self.number(value, form)} {self.name}"
+
+    def __str__(self) -> str:
+        return self.name
+
+
+PLAIN = DisplayUnit("")
+"""Of numbers without a unit, or with one that stands elsewhere."""
+
+
+@dataclass(frozen=True)
+class DisplayUnits:
+    """The units in which people read answers, one for each dimension.
+
+    Attributes
+    ----------
+    length, pressure, force, stiffness, rotational_stiffness, angle : DisplayUnit
+        By default mm, bar, N, N/m, N m/rad and degrees; `stiffness` is the translational one.
+    """
+
+    length: DisplayUnit
+    pressure: DisplayUnit
+    force: DisplayUnit
+    stiffness: DisplayUnit
+    rotational_stiffness: DisplayUnit
+    angle: DisplayUnit
+
+    @classmethod
+    def named(cls, text: str = "") -> DisplayUnits:
+        """Return the units that a text such as ``mm, bar, N/mm`` names, and the usual others.
+
+        Raises
+        ------
+        InputError
+            If a unit is unknown or measures something else, or two measure the same.
+        """
+        return _named(text)
+
+    def of_si(self, unit: str | None) -> DisplayUnit:
+        """Return the unit in which values of an SI unit, such as ``N*m/rad``, are shown.
+
+        What has another dimension is shown as it is.
+        """
+        for name, (si, _) in _USUAL.items():
+            if si == unit:
+                found: DisplayUnit = getattr(self, name)
+                return found
+        return DisplayUnit(_readable(unit or ""))
+
+
+@lru_cache(maxsize=16)
+def _named(text: str) -> DisplayUnits:
+    chosen: dict[str, str] = {}
+    for part in text.split(",") if text.strip() else ():
+        name = part.strip()
+        dimension = _dimension(name)
+        if dimension in chosen:
+            raise InputError(
+                f"{shown(chosen[dimension])} and {shown(name)} are both units of "
+                f"{_readable_dimension(dimension)}; expected one of them"
+            )
+        chosen[dimension] = name
+    return DisplayUnits(**{
+        name: _unit(chosen.get(name, usual), si, usual) for name, (si, usual) in _USUAL.items()
+    })  # fmt: skip
+
+
+def _dimension(name: str) -> str:
+    for dimension, (si, _) in _USUAL.items():
+        if unit_size(name, si) is not None:
+            return dimension
+    dimensions = [_readable_dimension(each) for each in _USUAL]
+    raise InputError(
+        f"{shown(name)} is no unit of {', '.join(dimensions[:-1])} or {dimensions[-1]}; expected "
+        f"units such as {_EXAMPLE}"
+    )
+
+
+def _unit(name: str, si: str, usual: str) -> DisplayUnit:
+    size, usual_size = unit_size(name, si) or Decimal(1), unit_size(usual, si) or Decimal(1)
+    return DisplayUnit(_readable(name), float(1 / size), round(log10(float(size / usual_size))))
+
+
+def _readable(unit: str) -> str:
+    return unit.replace("*", " ")
+
+
+def _readable_dimension(dimension: str) -> str:
+    return dimension.replace("_", " ")
+
+
+_chosen: DisplayUnits | None = None
+
+
+def choose_units(text: str | None) -> None:
+    """Show everything in units that a text such as ``mm, bar, N/mm`` names, from now on.
+
+    Parameters
+    ----------
+    text :
+        Dimensions that it does not name keep their usual units. None: what the environment
+        variable ``STIFFOPT_UNITS`` names.
+
+    Raises
+    ------
+    InputError
+        If a unit is unknown or measures something else, or two measure the same.
+    """
+    global _chosen
+    _chosen = None if text is None else DisplayUnits.named(text)
+
+
+def display_units() -> DisplayUnits:
+    """Return the units in which to show values.
+
+    Raises
+    ------
+    InputError
+        If the environment variable ``STIFFOPT_UNITS`` does not name units.
+    """
+    if _chosen is not None:
+        return _chosen
+    try:
+        return DisplayUnits.named(os.environ.get(VARIABLE, ""))
+    except InputError as error:
+        raise InputError(f"{VARIABLE}: {error}") from None
