@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.errors import CancelledError, InputError, PressureError
 from stiffopt.identify.fit import Fit, fit
+from stiffopt.identify.folds import held_back_errors
 from stiffopt.identify.results import (
     Comparison,
     Errors,
@@ -41,7 +42,6 @@ from stiffopt.identify.structures import (
     Candidate,
     ModelStructure,
     best,
-    held_back_errors,
     other_laws,
 )
 from stiffopt.identify.unknowns import BASE

@@ -1,17 +1,15 @@
-"""What a model cannot describe: a systematic error that rows at nearby pressures or times share.
+"""What a model cannot describe: a systematic error that rows at nearby pressures share.
 
-A thousand rows on one turn of a circle, and a thousand turns of it, tell the same about a model
-that is wrong there.  So the errors of each axis are taken for the sum of a smooth function of the
-recorded pressures, a slow drift within each log, and noise of each row.  The first two are
-Gaussian processes (M. C. Kennedy and A. O'Hagan, Bayesian calibration of computer models, 2001),
-here by their projections on few centres: ``error = Z b + noise`` with b of variance one.  For every
-model the best b is found along with the residuals, so that the fit sees what smooth errors and
-noise cannot explain, and what is paid for them.
+A thousand rows on one turn of a circle, and a thousand turns of it, tell the same of a model that
+is wrong there.  So the errors of each axis are taken for the sum of a smooth function of the
+pressures, a Gaussian process (M. C. Kennedy and A. O'Hagan, Bayesian calibration of computer
+models, 2001), and of noise of each row: ``error = Z b + noise`` with coefficients b of variance
+one, about centres among the recorded pressures.  Whatever the numbers of the model, the best b is
+found along with the residuals; these are what it leaves, and b itself.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,26 +19,36 @@ from stiffopt.identify.settings import FIT
 
 Array = NDArray[np.float64]
 
+_ROUNDING = 1e-6  # of a correlation, that keeps the centres' matrix regular
 
-def basis(points: Array, most: int) -> Array:
-    """Functions (M, m) of points (N = M, k), in scales: ``basis @ basis.T`` is their correlation.
 
-    The correlation of two points at a distance of r scales is ``exp(-r^2 / 2)``.
+def centres(points: Array, apart: float, most: int) -> list[int]:
+    """Rows of points (M, k), each as far as can be from those before it, until all are near one.
+
+    Parameters
+    ----------
+    points : (M, k)
+    apart : distance that counts as near.
+    most : of them.
     """
-    centres = points[_centres(points, most)]
-    among = _correlation(centres, centres) + 1e-6 * np.eye(len(centres))
-    root = np.linalg.cholesky(among)
-    return np.asarray(np.linalg.solve(root, _correlation(centres, points)).T)
-
-
-def _centres(points: Array, most: int) -> list[int]:
-    """Points far from each other, such that hardly a point is farther than a scale from one."""
     chosen = [0]
     nearest = ((points - points[0]) ** 2).sum(axis=1)
-    while len(chosen) < most and nearest.max() > FIT.centres_apart**2:
+    while len(chosen) < most and nearest.max() > apart**2:
         chosen.append(int(nearest.argmax()))
         nearest = np.minimum(nearest, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
     return chosen
+
+
+def smooth_functions(pressures: Array) -> Array:
+    """Functions (M, m) of recorded pressures (M, n); their products are correlations of rows.
+
+    Rows at a distance r in pressure are correlated by ``exp(-r^2 / 2 l^2)``, where l is the share
+    `FitSettings.near` of the highest recorded pressure.
+    """
+    points = pressures / (FIT.near * (np.abs(pressures).max(initial=0.0) or 1.0))
+    middle = points[centres(points, FIT.centres_apart, FIT.most_centres)]
+    root = np.linalg.cholesky(_correlation(middle, middle) + _ROUNDING * np.eye(len(middle)))
+    return np.asarray(np.linalg.solve(root, _correlation(middle, points)).T)
 
 
 def _correlation(one: Array, other: Array) -> Array:
@@ -49,32 +57,36 @@ def _correlation(one: Array, other: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Shared:
-    """Systematic errors of rows, by functions Z (M, m) whose coefficients have the variance one.
+class Systematic:
+    """Systematic errors of rows, in deviations of their noise.
 
-    Rows are divided by their noise; those that do not count are zero.
+    Attributes
+    ----------
+    functions : Z (M, m), of coefficients that have the variance one.
     """
 
     functions: Array
-    orthogonal: Array  # (M + m, m), of the functions and the prior of their coefficients
-    triangle: Array
+    _orthogonal: Array
+    _triangle: Array
 
     @classmethod
-    def of(cls, functions: Array) -> Shared:
-        """Of functions (M, m) that are divided by the noise of each row."""
+    def of(cls, functions: Array) -> Systematic:
+        """Of functions (M, m), zero in rows that do not count."""
         stacked = np.vstack([functions, np.eye(functions.shape[1])])
         orthogonal, triangle = np.linalg.qr(stacked)
         return cls(functions, orthogonal, triangle)
 
-    def left(self, errors: Array) -> Array:
-        """Errors (M + m, c) that are left of errors (M, c), and the coefficients that took them."""
-        own = self.orthogonal.T[:, : len(errors)] @ errors
-        found = -self.orthogonal @ own
+    def residuals(self, errors: Array) -> Array:
+        """What is left of errors (M, c), and the coefficients that took the rest: (M + m, c).
+
+        Their sum of squares is the least of ``|errors - Z b|^2 + |b|^2``, which is
+        ``errors' (1 + Z Z')^-1 errors``.
+        """
+        found = -self._orthogonal @ (self._orthogonal[: len(errors)].T @ errors)
         found[: len(errors)] += errors
         return np.asarray(found)
 
-    def coefficients(self, errors: Array) -> tuple[Array, Array]:
-        """Coefficients (m, c) of errors (M, c), and their variances (m,)."""
-        own = self.orthogonal.T[:, : len(errors)] @ errors
-        inverse = np.linalg.inv(self.triangle)
-        return inverse @ own, np.asarray((inverse**2).sum(axis=1))
+    def part(self, errors: Array) -> Array:
+        """The systematic part (M, c) of errors (M, c)."""
+        taken = self._orthogonal[: len(errors)].T @ errors
+        return np.asarray(self.functions @ np.linalg.solve(self._triangle, taken))

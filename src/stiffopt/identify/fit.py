@@ -1,9 +1,11 @@
 """Robust nonlinear least squares with priors, and the covariance of the result.
 
 Residuals of real arms are not white noise: what a model cannot describe changes slowly, so that
-neighbouring rows err alike.  Rows are therefore weighted by the number of independent rows among
-them, from the autocorrelation of the residuals, and residuals are divided by their own robust
-spread.  Only then do priors and covariance mean what they say.
+neighbouring rows err alike.  Where the model is wrong, all rows at nearby pressures err alike
+(`stiffopt.identify.discrepancy`).  Rows are weighted by the number of independent rows among them,
+from the autocorrelation of what is left, and that is divided by its own robust spread.  Only then
+do priors and covariance mean what they say: what a curve in pressure space cannot tell stays near
+the robot file, however often the curve was run.
 """
 
 from __future__ import annotations
@@ -144,37 +146,15 @@ def _reweighted(
     if not problem.samples:
         return problem, 1.0
     predicted = problem.predict(x)
-    left = [_left(problem, errors) for errors in predicted.errors]
-    position = _spread(np.concatenate([each[0] for each in left]), FIT.least_position)
-    turns = [read.turn for read in predicted.read if read.turn is not None]
+    moves = [problem.unshared(errors, "position") for errors in predicted.errors]
+    position = _spread(np.concatenate(moves), FIT.least_position)
+    read = [read.turn for read in predicted.read if read.turn is not None]
+    turns = [problem.unshared(turn, "angle") for turn in read]
     angle = _spread(np.concatenate(turns), FIT.least_angle) if turns else problem.noise.angle
-    found = _rows_per_independent(problem, left[0][0])
+    found = _rows_per_independent(problem, moves[0])
     factor = np.sqrt(independent / found)
     samples = [replace(sample, weight=sample.weight * factor) for sample in problem.samples]
-    noise = Noise(position, angle, FIT.systematic * problem.description.length, FIT.drift * problem.description.length)
-    import os
-    if os.environ.get("TELL"): print(f"      noise {1e3*position:.2f} independent {found:.1f} systematic ({1e3*left[0][1]:.2f}) drift {1e3*left[0][2]:.2f} centres {[f.shape[1] for f in problem.functions]}")
-    return problem.with_samples(samples, noise), found
-
-
-def _left(problem: CalibrationProblem, errors: Array) -> tuple[Array, float, float]:
-    """What systematic errors and drift leave of errors (M, 3), and deviations of these two."""
-    noise = problem.noise
-    if not noise.systematic:
-        return errors, 0.0, 0.0
-    known = ~np.isnan(errors.sum(axis=1))
-    shared = problem.shared(known)
-    weight = (np.where(known, problem._weights, 0.0) / noise.position)[:, np.newaxis]
-    bounded = np.clip(np.where(known[:, np.newaxis], errors, 0.0), -4*noise.position-4*noise.systematic, 4*noise.position+4*noise.systematic)
-    b, variance = shared.coefficients(bounded * weight)
-    squared = (b**2).mean(axis=1) + variance
-    m = problem.functions[0].shape[1]
-    z = [noise.systematic * problem.functions[0]] + ([noise.drift * problem.functions[1]] if noise.drift else [])
-    return (
-        errors - np.hstack(z) @ b,
-        noise.systematic * float(np.sqrt(squared[:m].mean())),
-        noise.drift * float(np.sqrt(squared[m:].mean())) if noise.drift else 0.0,
-    )
+    return problem.with_samples(samples, Noise(position, angle, FIT.systematic)), found
 
 
 def _spread(errors: Array, least: float) -> float:
@@ -187,13 +167,13 @@ def _spread(errors: Array, least: float) -> float:
     return max(float(np.sqrt(np.mean(kept**2))), least)
 
 
-def _rows_per_independent(problem: CalibrationProblem, left: Array) -> float:
-    """Integrated autocorrelation of the tip's errors along the rows, at least 1."""
+def _rows_per_independent(problem: CalibrationProblem, moves: Array) -> float:
+    """Integrated autocorrelation of the tip's errors (M, 3) along the rows, at least 1."""
     starts = problem.starts
     longest = max(1, max(len(sample.rows) for sample in problem.samples) // 3)
     total: Array = np.zeros(longest)
     for begin, end in pairwise(starts):
-        errors = left[begin:end]
+        errors = moves[begin:end]
         known = np.where(np.isfinite(errors), errors, 0.0)
         size = len(known) + longest  # so that nothing comes round
         spectrum = np.abs(np.fft.rfft(known, size, axis=0)) ** 2

@@ -16,9 +16,8 @@ from typing import Literal, cast
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
 
-from stiffopt.identify.discrepancy import Shared, basis
+from stiffopt.identify.discrepancy import Systematic, smooth_functions
 from stiffopt.identify.past import Past, Start
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.sensing import Readings, readings
@@ -39,6 +38,8 @@ Array = NDArray[np.float64]
 
 Begin = Literal["rest", "previous", "unknown"]
 """State in which a log begins: after a rise from no pressure, as the last one ended, or unknown."""
+Kind = Literal["position", "angle"]
+"""Of a residual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,19 +80,20 @@ class TrackedPoint:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of the residuals: of each axis of a position in m, of an angle in rad.
+    """Standard deviations of the residuals.
 
     Attributes
     ----------
-    position, angle : of single rows.
-    systematic : of errors that rows at nearby pressures share, in m.
-    drift : of errors that change slowly in a log, in m.
+    position : of each axis of a row's position, in m.
+    angle : of a row's angle, in rad.
+    systematic : of the errors that rows at nearby pressures share, as a share of the arm's length;
+        of angles twice that in rad, as an arm that bends too far by a misses by a / 2 of its
+        length.
     """
 
     position: float
     angle: float
     systematic: float = 0.0
-    drift: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +154,7 @@ class CalibrationProblem:
         self._index = {parameter.key: i for i, parameter in enumerate(self._parameters)}
         self._measured = [self._measurements(point) for point in self.points]
         self._weights = np.concatenate([sample.weight for sample in self.samples] or [np.zeros(0)])
-        self._shared: dict[bytes, Shared] = {}
+        self._of_rows: dict[tuple[Kind, bytes], Systematic] = {}
 
     @property
     def size(self) -> int:
@@ -187,7 +189,7 @@ class CalibrationProblem:
         other = copy(self)
         other.samples, other.noise = tuple(samples), noise
         other._weights = np.concatenate([sample.weight for sample in samples])
-        other._shared = {}
+        other._of_rows = {}
         return other
 
     def robot(self, x: Array) -> RobotDescription:
@@ -212,10 +214,10 @@ class CalibrationProblem:
         for error, read, (moved, turned) in zip(
             predicted.errors, predicted.read, slopes, strict=True
         ):
-            self._append(values, jacobians, error, -moved, 1.0)
+            self._append(values, jacobians, error, -moved, "position")
             turn = read.turn
             if turn is not None and turned is not None:
-                self._append(values, jacobians, -turn, -turned, self.noise.angle/self.noise.position)
+                self._append(values, jacobians, -turn, -turned, "angle")
         for table in self.tables:
             value, jacobian = self.of_table(table, x)
             values.append(value)
@@ -259,46 +261,50 @@ class CalibrationProblem:
         return self._predict(x)[0]
 
     def _append(
-        self, values: list[Array], jacobians: list[Array], error: Array, slope: Array, scale: float
+        self, values: list[Array], jacobians: list[Array], error: Array, slope: Array, kind: Kind
     ) -> None:
         """Add weighted residuals (M, 3) and their slopes (M, 3, d) by unscaled coordinates.
 
-        They are divided by the noise times `scale`.
+        Of errors that rows share, what is left and how large these are.
         """
         known = ~np.isnan(error.sum(axis=1))
-        weight = (np.where(known, self._weights, 0.0) / (scale * self.noise.position))
-        value = np.where(known[:, np.newaxis], error, 0.0) * weight[:, np.newaxis]
-        slope = np.where(known[:, np.newaxis, np.newaxis], slope, 0.0)
-        slope = slope * weight[:, np.newaxis, np.newaxis]
-        if self.noise.systematic > 0 and len(error):
-            shared = self.shared(known)
-            value = shared.left(value)
-            slope = shared.left(slope.reshape(len(slope), -1)).reshape(len(value), 3, self.size)
+        systematic, weight = self._systematic(known, kind)
+        value = np.where(known[:, np.newaxis], error, 0.0) * weight
+        slope = np.where(known[:, np.newaxis, np.newaxis], slope, 0.0) * weight[..., np.newaxis]
+        if systematic is not None:
+            value = systematic.residuals(value)
+            slope = systematic.residuals(slope.reshape(len(slope), -1))
         values.append(value.ravel())
         jacobians.append(slope.reshape(-1, self.size))
 
-    def shared(self, known: NDArray[np.bool_]) -> Shared:
-        """Systematic errors of positions over their noise, of the rows (M,) that are known."""
-        key = known.tobytes()
-        if key not in self._shared:
-            weight = np.where(known, self._weights, 0.0) / self.noise.position
-            functions = np.hstack([
-                self.noise.systematic * self.functions[0],
-                *([self.noise.drift * self.functions[1]] if self.noise.drift else []),
-            ])
-            self._shared[key] = Shared.of(functions * weight[:, np.newaxis])
-        return self._shared[key]
+    def unshared(self, error: Array, kind: Kind) -> Array:
+        """Errors (M, 3) of rows less the part that rows at nearby pressures share."""
+        known = ~np.isnan(error.sum(axis=1))
+        systematic, weight = self._systematic(known, kind)
+        if systematic is None:
+            return error
+        part = systematic.part(np.where(known[:, np.newaxis], error, 0.0) * weight)
+        return np.asarray(
+            error - np.divide(part, weight, out=np.zeros_like(part), where=weight > 0)
+        )
+
+    def _systematic(self, known: NDArray[np.bool_], kind: Kind) -> tuple[Systematic | None, Array]:
+        """Systematic errors of the rows (M,) that are known, and the weights (M, 1) of all."""
+        noise = self.noise
+        own = noise.position if kind == "position" else noise.angle
+        shared = noise.systematic * (self.description.length if kind == "position" else 2.0)
+        weight = (np.where(known, self._weights, 0.0) / own)[:, np.newaxis]
+        if not (shared and weight.any()):
+            return None, weight
+        key = (kind, known.tobytes())
+        if key not in self._of_rows:
+            self._of_rows[key] = Systematic.of(self._functions * (shared * weight))
+        return self._of_rows[key], weight
 
     @cached_property
-    def functions(self) -> tuple[Array, Array]:
-        """Of pressure (M, m) and of time (M, k): what systematic errors and drift are made of."""
-        span = np.subtract(self.description.pressure_max, self.description.pressure_min)
-        pressures = np.concatenate([s.recording.pressures[s.rows] for s in self.samples])
-        highest = np.abs(pressures).max()
-        by_pressure = basis(pressures / (FIT.near * highest), FIT.most_centres)
-        times = [s.recording.time[s.rows][:, np.newaxis] / FIT.drift_time for s in self.samples]
-        drifts = block_diag(*[basis(t, FIT.most_centres) for t in times])
-        return by_pressure, np.asarray(drifts)
+    def _functions(self) -> Array:
+        rows = [sample.recording.pressures[sample.rows] for sample in self.samples]
+        return smooth_functions(np.concatenate(rows))
 
     def _predict(self, x: Array) -> tuple[Predicted, list[tuple[Array, Array | None]]]:
         """Prediction, and the slopes (M, 3, d) of each point's position and turn."""
