@@ -443,7 +443,7 @@ def test_measured_pressures() -> None:
 def test_pressures_in_another_unit(unit: str, factor: float) -> None:
     log, _, _ = synthetic()
     with pytest.raises(InputError, match=f"^a.csv: .*look like {unit}, expected Pa"):
-        prepared(replace(log, commanded=log.commanded / factor))
+        prepared(replace(log, commanded=log.commanded / factor), keep_units=True)
 
 
 def test_positions_in_mm() -> None:

@@ -92,6 +92,14 @@ Frame = Annotated[
         "the robot file says, else the tracker itself.",
     ),
 ]
+Keep = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="WHAT",
+        help="units, clock, axes, channels or lines: take these as they were recorded, even where "
+        "they are clearly something else; may be repeated.",
+    ),
+]
 Report = Annotated[
     str | None,
     typer.Option(metavar="DIR", help="Write a page (report.md) with figures into this new folder."),
@@ -143,9 +151,9 @@ def calibrate(
         bool,
         typer.Option(
             "--quick",
-            help="A first answer, within about a minute for an arm without gravity: one model, "
-            "with hysteresis unless --model says another, fitted to few rows; models and strain "
-            "laws are not compared.",
+            help="A first answer, within about a minute: one model, with hysteresis unless --model "
+            "says another, fitted to few rows; models and strain laws are not compared, and "
+            "nothing is held back.",
         ),
     ] = False,
     sequence: Sequence = False,
@@ -153,6 +161,7 @@ def calibrate(
     pressures: Pressures = "commanded",
     channels: Channels = None,
     frame: Frame = None,
+    keep: Keep = None,
     rows: Annotated[
         int | None,
         typer.Option(
@@ -168,8 +177,9 @@ def calibrate(
     from stiffopt.cli import calibrate_run  # here, so that --help waits for no numerics
 
     recordings = calibrate_run.RecordingOptions(
-        robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame
-    )
+        robot, tuple(logs or ()), sequence, rezero, pressures, channels, frame,
+        tuple(keep or ()),
+    )  # fmt: skip
     return calibrate_run.run_calibrate(
         recordings, out, tables=stiffness or (), model=model, strain_law=strain_law, fix=fix or (),
         rows=rows, quick=quick, report=report, as_json=as_json, quiet=quiet,
@@ -185,6 +195,7 @@ def validate(
     pressures: Pressures = "commanded",
     channels: Channels = None,
     frame: Frame = None,
+    keep: Keep = None,
     report: Report = None,
     as_json: Json = False,
     units: Units = None,
@@ -194,6 +205,7 @@ def validate(
     from stiffopt.cli import calibrate_run
 
     recordings = calibrate_run.RecordingOptions(
-        robot, tuple(logs), sequence, rezero, pressures, channels, frame
-    )
+        robot, tuple(logs), sequence, rezero, pressures, channels, frame,
+        tuple(keep or ()),
+    )  # fmt: skip
     calibrate_run.run_validate(recordings, report, as_json=as_json, quiet=quiet)

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import stiffopt
 from stiffopt.cli import quantities
@@ -29,7 +29,7 @@ from stiffopt.files import save_file
 from stiffopt.identify.calibration import CalibrationResult
 from stiffopt.identify.calibration import calibrate as fit_robot
 from stiffopt.identify.results import together
-from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.settings import CalibrationSettings, Finding
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.identify.unknowns import history_unknowns, shape_unknowns
 from stiffopt.identify.validation import validate as compare_robot
@@ -155,11 +155,15 @@ class RecordingOptions:
     pressures: str
     channels: str | None
     frame: str | None
+    keep: tuple[str, ...] = ()
 
     def settings(self, **others: Any) -> CalibrationSettings:
         """Return the settings of a calibration: of these options, and others."""
         quantities.choice("--pressures", self.pressures, ("commanded", "measured"))
-        given = {"sequence": self.sequence, "rezero": self.rezero, "pressures": self.pressures}
+        for each in self.keep:
+            quantities.choice("--keep", each, get_args(Finding))
+        given = {"sequence": self.sequence, "rezero": self.rezero, "pressures": self.pressures,
+                 "keep": self.keep}  # fmt: skip
         return CalibrationSettings(**given, **others)
 
     def description(self) -> RobotDescription:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from stiffopt import lie
 from stiffopt.errors import CancelledError, InputError, PressureError
+from stiffopt.identify.detection import Comparer, Hypothesis, found_wrong
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.folds import held_back_errors
 from stiffopt.identify.results import (
@@ -44,6 +45,7 @@ from stiffopt.identify.structures import (
     best,
     other_laws,
 )
+from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
 from stiffopt.identify.unknowns import BASE
 from stiffopt.identify.validation import compare
 from stiffopt.logs import StiffnessTable
@@ -141,6 +143,8 @@ def calibrate(
     description, settings = description_of(robot), settings or CalibrationSettings()
     if not logs and not tables:
         raise InputError("there is nothing to fit to; expected a log or a table of stiffness")
+    if not settings.holds_back and settings.structure == "auto":
+        raise InputError("models are compared by what is held back; name one, or hold parts back")
     read = tables_of(tables, description)
     structures = _structures(settings.structure)
     for key in settings.fixed:
@@ -148,7 +152,7 @@ def calibrate(
     laws = other_laws(description) if settings.strain_law == "auto" else []
     teller = _Teller(progress, len(structures) + len(laws))
     recordings = recordings_of(description, logs, settings)
-    setup = Setup.of(description, recordings, read, settings)
+    setup = _put_right(Setup.of(description, recordings, read, settings), teller)
     if not recordings:  # poses are taken to be as the robot file has them
         teller.begin("fitting the stiffness")
         alone = ModelStructure(
@@ -157,11 +161,14 @@ def calibrate(
         return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
     candidates: list[Candidate] = []
     try:
-        chosen = _chosen(setup, structures, laws, candidates, teller)
-        teller.begin(f"final fit: {chosen.structure.words}")
-        near = chosen.fit.problem.named(chosen.fit.x)
-        final = _final(setup, chosen.structure, near, teller)
-        return _result(setup, final, chosen.structure, candidates, teller)
+        if settings.holds_back:
+            chosen = _chosen(setup, structures, laws, candidates, teller)
+            structure, near = chosen.structure, chosen.fit.problem.named(chosen.fit.x)
+        else:
+            structure, near = structures[0], _screened(setup, teller)
+        teller.begin(f"final fit: {structure.words}")
+        final = _final(setup, structure, near, teller)
+        return _result(setup, final, structure, candidates, teller)
     except CancelledError as stop:
         if candidates:
             leader = best(candidates)
@@ -281,7 +288,48 @@ def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
             if unknown.parameter is not None and unknown.parameter.key.endswith("youngs_modulus"):
                 start[i] = modulus
         starts.append(start)
-    return problem.named(fit(problem, starts, teller, rounds=1).x)
+    most = setup.settings.start_evaluations
+    return problem.named(fit(problem, starts, teller, rounds=1, most=most).x)
+
+
+def _put_right(setup: Setup, teller: _Teller) -> Setup:
+    """The setup with what is wrong with all recordings put right, if the evidence is overwhelming.
+
+    See `stiffopt.identify.detection`.
+    """
+    recordings, description = setup.recordings, setup.description
+    if not recordings:
+        return setup
+    teller.begin("checking how the logs were recorded")
+    stations = [description.length if each.at is None else each.at for each in setup.points]
+    comparer = Comparer(description, setup.base, stations, recordings)
+    found = found_wrong(comparer, description, setup.settings.keep)
+    if found is None:
+        return setup
+    told = found.hypothesis.told(description, [each.name for each in recordings])
+    remark = (
+        f"{told}; the robot file's arm then misses the tip by {found.then * 1e3:.1f} mm instead of "
+        f"{found.as_is * 1e3:.1f} mm, however soft it is; --keep {found.hypothesis.kind} leaves "
+        "that as it was recorded"
+    )
+    return replace(_under(setup, found.hypothesis, comparer.low), found=(remark,))
+
+
+def _under(setup: Setup, hypothesis: Hypothesis, low: Array) -> Setup:
+    """The setup as it is if a hypothesis holds; the robot file keeps an order and a common turn."""
+    given = setup.description.recordings or Recordings()
+    recordings = hypothesis.applied(setup.recordings, low)
+    if hypothesis.kind == "channels":
+        columns = given.channels or tuple(range(1, len(hypothesis.sources) + 1))
+        given = given.model_copy(update={"channels": tuple(columns[k] for k in hypothesis.sources)})
+    elif hypothesis.kind == "axes" and len(set(hypothesis.turns)) == 1:  # of the tracker
+        recordings = hypothesis.with_turns(0).applied(setup.recordings, low)
+        turn = lie.transform(CUBE_ROTATIONS[hypothesis.turns[0]], np.zeros(3))
+        places = {"tracker_in_base": _inverse_placement(np.linalg.inv(turn) @ setup.base)}
+        registration = given.registration.model_copy(update=places)
+        given = given.model_copy(update={"registration": registration})
+    description = setup.description.model_copy(update={"recordings": given})
+    return Setup.of(description, recordings, setup.tables, setup.settings)
 
 
 def _final(
@@ -296,7 +344,8 @@ def _final(
     for description in _softenings(setup):
         own = replace(setup, description=description)
         problem = own.problem(structure, setup.settings.rows)
-        found.append(fit(problem, [problem.start(near)], teller))
+        start = problem.start(near)
+        found.append(fit(problem, [start], teller, rounds=setup.settings.rounds))
     return min(found, key=_misfit_of_tables)
 
 
@@ -338,7 +387,8 @@ def _result(
     ) -> tuple[Comparison, ...]:
         return compare(Setup.of(description, setup.recordings, (), setup.settings), known, teller)
 
-    remarks = [
+    remarks = list(setup.found)
+    remarks += [
         f"{recording.name}: {remark}"
         for recording in setup.recordings
         for remark in recording.remarks

@@ -7,14 +7,14 @@ refused. What is doubtful is told in remarks.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import FileError, InputError, shown
-from stiffopt.identify.settings import PLAUSIBLE
+from stiffopt.identify.settings import DETECTION, PLAUSIBLE
 from stiffopt.identify.tracker_faults import (
     MEDIAN_NORM,
     dropouts,
@@ -30,6 +30,7 @@ from stiffopt.identify.tracker_faults import (
 )
 from stiffopt.logs import Body, Log
 from stiffopt.model.description import RobotDescription
+from stiffopt.model.manipulator import Manipulator
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -95,6 +96,7 @@ def prepare(
     frame: str | None = None,
     bodies: Sequence[str] = (),
     pressures: Literal["commanded", "measured"] = "commanded",
+    keep_units: bool = False,
 ) -> Recording:
     """Check a log and take out of it what a fit can use.
 
@@ -110,6 +112,7 @@ def prepare(
     bodies : further bodies to keep as tracks.
     pressures : which ones; a missing one is as the last before it (commanded) or on the line
         between its neighbours (measured).
+    keep_units : refuse pressures that look like another unit than Pa, even if it is clear which.
 
     Raises
     ------
@@ -129,6 +132,17 @@ def prepare(
     _check_lengths(name, log, frame, description.length)
     p, found = _pressures(log, name, columns, pressures)
     remarks += found
+    unit = None if keep_units else _unit(p, log.tip_position, description)
+    if unit is not None:
+        factor = _PRESSURE_UNITS[unit]
+        measured = None if log.measured is None else factor * log.measured
+        log = replace(log, commanded=factor * log.commanded, measured=measured)
+        p = factor * p
+        remarks += (
+            f"the pressures are in {unit}, not Pa: the largest is {p.max() / factor:.4g}, and only "
+            "in this unit does the robot file's arm move about as far as the tip did; --keep units "
+            "refuses them",
+        )
     remarks += _check_pressures(name, p, description)
 
     used = {_TIP: Body(log.tip_position, log.tip_quaternion)}
@@ -362,6 +376,32 @@ def _check_lengths(name: str, log: Log, frame: str | None, length: float) -> Non
 
 def _mm(length: float) -> str:
     return f"and the robot is {length:.3g} m long; the positions look like mm, expected m"
+
+
+def _unit(pressures: Array, tip: Array, description: RobotDescription) -> str | None:
+    """Return the unit of pressures (N, n) that are too small for Pa; None where that is not clear.
+
+    In the right one the robot file's arm moves about as far as the tip did; units are far apart.
+    """
+    limit = np.maximum(np.abs(description.pressure_min), np.abs(description.pressure_max))
+    share = float(np.max(np.max(np.abs(pressures), axis=0) / limit))
+    seen = np.flatnonzero(whole(tip))
+    if not 0 < share < PLAUSIBLE.tiny_pressure or len(seen) < PLAUSIBLE.least_rows:
+        return None
+    rows = seen[np.linspace(0, len(seen) - 1, min(len(seen), DETECTION.rows)).astype(int)]
+    moved = np.sqrt(np.var(tip[rows], axis=0).sum())
+    arm = Manipulator(
+        description.model_copy(update={"gravity": (0.0, 0.0, 0.0), "calibration": None})
+    )
+    fitting = []
+    for unit, factor in _PRESSURE_UNITS.items():
+        if share * factor > 1 + PLAUSIBLE.beyond:
+            continue
+        expected = arm.tip_pose(factor * pressures[rows])[:, :3, 3]
+        ratio = np.sqrt(np.var(expected, axis=0).sum()) / max(moved, 1e-9)
+        if 1 / DETECTION.unit < ratio < DETECTION.unit:
+            fitting.append(unit)
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def _check_pressures(name: str, pressures: Array, description: RobotDescription) -> tuple[str, ...]:

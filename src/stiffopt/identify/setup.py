@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
+from stiffopt.identify.detection import on_one_clock
 from stiffopt.identify.problem import Begin, CalibrationProblem, Noise, Sample, TrackedPoint
 from stiffopt.identify.recording import Recording, Track, prepare
 from stiffopt.identify.settings import SAMPLING, START, CalibrationSettings
@@ -104,7 +105,7 @@ def recordings_of(
 ) -> list[Recording]:
     """Return logs as recordings of this robot, read as its file and the settings say."""
     given = description.recordings or Recordings()
-    return [
+    found = [
         prepare(
             log,
             name,
@@ -113,9 +114,14 @@ def recordings_of(
             frame=given.frame,
             bodies=tuple(given.bodies),
             pressures=settings.pressures,
+            keep_units="units" in settings.keep,
         )
         for name, log in _named(logs)
     ]
+    if "clock" in settings.keep:
+        return found
+    span = np.subtract(description.pressure_max, description.pressure_min)
+    return [on_one_clock(recording, span) for recording in found]
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +136,7 @@ class Setup:
     settings : CalibrationSettings
     base : pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
     points : that are tracked.
+    found : what was wrong with the recordings altogether, and was put right, one sentence each.
     """
 
     description: RobotDescription
@@ -138,6 +145,7 @@ class Setup:
     settings: CalibrationSettings
     base: Array
     points: tuple[TrackedPoint, ...]
+    found: tuple[str, ...] = ()
 
     @classmethod
     def of(

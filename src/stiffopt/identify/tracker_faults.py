@@ -168,7 +168,7 @@ def _cube() -> Array:
 
 
 CUBE = _cube()
-_CUBE_ROTATIONS = np.array([lie.rotation_from_quaternion(q) for q in CUBE])
+CUBE_ROTATIONS = np.array([lie.rotation_from_quaternion(q) for q in CUBE])
 _PRODUCT = np.array(
     [[np.argmax(np.abs(CUBE @ lie.quaternion_product(a, b))) for b in CUBE] for a in CUBE]
 )  # (24, 24), which of them is g_a g_b
@@ -241,8 +241,8 @@ def aligned(track_rotation: Array, reference: Array) -> Array:
     """
     usable = np.isfinite(track_rotation).all(axis=(1, 2))
     near = reference.T @ track_rotation[usable].sum(axis=0)
-    best = np.argmax(np.einsum("ij,gji->g", near, _CUBE_ROTATIONS))
-    return np.asarray(track_rotation @ _CUBE_ROTATIONS[best])
+    best = np.argmax(np.einsum("ij,gji->g", near, CUBE_ROTATIONS))
+    return np.asarray(track_rotation @ CUBE_ROTATIONS[best])
 
 
 def unit_quaternions(quaternion: Array) -> Array:

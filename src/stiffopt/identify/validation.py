@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import StiffoptError
+from stiffopt.identify.detection import replaced
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Comparison
-from stiffopt.identify.settings import SAMPLING, CalibrationSettings
+from stiffopt.identify.settings import DETECTION, SAMPLING, CalibrationSettings
 from stiffopt.identify.setup import (
     NOISE,
     Beginnings,
@@ -67,7 +68,35 @@ def validate(
     recordings = recordings_of(description, logs, settings)
     if progress is not None:
         progress(1, 2, "comparing")
-    return compare(Setup.of(description, recordings, (), settings))
+    setup = Setup.of(description, recordings, (), settings)
+    found = compare(setup)
+    if description.calibration is None or "axes" in settings.keep:
+        return found
+    return _with_frames_found(setup, found)
+
+
+def _with_frames_found(setup: Setup, found: tuple[Comparison, ...]) -> tuple[Comparison, ...]:
+    """Comparisons with each log moved as a whole that is far off only because of its frame."""
+    recordings = list(setup.recordings)
+    length, words = setup.description.length, [""] * len(recordings)
+    for i, each in enumerate(found):
+        if each.errors.mean > DETECTION.off * length:
+            moved = replaced(recordings[i], each.measured, each.predicted, length)
+            recordings[i], words[i] = moved
+    if not any(words):
+        return found
+    again = list(compare(Setup.of(setup.description, recordings, (), setup.settings)))
+    for i, (before, after) in enumerate(zip(found, again, strict=True)):
+        if not words[i] or after.errors.mean > DETECTION.frame * before.errors.mean:
+            again[i] = before
+            continue
+        remark = (
+            f"the frame of this log was defined anew: its poses are {words[i]}, and the mean error "
+            f"is {after.errors.mean * 1e3:.1f} mm instead of {before.errors.mean * 1e3:.1f} mm; "
+            "--keep axes leaves them"
+        )
+        again[i] = replace(after, remarks=(*after.remarks, remark))
+    return tuple(again)
 
 
 def compare(
@@ -84,7 +113,7 @@ def compare(
     tell : is called at every evaluation.
     """
     description, recordings = setup.description, setup.recordings
-    most = SAMPLING.loaded_rows if any(description.gravity) else SAMPLING.rows
+    most = setup.settings.compared_rows if any(description.gravity) else SAMPLING.rows
     samples, kept = [], []
     for recording, begin in zip(recordings, setup.begins, strict=True):
         every = np.arange(len(recording.time))

@@ -1,0 +1,435 @@
+"""What is wrong with how an arm was recorded, found by itself where the evidence is overwhelming.
+
+Units of pressure and the clocks of pressures and tracker are found log by log. Axes of the tracker,
+the order of the channels and lines that are dead or shared are hypotheses about all logs: each is
+scored by how well the robot file's arm, softer or stiffer, scaled and moved a little, then follows
+the tip. (A fit would not tell: with enough numbers it follows a wrong recording too.) Where the
+recordings cannot tell, they stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.errors import PressureError
+from stiffopt.identify.recording import Recording, Track
+from stiffopt.identify.settings import DETECTION, Finding
+from stiffopt.identify.tracker_faults import CUBE_ROTATIONS, whole
+from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.model.manipulator import Manipulator
+
+Array = NDArray[np.float64]
+
+
+# -- clocks ----------------------------------------------------------------------------------------
+
+
+def on_one_clock(recording: Recording, span: Array) -> Recording:
+    """Return a recording whose pressures and tip have one clock.
+
+    The tip is regressed on the pressures and their products, behind a lag, at many shifts of time.
+    A shift is undone if it is none that an arm has, and leaves a small share of what the best of
+    those leaves that an arm may have.
+
+    Parameters
+    ----------
+    recording : Recording
+    span : range (n,) of the pressures, in Pa.
+    """
+    time, tip = recording.time, recording.tracks[0].position
+    seen = np.flatnonzero(whole(tip))
+    rows = seen[np.linspace(0, len(seen) - 1, min(len(seen), DETECTION.clock_rows)).astype(int)]
+    followed = _lagged(time, recording.pressures / span, DETECTION.clock_lag)
+
+    def misfits(shifts: Array) -> Array:
+        moved = (
+            [np.interp(time[rows] - shift, time, column) for column in followed.T]
+            for shift in shifts
+        )
+        return np.array([_unexplained(np.column_stack(each), tip[rows]) for each in moved])
+
+    most = min(DETECTION.clock_most, DETECTION.clock_share * float(time[-1] - time[0]))
+    step = max(2 * float(np.median(np.diff(time))), 0.2)
+    usual = misfits(np.linspace(-step, DETECTION.clock_usual, 12)).min()
+    coarse = np.linspace(-most, most, DETECTION.clock_shifts)
+    near = coarse[np.argmin(misfits(coarse))]
+    fine = np.linspace(near - coarse[1] + coarse[0], near + coarse[1] - coarse[0], 21)
+    found = misfits(fine)
+    best, share = float(fine[np.argmin(found)]), float(found.min() / max(usual, 1e-9))
+    if -step <= best <= DETECTION.clock_usual or share > DETECTION.clock_overwhelming:
+        return recording
+    moved = [np.interp(time - best, time, column) for column in recording.pressures.T]
+    remark = (
+        f"the tip moves {abs(best):.2g} s {'after' if best > 0 else 'before'} its pressures, as if "
+        f"they had two clocks: they are moved by that (a regression of the tip on them then misses "
+        f"it by {share * 100:.0f} % of what it does otherwise); --keep clock leaves them"
+    )
+    return replace(
+        recording,
+        pressures=np.column_stack(moved),
+        remarks=(*recording.remarks, remark),
+    )
+
+
+def _lagged(time: Array, pressures: Array, lag: float) -> Array:
+    """Pressures (N, n) behind a first-order lag, in s."""
+    followed = pressures.copy()
+    for i, share in enumerate(-np.expm1(-np.diff(time) / lag), start=1):
+        followed[i] = followed[i - 1] + share * (pressures[i] - followed[i - 1])
+    return followed
+
+
+def _unexplained(pressures: Array, tip: Array) -> float:
+    """What a regression of positions (N, 3) on pressures (N, n) and their products misses, in m."""
+    n = pressures.shape[1]
+    products = [pressures[:, i] * pressures[:, j] for i in range(n) for j in range(i, n)]
+    known = np.column_stack([np.ones(len(tip)), pressures, *products])
+    solution = np.linalg.lstsq(known, tip, rcond=1e-8)[0]
+    return float(np.sqrt(np.mean(np.sum((tip - known @ solution) ** 2, axis=1))))
+
+
+# -- axes, channels and lines ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What may be wrong with recordings.
+
+    Attributes
+    ----------
+    kind : see `Finding`; empty for "nothing".
+    words : what is wrong with a line.
+    sources : for each channel, counted from 0, that whose recorded pressure it has; -1 for none.
+    turns : for each recording the number of a rotation of the cube by which its axes are turned.
+    """
+
+    kind: Finding | None
+    words: str
+    sources: tuple[int, ...]
+    turns: tuple[int, ...]
+
+    def applied(self, recordings: Sequence[Recording], low: Array) -> list[Recording]:
+        """Recordings as they then are; `low` (n,) is the pressure of a dead line."""
+        found = []
+        for each, turn in zip(recordings, self.turns, strict=True):
+            pressures = _driven(each.pressures, self.sources, low)
+            before = _driven(each.before[np.newaxis], self.sources, low)[0]
+            driven = replace(each, pressures=pressures, before=before)
+            found.append(_moved(driven, CUBE_ROTATIONS[turn], np.zeros(3)))
+        return found
+
+    def with_turns(self, turn: int) -> Hypothesis:
+        """The same with one turn of the axes for all recordings."""
+        return replace(self, turns=(turn,) * len(self.turns))
+
+    def told(self, description: RobotDescription, names: Sequence[str]) -> str:
+        """What is wrong and what is done about it, as the beginning of a sentence."""
+        name = description.channel_name
+        if self.kind == "channels":
+            order = ", ".join(
+                f"{name(k)} has the column of {name(source)}"
+                for k, source in enumerate(self.sources)
+                if k != source
+            )
+            return f"the channels are in another order: {order}"
+        if self.kind == "lines":
+            return self.words
+        turned = {
+            name: _turn_text(CUBE_ROTATIONS[turn])
+            for name, turn in zip(names, self.turns, strict=True)
+            if turn
+        }
+        if len(set(self.turns)) == 1:
+            return f"the tracker's axes are turned in all logs, {next(iter(turned.values()))}"
+        return "the axes of the frame are turned: " + ", ".join(
+            f"{name} {text}" for name, text in turned.items()
+        )
+
+
+def _driven(recorded: Array, sources: Sequence[int], low: Array) -> Array:
+    """Pressures (N, n) of the channels, see `Hypothesis`, from those that were recorded."""
+    columns = [
+        np.full(len(recorded), low[k]) if source < 0 else recorded[:, source]
+        for k, source in enumerate(sources)
+    ]
+    return np.column_stack(columns)
+
+
+def _moved(recording: Recording, rotation: Array, shift: Array) -> Recording:
+    """A recording whose poses are turned (3, 3) about the origin of its frame, and shifted (3,)."""
+    tracks = tuple(
+        Track(
+            track.name,
+            track.position @ rotation.T + shift,
+            None if track.rotation is None else rotation @ track.rotation,
+        )
+        for track in recording.tracks
+    )
+    return replace(recording, tracks=tracks)
+
+
+class Comparer:
+    """Scores hypotheses by the robot file's arm, whose softness and turn are not taken for known.
+
+    Parameters
+    ----------
+    description : RobotDescription
+        Weight and history are left out.
+    base : pose (4, 4) of the base in the recordings' frame, as far as the robot file knows.
+    stations : arc lengths in m of the tracks, the tip first.
+    recordings : sequence of Recording
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        base: Array,
+        stations: Sequence[float],
+        recordings: Sequence[Recording],
+    ) -> None:
+        self.nothing = Hypothesis(
+            None, "", tuple(range(description.n_pressures)), (0,) * len(recordings)
+        )
+        light = description.model_copy(update={"gravity": (0.0, 0.0, 0.0), "calibration": None})
+        self._arm = Manipulator(light)
+        self._stations = np.array(stations)
+        self.low = np.maximum(description.pressure_min, 0.0)
+        tolerances = description.tolerances or Tolerances()
+        self.any_turn = tolerances.base_turn > DETECTION.unknown_turn
+        to_base = np.linalg.inv(base)
+        self._pressures: list[Array] = []
+        self._measured: list[Array] = []
+        count = max(DETECTION.rows // len(recordings), 8)
+        for each in recordings:
+            seen = np.flatnonzero(np.logical_and.reduce([whole(t.position) for t in each.tracks]))
+            rows = seen[np.unique(np.linspace(0, len(seen) - 1, count).astype(int))]
+            self._pressures.append(_lagged(each.time, each.pressures, DETECTION.clock_lag)[rows])
+            self._measured.append(np.stack([t.position[rows] for t in each.tracks], axis=1))
+        self._from_frame = to_base[:3, :3], to_base[:3, 3]
+        self._kept: dict[tuple[int, ...], list[list[Array]]] = {}
+
+    def score(self, hypothesis: Hypothesis) -> float:
+        """Distance in m between the tracks and the arm that is nearest to them."""
+        measured = [
+            self._in_base(each, CUBE_ROTATIONS[turn])
+            for each, turn in zip(self._measured, hypothesis.turns, strict=True)
+        ]
+        return min(
+            float(
+                np.sqrt(np.mean([self._square(m, q) for m, q in zip(measured, each, strict=True)]))
+            )
+            for each in self._predicted(hypothesis.sources)
+        )
+
+    def of_turns(self, sources: tuple[int, ...]) -> Array:
+        """Distances (logs, 24) of each recording in each of the rotations of its axes."""
+        turned = [
+            [self._in_base(m, rotation) for rotation in CUBE_ROTATIONS] for m in self._measured
+        ]
+        found = [
+            np.array(
+                [[self._square(m, q) for m in log] for log, q in zip(turned, each, strict=True)]
+            )
+            for each in self._predicted(sources)
+        ]
+        return np.asarray(np.sqrt(min(found, key=lambda squares: float(squares.min(axis=1).sum()))))
+
+    def _in_base(self, positions: Array, turn: Array) -> Array:
+        rotation, origin = self._from_frame
+        return np.asarray(positions @ turn.T @ rotation.T + origin)
+
+    def _predicted(self, sources: tuple[int, ...]) -> list[list[Array]]:
+        """Tracks of each recording, (N, k, 3), for each softness that the law allows."""
+        if sources not in self._kept:
+            driven = [_driven(each, sources, self.low) for each in self._pressures]
+            self._kept[sources] = [
+                found
+                for factor in DETECTION.softness
+                if (found := self._positions([factor * each for each in driven])) is not None
+            ]
+        return self._kept[sources]
+
+    def _positions(self, pressures: Sequence[Array]) -> list[Array] | None:
+        try:
+            return [self._arm.pose(p, self._stations)[:, :, :3, 3] for p in pressures]
+        except PressureError:
+            return None
+
+    def _square(self, measured: Array, predicted: Array) -> float:
+        """Mean square between tracks (N, k, 3) when the arm is scaled, turned and moved."""
+        lateral = [
+            (m[:, 0] + 1j * m[:, 1], q[:, 0] + 1j * q[:, 1])
+            for m, q in zip(measured.swapaxes(0, 1), predicted.swapaxes(0, 1), strict=True)
+        ]
+        factor = _factor(lateral)
+        factor = factor if self.any_turn else complex(max(factor.real, 0.0))
+        total = 0.0
+        for k, (m, q) in enumerate(lateral):
+            rest = m - factor * q
+            up, along = measured[:, k, 2], predicted[:, k, 2]
+            slope = _slope(along, up)
+            high = up - slope * (along - along.mean()) - along.mean()
+            moved = np.array([rest.real.mean(), rest.imag.mean(), high.mean()])
+            far = max(float(np.linalg.norm(moved)), 1e-9)
+            moved *= min(1.0, DETECTION.moved * self._arm.length / far)
+            total += float(np.mean(np.abs(rest - moved[0] - 1j * moved[1]) ** 2))
+            total += float(np.mean((high - moved[2]) ** 2))
+        return total / len(lateral)
+
+
+def _factor(pairs: Sequence[tuple[NDArray[np.complex128], NDArray[np.complex128]]]) -> complex:
+    """The complex number that turns and scales the second of each pair into the first."""
+    over = sum(np.vdot(q - q.mean(), m - m.mean()) for m, q in pairs)
+    under = sum(float(np.vdot(q - q.mean(), q - q.mean()).real) for _, q in pairs)
+    return complex(over / under) if under > 0 else 1.0 + 0j
+
+
+def _slope(x: Array, y: Array) -> float:
+    """Slope of y over x, at least zero."""
+    centred = x - x.mean()
+    under = float(centred @ centred)
+    return max(float(centred @ y) / under, 0.0) if under > 0 else 0.0
+
+
+@dataclass(frozen=True)
+class Found:
+    """The hypothesis that is told, with the scores in m of no hypothesis and of this one."""
+
+    hypothesis: Hypothesis
+    as_is: float
+    then: float
+
+
+def found_wrong(
+    comparer: Comparer, description: RobotDescription, keep: Sequence[str]
+) -> Found | None:
+    """What is wrong with the recordings of a comparer; None if nothing is, or it is not clear what.
+
+    A hypothesis must leave a small share of the misfit, and clearly less than any other does.
+    """
+    nothing = comparer.nothing
+    as_is = comparer.score(nothing)
+    scored = [
+        (comparer.score(each), each)
+        for each in (*_lines(description, nothing), *_orders(description, nothing))
+        if each.kind not in keep
+    ]
+    worthy = [pair for pair in scored if pair[0] <= DETECTION.overwhelming * as_is]
+    if "axes" not in keep:
+        turns = _turns(comparer.of_turns(nothing.sources))
+        if any(turns):
+            turned = replace(nothing, kind="axes", turns=turns)
+            worthy.append((comparer.score(turned), turned))
+    if not worthy:
+        return None
+    then, best = min(worthy, key=lambda pair: pair[0])
+    rivals = [pair[0] for pair in worthy if not _alike(pair[1], best)]
+    if any(then > DETECTION.tie * each for each in rivals):
+        return None
+    return Found(best, as_is, then)
+
+
+def _alike(one: Hypothesis, other: Hypothesis) -> bool:
+    """Whether two hypotheses are one, or orders that differ by a turn of the arm."""
+    return one is other or one.kind == other.kind == "channels"
+
+
+def _lines(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypothesis]:
+    """Lines that may be dead, or shared by two channels."""
+    name, order = description.channel_name, nothing.sources
+    for k in order:
+        for source in (-1, *(j for j in order if j != k)):
+            words = f"the line of {name(k)} is dead"
+            if source >= 0:
+                words = f"{name(k)} has the pressure of {name(source)}, as if they shared a line"
+            sources = (*order[:k], source, *order[k + 1 :])
+            yield replace(nothing, kind="lines", words=words, sources=sources)
+
+
+def _orders(description: RobotDescription, nothing: Hypothesis) -> Iterator[Hypothesis]:
+    """Orders of channels to try: all of few; of many, two exchanged, or whole segments."""
+    n = description.n_pressures
+    if n <= DETECTION.few_channels:
+        orders = set(permutations(range(n)))
+    else:
+        orders = {_exchanged(n, i, j) for i in range(n) for j in range(i)}
+        ends = np.cumsum([0, *(segment.n_channels for segment in description.segments)]).tolist()
+        for places in permutations(range(description.n_segments)):
+            orders.add(tuple(c for k in places for c in range(ends[k], ends[k + 1])))
+    for order in sorted(orders - {nothing.sources}):
+        yield replace(nothing, kind="channels", sources=order)
+
+
+def _exchanged(n: int, i: int, j: int) -> tuple[int, ...]:
+    return tuple({i: j, j: i}.get(k, k) for k in range(n))
+
+
+def _turns(scores: Array) -> tuple[int, ...]:
+    """The turn of each log by scores (logs, 24): none unless it explains a log overwhelmingly.
+
+    Of turns that explain it as well the one is taken that does so for most logs.
+    """
+    clear = scores.min(axis=1) <= DETECTION.overwhelming * scores[:, 0]
+    near = scores <= scores.min(axis=1, keepdims=True) / DETECTION.tie
+    votes = near[clear].sum(axis=0)
+    return tuple(
+        int(np.argmax(np.where(row, votes, -1))) if is_clear else 0
+        for row, is_clear in zip(near, clear, strict=True)
+    )
+
+
+def _turn_text(rotation: Array) -> str:
+    """A rotation as the end of a sentence."""
+    vector = np.asarray(lie.log(lie.transform(rotation, np.zeros(3))))[3:]
+    angle = float(np.linalg.norm(vector))
+    axis = ", ".join(f"{each + 0.0:.2g}" for each in np.round(vector / max(angle, 1e-9), 2))
+    return f"by {np.degrees(angle):.0f} deg about ({axis})"
+
+
+# -- a frame that was defined anew -----------------------------------------------------------------
+
+
+def replaced(
+    recording: Recording, measured: Array, predicted: Array, length: float
+) -> tuple[Recording, str]:
+    """Move a recording as a whole to where a model that is known predicts its tip.
+
+    A quarter turn of the axes, if that is about as good as any motion.
+
+    Parameters
+    ----------
+    recording : Recording
+    measured, predicted : (N, 3), in m.
+    length : of the arm, in m.
+
+    Returns
+    -------
+    recording, words
+        The words say what was done, as the end of a sentence.
+    """
+    seen = whole(measured)
+    x, y = measured[seen], predicted[seen]
+
+    def miss(rotation: Array, shift: Array) -> float:
+        return float(np.linalg.norm(x @ rotation.T + shift - y, axis=1).mean())
+
+    quarter = min(CUBE_ROTATIONS, key=lambda rotation: miss(rotation, np.zeros(3)))
+    turned = x @ quarter.T
+    centre = turned.mean(axis=0)
+    spread = (y - y.mean(axis=0)).T @ (turned - centre)
+    weight = len(x) * (DETECTION.known_turn * length) ** 2  # turns that the tip does not tell: none
+    u, _, vt = np.linalg.svd(spread + weight * np.eye(3))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt @ quarter
+    shift = y.mean(axis=0) - rotation @ x.mean(axis=0)
+    if DETECTION.overwhelming * miss(quarter, np.zeros(3)) < miss(rotation, shift):
+        rotation, shift = quarter, np.zeros(3)
+    words = f"turned {_turn_text(rotation)}"
+    if shift.any():
+        words += f" and moved by {np.linalg.norm(shift) * 1e3:.0f} mm"
+    return _moved(recording, rotation, shift), words

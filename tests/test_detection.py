@@ -1,0 +1,259 @@
+"""What is wrong with how an arm was recorded: found where it is clear, else left alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from made_logs import course, made_log
+from recordings import ASU, UCL, recordings
+from stiffopt.errors import FileError
+from stiffopt.identify.calibration import calibrate
+from stiffopt.identify.detection import Comparer, Found, found_wrong, on_one_clock
+from stiffopt.identify.recording import Recording
+from stiffopt.identify.settings import CalibrationSettings
+from stiffopt.identify.setup import Setup, recordings_of
+from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
+from stiffopt.identify.validation import validate
+from stiffopt.logs import Body, Log, read_log
+from stiffopt.model.calibration import Calibration
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.history import History
+from stiffopt.model.robot_files import load_description
+
+Array = NDArray[np.float64]
+
+AS_RECORDED = CalibrationSettings()
+AWAY = np.array([0.3, -0.1, 0.2])
+FAST = {"structure": "static", "strain_law": "keep", "rows": 60, "trial_rows": 60, "start_rows": 40}
+MODULES = recordings("ucl_stiff_flop_*55mm/*.csv")
+
+
+def arm(name: str = "stiff-flop-1") -> RobotDescription:
+    """An arm that lags a little."""
+    robot = load_description(name)
+    segments = [each.model_copy(update={"history": History(lag=0.2)}) for each in robot.segments]
+    return robot.model_copy(update={"segments": tuple(segments)})
+
+
+def calibrated(robot: RobotDescription) -> RobotDescription:
+    return robot.model_copy(update={"calibration": Calibration(logs=("before.csv",))})
+
+
+def driven(pressures: Array, time: Array, name: str = "stiff-flop-1") -> Log:
+    return made_log(arm(name), time, pressures)
+
+
+def log_of(name: str = "stiff-flop-1", n: int = 3, duration: float = 60.0, seed: int = 0) -> Log:
+    time, pressures = course(n, duration, seed, rate=5.0)
+    return driven(pressures, time, name)
+
+
+def turned(log: Log, rotation: Array) -> Log:
+    """The log of a tracker whose axes are turned."""
+    return replace(log, tip_position=log.tip_position @ rotation)
+
+
+def found_in(robot: RobotDescription, logs: list[Log]) -> Found | None:
+    """What is wrong with all of these logs."""
+    return of_recordings(robot, recordings_of(robot, list(logs), AS_RECORDED))
+
+
+def of_recordings(robot: RobotDescription, read: list[Recording]) -> Found | None:
+    setup = Setup.of(robot, read, (), AS_RECORDED)
+    stations = [robot.length if each.at is None else each.at for each in setup.points]
+    return found_wrong(Comparer(robot, setup.base, stations, read), robot, ())
+
+
+# -- channels, lines and axes ----------------------------------------------------------------------
+
+
+def test_of_a_log_as_it_should_be_nothing_is_said() -> None:
+    assert not found_in(load_description("stiff-flop-1"), [log_of()])
+    assert not found_in(load_description("stiff-flop-2"), [log_of("stiff-flop-2", 6)])
+
+
+def test_channels_that_were_exchanged_are_found_and_kept_in_the_file() -> None:
+    robot, log = load_description("stiff-flop-1"), log_of()
+    order = [2, 0, 1]  # column of the log that channel 1, 2, 3 has
+    wrong = replace(log, commanded=log.commanded[:, np.argsort(order)])
+    result = calibrate(robot, [wrong], settings=CalibrationSettings(**FAST))
+    assert result.robot.recordings is not None
+    assert result.robot.recordings.channels == tuple(k + 1 for k in order)
+    assert "the channels are in another order" in result.remarks[0]
+    assert "--keep channels" in result.remarks[0]
+    assert not result.unfit
+    (again,) = validate(result.robot, [wrong])
+    assert again.errors.mean < 5e-3
+    kept = calibrate(robot, [wrong], settings=CalibrationSettings(keep=("channels",), **FAST))
+    assert kept.robot.recordings is None or not kept.robot.recordings.channels
+    assert not any("another order" in remark for remark in kept.remarks)
+
+
+def test_exchanged_segments_are_found() -> None:
+    log = log_of("stiff-flop-2", 6)
+    wrong = replace(log, commanded=np.roll(log.commanded, 3, axis=1))
+    found = found_in(load_description("stiff-flop-2"), [wrong])
+    assert found is not None
+    assert (found.hypothesis.kind, found.hypothesis.sources) == ("channels", (3, 4, 5, 0, 1, 2))
+
+
+@pytest.mark.parametrize(("source", "words"), [(-1, "is dead"), (2, "as if they shared a line")])
+def test_a_line_that_does_not_do_what_was_commanded_is_found(source: int, words: str) -> None:
+    time, pressures = course(3, 60.0, rate=5.0)
+    real = pressures.copy()
+    real[:, 1] = 0.0 if source < 0 else pressures[:, source]
+    wrong = replace(driven(real, time), commanded=pressures)
+    result = calibrate("stiff-flop-1", [wrong], settings=CalibrationSettings(**FAST))
+    assert "segment 1 channel 2" in result.remarks[0]
+    assert words in result.remarks[0]
+    assert result.calibrated[0].errors.mean < 4e-3
+
+
+@pytest.mark.parametrize("turn", range(0, 24, 5))
+def test_the_axes_of_the_tracker_are_found_for_each_log(turn: int) -> None:
+    robot, rotation = load_description("stiff-flop-1"), CUBE_ROTATIONS[turn]
+    logs = [log_of(seed=0), turned(log_of(seed=1), rotation)]
+    found = found_in(robot, logs)
+    if turn == 0:
+        assert found is None
+        return
+    assert found is not None
+    assert (found.hypothesis.kind, found.hypothesis.turns) == ("axes", (0, turn))
+
+
+def test_axes_that_all_logs_share_go_into_the_registration() -> None:
+    rotation = CUBE_ROTATIONS[7]
+    logs = [turned(log_of(seed=k), rotation) for k in (0, 1)]
+    result = calibrate("stiff-flop-1", logs, settings=CalibrationSettings(**FAST))
+    assert "the tracker's axes are turned in all logs" in result.remarks[0]
+    other = turned(log_of(seed=2), rotation)
+    (found,) = validate(result.robot, [other], CalibrationSettings(keep=("axes",)))
+    assert found.errors.mean < 3e-3
+
+
+# -- frames that were defined anew -----------------------------------------------------------------
+
+
+def test_a_frame_that_was_defined_anew_is_found_when_a_model_is_validated() -> None:
+    robot, log = calibrated(arm()), log_of()
+    rotation = CUBE_ROTATIONS[9]
+    (found,) = validate(robot, [turned(log, rotation)])
+    assert found.errors.mean < 1e-3
+    assert "defined anew" in found.remarks[-1]
+    assert "turned by" in found.remarks[-1]
+    (kept,) = validate(robot, [turned(log, rotation)], CalibrationSettings(keep=("axes",)))
+    assert kept.errors.mean > 0.05
+    anywhere = replace(log, tip_position=turned(log, rotation).tip_position + AWAY)
+    (found,) = validate(robot, [anywhere])
+    assert found.errors.mean < 1e-3
+    assert "moved by" in found.remarks[-1]
+
+
+def test_a_model_that_is_wrong_is_not_excused_by_its_frame() -> None:
+    softer = log_of()
+    stiff = calibrated(arm())
+    material = stiff.segments[0].material.model_copy(update={"youngs_modulus": 400e3})
+    segment = stiff.segments[0].model_copy(update={"material": material})
+    (found,) = validate(stiff.model_copy(update={"segments": (segment,)}), [softer])
+    assert found.errors.mean > 8e-3
+    assert not found.remarks
+
+
+# -- units -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor"), [("kPa", 1e3), ("psi", 6894.757), ("bar", 1e5), ("MPa", 1e6)]
+)
+def test_pressures_in_other_units_are_found(unit: str, factor: float) -> None:
+    log, robot = log_of(), load_description("stiff-flop-1")
+    wrong = replace(log, commanded=log.commanded / factor)
+    (read,) = recordings_of(robot, [wrong], AS_RECORDED)
+    np.testing.assert_allclose(read.pressures, log.commanded, atol=1e-6)
+    assert f"the pressures are in {unit}, not Pa" in read.remarks[0]
+    with pytest.raises(FileError, match="expected Pa"):
+        recordings_of(robot, [wrong], CalibrationSettings(keep=("units",)))
+
+
+def test_a_unit_that_is_not_clear_is_refused() -> None:
+    log = log_of()
+    wrong = replace(log, commanded=log.commanded / 2.5e3)  # between kPa and psi
+    with pytest.raises(FileError, match="expected Pa"):
+        recordings_of(load_description("stiff-flop-1"), [wrong], AS_RECORDED)
+
+
+# -- clocks ----------------------------------------------------------------------------------------
+
+
+def shifted(log: Log, by: float) -> Log:
+    """The log of a tracker whose clock is late."""
+    columns = [np.interp(log.time - by, log.time, column) for column in log.tip_position.T]
+    return replace(log, tip_position=np.column_stack(columns))
+
+
+@pytest.mark.parametrize("by", [-6.0, -1.5, 5.0])
+def test_two_clocks_are_made_one(by: float) -> None:
+    robot, log = load_description("stiff-flop-1"), log_of(duration=80.0)
+    (read,) = recordings_of(robot, [shifted(log, by)], AS_RECORDED)
+    assert "as if they had two clocks" in read.remarks[-1]
+    late = np.column_stack([np.interp(log.time - by, log.time, c) for c in log.commanded.T])
+    assert np.abs(read.pressures - late).mean() < 0.05 * log.commanded.max()
+    (kept,) = recordings_of(robot, [shifted(log, by)], CalibrationSettings(keep=("clock",)))
+    np.testing.assert_array_equal(kept.pressures, log.commanded)
+
+
+def test_an_arm_that_lags_has_one_clock() -> None:
+    robot, log = load_description("stiff-flop-1"), log_of(duration=80.0)
+    for by in (0.0, 0.5, 1.0):
+        (read,) = recordings_of(robot, [shifted(log, by)], AS_RECORDED)
+        np.testing.assert_array_equal(read.pressures, log.commanded)
+
+
+# -- real arms -------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not (UCL and ASU and MODULES), reason="the recordings are not there")
+def test_recordings_of_real_arms_are_left_as_they_are() -> None:
+    one = load_description("ucl-stiff-flop")
+    for path in [*UCL, *MODULES]:
+        log = read_log(path)
+        if log.n != 3:
+            continue
+        (read,) = recordings_of(one, [log], AS_RECORDED)
+        np.testing.assert_array_equal(read.pressures, np.nan_to_num(log.commanded))
+        assert not of_recordings(one, [read])
+    robot = load_description("asu-two-segment")
+    read = recordings_of(robot, list(ASU), AS_RECORDED)
+    span = np.subtract(robot.pressure_max, robot.pressure_min)
+    assert all(on_one_clock(each, span) is each for each in read)
+    assert not of_recordings(robot, read)
+
+
+@pytest.mark.skipif(not ASU, reason="the recordings are not there")
+def test_a_body_of_a_real_arm_that_was_defined_anew_is_found() -> None:
+    robot = load_description("asu-two-segment")
+    logs = [read_log(path) for path in ASU]
+    turns = (0, 0, 0, 6, 0, 0, 0)  # the base body of one of seven logs
+    wrong = [with_base_turned(log, turn) for log, turn in zip(logs, turns, strict=True)]
+    found = found_in(robot, wrong)
+    assert found is not None
+    assert (found.hypothesis.kind, found.hypothesis.turns) == ("axes", turns)
+
+
+def with_base_turned(log: Log, turn: int) -> Log:
+    """A log whose body "base" has other axes."""
+    from scipy.spatial.transform import Rotation
+
+    body = log.bodies["base"]
+    assert body.quaternion is not None
+    known = np.isfinite(body.quaternion).all(axis=1)
+    quaternion = body.quaternion.copy()
+    other = Rotation.from_quat(quaternion[known], scalar_first=True)
+    quaternion[known] = (other * Rotation.from_matrix(CUBE_ROTATIONS[turn])).as_quat(
+        scalar_first=True
+    )
+    return replace(log, bodies={**log.bodies, "base": Body(body.position, quaternion)})
