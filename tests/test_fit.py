@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import Any
@@ -10,16 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from made_logs import course, made_log, reddened
 from stiffopt import lie
 from stiffopt.errors import EquilibriumError, InputError
 from stiffopt.identify.calibration import CalibrationResult, calibrate
-from stiffopt.identify.discrepancy import smooth_functions
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.problem import CalibrationProblem
-from stiffopt.identify.settings import FIT, CalibrationSettings
+from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.identify.validation import validate
@@ -160,10 +157,7 @@ KNOWN = ONE.model_copy(
 
 
 def recovered(seed: int, structure: str, rho: float, turns: bool = False) -> tuple[Array, Fit]:
-    """Errors (d,) of a fit over its own deviations.
-
-    The truth is drawn from the prior, and so are errors that no model has, of places and turns.
-    """
+    """Errors (d,) of a fit over its own deviations; the truth is drawn from the prior."""
     random = np.random.default_rng(seed)
     time, pressures = course(3, 40.0, seed)
     told = settings(structure)
@@ -182,13 +176,6 @@ def recovered(seed: int, structure: str, rho: float, turns: bool = False) -> tup
         problem.robot(x), time, pressures, seed=seed, noise=5e-4, rho=rho, turns=turns,
         base=np.asarray(lie.exp(coordinates[base])), sensor=np.asarray(lie.exp(sensor)),
     )  # fmt: skip
-    shared = smooth_functions(pressures)
-    shared = FIT.systematic * shared @ random.normal(size=(shared.shape[1], 6))
-    log = replace(log, tip_position=log.tip_position + KNOWN.length * shared[:, :3])
-    if log.tip_quaternion is not None:
-        turned = Rotation.from_quat(log.tip_quaternion, scalar_first=True)
-        turned = turned * Rotation.from_rotvec(2 * shared[:, 3:])
-        log = replace(log, tip_quaternion=turned.as_quat(scalar_first=True))
     problem = problem_of(log)
     found = fit(problem, [np.zeros(problem.size)])
     return (found.x - x) / np.sqrt(np.diag(found.covariance)), found
@@ -211,7 +198,7 @@ def test_true_values_lie_inside_the_intervals() -> None:
     assert np.mean([found.independent for _, found in white]) < 1.2
     assert np.mean([found.independent for _, found in red]) > 5
     deviation = [np.median([np.diag(f.covariance) for _, f in each]) for each in (white, red)]
-    assert deviation[1] > 1.1 * deviation[0]  # fewer independent rows say less
+    assert deviation[1] > 1.2 * deviation[0]  # fewer independent rows say less
 
 
 @pytest.mark.long
@@ -250,7 +237,7 @@ def test_what_was_not_learnt_keeps_its_prior_and_is_named() -> None:
     assert result.robot.calibration is not None
     priors = {p.key: p.deviation / p.prior for p in result.robot.calibration.parameters}
     assert priors["segments[0].corrections.gain[2]"] == pytest.approx(1.0, abs=0.02)
-    assert priors["segments[0].compensation.area"] < 0.25
+    assert priors["segments[0].compensation.area"] < 0.5
 
 
 # -- what is chosen -------------------------------------------------------------------------

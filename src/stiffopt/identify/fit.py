@@ -34,7 +34,9 @@ class Fit:
     problem : with the noise and the weights that were used at last.
     x : scaled coordinates (d,).
     cost : half the sum of the squared residuals, with the loss and the prior.
-    covariance : of x, (d, d): unknowns that nothing was learnt of have the variance one.
+    covariance : of x, (d, d), by noise and prior: unknowns that nothing was learnt of have the
+        variance one.
+    gain : inverse (d, d) of the normal matrix: x moves by ``gain @ slopes.T @ residuals``.
     independent : how many rows are one independent one.
     """
 
@@ -42,6 +44,7 @@ class Fit:
     x: Array
     cost: float
     covariance: Array
+    gain: Array
     independent: float
 
     @property
@@ -80,7 +83,7 @@ def fit(
     for _ in range(rounds):
         problem, independent = _reweighted(problem, x, independent)
         x, cost = _minimum(problem, x, tell, most)
-    return Fit(problem, x, cost, _covariance(problem, x), independent)
+    return Fit(problem, x, cost, *_covariance(problem, x), independent)
 
 
 def _minimum(
@@ -188,10 +191,15 @@ def _rows_per_independent(problem: CalibrationProblem, moves: Array) -> float:
     return float(max(1.0, 1 + 2 * correlation[1:stop].sum()))
 
 
-def _covariance(problem: CalibrationProblem, x: Array) -> Array:
-    """Inverse of the normal matrix with the weights of the loss; the prior is part of it."""
+def _covariance(problem: CalibrationProblem, x: Array) -> tuple[Array, Array]:
+    """Covariance by noise and prior, with the weights of the loss, and the normal matrix's inverse.
+
+    The former is ``N^-1 (N - S'S) N^-1`` with the normal matrix N and the slopes S of what rows share: how
+    large the latter is, is told by what was held back (`stiffopt.identify.error_model`).
+    """
     value, slope = problem.residuals(x)
-    weight = 1 / np.sqrt(1 + value**2 / FIT.loss_scale**2)
-    normal = slope.T @ (slope * weight[:, np.newaxis]) + np.eye(problem.size)
-    found = np.linalg.inv(normal)
-    return np.asarray((found + found.T) / 2, dtype=float)
+    slope = slope / np.sqrt(np.sqrt(1 + value**2 / FIT.loss_scale**2))[:, np.newaxis]
+    inverse = np.linalg.inv(slope.T @ slope + np.eye(problem.size))
+    rows = slope[: len(slope) - problem.n_shared]
+    found = inverse @ (rows.T @ rows + np.eye(problem.size)) @ inverse
+    return np.asarray((found + found.T) / 2, dtype=float), np.asarray(inverse, dtype=float)

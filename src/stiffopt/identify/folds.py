@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.identify.discrepancy import centres
+from stiffopt.identify.error_model import HeldBack
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.results import Errors
@@ -23,8 +24,8 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 
-def held_back_errors(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, Errors]:
-    """Errors in logs, or parts and regions of logs, when the rest is fitted.
+def held_back(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, HeldBack]:
+    """Hold back logs, or stretches and regions of them, fit the rest, and predict these.
 
     Parameters
     ----------
@@ -33,21 +34,22 @@ def held_back_errors(found: Fit, settle: float, tell: Callable[[], None]) -> dic
         they would if it were predicted.
     """
     problem = found.problem
-    errors = {}
+    parts = {}
     for name, away in folds(problem).items():
         kept = [_without_beginning(each, problem, i, settle) for i, each in enumerate(away)]
         if not any(each.any() for each in kept):
             continue  # a log that ends before its beginning does
-        x = fit(problem.without(kept), [found.x], tell, rounds=0, most=CHOICE.evaluations).x
-        distances = np.linalg.norm(problem.predict(x).errors[0], axis=1)
-        found_there = Errors.of(distances[np.concatenate(kept)], None)
-        if found_there.n:
-            errors[name] = found_there
-    if not errors:
+        rows = np.concatenate(kept)
+        others = fit(problem.without(kept), [found.x], tell, rounds=0, most=CHOICE.evaluations)
+        distances = np.linalg.norm(others.predicted.errors[0], axis=1)
+        errors = Errors.of(distances[rows], None)
+        if errors.n:
+            parts[name] = HeldBack(rows, others, errors)
+    if not parts:
         raise InputError(
             "there is nothing left to compare models with; expected longer logs, or name a model"
         )
-    return errors
+    return parts
 
 
 def folds(problem: CalibrationProblem) -> dict[str, list[Rows]]:

@@ -106,12 +106,15 @@ class Predicted:
     poses : of each point in the base frame (M, 4, 4).
     read : of each point, in the frame of the recordings.
     errors : measured less read (M, 3), of each point; NaN where nothing was measured.
+    per_pressure : slopes (M, 3, n) of the positions that are read, of each point, by the effective
+        pressures, in m/Pa.
     """
 
     effective: Array
     poses: tuple[Array, ...]
     read: tuple[Readings, ...]
     errors: tuple[Array, ...]
+    per_pressure: tuple[Array, ...]
 
 
 class CalibrationProblem:
@@ -176,6 +179,14 @@ class CalibrationProblem:
         pairs = zip(self.unknowns.all, x, strict=True)
         return {unknown.name: float(value) for unknown, value in pairs}
 
+    @property
+    def n_shared(self) -> int:
+        """How many of the residuals, the last ones, are coefficients of errors that rows share."""
+        if not (self.noise.systematic and self.samples):
+            return 0
+        kinds = sum(1 + (rotation is not None) for _, rotation in self._measured)
+        return 3 * kinds * self._functions.shape[1]
+
     def without(self, held_back: Sequence[NDArray[np.bool_]]) -> CalibrationProblem:
         """The same problem, in which some rows of its samples do not count."""
         samples = [
@@ -206,18 +217,25 @@ class CalibrationProblem:
     def residuals(self, x: Array) -> tuple[Array, Array]:
         """Residuals (m,) of samples and tables at scaled coordinates, and their Jacobian (m, d).
 
-        Rows without a measurement are zero.  The prior is not among them.
+        Rows without a measurement are zero.  The prior is not among them.  Of errors that rows
+        share, the rows have what is left, and how large these errors are comes last.
         """
         predicted, slopes = self._predict(x)
         values: list[Array] = []
         jacobians: list[Array] = []
+        shared: list[tuple[Array, Array]] = []
         for error, read, (moved, turned) in zip(
             predicted.errors, predicted.read, slopes, strict=True
         ):
-            self._append(values, jacobians, error, -moved, "position")
+            found = [self._divided(error, -moved, "position")]
             turn = read.turn
             if turn is not None and turned is not None:
-                self._append(values, jacobians, -turn, -turned, "angle")
+                found.append(self._divided(-turn, -turned, "angle"))
+            rows = 3 * len(error)
+            for value, slope in found:
+                values.append(value[:rows])
+                jacobians.append(slope[:rows])
+                shared.append((value[rows:], slope[rows:]))
         for table in self.tables:
             value, jacobian = self.of_table(table, x)
             values.append(value)
@@ -225,8 +243,8 @@ class CalibrationProblem:
         excess, per_parameter, *_ = self._of_parameters(x)
         jacobian = np.zeros((len(excess), self.size))
         jacobian[:, : len(self._parameters)] = per_parameter
-        values.append(excess[:, 0])
-        jacobians.append(jacobian)
+        values += [excess[:, 0], *(value for value, _ in shared)]
+        jacobians += [jacobian, *(slope for _, slope in shared)]
         return np.concatenate(values), np.concatenate(jacobians) * self.scale
 
     def _of_parameters(self, x: Array) -> list[Array]:
@@ -260,12 +278,15 @@ class CalibrationProblem:
         """What the model says at scaled coordinates (d,)."""
         return self._predict(x)[0]
 
-    def _append(
-        self, values: list[Array], jacobians: list[Array], error: Array, slope: Array, kind: Kind
-    ) -> None:
-        """Add weighted residuals (M, 3) and their slopes (M, 3, d) by unscaled coordinates.
+    def with_slopes(self, x: Array) -> tuple[Predicted, Array]:
+        """`predict`, and slopes (M, 3, d) of the tip's position by scaled coordinates."""
+        predicted, slopes = self._predict(x)
+        return predicted, slopes[0][0] * self.scale
 
-        Of errors that rows share, what is left and how large these are.
+    def _divided(self, error: Array, slope: Array, kind: Kind) -> tuple[Array, Array]:
+        """Residuals (3 M + 3 m,) of errors (M, 3) of rows, and their slopes by coordinates.
+
+        Of errors that rows share, what is left and the m coefficients of these.
         """
         known = ~np.isnan(error.sum(axis=1))
         systematic, weight = self._systematic(known, kind)
@@ -274,8 +295,7 @@ class CalibrationProblem:
         if systematic is not None:
             value = systematic.residuals(value)
             slope = systematic.residuals(slope.reshape(len(slope), -1))
-        values.append(value.ravel())
-        jacobians.append(slope.reshape(-1, self.size))
+        return value.ravel(), slope.reshape(-1, self.size)
 
     def unshared(self, error: Array, kind: Kind) -> Array:
         """Errors (M, 3) of rows less the part that rows at nearby pressures share."""
@@ -294,7 +314,7 @@ class CalibrationProblem:
         own = noise.position if kind == "position" else noise.angle
         shared = noise.systematic * (self.description.length if kind == "position" else 2.0)
         weight = (np.where(known, self._weights, 0.0) / own)[:, np.newaxis]
-        if not (shared and weight.any()):
+        if not (shared and len(known)):
             return None, weight
         key = (kind, known.tobytes())
         if key not in self._of_rows:
@@ -313,7 +333,7 @@ class CalibrationProblem:
         effective, by_history = self._effective(coordinates, sides)
         k = len(self._parameters)
         starts = self.starts
-        poses, read, errors, slopes = [], [], [], []
+        poses, read, errors, acting, slopes = [], [], [], [], []
         for point, sensor, (position, rotation) in zip(
             self.points, sensors, self._measured, strict=True
         ):
@@ -346,8 +366,10 @@ class CalibrationProblem:
             poses.append(found.transforms)
             read.append(replace(seen, position=place))
             errors.append(position - place)
+            acting.append(seen.per_twist[:, :, :6] @ found.per_pressure)
             slopes.append((moved, turned))
-        return Predicted(effective, tuple(poses), tuple(read), tuple(errors)), slopes
+        predicted = Predicted(effective, tuple(poses), tuple(read), tuple(errors), tuple(acting))
+        return predicted, slopes
 
     def _effective(self, coordinates: Array, sides: Sequence[slice]) -> tuple[Array, Array]:
         """Effective pressures (M, n) of all samples and their slopes (M, n, d)."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
+from stiffopt.identify.error_model import HeldBack
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.folds import is_region
 from stiffopt.identify.recording import Recording
@@ -196,12 +197,17 @@ class Candidate:
     ----------
     structure : ModelStructure
     fit : to all rows of the trial.
-    folds : errors of what was held back, by what that was.
+    held_back : what was held back, by what that was.
     """
 
     structure: ModelStructure
     fit: Fit
-    folds: dict[str, Errors] = field(default_factory=dict)
+    held_back: dict[str, HeldBack] = field(default_factory=dict)
+
+    @property
+    def folds(self) -> dict[str, Errors]:
+        """Errors of what was held back, by what that was."""
+        return {name: each.errors for name, each in self.held_back.items()}
 
     @property
     def score(self) -> float:
