@@ -194,8 +194,8 @@ def _rows_per_independent(problem: CalibrationProblem, moves: Array) -> float:
 def _covariance(problem: CalibrationProblem, x: Array) -> tuple[Array, Array]:
     """Covariance by noise and prior, with the weights of the loss, and the normal matrix's inverse.
 
-    The former is ``N^-1 (N - S'S) N^-1`` with the normal matrix N and the slopes S of what rows share: how
-    large the latter is, is told by what was held back (`stiffopt.identify.error_model`).
+    The former is ``N^-1 (N - S'S) N^-1`` with the normal matrix N and the slopes S of what rows
+    share: how large that is, is told by what was held back (`stiffopt.identify.error_model`).
     """
     value, slope = problem.residuals(x)
     slope = slope / np.sqrt(np.sqrt(1 + value**2 / FIT.loss_scale**2))[:, np.newaxis]

@@ -185,7 +185,7 @@ class CalibrationProblem:
         if not (self.noise.systematic and self.samples):
             return 0
         kinds = sum(1 + (rotation is not None) for _, rotation in self._measured)
-        return 3 * kinds * self._functions.shape[1]
+        return int(3 * kinds * self._functions.shape[1])
 
     def without(self, held_back: Sequence[NDArray[np.bool_]]) -> CalibrationProblem:
         """The same problem, in which some rows of its samples do not count."""
