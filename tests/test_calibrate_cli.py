@@ -18,8 +18,9 @@ from recordings import UCL, needs_ucl
 from stiffopt.cli import calibrate_run, exits
 from stiffopt.cli.calibrate_run import fixed_keys, log_names
 from stiffopt.cli.main import main
-from stiffopt.errors import FileError
+from stiffopt.errors import FileError, InputError
 from stiffopt.files import save_file
+from stiffopt.identify.calibration import calibrate
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.structures import STRUCTURES
 from stiffopt.logs import (
@@ -619,13 +620,17 @@ def test_quick_fits_one_model_to_few_rows() -> None:
     chosen = CalibrationSettings(structure="lag", rows=100, trial_rows=80).quick(is_loaded=False)
     assert (chosen.structure, chosen.rows, chosen.trial_rows) == ("lag", 100, 80)
     assert CalibrationSettings().quick(is_loaded=True).rows < quick.rows
+    with pytest.raises(InputError, match="name one"):
+        calibrate("stiff-flop-1", [Path("log.csv")], settings=CalibrationSettings(holds_back=False))
 
 
 def test_the_command_is_quick(folder: Path, tmp_path: Path, capsys: Any) -> None:
     command = ["calibrate", "--robot", "stiff-flop-1", folder / "monday.csv"]
     options = ["--out", tmp_path / "q.yaml", "--quick", "--model", "lag", "--rows", "60", "--json"]
     code, text, _ = run(capsys, *command, *options)
-    assert (code, len(json.loads(text)["models"])) == (0, 1)
+    found = json.loads(text)
+    assert (code, found["models"], found["model"]) == (0, [], "lag")
+    assert found["after"] is not None
 
 
 # -- a real arm -----------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ from running import (
 )
 from stiffopt.cli import run_daemon
 from stiffopt.cli.main import main
+from stiffopt.cli.path_records import csv_text
 from stiffopt.cli.run_daemon import Screen
 from stiffopt.cli.run_display import Lines, LiveStatus, status
 from stiffopt.control.controller import TipController
@@ -43,6 +44,9 @@ from stiffopt.control.state import Alarm, Event, Severity, State, Timing
 from stiffopt.daemon import daemon as daemon_module
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.daemon import TIMES
+from stiffopt.daemon.run_log import read_run
+from stiffopt.model.manipulator import load_robot
+from stiffopt.paths.solution import PathSolution
 
 ROOT = Path(__file__).resolve().parent.parent
 EDGES, COUNTS = (1e-4, 1e-3, 1e-2), (90, 8, 2, 0)
@@ -78,6 +82,9 @@ def test_what_cannot_be_run_is_refused(
     assert "--task needs --arm" in refused(capsys, rig, "--task", task)
     assert "nobody else could" in refused(capsys, rig, "--no-service")
     assert "nobody else could" in refused(capsys, rig, "--no-service", "--arm")
+    assert "--play needs --arm" in refused(capsys, rig, "--play", "m.csv")
+    assert "no --task" in refused(capsys, rig, "--arm", "--play", "m.csv", "--task", task)
+    assert "no such file" in refused(capsys, rig, *alone[:2], "--play", str(tmp_path / "none.csv"))
     assert "above 0 s" in refused(capsys, rig, "--duration", "0 s")
     assert "--duration" in refused(capsys, rig, "--duration", "soon")
     assert "not both" in refused(capsys, rig, "--plain", "--json-lines")
@@ -186,6 +193,30 @@ def test_two_segments_hold_a_task_without_the_extra_and_for_a_time(
         kinds = [line["kind"] for line in run.lines]
         assert "url" not in run.line("started")
     assert {"armed", "task", "vented", "log"} <= set(kinds)  # `log`: nothing is recorded
+
+
+def test_a_motion_is_played_from_its_file(tmp_path: Path, compiled: Path) -> None:
+    rig = str(patient_rig(tmp_path))
+    arm = load_robot("stiff-flop-1")
+    pressures = np.linspace([0.3e5, 0, 0], [0.8e5, 0.2e5, 0], 4)
+    times = np.linspace(0, 1.5, 4)
+    motion = PathSolution("solved", "", arm, times, pressures, arm.tip_pose(pressures))
+    (tmp_path / "motion.csv").write_text(csv_text(motion))
+    options = (
+        "--play",
+        str(tmp_path / "motion.csv"),
+        "--arm",
+        "--no-service",
+        "--duration",
+        "12 s",
+    )
+    with running("run", rig, *options) as run:
+        assert run.wait(180) == 0, run.err
+    (recording,) = (tmp_path / "runs").glob("*.mcap")
+    recorded = read_run(recording)
+    targets = recorded.target_position[np.isfinite(recorded.target_position).all(axis=1)]
+    np.testing.assert_allclose(targets[-1], motion.tip_poses[-1, :3, 3], atol=1e-4)
+    assert np.abs(recorded.commanded - pressures[-1]).max(axis=1).min() < 0.15e5
 
 
 def test_a_second_ctrl_c_vents_at_once(tmp_path: Path, compiled: Path, task: str) -> None:

@@ -151,9 +151,9 @@ def calibrate(
         bool,
         typer.Option(
             "--quick",
-            help="A first answer, within about a minute for an arm without gravity: one model, "
-            "with hysteresis unless --model says another, fitted to few rows; models and strain "
-            "laws are not compared.",
+            help="A first answer, within about a minute: one model, with hysteresis unless --model "
+            "says another, fitted to few rows; models and strain laws are not compared, and "
+            "nothing is held back.",
         ),
     ] = False,
     sequence: Sequence = False,

@@ -17,10 +17,9 @@ from stiffopt.cli.solve_files import check_result_file, names_for_each, picture_
 from stiffopt.documents import write_file, write_whole
 from stiffopt.errors import EquilibriumError, FileError, InputError
 from stiffopt.model.manipulator import load_robot
+from stiffopt.paths.motion_file import RESULT_FORMAT
 from stiffopt.paths.path import load_path
 from stiffopt.paths.solution import PathSolution
-
-RESULT_FORMAT = "stiffopt-path-result/1"
 
 
 class PathBatch(Batch[SolvedPath]):

@@ -14,7 +14,7 @@ from stiffopt.cli.console import report_error, show, write_json
 from stiffopt.cli.exits import interruptible_work
 from stiffopt.cli.outputs import check_picture
 from stiffopt.cli.path_records import csv_text, solution_quantities, solution_values
-from stiffopt.cli.path_run import RESULT_FORMAT, check_csv, is_csv
+from stiffopt.cli.path_run import check_csv, is_csv
 from stiffopt.cli.quantities import listed, quantity
 from stiffopt.cli.quantities import view as view_angles
 from stiffopt.cli.solve_files import check_result_file
@@ -24,6 +24,7 @@ from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.scene import Scene, load_scene
 from stiffopt.optimise.task import Task, load_task
 from stiffopt.paths.motion import plan_motion
+from stiffopt.paths.motion_file import RESULT_FORMAT
 from stiffopt.paths.solution import PathSolution, Vector
 
 if TYPE_CHECKING:

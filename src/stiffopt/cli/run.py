@@ -12,8 +12,9 @@ RUN_HELP = """\
 Hold an arm at its task in closed loop: run the daemon of a rig in the foreground.
 
 It connects to the devices of RIG, vents, checks everything and waits, vented, for a client
-('stiffopt.Client', or HTTP). With --arm it arms by itself and pursues TASK. A process of its own,
-the guard, owns the pressures and vents when this one is killed, stopped or hangs.
+('stiffopt.Client', or HTTP). With --arm it arms by itself and pursues TASK, or plays a motion: the
+arm goes to its first point, follows it and stays at its end. A process of its own, the guard, owns
+the pressures and vents when this one is killed, stopped or hangs.
 
 On a terminal it shows how things stand; otherwise it prints one JSON object a line. Ctrl-C, SIGTERM
 and a terminal that is closed let the pressures down and vent; a second Ctrl-C vents at once.
@@ -25,6 +26,7 @@ Examples:
   stiffopt run rig/sim-two-segment.yaml
   stiffopt run rig/sim.yaml --task task.yaml --arm
   stiffopt run rig/sim.yaml --task task.yaml --arm --no-service --duration '20 s'
+  stiffopt run rig/sim.yaml --play motion.csv --arm --duration '20 s'
 
 \b
 Exit codes:
@@ -40,6 +42,14 @@ def run(
     task: Annotated[
         str | None,
         typer.Option(metavar="TASK", help="A task file to pursue once armed; needs --arm."),
+    ] = None,
+    play: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="What 'stiffopt path --out' or 'plan --out' wrote, to play once armed; needs "
+            "--arm.",
+        ),
     ] = None,
     arm: Annotated[
         bool, typer.Option("--arm", help="Arm at once: the arm MOVES without anybody asking.")
@@ -72,6 +82,6 @@ def run(
     is_terminal = sys.stdout is not None and sys.stdout.isatty()
     style = "plain" if plain else "live" if is_terminal and not json_lines else "json"
     return run(
-        rig, task=task, arm=arm, duration=duration, service=not no_service, log_folder=log_folder,
-        style=style,
+        rig, task=task, play=play, arm=arm, duration=duration, service=not no_service,
+        log_folder=log_folder, style=style,
     )  # fmt: skip

@@ -41,6 +41,7 @@ def run(
     rig: str,
     *,
     task: str | None,
+    play: str | None,
     arm: bool,
     duration: str | None,
     service: bool,
@@ -49,13 +50,17 @@ def run(
 ) -> int:
     """Run the daemon of a rig until it is ended; return the exit code.
 
-    `rig` and `task` are paths of files, `duration` is text with a unit, `service` says whether
-    ports are opened, `style` is ``live``, ``plain`` or ``json``.
+    `rig`, `task` and `play` are paths of files, `duration` is text with a unit, `service` says
+    whether ports are opened, `style` is ``live``, ``plain`` or ``json``.
     """
     if task is not None and not arm:
         raise InputError("--task needs --arm: a task is pursued once the arm is armed")
-    if not service and not (arm and task):
-        raise InputError("--no-service needs --arm and --task: nobody else could give them")
+    if play is not None and (task is not None or not arm):
+        raise InputError("--play needs --arm, and no --task: a motion is played once it is armed")
+    if not service and not (arm and (task or play)):
+        raise InputError(
+            "--no-service needs --arm and --task or --play: nobody else could give them"
+        )
     if arm and os.environ.get("NOTIFY_SOCKET"):
         raise InputError(
             "a service must not arm by itself, for it would do so whenever it is restarted; let a "
@@ -75,7 +80,7 @@ def run(
         longest = daemon.description.safety.ramp_time + TIMES.stop
         with Backstop(longest, watch.is_ending), showing_slow_warnings(watch.say_slow):
             state, refused = _steered(
-                daemon, watch, task, arm=arm, seconds=seconds, unattended=not service
+                daemon, watch, task, play, arm=arm, seconds=seconds, unattended=not service
             )
             code = _verdict(daemon, watch, state, refused)
             if not screen.finish(_LAST_OUTPUT) or daemon.hung:
@@ -87,6 +92,7 @@ def _steered(
     daemon: Daemon,
     watch: _Watch,
     task_file: str | None,
+    motion_file: str | None,
     *,
     arm: bool,
     seconds: float,
@@ -97,12 +103,13 @@ def _steered(
     try:
         with watch.signals.interrupting():
             task = None if task_file is None else daemon.read_task(task_file)
+            motion = None if motion_file is None else daemon.read_motion(motion_file)
             name = daemon.description.name
             watch.say("starting", f"connecting to {name}; a first start compiles the model")
             daemon.start()
             watch.begin()
             if arm and not watch.is_ending():
-                daemon.arm(task)
+                daemon.arm(task, motion)
         watch.go_on(time.monotonic() + seconds, unattended=unattended)
     except KeyboardInterrupt:
         pass  # before it was ready

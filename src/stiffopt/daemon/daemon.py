@@ -27,6 +27,7 @@ from stiffopt.files import file_text
 from stiffopt.model.manipulator import load_robot
 from stiffopt.model.robot_files import robot_path
 from stiffopt.optimise.task import Task, load_task
+from stiffopt.paths.motion_file import MotionTable, read_motion
 from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.safety.guard_client import GuardLink
 from stiffopt.safety.realtime import real_time, tidy
@@ -55,6 +56,7 @@ class DaemonTimes:
     stop : beyond `Safety.ramp_time`, in which a daemon has ended, whatever hangs. The times below
         add up to less, so that the command has some time left to report the outcome.
     control : beyond the ramp, in which the control thread must have ended.
+    to_first_point : that the way to a motion's first point takes at least.
     keeper, vent, supply, rest : in which the keeper, a direct command to vent, the supply and all
         other parts must have ended.
     """
@@ -69,6 +71,7 @@ class DaemonTimes:
     vent: float = 1.0
     supply: float = 3.0
     rest: float = 2.5
+    to_first_point: float = 2.0
 
 
 TIMES = DaemonTimes()
@@ -246,10 +249,15 @@ class Daemon:
             )
         return task
 
-    def arm(self, task: Task | None = None) -> None:
-        """Arm as soon as the vented arm has been seen for long enough, and pursue a task.
+    def read_motion(self, path: str | os.PathLike[str]) -> MotionTable:
+        """Read a motion of this rig's robot; raise `FileError` if it is wrong."""
+        return read_motion(path, self.robot.description)
 
-        If it cannot be armed, or the task does not suit, it is inactive and `InputError` is raised.
+    def arm(self, task: Task | None = None, motion: MotionTable | None = None) -> None:
+        """Arm as soon as the vented arm has been seen for long enough.
+
+        Then pursue a task, or play a motion. If it cannot be armed, or what it is to do does not
+        suit, it is inactive and `InputError` is raised.
         """
         end = time.monotonic() + TIMES.arming
         while True:
@@ -261,14 +269,22 @@ class Daemon:
                 if last or self._stopping.is_set():
                     raise
             self._stopping.wait(TIMES.arming_again)
-        if task is None:
-            return
         try:
-            self.loop.set_task(task)
+            if task is not None:
+                self.loop.set_task(task)
+            if motion is not None:
+                self._play(motion)
         except BaseException:
             with suppress(StiffoptError):
                 self.loop.disarm()
             raise
+
+    def _play(self, motion: MotionTable) -> None:
+        """Go to the first point of a motion, slower than the slew allows, and follow it."""
+        way = np.abs(motion.pressures[0] - self.loop.snapshot().commanded)
+        begin = max(TIMES.to_first_point, 2 * float((way / self.loop.rig.slew).max()))
+        ranges = self.robot.pressure_max - self.robot.pressure_min
+        self.loop.follow_trajectory(motion.trajectory(ranges, begin))
 
     def begin_stop(self) -> None:
         """Let the pressures down, vent and end control; this does not wait for it."""

@@ -143,6 +143,8 @@ def calibrate(
     description, settings = description_of(robot), settings or CalibrationSettings()
     if not logs and not tables:
         raise InputError("there is nothing to fit to; expected a log or a table of stiffness")
+    if not settings.holds_back and settings.structure == "auto":
+        raise InputError("models are compared by what is held back; name one, or hold parts back")
     read = tables_of(tables, description)
     structures = _structures(settings.structure)
     for key in settings.fixed:
@@ -159,11 +161,14 @@ def calibrate(
         return _result(setup, _final(setup, alone, {}, teller), alone, [], teller)
     candidates: list[Candidate] = []
     try:
-        chosen = _chosen(setup, structures, laws, candidates, teller)
-        teller.begin(f"final fit: {chosen.structure.words}")
-        near = chosen.fit.problem.named(chosen.fit.x)
-        final = _final(setup, chosen.structure, near, teller)
-        return _result(setup, final, chosen.structure, candidates, teller)
+        if settings.holds_back:
+            chosen = _chosen(setup, structures, laws, candidates, teller)
+            structure, near = chosen.structure, chosen.fit.problem.named(chosen.fit.x)
+        else:
+            structure, near = structures[0], _screened(setup, teller)
+        teller.begin(f"final fit: {structure.words}")
+        final = _final(setup, structure, near, teller)
+        return _result(setup, final, structure, candidates, teller)
     except CancelledError as stop:
         if candidates:
             leader = best(candidates)
@@ -283,7 +288,8 @@ def _screened(setup: Setup, teller: _Teller) -> dict[str, float]:
             if unknown.parameter is not None and unknown.parameter.key.endswith("youngs_modulus"):
                 start[i] = modulus
         starts.append(start)
-    return problem.named(fit(problem, starts, teller, rounds=1).x)
+    most = setup.settings.start_evaluations
+    return problem.named(fit(problem, starts, teller, rounds=1, most=most).x)
 
 
 def _put_right(setup: Setup, teller: _Teller) -> Setup:
@@ -338,7 +344,8 @@ def _final(
     for description in _softenings(setup):
         own = replace(setup, description=description)
         problem = own.problem(structure, setup.settings.rows)
-        found.append(fit(problem, [problem.start(near)], teller))
+        start = problem.start(near)
+        found.append(fit(problem, [start], teller, rounds=setup.settings.rounds))
     return min(found, key=_misfit_of_tables)
 
 

@@ -69,9 +69,10 @@ def fit(
         Scaled coordinates.
     tell : is called at every evaluation of the problem, to show progress or to stop by raising.
     rounds : how often the noise and the weights are made to fit the residuals.
-    most : evaluations of the problem in each round.
+    most : evaluations of the problem from each start, and in each round.
     """
-    begun = [_minimum(problem, start, tell, most) for start in starts]
+    different = {start.tobytes(): start for start in starts}.values()
+    begun = [_minimum(problem, start, tell, most) for start in different]
     x, cost = min(begun, key=lambda found: found[1])
     independent = 1.0
     for _ in range(rounds):

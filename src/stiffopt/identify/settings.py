@@ -15,58 +15,6 @@ Finding = Literal["units", "clock", "axes", "channels", "lines"]
 """What is found by itself in recordings (`stiffopt.identify.detection`) unless it is to be kept."""
 
 
-class CalibrationSettings(Schema):
-    """How logs are read, and what is fitted to them.
-
-    Attributes
-    ----------
-    structure : name of a model of `stiffopt.identify.structures.STRUCTURES`, or ``auto``: the one
-        that predicts held-back logs (of a single log, held-back parts) best; of those that are as
-        good, the simplest.
-    strain_law : ``auto``: the robot file's, unless another law of `stiffopt.model.laws` predicts
-        what is held back clearly better; or ``keep``.
-    sequence : whether the logs follow each other, so that each begins in the state in which the
-        one before it ended.
-    rezero : whether positions are counted anew in each log.
-    pressures : which of the recorded pressures the model is run with.
-    fixed : keys of parameters that stay as they are.
-    keep : what is taken as it was recorded: the ``units`` of pressures, the ``clock`` of pressures
-        and tracker, the ``axes`` of a log's frame, the order of the ``channels``, dead or shared
-        ``lines``. All else is put right where the evidence is overwhelming, and told.
-    settle : time at the beginning of a log that does not begin at rest, from which its state (and
-        its zero) is estimated where the log is only predicted, in s.
-    rows : number of rows that are fitted, of all logs together; chosen so as to cover them.
-    trial_rows : the same, while models are compared.
-    start_rows : the same, while a start is chosen among several.
-    """
-
-    structure: str = "auto"
-    strain_law: Literal["auto", "keep"] = "auto"
-    sequence: bool = False
-    rezero: bool = False
-    pressures: Literal["commanded", "measured"] = "commanded"
-    fixed: Items[str] = ()
-    keep: Items[Finding] = ()
-    settle: Annotated[Duration, Field(gt=0)] = 2.0
-    rows: Annotated[int, Field(ge=50, le=100_000)] = 2000
-    trial_rows: Annotated[int, Field(ge=50, le=100_000)] = 600
-
-    start_rows: Annotated[int, Field(ge=20, le=100_000)] = 150
-
-    def quick(self, *, is_loaded: bool) -> CalibrationSettings:
-        """These settings for a first answer: one model, its law kept, few rows.
-
-        Parameters
-        ----------
-        is_loaded : whether each pose is an equilibrium to be found, which takes longer.
-        """
-        structure = "hysteresis" if self.structure == "auto" else self.structure
-        most = {"rows": 80, "trial_rows": 50, "start_rows": 40} if is_loaded else {
-            "rows": 400, "trial_rows": 200, "start_rows": 150}  # fmt: skip
-        rows = {name: min(getattr(self, name), count) for name, count in most.items()}
-        return self.model_copy(update={"structure": structure, "strain_law": "keep", **rows})
-
-
 @dataclass(frozen=True)
 class TrackerFaultSettings:
     """Which readings of a tracker count as faults (`stiffopt.identify.tracker_faults`).
@@ -341,3 +289,66 @@ FIT = FitSettings()
 CHOICE = ChoiceSettings()
 REPORT = ReportSettings()
 DETECTION = DetectionSettings()
+
+
+class CalibrationSettings(Schema):
+    """How logs are read, and what is fitted to them.
+
+    Attributes
+    ----------
+    structure : name of a model of `stiffopt.identify.structures.STRUCTURES`, or ``auto``: the one
+        that predicts held-back logs (of a single log, held-back parts) best; of those that are as
+        good, the simplest.
+    strain_law : ``auto``: the robot file's, unless another law of `stiffopt.model.laws` predicts
+        what is held back clearly better; or ``keep``.
+    sequence : whether the logs follow each other, so that each begins in the state in which the
+        one before it ended.
+    rezero : whether positions are counted anew in each log.
+    pressures : which of the recorded pressures the model is run with.
+    fixed : keys of parameters that stay as they are.
+    keep : what is taken as it was recorded: the ``units`` of pressures, the ``clock`` of pressures
+        and tracker, the ``axes`` of a log's frame, the order of the ``channels``, dead or shared
+        ``lines``. All else is put right where the evidence is overwhelming, and told.
+    settle : time at the beginning of a log that does not begin at rest, from which its state (and
+        its zero) is estimated where the log is only predicted, in s.
+    rows : number of rows that are fitted, of all logs together; chosen so as to cover them.
+    trial_rows : the same, while models are compared.
+    start_rows : the same, while a start is chosen among several.
+    compared_rows : the same, of each log, where the arm is under gravity and all is compared.
+    start_evaluations : most evaluations of the problem from each of several starts.
+    rounds : number of fits, each with the spread of residuals that the one before left.
+    holds_back : whether models are fitted without parts of the logs and compared by these; else
+        `structure` names one.
+    """
+
+    structure: str = "auto"
+    strain_law: Literal["auto", "keep"] = "auto"
+    sequence: bool = False
+    rezero: bool = False
+    pressures: Literal["commanded", "measured"] = "commanded"
+    fixed: Items[str] = ()
+    keep: Items[Finding] = ()
+    settle: Annotated[Duration, Field(gt=0)] = 2.0
+    rows: Annotated[int, Field(ge=50, le=100_000)] = 2000
+    trial_rows: Annotated[int, Field(ge=50, le=100_000)] = 600
+
+    start_rows: Annotated[int, Field(ge=20, le=100_000)] = 150
+    compared_rows: Annotated[int, Field(ge=20, le=100_000)] = SAMPLING.loaded_rows
+    start_evaluations: Annotated[int, Field(ge=1)] = FIT.evaluations
+    rounds: Annotated[int, Field(ge=0)] = FIT.rounds
+    holds_back: bool = True
+
+    def quick(self, *, is_loaded: bool) -> CalibrationSettings:
+        """These settings for a first answer: one model, its law kept, nothing held back, few rows.
+
+        Parameters
+        ----------
+        is_loaded : whether each pose is an equilibrium to be found, which takes longer.
+        """
+        structure = "hysteresis" if self.structure == "auto" else self.structure
+        most = {"rows": 60, "start_rows": 40, "compared_rows": 60} if is_loaded else {
+            "rows": 400, "start_rows": 150}  # fmt: skip
+        most |= {"start_evaluations": 10, "rounds": 1}
+        fewer = {name: min(getattr(self, name), count) for name, count in most.items()}
+        kept = {"structure": structure, "strain_law": "keep", "holds_back": False}
+        return self.model_copy(update={**kept, **fewer})

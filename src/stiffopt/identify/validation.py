@@ -113,7 +113,7 @@ def compare(
     tell : is called at every evaluation.
     """
     description, recordings = setup.description, setup.recordings
-    most = SAMPLING.loaded_rows if any(description.gravity) else SAMPLING.rows
+    most = setup.settings.compared_rows if any(description.gravity) else SAMPLING.rows
     samples, kept = [], []
     for recording, begin in zip(recordings, setup.begins, strict=True):
         every = np.arange(len(recording.time))

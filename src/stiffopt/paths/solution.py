@@ -10,17 +10,9 @@ from stiffopt.display import display_units
 from stiffopt.errors import InputError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.notebook import ShownInNotebook
-from stiffopt.optimise.target import Target
-from stiffopt.paths.trajectory import (
-    CLOSEST,
-    MAX_WAYPOINTS,
-    Trajectory,
-    Waypoint,
-    without_straight,
-)
+from stiffopt.paths.trajectory import Trajectory, trajectory_through
 
 Vector = NDArray[np.float64]
-_ON_THE_LINE = 1e-3  # of the range of a pressure
 
 Status = Literal["solved", "unreachable", "failed"]
 
@@ -102,9 +94,7 @@ class PathSolution(ShownInNotebook):
     def trajectory(self, begin: float = 0.0) -> Trajectory:
         """What a `ControlLoop` follows: the pressures, and the tip positions that they give.
 
-        Of more points than a trajectory may have waypoints, or of points that follow each other
-        sooner than these may, those are left out that lie on the straight lines between the others,
-        to a thousandth of the range of each pressure.
+        Points that are too many or too close are left out; see `trajectory_through`.
 
         Parameters
         ----------
@@ -118,21 +108,9 @@ class PathSolution(ShownInNotebook):
         """
         if not len(self.times):
             raise InputError(f"there is nothing to follow: {self.message}")
-        kept = np.arange(len(self.times))
-        close = (np.diff(self.times) < CLOSEST).any()
-        if len(kept) > MAX_WAYPOINTS or close:
-            ranges = self.robot.pressure_max - self.robot.pressure_min
-            kept = without_straight(self.times, self.pressures / ranges, _ON_THE_LINE)
-        return Trajectory(
-            waypoints=tuple(
-                Waypoint(
-                    time=begin + float(self.times[index]),
-                    target=Target(position=tuple(self.tip_poses[index, :3, 3].tolist())),
-                    pressures=tuple(self.pressures[index].tolist()),
-                )
-                for index in kept
-            )
-        )
+        ranges = self.robot.pressure_max - self.robot.pressure_min
+        tips = self.tip_poses[:, :3, 3]
+        return trajectory_through(self.times, self.pressures, tips, ranges, begin)
 
     def __repr__(self) -> str:
         if not len(self.times):

@@ -20,6 +20,7 @@ _LONGEST = 86_400.0  # s, of a trajectory
 CLOSEST = 1e-3
 """Between waypoints, in s."""
 _ROUNDING = 1e-6  # of that
+_ON_THE_LINE = 1e-3  # of the range of a pressure
 
 
 class Waypoint(Schema):
@@ -76,6 +77,52 @@ class Trajectory(Schema):
         if self.waypoints[0].pressures is None:
             return None
         return np.array([waypoint.pressures for waypoint in self.waypoints])
+
+
+def trajectory_through(
+    times: NDArray[np.float64],
+    pressures: NDArray[np.float64],
+    tips: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    begin: float = 0.0,
+) -> Trajectory:
+    """Return a trajectory of pressures and of the tip positions that they give.
+
+    Of more points than a trajectory may have waypoints, or of points that follow each other
+    sooner than these may, those are left out that lie on the straight lines between the others,
+    to a thousandth of the range of each pressure.
+
+    Parameters
+    ----------
+    times : (N,)
+        In s, increasing from 0.
+    pressures : (N, n)
+        In Pa.
+    tips : (N, 3)
+        In m, in the base frame.
+    ranges : (n,)
+        Of the pressures, in Pa.
+    begin :
+        When to be at the first point, in s, for an arm that has to go there.
+
+    Raises
+    ------
+    InputError
+        There are too many points that cannot be left out.
+    """
+    kept = np.arange(len(times))
+    if len(kept) > MAX_WAYPOINTS or (np.diff(times) < CLOSEST).any():
+        kept = without_straight(times, pressures / ranges, _ON_THE_LINE)
+    return Trajectory(
+        waypoints=tuple(
+            Waypoint(
+                time=begin + float(times[index]),
+                target=Target(position=tuple(tips[index].tolist())),
+                pressures=tuple(pressures[index].tolist()),
+            )
+            for index in kept
+        )
+    )
 
 
 def check_times(times: list[float]) -> None:

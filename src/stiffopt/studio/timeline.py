@@ -15,9 +15,11 @@ from stiffopt.daemon.run_log import RecordedRun, log_of_run
 from stiffopt.display import display_units
 from stiffopt.errors import FileError, InputError
 from stiffopt.logs.log import Log
+from stiffopt.logs.table import read_table
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.scene import Scene
+from stiffopt.paths.motion_file import read_motion
 from stiffopt.paths.path import Path
 from stiffopt.paths.solution import PathSolution
 from stiffopt.plots.wording import stiffness_text
@@ -153,26 +155,15 @@ class Timeline:
     @classmethod
     def of_motion(cls, file: str | os.PathLike[str], description: RobotDescription) -> Timeline:
         """What `stiffopt path` or `stiffopt plan` has written as CSV."""
-        try:
-            table = np.genfromtxt(file, delimiter=",", names=True, dtype=float, ndmin=1)
-            names = table.dtype.names or ()
-            times = np.asarray(table["time_s"])
-            pressures = np.stack(
-                [table[f"p{k + 1}_pa"] for k in range(description.n_pressures)], axis=1
-            )
-        except (ValueError, OSError) as error:
-            raise FileError(file, f"is no motion of '{description.name}': {error}") from None
-        if f"p{description.n_pressures + 1}_pa" in names:
-            raise FileError(file, f"has more channels than '{description.name}'")
-        _check_rows(file, times, pressures)
+        motion, table = read_motion(file, description), read_table(file)
         charts = [
-            TimelineChart(name.replace("_", " "), ("",), np.asarray(table[name])[:, None])
-            for name in names
+            TimelineChart(name.replace("_", " "), ("",), table[name][:, None])
+            for name in table.columns
             if name.startswith("stiffness")
         ]
         return cls(
-            load_robot(description), times - times[0], pressures,
-            (*charts, *_pressure_charts(description, pressures)), FilePath(file).name,
+            load_robot(description), motion.times, motion.pressures,
+            (*charts, *_pressure_charts(description, motion.pressures)), FilePath(file).name,
         )  # fmt: skip
 
     @classmethod

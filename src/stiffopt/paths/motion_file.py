@@ -1,0 +1,128 @@
+"""Files with a motion, as ``--out`` of `stiffopt path` and `stiffopt plan` writes them."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.documents import read_document
+from stiffopt.errors import FileError, InputError
+from stiffopt.logs.table import read_table
+from stiffopt.model.description import RobotDescription
+from stiffopt.paths.trajectory import Trajectory, trajectory_through
+from stiffopt.units import parse_quantity
+
+RESULT_FORMAT = "stiffopt-path-result/1"
+"""Format of a result file of paths and motions."""
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionTable:
+    """Pressures over time.
+
+    Attributes
+    ----------
+    file : where they come from.
+    times : (N,) in s, increasing.
+    pressures : (N, n) in Pa; between two times they change linearly.
+    tips : (N, 3) in m: where the tip is then, in the base frame.
+    """
+
+    file: str
+    times: Vector
+    pressures: Vector
+    tips: Vector
+
+    def trajectory(self, ranges: Vector, begin: float) -> Trajectory:
+        """What a control loop follows.
+
+        Parameters
+        ----------
+        ranges : (n,)
+            Of the pressures, in Pa; see `trajectory_through`.
+        begin :
+            When to be at the first point, in s.
+
+        Raises
+        ------
+        FileError
+            It has too many points.
+        """
+        try:
+            return trajectory_through(self.times, self.pressures, self.tips, ranges, begin)
+        except InputError as error:
+            raise FileError(self.file, f"cannot be played: {error}") from None
+
+
+def read_motion(file: str | os.PathLike[str], description: RobotDescription) -> MotionTable:
+    """Read a motion of a robot: CSV, or a result file with one result.
+
+    Raises
+    ------
+    FileError
+        It cannot be read, is no motion or no whole one, or is of another robot.
+    """
+    name = os.fspath(file)
+    if name.lower().endswith(".csv"):
+        motion = _of_csv(name, description)
+    else:
+        motion = _of_result(name, description)
+    if len(motion.times) < 2:
+        raise FileError(name, "has too few points with pressures to play; expected two or more")
+    columns = np.column_stack([motion.times, motion.pressures, motion.tips])
+    if not np.isfinite(columns).all() or not (np.diff(motion.times) > 0).all():
+        raise FileError(name, "has numbers that are missing, or times that do not increase")
+    return motion
+
+
+def _of_csv(name: str, description: RobotDescription) -> MotionTable:
+    table = read_table(name)
+    n = description.n_pressures
+    wanted = ["time_s", *(f"p{k + 1}_pa" for k in range(n)), *(f"tip_{a}_m" for a in "xyz")]
+    missing = [each for each in wanted if each not in table.columns]
+    if missing:
+        raise FileError(
+            name,
+            f"is no motion of '{description.name}', which has {n} channels: there is no column "
+            f"{missing[0]}",
+        )
+    if f"p{n + 1}_pa" in table.columns:
+        raise FileError(name, f"has more channels than '{description.name}'")
+    values = np.column_stack([table[each] for each in wanted])
+    return MotionTable(name, values[:, 0] - values[0, 0], values[:, 1 : n + 1], values[:, n + 1 :])
+
+
+def _of_result(name: str, description: RobotDescription) -> MotionTable:
+    data = read_document(name).data
+    results = data.get("results")
+    if not isinstance(results, list) or data.get("format") != RESULT_FORMAT:
+        raise FileError(
+            name, "is no motion; expected a file that 'stiffopt path --out' or 'plan --out' wrote"
+        )
+    if len(results) != 1:
+        raise FileError(name, f"has {len(results)} results; expected one")
+    result: dict[str, Any] = results[0]
+    if result.get("status") != "solved":
+        raise FileError(name, f"is not solved: {result.get('message', result.get('status'))}")
+    if result.get("robot") != description.name:
+        raise FileError(name, f"is for the robot '{result.get('robot')}'; this is another one")
+    try:
+        times = _si(result["times"], "s", "time")
+        pressures = [_si(each, "Pa", "pressure") for each in result["pressures"].values()]
+        tips = [_si(result["tip"][axis], "m", "length") for axis in "xyz"]
+        motion = MotionTable(name, times, np.stack(pressures, axis=1), np.stack(tips, axis=1))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FileError(name, f"is no whole result: {error}") from None
+    if motion.pressures.shape[1] != description.n_pressures:
+        raise FileError(name, f"has other channels than '{description.name}'")
+    return motion
+
+
+def _si(values: list[str], unit: str, what: str) -> Vector:
+    return np.array([parse_quantity(value, unit, what) for value in values])
