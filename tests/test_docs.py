@@ -47,7 +47,7 @@ from stiffopt.rig.config import (
     load_rig_description,
 )
 from stiffopt.rig.registry import KINDS, driver_class, driver_names
-from stiffopt.rig.settings import ControlSettings, ServiceSettings
+from stiffopt.rig.settings import ControlSettings, Published, ServiceSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -85,7 +85,7 @@ SCHEMAS: list[type[BaseModel]] = [
     *(Scene, SceneObject, AllowedContact, *OBSTACLES.values()),
     *schemas_of(PathDescription, "stiffopt.paths."),
     *(RigDescription, Safety, LogSettings, Registration, Placement),
-    *(ControlSettings, ServiceSettings, Trajectory, Waypoint),
+    *(ControlSettings, Published, ServiceSettings, Trajectory, Waypoint),
     *schemas_of(simulated.PlantSettings, "stiffopt.plant"),
     simulated.LabSettings,
     *driver_schemas(),
