@@ -79,7 +79,7 @@ $(VENV)/.created:
 	@touch $@
 
 $(VENV)/.installed-plot: $(VENV)/.created pyproject.toml
-	@echo "Installing stiffopt into $(VENV) ..."
+	@echo "Installing stiffopt and what it needs into $(VENV): pip may take some minutes ..."
 	@$(PIP) install --editable '.[plot]'
 	@touch $@
 

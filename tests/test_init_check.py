@@ -103,9 +103,10 @@ def test_rigs_with_devices(supply: str, tracker: str) -> None:
     ("arguments", "message"),
     [
         (("robot", "--length", "90"), "--length: '90' has no unit"),
-        (("robot", "--length", "-90 mm"), "segments[0].length: "),
+        (("robot", "--length", "-90 mm"), "--length: must be greater than 0"),
+        (("robot", "--outer-radius", "2 mm"), "segments[0].inner_radius: 4.5 mm must be less"),
         (("robot", "--chambers", "7"), "--channels: 3 regulators cannot feed 7 chambers alike"),
-        (("robot", "--chamber-offset", "14 mm"), "nothing was written"),
+        (("robot", "--chamber-offset", "14 mm"), "--chamber-offset: chambers of radius 2.25 mm"),
         (("robot", "--mounting", "upside"), "--mounting: expected weightless or hanging"),
         (("task", "--robot", "stiff-flop-9"), "there is no robot 'stiff-flop-9'"),
         (("task", "--position", "1 mm, 2 mm"), "--position: expected a position such as"),
@@ -268,3 +269,14 @@ def test_completion_and_python_m() -> None:
     assert done.stdout.split() == ["init"]
     done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == f"stiffopt {stiffopt.__version__}"
+
+
+def test_a_pipe_that_nobody_writes_is_not_waited_for() -> None:
+    os.mkfifo("pipe.yaml")
+    os.mkfifo("pipe.csv")
+    reader, writer = os.pipe()
+    found = run("check", "pipe.yaml", "pipe.csv", f"/dev/fd/{reader}")  # as a shell's <(...)
+    os.close(reader)
+    os.close(writer)
+    assert found.exit_code == 2
+    assert found.stdout.count("is a pipe; expected a file") == 3

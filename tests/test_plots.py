@@ -275,6 +275,19 @@ def test_numbers_on_bars_stand_apart(name: str) -> None:
     assert all(not one.overlaps(other) for one, other in pairwise(boxes))
 
 
+def test_the_legend_keeps_clear_of_the_box() -> None:
+    from stiffopt.plots.view import box_corners
+
+    arm, solution = solved("stiff-flop-3", target=(-0.06, 0.02, 0.25))
+    figure = plots.plot_solution(arm, solution)
+    figure.canvas.draw()
+    axes, panel = figure.axes[:2]
+    corners = axes.transData.transform(on_page(axes, *map(tuple, box_corners(axes))))
+    (legend,) = figure.legends
+    assert legend.get_window_extent().x1 < corners[:, 0].min()
+    assert corners[:, 0].max() < panel.bbox.x0
+
+
 def test_many_channels_have_no_numbers_on_top_of_each_other() -> None:
     arm, solution = solved("stiff-flop-3", target=(-0.06, 0.02, 0.25))
     assert len(plots.plot_solution(arm, solution).axes[1].get_xticks()) == 9

@@ -7,6 +7,7 @@ import json
 import os
 import pty
 import re
+import shlex
 import signal
 import socket
 import stat
@@ -21,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
 
 from fake_loop import FakeLoop
@@ -217,6 +219,31 @@ def test_a_motion_is_played_from_its_file(tmp_path: Path, compiled: Path) -> Non
     targets = recorded.target_position[np.isfinite(recorded.target_position).all(axis=1)]
     np.testing.assert_allclose(targets[-1], motion.tip_poses[-1, :3, 3], atol=1e-4)
     assert np.abs(recorded.commanded - pressures[-1]).max(axis=1).min() < 0.15e5
+
+
+@pytest.mark.long
+def test_the_commands_of_ten_minutes_that_need_real_time(
+    tmp_path: Path, compiled: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the page shows but does not run, with a rig that is patient with a busy machine."""
+    page = (ROOT / "docs" / "ten-minutes.md").read_text(encoding="utf-8").replace("\\\n", "")
+    shown = [shlex.split(line) for line in re.findall(r"^\$ stiffopt (.*?) *(?:#.*)?$", page, re.M)]
+    holds, draws, plays = shown
+    assert (holds[:2], draws[:2]) == (["run", "my-rig.yaml"], ["log", "plot"])
+    monkeypatch.chdir(tmp_path)
+    for line in re.findall(r"^stiffopt (?:init|path) .*$", page, re.M):
+        assert main(shlex.split(line)[1:]) == 0, line
+    robot = str(tmp_path / "my-arm.yaml")
+    rig = patient_rig(tmp_path)
+    content = yaml.safe_load(rig.read_text()) | {"robot": robot}
+    content.pop("probe", None)
+    Path("my-rig.yaml").write_text(yaml.safe_dump(content))
+    for command in (holds, plays):
+        with running(*command, "--no-service", "--duration", "15 s") as run:
+            assert run.wait(400) == 0, run.err
+    for recording in (tmp_path / "runs").glob("*.mcap"):
+        assert main([*draws[:2], str(recording)]) == 0
+    assert len([*(tmp_path / "runs").glob("*.png")]) == 2
 
 
 def test_a_second_ctrl_c_vents_at_once(tmp_path: Path, compiled: Path, task: str) -> None:

@@ -264,6 +264,13 @@ def test_only_the_key_opens_the_page_and_its_socket(page: object) -> None:
     assert asked(page, "/?key=wrong")[0] == 403
     assert asked(page, **UPGRADE)[0] == 403
     assert asked(page, f"/?key={key}", Host="evil.example")[0] == 403
+    from websockets.datastructures import Headers
+
+    from stiffopt.studio.page import KeyCheck
+
+    refusal = KeyCheck()("/", Headers({"Host": "evil.example"}))
+    assert b"this studio" in refusal.body
+    assert b"rig" not in refusal.body
     status, headers = asked(page, f"/?key={key}")
     assert (status, headers["Location"]) == (303, "/")
     assert "HttpOnly; SameSite=Lax" in headers["Set-Cookie"]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
+import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -59,6 +61,8 @@ def check_file(path: str) -> tuple[str, list[FileError]]:
 
 def _kind_of(path: str) -> str:
     """Return the kind of a file by its ending, and of a YAML file by its format."""
+    if _is_pipe(path):  # it can be read once, and is waited for until somebody writes
+        raise FileError(path, "is a pipe; expected a file")
     ending = Path(path).suffix.lower()
     if ending in (".csv", ".mcap"):
         return "log"
@@ -75,6 +79,14 @@ def _kind_of(path: str) -> str:
     hint = f"; did you mean '{near[0]}'?" if near else f"; {expected}"
     reason = f"{shown(given)} is no format of a file that people write{hint}"
     raise document.error(("format",), reason)
+
+
+def _is_pipe(path: str) -> bool:
+    """Whether a path is a pipe, or leads to one as a shell's ``<(...)`` does."""
+    try:
+        return stat.S_ISFIFO(os.stat(path).st_mode)
+    except OSError:
+        return False
 
 
 def _check_robot(path: str) -> None:

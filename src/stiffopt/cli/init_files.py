@@ -26,6 +26,22 @@ Ask = Callable[[str, str], str]
 """Takes a question and the default; returns the answer."""
 
 _CUSTOM = "(built-in, or a robot file)"
+_KEYS = {
+    "chamber_radius": "chambers.radius",
+    "chamber_offset": "chambers.offset",
+    "outer_radius": "outer_radius",
+    "inner_radius": "inner_radius",
+    "length": "length",
+    "modulus": "youngs_modulus",
+    "max_pressure": "pressure.max",
+    "position": "target.position",
+    "direction": "direction",
+    "from": "line.from",
+    "to": "line.to",
+    "speed": "timing.speed",
+    "clearance": "clearance",
+}
+"""Names of options, and how the keys end at which their values stand."""
 
 
 def write_first_file(
@@ -53,15 +69,16 @@ def write_first_file(
     check_writable(path)
     if os.path.lexists(path) and not force:
         raise FileError(path, "exists; give another name, or --force to write in its place")
-    body, advice = _TEXTS[kind](_Answers(given, ask, Path(path).parent), path)
+    answers = _Answers(given, ask, Path(path).parent)
+    body, advice = _TEXTS[kind](answers, path)
     typed = shlex.quote(path)
     head = (
         f"# yaml-language-server: $schema={schema_file(kind).as_uri()}\n"
         f"# Editors with a YAML language server complete and check this file by the line above.\n"
-        f"# All keys: docs/files.md. Check it: stiffopt check {printable(typed)}\n"
+        f"# Check it: stiffopt check {printable(typed)}\n"
         f"format: {format_of(kind)}\n"
     )
-    _write_checked(path, head + textwrap.dedent(body).lstrip("\n"))
+    _write_checked(path, head + textwrap.dedent(body).lstrip("\n"), answers)
     write_line(f"{path}: written. Next:")
     for line in advice:
         write_line(f"  {line}")
@@ -80,6 +97,11 @@ class _Answers:
 
     def __init__(self, given: Mapping[str, Any], ask: Ask | None, folder: Path) -> None:
         self._given, self._ask, self._folder = given, ask, folder
+
+    def option_of(self, key: str) -> str:
+        """Return the option from which the value of a key came; empty: from none."""
+        name = next((name for name, end in _KEYS.items() if key.endswith(end)), "")
+        return _option(name) if self._given.get(name) is not None else ""
 
     def text(
         self,
@@ -187,7 +209,7 @@ def _option(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def _write_checked(path: str, text: str) -> None:
+def _write_checked(path: str, text: str, answers: _Answers) -> None:
     """Write a file after a check of its text; what was there stays if that is wrong."""
     folder = Path(path).absolute().parent  # where the files that it names are looked for
     handle, draft = tempfile.mkstemp(dir=folder, prefix=".", suffix=".yaml")
@@ -199,7 +221,8 @@ def _write_checked(path: str, text: str) -> None:
         os.unlink(draft)
     if mistakes:
         first = mistakes[0]
-        raise InputError(f"{first.key or path}: {first.own_reason}; nothing was written")
+        where = answers.option_of(first.key or "") or first.key or path
+        raise InputError(f"{where}: {first.own_reason}; nothing was written")
     write_whole(path, text.encode())
 
 
@@ -272,7 +295,7 @@ def _robot(answers: _Answers, path: str) -> tuple[str, list[str]]:
         f"stiffopt init task --robot {shlex.quote(path)}     # a task for this arm",
         f"stiffopt map arm {shlex.quote(path)}               # its stiffness along the arm",
         "measure lengths and radii of your arm and correct them in the file;",
-        "`stiffopt calibrate` finds the moduli from a recording (docs/calibration.md)",
+        "`stiffopt calibrate --help`: how the moduli are found from recordings",
     ]
 
 
@@ -350,7 +373,7 @@ def _rig(answers: _Answers, path: str) -> tuple[str, list[str]]:
     if supply == "simulated":
         text += "# how the simulated arm differs from its robot file\n"
         text += "plant: {seed: 1, spread: {gain: 3 %, modulus: 5 %}}\n"
-        return text, [f"stiffopt run {shlex.quote(path)} --task my-task.yaml"]
+        return text, [f"stiffopt run {shlex.quote(path)} --task my-task.yaml --arm"]
     return text, [
         "put in the addresses and ranges of your devices; rig/ has examples with their wiring",
         f"stiffopt lab {shlex.quote(path)}     # rehearse with a virtual arm behind these devices",

@@ -14,7 +14,13 @@ from stiffopt.daemon.reports import RefusalError
 from stiffopt.daemon.secret import is_address
 
 
-def check_place(hosts: Sequence[str], origins: Iterable[str], known: Iterable[str]) -> None:
+def check_place(
+    hosts: Sequence[str],
+    origins: Iterable[str],
+    known: Iterable[str],
+    server: str = "daemon",
+    setting: str = "the host of the rig file's service",
+) -> None:
     """Raise `RefusalError` unless a request was sent by a page of the server itself, or by none.
 
     Parameters
@@ -23,6 +29,8 @@ def check_place(hosts: Sequence[str], origins: Iterable[str], known: Iterable[st
         All headers Host and Origin of the request.
     known :
         Names of this machine, other than localhost.
+    server, setting :
+        What the server is called in a refusal, and what sets its name.
     """
     names = {"localhost", *(host.lower().rstrip(".") for host in known)} - {""}
     name = _host_name(hosts[0]) if len(hosts) == 1 else ""
@@ -30,13 +38,15 @@ def check_place(hosts: Sequence[str], origins: Iterable[str], known: Iterable[st
         raise RefusalError(
             403,
             "host",
-            "the header Host names no address of this daemon; use its IP address, localhost, "
-            "or the host of the rig file's service",
+            f"the header Host names no address of this {server}; use its IP address, localhost, "
+            f"or {setting}",
         )
     for origin in origins:
         scheme, _, place = origin.partition("://")
         if scheme not in ("http", "https") or place.lower() != hosts[0].lower():
-            raise RefusalError(403, "origin", "pages of other sites may not speak to this daemon")
+            raise RefusalError(
+                403, "origin", f"pages of other sites may not speak to this {server}"
+            )
 
 
 def _host_name(host: str) -> str:

@@ -192,7 +192,10 @@ def legend_beside(axes: Any, **settings: Any) -> None:
 
 
 def legend_in_corner(axes: Any, handles: Sequence[Any]) -> None:
-    """Put a legend into the upper left corner of axes in 3-D and of the place that they have."""
+    """Put a legend into the upper left corner of the place of axes in 3-D, and these beside it."""
+    from stiffopt.plots.view import move_to_the_right
+
+    move_to_the_right(axes)
     place = axes.get_position(original=True)
     axes.get_figure().legend(
         handles=handles, loc="upper left", bbox_to_anchor=(place.x0, place.y1), fontsize=9,

@@ -90,6 +90,19 @@ def fill_panel(axes: Any) -> None:
     axes.stale = True
 
 
+def move_to_the_right(axes: Any) -> None:
+    """Move the box of axes in 3-D from their middle to their right, where a legend is at the left.
+
+    `fill_panel` has set their limits.
+    """
+    x, _ = projected(axes, box_corners(axes))
+    left, right = axes.viewLim.intervalx
+    size = axes.bbox.width / axes.get_figure(root=True).dpi * 72  # points
+    end = min(right, x.max() + (right - left) * min(_ASIDE / size, 0.3))
+    axes.viewLim.intervalx = (end - (right - left), end)
+    axes.stale = True
+
+
 def box_corners(axes: Any) -> Vector:
     """Corners (8, 3) of the box of axes in 3-D."""
     limits = axes.get_xlim(), axes.get_ylim(), axes.get_zlim()

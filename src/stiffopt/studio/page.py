@@ -66,7 +66,8 @@ class KeyCheck:
     def __call__(self, path: str, headers: Headers) -> Response | None:
         """Return the answer to a request that does not pass; None: it does."""
         try:
-            check_place(headers.get_all("Host"), headers.get_all("Origin"), self._hosts)
+            hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+            check_place(hosts, origins, self._hosts, "studio", "the name given with --host")
         except RefusalError as refusal:
             return _answer(refusal.message)
         given = parse_qs(urlsplit(path).query).get("key", [""])[-1]
