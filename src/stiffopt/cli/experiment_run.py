@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from stiffopt.cli import experiment_report, quantities
 from stiffopt.cli.console import (
@@ -53,9 +53,6 @@ from stiffopt.logs import StiffnessTable, read_stiffness_table, write_stiffness_
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
 from stiffopt.rig.settings import Published
-
-if TYPE_CHECKING:
-    from stiffopt.rig.config import RigDescription
 
 Settings = KinematicsSettings | StiffnessSettings
 
@@ -143,9 +140,8 @@ def _planned(
     resume: str | None,
     model_name: str | None,
 ) -> _Plan:
-    rig, description = _rig(rig_file)
-    name, rate, log_folder = description.name, description.rate, description.log.folder
-    published, table = _published(rig_file, description)
+    rig, name, rate, log_folder = _rig(rig_file)
+    published, table = _published(rig, rig_file)
     if resume is None:
         about = {"rig": name, "robot": rig.robot.name, "channels": rig.supply.n}
         schema = KinematicsSettings if experiment == "kinematics" else StiffnessSettings
@@ -182,24 +178,21 @@ def _planned(
     )
 
 
-def _rig(path: str) -> tuple[Rig, RigDescription]:
-    """The rig of a file and its description."""
+def _rig(path: str) -> tuple[Rig, str, float, str]:
+    """The rig of a file, its name, its rate and its log folder."""
     from stiffopt.rig.config import load_rig_description
     from stiffopt.safety.rigs import open_rig
 
     description = load_rig_description(path)
-    return open_rig(path), description
+    return open_rig(path), description.name, description.rate, description.log.folder
 
 
-def _published(
-    path: str, description: RigDescription
-) -> tuple[Published | None, StiffnessTable | None]:
+def _published(rig: Rig, path: str) -> tuple[Published | None, StiffnessTable | None]:
     """What a rig file says was published of its arm, with the table of stiffness that it names."""
-    published = description.published
+    published = None if rig.settings is None else rig.settings.published
     if published is None or published.stiffness is None:
         return published, None
-    table = read_stiffness_table(Path(path).parent / published.stiffness)
-    return published, table
+    return published, read_stiffness_table(Path(path).parent / published.stiffness)
 
 
 def _new_name(experiment: str, rig: str) -> str:

@@ -61,14 +61,14 @@ class BenchArm(Schema):
     sequence: bool = False
 
 
-class Bench(Schema):
+class BenchFile(Schema):
     """Arms with their splits, `format: stiffopt-bench/1`."""
 
     arms: Annotated[Items[BenchArm], Field(min_length=1)]
 
 
 @dataclass(frozen=True, eq=False)
-class Predicted:
+class BenchErrors:
     """A file's tip, measured and predicted.
 
     Attributes
@@ -105,18 +105,18 @@ class BenchScore:
     rows: int
 
 
-def load_bench(path: str | None = None) -> tuple[Bench, Path]:
+def load_bench(path: str | None = None) -> tuple[BenchFile, Path]:
     """Read a bench file, by default the one that comes with stiffopt; and its folder."""
     if path is not None:
-        return read_file(path, "bench", Bench), Path(path).parent
+        return read_file(path, "bench", BenchFile), Path(path).parent
     with as_file(files("stiffopt").joinpath("benches", "recordings.yaml")) as built_in:
-        return read_file(built_in, "bench", Bench), Path()
+        return read_file(built_in, "bench", BenchFile), Path()
 
 
 def run_bench(
     folder: Path,
     methods: Sequence[str],
-    bench: Bench,
+    bench: BenchFile,
     base: Path,
     *,
     rows: int,
@@ -193,10 +193,10 @@ class BenchTask:
         return lagged(recording.time, p, _LAG)[rows], recording.tracks[0].position[rows]
 
 
-Method = Callable[[BenchTask], dict[str, Predicted]]
+Method = Callable[[BenchTask], dict[str, BenchErrors]]
 
 
-def _score(task: BenchTask, method: str, found: dict[str, Predicted]) -> BenchScore:
+def _score(task: BenchTask, method: str, found: dict[str, BenchErrors]) -> BenchScore:
     def distances(names: Sequence[str]) -> Array:
         parts = [np.linalg.norm(found[name].errors, axis=1) for name in names]
         return np.concatenate([*parts, np.zeros(0)])
@@ -215,7 +215,7 @@ def _score(task: BenchTask, method: str, found: dict[str, Predicted]) -> BenchSc
     )
 
 
-def stiffopt_method(task: BenchTask) -> dict[str, Predicted]:
+def stiffopt_method(task: BenchTask) -> dict[str, BenchErrors]:
     """`stiffopt.calibrate`, and what `stiffopt.validate` says of the test files."""
     logs = [(name, task.logs[name]) for name in task.arm.train]
     result = calibrate(task.robot, logs, settings=task.settings)
@@ -231,7 +231,7 @@ def stiffopt_method(task: BenchTask) -> dict[str, Predicted]:
     return {each.name: _of_model(each, arm, axes) for each in compared}
 
 
-def _of_model(found: Comparison, arm: Manipulator, axes: Array) -> Predicted:
+def _of_model(found: Comparison, arm: Manipulator, axes: Array) -> BenchErrors:
     """Errors, and coverage by the region about `tip_pose` moved to the prediction with history."""
     seen = np.flatnonzero(whole(found.measured))
     errors = (found.predicted - found.measured)[seen]
@@ -241,10 +241,10 @@ def _of_model(found: Comparison, arm: Manipulator, axes: Array) -> Predicted:
         region = arm.tip_uncertainty(found.pressures[seen[k]]).covariance
         e = axes @ errors[k]
         covered.append(float(e @ np.linalg.solve(region, e)) <= _CHI_SQUARED)
-    return Predicted(errors, np.array(covered))
+    return BenchErrors(errors, np.array(covered))
 
 
-def constant_curvature(task: BenchTask) -> dict[str, Predicted]:
+def constant_curvature(task: BenchTask) -> dict[str, BenchErrors]:
     """Arcs whose curvature and length are linear in pressure; gains and the base are fitted."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
@@ -298,7 +298,7 @@ def constant_curvature(task: BenchTask) -> dict[str, Predicted]:
 def _learnt(make: Callable[[int], Any]) -> Method:
     """A method of a regressor of scikit-learn, made of a seed."""
 
-    def method(task: BenchTask) -> dict[str, Predicted]:
+    def method(task: BenchTask) -> dict[str, BenchErrors]:
         from sklearn.compose import TransformedTargetRegressor
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.preprocessing import StandardScaler
@@ -317,7 +317,7 @@ def _learnt(make: Callable[[int], Any]) -> Method:
 
 def _regressed(
     task: BenchTask, fitted: Callable[[Array, Array], Callable[[Array], Array]]
-) -> dict[str, Predicted]:
+) -> dict[str, BenchErrors]:
     """Predictions of a map from features to tips; its region is the spread of what is left.
 
     That is taken from each fifth of the training rows when the map is fitted to the others.
@@ -338,7 +338,7 @@ def _regressed(
         seen, measured = task.chosen(one, task.rows)
         errors = predict(seen) - measured
         covered = np.einsum("ni,ij,nj->n", errors, region, errors) <= _CHI_SQUARED
-        found[one.name] = Predicted(errors, covered)
+        found[one.name] = BenchErrors(errors, covered)
     return found
 
 
