@@ -105,7 +105,7 @@ def test_built_in_robots_are_the_papers(name: str) -> None:
 
 
 def test_there_are_the_papers_robots_and_those_of_recorded_arms() -> None:
-    modules = ("ucl-stiff-flop-55", "ucl-stiff-flop-2x55")
+    modules = ("ucl-55", "ucl-2x55")
     others = ("stiff-flop-1-calibrated", "ucl-stiff-flop", "asu-two-segment", *modules)
     others += tuple(f"{name}-calibrated" for name in modules)
     assert builtin_robots() == tuple(sorted((*PAPERS, *others)))
