@@ -21,7 +21,7 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ["OPENBLAS_NUM_THREADS"] = "1"  # before numpy is imported: small matrices, many processes
 os.environ["STIFFOPT_COMPILER"] = "none"  # but for tests that ask for `compiled`
 os.environ["STIFFOPT_PROGRESS"] = "none"  # but for tests of progress
-os.environ.pop("COLUMNS", None)  # pytest-xdist tells its processes the width of the terminal
+os.environ.pop("COLUMNS", None)  # what is printed has the width that it has by itself
 os.environ["STIFFOPT_COMPILE"] = "wait"  # but for tests of code that is made in the background
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in the background of a shell

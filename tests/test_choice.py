@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from made_logs import course, made_log
 from stiffopt.identify import structures
+from stiffopt.identify.error_model import HeldBack
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
-from stiffopt.identify.structures import STRUCTURES, Candidate, best, held_back_errors
+from stiffopt.identify.structures import STRUCTURES, Candidate, best, held_back
 from stiffopt.logs import Log
 from stiffopt.model.robot_files import load_description
 
@@ -32,8 +33,11 @@ class Nothing:
 
 
 def candidate(index: int, means: list[float]) -> Candidate:
-    folds = {str(i): Errors(10, mean, mean, mean, mean, None) for i, mean in enumerate(means)}
     nothing: Any = Nothing()
+    folds = {
+        str(i): HeldBack(np.ones(10, dtype=bool), nothing, Errors(10, mean, mean, mean, mean, None))
+        for i, mean in enumerate(means)
+    }
     return Candidate(STRUCTURES[index], nothing, folds)
 
 
@@ -105,9 +109,9 @@ def test_what_is_held_back_has_no_say() -> None:
     spoilt = Log(logs[2][1].time, logs[2][1].commanded, logs[2][1].tip_position + 0.01)
     problem = problem_of([*logs[:2], ("c", spoilt)])
     found = fit(problem, [np.zeros(problem.size)], rounds=0)
-    errors = held_back_errors(found, 2.0, lambda: None)
-    assert errors["c"].mean == pytest.approx(0.01 * np.sqrt(3), rel=0.1)
-    assert errors["c"].n == len(problem.samples[2].rows)
+    part = held_back(found, 2.0, lambda: None)["c"]
+    assert part.errors.mean == pytest.approx(0.01 * np.sqrt(3), rel=0.1)
+    assert part.errors.n == part.rows.sum() == len(problem.samples[2].rows)
     away = [np.zeros(len(s.rows), dtype=bool) for s in problem.samples]
     away[2][:] = True
     value, slope = problem.without(away).residuals(found.x)

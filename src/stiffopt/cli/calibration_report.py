@@ -20,7 +20,15 @@ from stiffopt.directions import direction_name
 from stiffopt.display import FIGURES, DisplayUnit, display_units
 from stiffopt.errors import printable
 from stiffopt.identify.calibration import CalibrationResult
-from stiffopt.identify.results import TIED, Comparison, Errors, FittedEstimate, together
+from stiffopt.identify.results import (
+    LEVELS,
+    TIED,
+    Comparison,
+    Errors,
+    FittedEstimate,
+    coverage,
+    together,
+)
 from stiffopt.identify.unknowns import BASE, SENSOR
 from stiffopt.identify.validation import StiffnessComparison, compare_stiffness
 from stiffopt.model.description import RobotDescription
@@ -76,6 +84,9 @@ def validation(
     """Return the report of a validation for the terminal."""
     blocks: list[RenderableType] = [title(f"{robot.name}: validation")]
     blocks += [Text(""), errors_of_logs(robot, found).renderable()]
+    covered = coverage_table(found)
+    if covered.rows:
+        blocks += [Text(""), covered.renderable()]
     blocks += _list("Training range", range_remarks(robot, found), report, most=None)
     remarks = [f"{each.name}: {remark}" for each in found for remark in each.remarks]
     blocks += _list("What was found in the logs", remarks, report)
@@ -276,6 +287,22 @@ def errors_of_logs(robot: RobotDescription, found: Sequence[Comparison]) -> Text
         remark += "; outside: rows with pressures that the calibration had not seen"
     return TextTable(
         f"Error of the tip in {units.length}", (*heading, *further), tuple(rows), remark
+    )
+
+
+def coverage_table(found: Sequence[Comparison]) -> TextTable:
+    """Share of the measured tips within the regions about the predictions."""
+    rows = tuple(
+        (kind, f"{each.n}", *(_percent(share) for share in each.shares))
+        for kind, each in coverage(found).items()
+    )
+    return TextTable(
+        "Measured tips within the regions about the predictions",
+        ("region", "rows", *(f"{level:.0%}".replace("%", " %") for level in LEVELS)),
+        rows,
+        "with history: about the prediction that knows what was commanded before; moving, settled: "
+        "about the tip's pose at the commanded pressures alone, which change or are held; inside, "
+        "outside: of what the calibration has seen",
     )
 
 
@@ -483,6 +510,10 @@ def validation_record(robot: RobotDescription, found: Sequence[Comparison]) -> d
     return {
         **_outside_record(robot, found),
         "robot": robot.name,
+        "coverage": {
+            kind: {"n": each.n, **{f"{level:g}": share for level, share in each.by_level.items()}}
+            for kind, each in coverage(found).items()
+        },
         "remarks": [f"{each.name}: {remark}" for each in found for remark in each.remarks],
         "logs": {each.name: _outside_record(robot, [each]) for each in found},
     }

@@ -28,6 +28,7 @@ from stiffopt.plots.wording import (
 _PARTS = {
     "parameters": "the errors of the calibrated parameters",
     "hysteresis": "hysteresis: it matters where the arm was before",
+    "discrepancy": "what the model gets wrong far from the recorded pressures",
     "residual": "what no parameter explained in the recordings",
 }
 
@@ -159,15 +160,8 @@ def _uncertainty(solved: SolvedTask) -> Iterable[Line]:
             f", semi-axes of the tip's 95 % ellipsoid\nmostly for {_PARTS[known.largest_part]}",
         ),
     )
-    if not known.inside:
-        yield (
-            "warning",
-            Text(
-                "the calibration saw no such pressures: the model extrapolates, and real errors\n"
-                "may be larger than this",
-                style="yellow",
-            ),
-        )
+    if known.extrapolation:
+        yield "warning", Text(known.extrapolation, style="yellow")
 
 
 def _stiffnesses(solved: SolvedTask) -> Iterable[Line]:

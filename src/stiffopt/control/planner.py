@@ -252,7 +252,7 @@ class PlanningEnd:
     def answer(self, answer: Plan | str | None) -> None:
         """Send the plan for the last request, or why there is none; None: the process is ready."""
         if isinstance(answer, Plan):
-            names = ("reached", "stiffness", "message", "blocked")
+            names = ("reached", "stiffness", "message", "blocked", "doubt")
             own = {name: getattr(answer, name) for name in names}
             self.connection.send({"pressures": answer.pressures.tolist(), **own})
         else:

@@ -63,6 +63,7 @@ class Plan:
     stiffness: float  # along the task's first direction; NaN where it names none
     message: str  # why it is not reached
     blocked: str = ""  # why the way there is not clear of the scene
+    doubt: str = ""  # that the model extrapolates there
 
 
 class Planning:
@@ -87,6 +88,10 @@ class Planning:
         if request.task is None or request.target is None:
             return self._checked(request)
         plan = self._planned(request, request.task, request.target)
+        known = self._robot.description.calibration
+        if known is not None:
+            channels = [each.n_channels for each in self._robot.description.segments]
+            plan = replace(plan, doubt=known.extrapolation(channels, plan.pressures))
         if self._ways is None or not len(request.way):
             return plan
         blocked = self._ways.blocked(np.vstack([request.way, plan.pressures]))

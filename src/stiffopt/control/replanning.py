@@ -173,6 +173,8 @@ class Replanner:
         if plan is not None and plan.serial == self._serial and not plan.reached:
             text = f"the target cannot be reached: {plan.message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
+        if plan is not None and plan.doubt:
+            notices = (*notices, Notice("extrapolating", plan.doubt, standing=True))
         if self._blocked:
             text = f"the arm does not go on: {self._blocked}"
             notices = (*notices, Notice("blocked", text, standing=True))

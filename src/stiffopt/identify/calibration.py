@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from stiffopt import lie
 from stiffopt.errors import CancelledError, InputError, PressureError
 from stiffopt.identify.detection import Comparer, Hypothesis, found_wrong
+from stiffopt.identify.error_model import covariance_with, error_model, kept_unknowns
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.results import (
     Comparison,
@@ -42,7 +43,7 @@ from stiffopt.identify.structures import (
     Candidate,
     ModelStructure,
     best,
-    held_back_errors,
+    held_back,
     other_laws,
 )
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS
@@ -50,7 +51,7 @@ from stiffopt.identify.unknowns import BASE
 from stiffopt.identify.validation import compare
 from stiffopt.logs import StiffnessTable
 from stiffopt.model.actuation import StrainLaw
-from stiffopt.model.calibration import Calibration, FittedParameter
+from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
 from stiffopt.model.description import Recordings, RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
@@ -228,7 +229,7 @@ def _candidate(
     problem = setup.problem(structure, settings.trial_rows)
     found = fit(problem, [problem.start(each) for each in near], teller, rounds=1)
     teller.begin(f"predicting held-back logs: {structure.words}")
-    return Candidate(structure, found, held_back_errors(found, settings.settle, teller))
+    return Candidate(structure, found, held_back(found, settings.settle, teller))
 
 
 class _Teller:
@@ -378,8 +379,13 @@ def _result(
     candidates: Sequence[Candidate],
     teller: _Teller,
 ) -> CalibrationResult:
+    chosen = [each for each in candidates if each.structure is structure]
+    errors = None
+    if chosen:
+        errors = error_model(chosen[0].fit, chosen[0].held_back, _recorded(setup))
+        found = replace(found, covariance=covariance_with(found, errors))
     listed = estimates(found)
-    robot = _robot(setup, found)
+    robot = _robot(setup, found, errors)
     teller.begin("comparing")
 
     def compared(
@@ -400,7 +406,6 @@ def _result(
         for recording in setup.recordings
         if known is not None and recording.name in known.logs
     ]
-    folds = [each.folds for each in candidates if each.structure is structure]
     calibrated = compared(robot, found.problem.named(found.x)) if setup.recordings else ()
     if is_unfit(calibrated, robot.length) and robot.calibration is not None:
         known = robot.calibration.model_copy(update={"unfit": True})
@@ -414,13 +419,13 @@ def _result(
         estimates=listed,
         nominal=compared(setup.description, {}) if setup.recordings else (),
         calibrated=calibrated,
-        held_back=folds[0] if folds else {},
+        held_back=chosen[0].folds if chosen else {},
         tables=setup.tables,
         remarks=(*remarks, *outliers(found), *doubts(found, listed)),
     )
 
 
-def _robot(setup: Setup, found: Fit) -> RobotDescription:
+def _robot(setup: Setup, found: Fit, errors: ErrorModel | None) -> RobotDescription:
     """Return the calibrated robot with its registration and its covariance."""
     problem, x = found.problem, found.x
     recordings = setup.description.recordings
@@ -452,7 +457,9 @@ def _robot(setup: Setup, found: Fit) -> RobotDescription:
         )
     robot = _with_the_same_mass(found.robot, setup.description)
     _check_usable(robot)
-    return robot.model_copy(update={"recordings": recordings, "calibration": _record(setup, found)})
+    return robot.model_copy(
+        update={"recordings": recordings, "calibration": _record(setup, found, errors)}
+    )
 
 
 def _moved_along(at: float, before: RobotDescription, after: RobotDescription) -> float:
@@ -491,33 +498,45 @@ def _check_usable(robot: RobotDescription) -> None:
         ) from None
 
 
-def _record(setup: Setup, found: Fit) -> Calibration:
+def _record(setup: Setup, found: Fit, errors: ErrorModel | None) -> Calibration:
     """Return the covariance and the range of the calibration, for the robot file.
 
     A fit to tables alone keeps what an earlier calibration knew of everything else.
     """
     from scipy.linalg import block_diag  # a large library; only fits need it
 
+    unknowns = found.problem.unknowns.all
+    places = kept_unknowns(found.problem)
+    deviations = np.sqrt(np.diag(found.covariance))[places]
+    correlation = found.covariance[np.ix_(places, places)] / np.outer(deviations, deviations)
+    correlation = np.round(correlation, REPORT.correlation_digits)
     fitted: list[FittedParameter] = []
-    places = []
-    deviations = np.sqrt(np.diag(found.covariance))
-    for i, unknown in enumerate(found.problem.unknowns.parameters):
-        if unknown.parameter is not None and not unknown.parameter.is_history:
-            deviation = float(f"{deviations[i] * unknown.deviation:.6g}")
-            places.append(i)
-            fitted.append(
-                FittedParameter(
-                    key=unknown.parameter.key, deviation=deviation, prior=unknown.deviation
-                )
-            )
-    correlation = (found.covariance / np.outer(deviations, deviations))[np.ix_(places, places)]
-    fitted += (unlearnt := _softening(setup, found))
+    frames: list[float] = []
+    for deviation, unknown in zip(deviations, (unknowns[i] for i in places), strict=True):
+        deviation = float(f"{deviation * unknown.deviation:.6g}")
+        if unknown.parameter is None:
+            frames.append(deviation)
+        else:
+            key, prior = unknown.parameter.key, unknown.deviation
+            fitted.append(FittedParameter(key=key, deviation=deviation, prior=prior))
     known = setup.description.calibration
     before = known if known is not None and not setup.recordings else Calibration()
-    keys = {each.key for each in fitted}
-    kept = [i for i, each in enumerate(before.parameters) if each.key not in keys]
-    blocks = [np.round(correlation, REPORT.correlation_digits), np.eye(len(unlearnt))]
-    blocks.append(np.reshape(before.correlation, (len(before.parameters),) * 2)[np.ix_(kept, kept)])
+    unlearnt = _softening(setup, found)
+    keys = {each.key for each in (*fitted, *unlearnt)}
+    n = len(before.parameters)
+    kept = [i for i in range(n) if before.parameters[i].key not in keys]
+    size = n + len(before.frames)
+    old = np.reshape(before.correlation, (size, size))
+    k = len(fitted)
+    whole = block_diag(
+        correlation[:k, :k], np.eye(len(unlearnt)), old[np.ix_(kept, kept)], correlation[k:, k:]
+    )
+    if frames:
+        whole[:k, -len(frames) :] = correlation[:k, k:]
+        whole[-len(frames) :, :k] = correlation[k:, :k]
+    else:
+        rows = [*kept, *range(n, size)]
+        whole = block_diag(correlation, np.eye(len(unlearnt)), old[np.ix_(rows, rows)])
     pressures = [recording.pressures for recording in setup.recordings]
     seen = np.concatenate([*pressures, *(table.pressures for table in setup.tables)])
     ends = np.cumsum([0, *(segment.n_channels for segment in setup.description.segments)])
@@ -530,13 +549,15 @@ def _record(setup: Setup, found: Fit) -> Calibration:
     turns = any(point.turns for point in found.problem.points)
     return Calibration(
         logs=before.logs + tuple(recording.name for recording in setup.recordings),
-        parameters=(*fitted, *(before.parameters[i] for i in kept)),
-        correlation=tuple(tuple(row) for row in block_diag(*blocks).tolist()),
+        parameters=(*fitted, *unlearnt, *(before.parameters[i] for i in kept)),
+        frames=tuple(frames) or before.frames,
+        correlation=tuple(tuple(row) for row in whole.tolist()),
         position_residual=noise.position if setup.recordings else before.position_residual,
         angle_residual=noise.angle if turns else before.angle_residual,
         pressure_min=tuple(low.tolist()),
         pressure_max=tuple(high.tolist()),
         pressure_norm=tuple(norms),
+        errors=errors or before.errors,
     )
 
 
@@ -552,6 +573,11 @@ def _softening(setup: Setup, found: Fit) -> list[FittedParameter]:
         for s, segment in enumerate(found.robot.segments)
         if segment.compensation is not None and segment.compensation.modulus_per_pressure
     ]
+
+
+def _recorded(setup: Setup) -> Array:
+    """All recorded pressures (N, n), in Pa."""
+    return np.concatenate([recording.pressures for recording in setup.recordings])
 
 
 def _motion(twist: Array) -> Array:

@@ -93,12 +93,15 @@ class Predicted:
     poses : of each point in the base frame (M, 4, 4).
     read : of each point, in the frame of the recordings.
     errors : measured less read (M, 3), of each point; NaN where nothing was measured.
+    per_pressure : slopes (M, 3, n) of the positions that are read, of each point, by the effective
+        pressures, in m/Pa.
     """
 
     effective: Array
     poses: tuple[Array, ...]
     read: tuple[Readings, ...]
     errors: tuple[Array, ...]
+    per_pressure: tuple[Array, ...]
 
 
 class CalibrationProblem:
@@ -245,6 +248,11 @@ class CalibrationProblem:
         """What the model says at scaled coordinates (d,)."""
         return self._predict(x)[0]
 
+    def with_slopes(self, x: Array) -> tuple[Predicted, Array]:
+        """`predict`, and slopes (M, 3, d) of the tip's position by scaled coordinates."""
+        predicted, slopes = self._predict(x)
+        return predicted, slopes[0][0] * self.scale
+
     def _append(
         self, values: list[Array], jacobians: list[Array], error: Array, slope: Array, scale: float
     ) -> None:
@@ -262,7 +270,7 @@ class CalibrationProblem:
         effective, by_history = self._effective(coordinates, sides)
         k = len(self._parameters)
         starts = self.starts
-        poses, read, errors, slopes = [], [], [], []
+        poses, read, errors, acting, slopes = [], [], [], [], []
         for point, sensor, (position, rotation) in zip(
             self.points, sensors, self._measured, strict=True
         ):
@@ -295,8 +303,10 @@ class CalibrationProblem:
             poses.append(found.transforms)
             read.append(replace(seen, position=place))
             errors.append(position - place)
+            acting.append(seen.per_twist[:, :, :6] @ found.per_pressure)
             slopes.append((moved, turned))
-        return Predicted(effective, tuple(poses), tuple(read), tuple(errors)), slopes
+        predicted = Predicted(effective, tuple(poses), tuple(read), tuple(errors), tuple(acting))
+        return predicted, slopes
 
     def _effective(self, coordinates: Array, sides: Sequence[slice]) -> tuple[Array, Array]:
         """Effective pressures (M, n) of all samples and their slopes (M, n, d)."""

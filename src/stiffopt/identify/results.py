@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,6 +80,11 @@ class Comparison:
     angle : (N,), between the measured and the predicted axis of the tip, in rad; None where no
         orientation was recorded.
     inside : (N,), whether the calibration had seen such pressures; all true without one.
+    moving : (N,), whether the pressures were changing.
+    levels : (N,), probability of the smallest region about the prediction that holds the measured
+        tip; None where the robot file does not tell the errors of predictions.
+    unsettled_levels : (N,), the same about `Manipulator.tip_pose` at the commanded pressures, for
+        whoever does not know what was commanded before.
     remarks : what was found in the log, one sentence each.
     """
 
@@ -91,6 +96,9 @@ class Comparison:
     predicted: Array
     angle: Array | None
     inside: NDArray[np.bool_]
+    moving: NDArray[np.bool_]
+    levels: Array | None
+    unsettled_levels: Array | None
     remarks: tuple[str, ...]
 
     @property
@@ -110,7 +118,7 @@ class Comparison:
 
     def rows(self, wanted: NDArray[np.bool_]) -> Comparison:
         """Some rows (N,) of it."""
-        names = ("time", "pressures", "effective", "measured", "predicted", "angle", "inside")
+        names = [each.name for each in fields(self) if each.name not in ("name", "remarks")]
         columns = {name: getattr(self, name) for name in names}
         kept = {name: column[wanted] for name, column in columns.items() if column is not None}
         return replace(self, **kept)
@@ -121,6 +129,62 @@ def together(comparisons: Sequence[Comparison]) -> Errors:
     distances = np.concatenate([np.zeros(0), *(each.distance for each in comparisons)])
     angles = [each.angle for each in comparisons if each.angle is not None]
     return Errors.of(distances, np.concatenate(angles) if angles else None)
+
+
+LEVELS = (0.5, 0.68, 0.9, 0.95, 0.99)
+"""Probabilities of the regions whose coverage is told."""
+
+
+@dataclass(frozen=True)
+class RegionCoverage:
+    """Share of measured positions within the regions of `LEVELS`.
+
+    Attributes
+    ----------
+    n : number of rows.
+    shares : for each level, from 0 to 1.
+    """
+
+    n: int
+    shares: tuple[float, ...]
+
+    @property
+    def by_level(self) -> dict[float, float]:
+        """Shares by their levels."""
+        return dict(zip(LEVELS, self.shares, strict=True))
+
+
+def coverage(comparisons: Sequence[Comparison]) -> dict[str, RegionCoverage]:
+    """RegionCoverage of the regions about predictions, over the rows of all logs together.
+
+    Returns
+    -------
+    By what is known: ``with history``, and about `Manipulator.tip_pose` ``moving`` and ``settled``;
+    each also for rows ``inside`` and ``outside`` of what was recorded, as in ``settled, outside``.
+    Kinds without a row are left out.
+    """
+    found: dict[str, list[Array]] = {}
+    for each in comparisons:
+        if each.levels is None or each.unsettled_levels is None:
+            continue
+        every = np.ones_like(each.moving)
+        kinds = {
+            "with history": (each.levels, every),
+            "moving": (each.unsettled_levels, each.moving),
+            "settled": (each.unsettled_levels, ~each.moving),
+        }
+        places = {"": every, ", inside": each.inside, ", outside": ~each.inside}
+        for kind, (levels, wanted) in kinds.items():
+            for place, where in places.items():
+                known = levels[wanted & where]
+                found.setdefault(kind + place, []).append(known[np.isfinite(known)])
+    answer = {}
+    for kind, parts in found.items():
+        levels = np.concatenate(parts)
+        if len(levels):
+            shares = tuple(float(np.mean(levels <= level)) for level in LEVELS)
+            answer[kind] = RegionCoverage(len(levels), shares)
+    return answer
 
 
 @dataclass(frozen=True)

@@ -210,6 +210,47 @@ class ChoiceSettings:
 
 
 @dataclass(frozen=True)
+class ErrorSettings:
+    """The error model of a calibration (`stiffopt.identify.error_model`).
+
+    Attributes
+    ----------
+    discrepancy, residual, tail : what is expected before anything was held back: error of the tip
+        far from what was recorded, in lengths of the arm; standard deviation of an axis in what is
+        held back, by that of the fit; degrees of freedom beyond four.
+    deviations : of their logarithms.
+    per_cell : rows that count in a cell of pressures that is as wide as the reach.
+    reaches, reach : distances over which the discrepancy may grow, and the expected one, as shares
+        of the range of recorded pressures.
+    gain : relative error of what pressures do in directions that were not recorded; no recording
+        tells it.
+    rows : most rows that tell what the discrepancy does to a fit.
+    representatives, spacing : most pressures of a segment that stand for all that were recorded;
+        and their distance, as a share of the range of pressures, at which they are enough.
+    hold, still : pressures are held if they have not changed for so many s by more than this share
+        of their range.
+    compared : most rows of a log whose regions are compared with the readings.
+    least_rows : of held, and of moving pressures that tell how far effective ones are from them.
+    """
+
+    discrepancy: float = 0.1
+    residual: float = 1.2
+    tail: float = 4.0
+    deviations: tuple[float, float, float] = (0.8, 0.4, 0.7)
+    per_cell: float = 1.0
+    reaches: tuple[float, ...] = (0.2, 0.4, 0.8)
+    reach: float = 0.4
+    gain: float = 0.1
+    rows: int = 800
+    representatives: int = 60
+    spacing: float = 0.04
+    hold: float = 2.0
+    still: float = 0.01
+    compared: int = 1000
+    least_rows: int = 20
+
+
+@dataclass(frozen=True)
 class ReportSettings:
     """What is remarked on in the result (`stiffopt.identify.results`).
 
@@ -287,6 +328,7 @@ SAMPLING = SamplingSettings()
 START = StartSettings()
 FIT = FitSettings()
 CHOICE = ChoiceSettings()
+ERRORS = ErrorSettings()
 REPORT = ReportSettings()
 DETECTION = DetectionSettings()
 

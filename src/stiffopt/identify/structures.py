@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
+from stiffopt.identify.error_model import HeldBack
 from stiffopt.identify.fit import Fit, fit
 from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.recording import Recording
@@ -197,12 +198,17 @@ class Candidate:
     ----------
     structure : ModelStructure
     fit : to all rows of the trial.
-    folds : errors of what was held back, by what that was.
+    held_back : what was held back, by what that was.
     """
 
     structure: ModelStructure
     fit: Fit
-    folds: dict[str, Errors] = field(default_factory=dict)
+    held_back: dict[str, HeldBack] = field(default_factory=dict)
+
+    @property
+    def folds(self) -> dict[str, Errors]:
+        """Errors of what was held back, by what that was."""
+        return {name: each.errors for name, each in self.held_back.items()}
 
     @property
     def score(self) -> float:
@@ -210,8 +216,8 @@ class Candidate:
         return float(np.mean([errors.mean for errors in self.folds.values()]))
 
 
-def held_back_errors(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, Errors]:
-    """Errors in logs or parts of logs when the others are fitted.
+def held_back(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, HeldBack]:
+    """Hold back logs or parts of logs, fit the others, and predict what was held back.
 
     Parameters
     ----------
@@ -220,21 +226,22 @@ def held_back_errors(found: Fit, settle: float, tell: Callable[[], None]) -> dic
         they would if it were predicted.
     """
     problem = found.problem
-    errors = {}
+    parts = {}
     for name, away in _folds(problem).items():
         kept = [_without_beginning(each, problem, i, settle) for i, each in enumerate(away)]
         if not any(each.any() for each in kept):
             continue  # a log that ends before its beginning does
-        x = fit(problem.without(kept), [found.x], tell, rounds=0, most=CHOICE.evaluations).x
-        distances = np.linalg.norm(problem.predict(x).errors[0], axis=1)
-        found_there = Errors.of(distances[np.concatenate(kept)], None)
-        if found_there.n:
-            errors[name] = found_there
-    if not errors:
+        rows = np.concatenate(kept)
+        others = fit(problem.without(kept), [found.x], tell, rounds=0, most=CHOICE.evaluations)
+        distances = np.linalg.norm(others.predicted.errors[0], axis=1)
+        errors = Errors.of(distances[rows], None)
+        if errors.n:
+            parts[name] = HeldBack(rows, others, errors)
+    if not parts:
         raise InputError(
             "there is nothing left to compare models with; expected longer logs, or name a model"
         )
-    return errors
+    return parts
 
 
 def best(candidates: Sequence[Candidate]) -> Candidate:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import StiffoptError
 from stiffopt.identify.detection import replaced
+from stiffopt.identify.error_model import is_moving
 from stiffopt.identify.fit import fit
 from stiffopt.identify.problem import CalibrationProblem, Noise, Predicted, Sample
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Comparison
-from stiffopt.identify.settings import DETECTION, SAMPLING, CalibrationSettings
+from stiffopt.identify.settings import DETECTION, ERRORS, SAMPLING, CalibrationSettings
 from stiffopt.identify.setup import (
     NOISE,
     Beginnings,
@@ -33,6 +34,7 @@ from stiffopt.logs import StiffnessTable
 from stiffopt.model.compliance import Boundary
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.uncertainty import Uncertainty
 
 Array = NDArray[np.float64]
 
@@ -194,6 +196,8 @@ def _comparison(
         counts = [segment.n_channels for segment in description.segments]
         inside = description.calibration.covers(counts, pressures)
     position = predicted.read[0].position[own]
+    moving = is_moving(recording.time, recording.pressures)[rows]
+    levels = _levels(setup, pressures, predicted.effective[own], predicted.errors[0][own], moving)
     return Comparison(
         name=recording.name,
         time=recording.time[rows],
@@ -203,8 +207,36 @@ def _comparison(
         predicted=position,
         angle=angle,
         inside=inside,
+        moving=moving,
+        levels=levels[0] if levels else None,
+        unsettled_levels=levels[1] if levels else None,
         remarks=recording.remarks,
     )
+
+
+def _levels(
+    setup: Setup, pressures: Array, effective: Array, errors: Array, moving: NDArray[np.bool_]
+) -> tuple[Array, Array] | None:
+    """Probabilities (N,) of the regions that hold the measured tip, with and without its history.
+
+    `errors` (N, 3) are those of the prediction with its history, in the frame of the recordings.
+    """
+    calibration = setup.description.calibration
+    if calibration is None or calibration.errors is None:
+        return None
+    rows = np.linspace(0, len(errors) - 1, min(len(errors), ERRORS.compared)).astype(np.intp)
+    source = Uncertainty(setup.description)
+    p, u = pressures[rows], effective[rows]
+    known = source.errors(p, effective=u)
+    unknown = source.errors(p, moving=moving[rows])
+    off = errors[rows] @ setup.base[:3, :3]
+    found = []
+    for each, error in ((known, off), (unknown, off + known.position - unknown.position)):
+        seen = np.isfinite(error).all(axis=1)
+        levels = np.full(len(errors), np.nan)
+        levels[rows[seen]] = source.levels(error[seen], each.covariance[seen])
+        found.append(levels)
+    return found[0], found[1]
 
 
 # measured stiffness -------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
@@ -13,11 +14,12 @@ from pydantic import Field, model_validator
 
 from stiffopt.errors import shown
 from stiffopt.schema import BadKeyError, Items, Schema
-from stiffopt.units import Angle, Length, Number, Pressure
+from stiffopt.units import Angle, Length, Number, Pressure, Ratio
 
 Array = NDArray[np.float64]
 _POSITIVE = Field(ge=0)
 _ROUNDING = 1e-3  # of correlations, which are written with few digits
+_NEAR = 0.1  # of the range of recorded pressures: so near to one counts as recorded
 _SLACK = 0.02  # of the highest recorded pressure, by which others may exceed what was recorded
 
 
@@ -67,6 +69,112 @@ class FittedParameter(Schema):
     prior: Annotated[Number, _POSITIVE]
 
 
+class ErrorModel(Schema):
+    """How far the tip may be from a prediction, near recorded pressures and far from them.
+
+    An arm behaves as if its effective pressures were wrong by a discrepancy, a Gaussian process in
+    the pressures of each segment: at a distance d from the nearest recorded pressure the variance
+    of each channel is ``discrepancy^2 (1 - exp(-2 d / reach)) + (gain d_u)^2``.  Here d_u is the
+    part of the way x there that leads in directions in which nothing was recorded:
+    ``d_u^2 = x' (I - S (S + e I)^-1) x`` with the mean square S of the ways from the nearest to
+    the other recorded pressures about it, and ``e = (reach / 4)^2``.
+
+    Attributes
+    ----------
+    residual : standard deviation of each axis of the tip where such pressures were recorded, in m.
+    discrepancy : of an effective pressure far from what was recorded, in Pa.
+    reach : distance over which the discrepancy grows, in Pa.
+    gain : relative error of what pressures do in directions that were not recorded.
+    degrees_of_freedom : of the multivariate t-distribution of the errors.
+    settled, moving : root mean square of effective minus commanded pressure of each channel, in Pa,
+        while pressures were held and while they changed; empty where that was not recorded.
+    recorded : pressures that stand for all that were recorded, in Pa, a row for each.
+    spacing : largest distance of a recorded pressure from the nearest of these, in Pa.
+    """
+
+    residual: Annotated[Length, _POSITIVE]
+    discrepancy: Annotated[Pressure, _POSITIVE]
+    reach: Annotated[Pressure, Field(gt=0)]
+    gain: Annotated[Ratio, _POSITIVE]
+    degrees_of_freedom: Annotated[Number, Field(gt=2)]
+    settled: Items[Pressure] = ()
+    moving: Items[Pressure] = ()
+    recorded: Items[Items[Pressure]] = Field(min_length=1)
+    spacing: Annotated[Pressure, _POSITIVE] = 0.0
+
+    def distances(self, channels: Sequence[int], pressures: Array) -> Array:
+        """Distance (N, segments) of each segment's pressures from the nearest recorded, in Pa.
+
+        Parameters
+        ----------
+        channels : number of channels of each segment.
+        pressures : (N, n)
+            In Pa.
+        """
+        _, ways = nearest_recorded(channels, pressures, np.array(self.recorded))
+        found = np.stack([np.linalg.norm(way, axis=1) for way in ways], axis=1)
+        return np.asarray(np.maximum(found - self.spacing, 0.0))
+
+    def variances(self, channels: Sequence[int], pressures: Array) -> Array:
+        """Variance (N, n) of the discrepancy of each channel at pressures (N, n), in Pa^2."""
+        recorded = np.array(self.recorded)
+        nearest, ways = nearest_recorded(channels, pressures, recorded)
+        ends = np.cumsum([0, *channels])
+        found = np.zeros_like(pressures)
+        for way, index, begin, end in zip(ways, nearest.T, ends, ends[1:], strict=False):
+            distance = np.linalg.norm(way, axis=1)
+            beyond = np.maximum(distance - self.spacing, 0.0)
+            way = way * (beyond / np.maximum(distance, 1.0))[:, np.newaxis]
+            share = self._untested(recorded[:, begin:end])[index]
+            untested = np.maximum(np.einsum("ni,nij,nj->n", way, share, way), 0.0)
+            variance = self.discrepancy**2 * -np.expm1(-2 * beyond / self.reach)
+            found[:, begin:end] = (variance + self.gain**2 * untested)[:, np.newaxis]
+        return found
+
+    def _untested(self, recorded: Array) -> Array:
+        """Share (K, c, c) of the directions about recorded pressures (K, c) that was not tested."""
+        between = recorded - recorded[:, np.newaxis]
+        weight = np.exp(-((between**2).sum(axis=2)) / (2 * self.reach**2))
+        spread = np.einsum("kl,kli,klj->kij", weight, between, between)
+        spread /= weight.sum(axis=1)[:, np.newaxis, np.newaxis]
+        identity = np.eye(recorded.shape[1])
+        ridge = (self.reach / 4) ** 2 * identity
+        return np.asarray(identity - np.linalg.solve(spread + ridge, spread))
+
+    @property
+    def near(self) -> float:
+        """Distance in Pa up to which a pressure counts as recorded."""
+        return float(_NEAR * np.ptp(np.array(self.recorded), axis=0).max())
+
+
+def nearest_recorded(
+    channels: Sequence[int], pressures: Array, recorded: Array
+) -> tuple[NDArray[np.intp], list[Array]]:
+    """Of each segment's pressures the nearest recorded, and the way from there, in Pa.
+
+    Parameters
+    ----------
+    channels : number of channels of each segment.
+    pressures, recorded : (N, n) and (K, n)
+
+    Returns
+    -------
+    Indices (N, segments) of the rows that were recorded, and for each segment ways (N, c).
+    """
+    ends = np.cumsum([0, *channels])
+    nearest = np.zeros((len(pressures), len(channels)), dtype=np.intp)
+    ways = []
+    for segment, (begin, end) in enumerate(pairwise(ends)):
+        own = pressures[:, begin:end]
+        least = np.full(len(own), np.inf)
+        for index, other in enumerate(recorded[:, begin:end]):
+            squares = ((own - other) ** 2).sum(axis=1)
+            nearest[squares < least, segment] = index
+            np.minimum(least, squares, out=least)
+        ways.append(own - recorded[nearest[:, segment], begin:end])
+    return nearest, ways
+
+
 class Calibration(Schema):
     """How well a calibration knows the arm.
 
@@ -74,30 +182,35 @@ class Calibration(Schema):
     ----------
     logs : names of the recordings it was fitted to.
     parameters : the numbers that were fitted.
-    correlation : of their errors, one row for each.
+    frames : standard deviations of the twist of the base in the tracker's frame (in base axes, m
+        and rad), then of the sensor on the tip (in the tip's axes), as far as they were fitted.
+    correlation : of the errors of parameters and frames, one row for each.
     position_residual, angle_residual : root mean square of the difference between the recorded
         positions (each axis) and angles and those of the model.
     pressure_min, pressure_max : lowest and highest recorded pressure of each channel, in Pa.
     pressure_norm : largest recorded norm of each segment's pressures, in Pa.
-        Where these three are missing, all pressures count as recorded.
+        Where these three and `errors` are missing, all pressures count as recorded.
+    errors : how far the tip may be from a prediction; None in files from before it was known.
     unfit : whether the fit missed its own recordings by so much that nothing that is computed with
         the robot can be relied on. Whoever reads such a file is warned.
     """
 
     logs: Items[str] = ()
     parameters: Items[FittedParameter] = ()
+    frames: Items[Annotated[Number, _POSITIVE]] = ()
     correlation: Items[Items[Number]] = ()
     position_residual: Annotated[Length, _POSITIVE] = 0.0
     angle_residual: Annotated[Angle, _POSITIVE] | None = None
     pressure_min: Items[Pressure] = ()
     pressure_max: Items[Pressure] = ()
     pressure_norm: Items[Pressure] = ()
+    errors: ErrorModel | None = None
     unfit: bool = False
 
     @property
     def covariance(self) -> Array:
-        """Covariance (k, k) of the parameters' coordinates, without negative variances."""
-        deviations = np.array([parameter.deviation for parameter in self.parameters])
+        """Covariance (k, k) of the coordinates of parameters and frames; no negative variances."""
+        deviations = np.array([*(each.deviation for each in self.parameters), *self.frames])
         matrix = np.array(self.correlation, dtype=float).reshape(len(deviations), len(deviations))
         # the file's few digits may leave what is as good as known slightly below zero
         values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
@@ -113,6 +226,9 @@ class Calibration(Schema):
         pressures : (N, n)
             In Pa.
         """
+        if self.errors is not None:
+            distances = self.errors.distances(channels, pressures)
+            return np.asarray((distances <= self.errors.near).all(axis=1))
         everything = (np.inf,) * pressures.shape[1]
         low = np.array(self.pressure_min or np.negative(everything))
         high = np.array(self.pressure_max or everything)
@@ -125,9 +241,24 @@ class Calibration(Schema):
             inside &= np.linalg.norm(pressures[:, begin:end], axis=1) <= norm + slack
         return np.asarray(inside)
 
+    def extrapolation(self, channels: Sequence[int], pressures: Array) -> str:
+        """Say that the model extrapolates at pressures (n,) in Pa; empty where it does not."""
+        p = pressures[np.newaxis]
+        if self.covers(channels, p)[0]:
+            return ""
+        text = "the calibration saw no such pressures"
+        if self.errors is not None:
+            away = float(self.errors.distances(channels, p).max())
+            text += f", the nearest are {away * 1e-3:.0f} kPa away"
+        return f"{text}: the model extrapolates"
+
     @model_validator(mode="after")
     def _check(self) -> Calibration:
-        k = len(self.parameters)
+        if len(self.frames) not in (0, 6, 12):
+            raise BadKeyError(
+                "frames", "expected 6 numbers, 12 with the sensor on the tip, or none"
+            )
+        k = len(self.parameters) + len(self.frames)
         keys = [parameter.key for parameter in self.parameters]
         for index, key in enumerate(keys):
             if key in keys[:index]:

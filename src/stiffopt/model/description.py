@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from stiffopt.errors import InputError, shown
-from stiffopt.model.calibration import Calibration
+from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.model.history import History
 from stiffopt.registration import Placement, Registration
 from stiffopt.schema import BadKeyError, Items, Schema, Vector, explain
@@ -563,6 +563,18 @@ class RobotDescription(Schema):
                 raise BadKeyError(
                     f"calibration.{key}",
                     f"has {len(values)} values; expected {n}, one for each {what} of the robot",
+                )
+        if (errors := self.calibration.errors) is not None:
+            self._check_errors(errors)
+
+    def _check_errors(self, errors: ErrorModel) -> None:
+        rows = {f"recorded.{i}": row for i, row in enumerate(errors.recorded)}
+        for key, values in {"settled": errors.settled, "moving": errors.moving, **rows}.items():
+            if len(values) != self.n_pressures and (values or key in rows):
+                raise BadKeyError(
+                    f"calibration.errors.{key}",
+                    f"has {len(values)} values; expected {self.n_pressures}, one for each channel "
+                    "of the robot",
                 )
 
     def _has_number(self, key: str) -> bool:

@@ -286,8 +286,13 @@ class Manipulator(Arm, ShownInNotebook):
             ("stiffness gradient", measure), lambda tip: tip.total_jacobian(stiffness(tip)), p
         )[..., 0, :]
 
-    def tip_uncertainty(self, p: ArrayLike) -> TipUncertainty:
+    def tip_uncertainty(self, p: ArrayLike, *, moving: bool = False) -> TipUncertainty:
         """How well a calibration knows the tip at pressures p (n,), and its stiffness.
+
+        Parameters
+        ----------
+        p : commanded pressures (n,) in Pa; what was commanded before is not known.
+        moving : whether the pressures change, as they did in the recordings; else they are held.
 
         Raises
         ------
@@ -298,7 +303,7 @@ class Manipulator(Arm, ShownInNotebook):
         known = self.kept(
             ("uncertainty", self.tip_load), lambda: Uncertainty(self.description, self.tip_load)
         )
-        return known.at(p)
+        return known.at(p, moving=moving)
 
     # -- screws and loads -------------------------------------------------------------------
 

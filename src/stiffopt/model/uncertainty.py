@@ -1,15 +1,15 @@
 """Uncertainty of the tip's position and stiffness of a calibrated arm.
 
-There are three independent sources: the parameters, whose covariance the calibration found; the
+There are four independent sources: the parameters, whose covariance the calibration found; the
 hysteresis, since the same pressures hold the arm anywhere between where loading and unloading take
-it; and the residual that no parameter explained in the recordings.  The first two are propagated to
-the tip by their Jacobians, to first order.
+it; the discrepancy between model and arm, which grows with the distance from what was recorded; and
+the residual that no parameter explained in the recordings.  All but the last are propagated to the
+tip by their Jacobians, to first order.  Together they follow a multivariate t-distribution.
 
-Hysteresis is taken long after the pressures were reached, when lag and creep are over.  No play
-operator was ever dragged beyond the robot's pressure limits, so that less hysteresis is possible
-near the limits than between them.  Each channel's effective pressure is taken to be distributed
-evenly between the least and the largest possible value.  Its mean square is taken about the
-equilibrium, which is what `tip_pose` returns; near the limits that is not the middle.
+What hysteresis does is bounded: no play operator was ever dragged beyond the robot's pressure
+limits, so that less hysteresis is possible near the limits than between them.  Its mean square is
+that of effective minus commanded pressures as recorded, and at most that of an even distribution
+between the bounds, about the equilibrium, which is what `tip_pose` returns.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 
 Vector = NDArray[np.float64]
-Part = Literal["parameters", "hysteresis", "residual"]
+Part = Literal["parameters", "hysteresis", "discrepancy", "residual"]
 
-_CHI_SQUARED = 7.814727903251179  # 95 % quantile, three degrees of freedom
+_LEVEL = 0.95  # of the regions that are told everywhere
 _NORMAL = 1.959963984540054  # 97.5 % quantile
 
 
@@ -44,32 +44,42 @@ class TipUncertainty:
 
     Attributes
     ----------
-    parameters, hysteresis, residual : ndarray
+    parameters, hysteresis, discrepancy, residual : ndarray
         Mean squares (3, 3) of the error of `Manipulator.tip_pose`'s position in base axes, in m^2,
-        that come from the parameters' errors, from hysteresis, and from what the calibration left
-        unexplained.
+        that come from the parameters' errors, from hysteresis, from what the model gets wrong far
+        from recorded pressures, and from what the calibration left unexplained.
     inside : bool
-        Whether the calibration saw such pressures; outside, the model extrapolates and the real
-        errors may be larger.
+        Whether the calibration saw such pressures; outside, the model extrapolates.
+    extrapolation : str
+        A sentence that says so, with the distance to the nearest recorded pressures; else empty.
     """
 
     parameters: Vector
     hysteresis: Vector
+    discrepancy: Vector
     residual: Vector
     inside: bool
+    extrapolation: str
     _source: Uncertainty
     _pressures: Vector
 
     @property
     def covariance(self) -> Vector:
         """Mean square (3, 3) of the position's error in base axes, in m^2."""
-        return np.asarray(self.parameters + self.hysteresis + self.residual)
+        return np.asarray(self.parameters + self.hysteresis + self.discrepancy + self.residual)
 
     @cached_property
     def semi_axes(self) -> Vector:
         """Half lengths (3,) of the 95 % ellipsoid about `tip_pose` in m, the longest first."""
+        return self.semi_axes_at(_LEVEL)
+
+    def semi_axes_at(self, level: float) -> Vector:
+        """Half lengths (3,) in m of the ellipsoid that holds the tip with a probability."""
+        if not 0 < level < 1:
+            raise InputError(f"a probability lies between 0 and 1, both excluded; got {level!r}")
         values = np.linalg.eigvalsh(self.covariance)[::-1]
-        return np.asarray(np.sqrt(_CHI_SQUARED * np.maximum(values, 0.0)))
+        factor = squared_radius(level, self._source.degrees_of_freedom)
+        return np.asarray(np.sqrt(factor * np.maximum(values, 0.0)))
 
     @cached_property
     def axes(self) -> Vector:
@@ -82,6 +92,7 @@ class TipUncertainty:
         parts: dict[Part, float] = {
             "parameters": float(np.trace(self.parameters)),
             "hysteresis": float(np.trace(self.hysteresis)),
+            "discrepancy": float(np.trace(self.discrepancy)),
             "residual": float(np.trace(self.residual)),
         }
         return max(parts, key=lambda part: parts[part])
@@ -95,10 +106,33 @@ class TipUncertainty:
     ) -> tuple[float, float]:
         """95 % interval of a directional stiffness, in N/m or N m/rad; see `Manipulator.stiffness`.
 
-        From the parameters' errors and hysteresis, on a logarithmic scale, to first order. It
-        contains `Manipulator.stiffness`.
+        From the errors of the parameters and of the effective pressures, on a logarithmic scale, to
+        first order. It contains `Manipulator.stiffness`.
         """
         return self._source.stiffness_interval(self._pressures, direction, kind, boundary, frame)
+
+
+@dataclass(frozen=True, eq=False)
+class PositionErrors:
+    """Errors of predictions of the tip's position.
+
+    Attributes
+    ----------
+    position : predicted (N, 3), in base axes and m.
+    parameters, hysteresis, discrepancy, residual : mean squares (N, 3, 3) of its error by source,
+        as in `TipUncertainty`.
+    """
+
+    position: Vector
+    parameters: Vector
+    hysteresis: Vector
+    discrepancy: Vector
+    residual: Vector
+
+    @property
+    def covariance(self) -> Vector:
+        """Of all sources (N, 3, 3)."""
+        return np.asarray(self.parameters + self.hysteresis + self.discrepancy + self.residual)
 
 
 class Uncertainty:
@@ -115,7 +149,9 @@ class Uncertainty:
         The robot was not calibrated.
     """
 
-    def __init__(self, description: RobotDescription, tip_load: Sequence[float]) -> None:
+    def __init__(
+        self, description: RobotDescription, tip_load: Sequence[float] = (0.0,) * 12
+    ) -> None:
         if description.calibration is None:
             raise InputError(
                 f"robot '{description.name}' was not calibrated, so that nothing is known of its "
@@ -124,40 +160,110 @@ class Uncertainty:
         self._description = description
         self._channels = [segment.n_channels for segment in description.segments]
         self._calibration: Calibration = description.calibration
-        parameters = [Parameter(fitted.key) for fitted in self._calibration.parameters]
-        self._arm = ParametricArm(description, parameters, tip_load)
+        self._slopes = ReadingSlopes(
+            description,
+            [Parameter(fitted.key) for fitted in self._calibration.parameters],
+            len(self._calibration.frames),
+            tip_load,
+        )
         self._covariance = self._calibration.covariance
 
-    def at(self, pressures: Vector) -> TipUncertainty:
-        """Uncertainty at pressures (n,)."""
-        found = self._arm.poses(pressures[np.newaxis], self._rest)
-        rotation = found.transforms[0, :3, :3]
-        per_coordinate = rotation @ found.per_coordinate[0, :3]
-        per_pressure = rotation @ found.per_pressure[0, :3]
+    @property
+    def degrees_of_freedom(self) -> float:
+        """Of the t-distribution of the errors; infinite where it is normal."""
+        errors = self._calibration.errors
+        return np.inf if errors is None else errors.degrees_of_freedom
+
+    def at(self, pressures: Vector, *, moving: bool = False) -> TipUncertainty:
+        """Uncertainty at commanded pressures (n,), held or `moving`, of an unknown history."""
+        p = pressures[np.newaxis]
+        found = self.errors(p, moving=np.array([moving]))
+        extrapolation = self._calibration.extrapolation(self._channels, pressures)
         return TipUncertainty(
-            parameters=per_coordinate @ self._covariance @ per_coordinate.T,
-            hysteresis=(per_pressure * self._hysteresis(pressures)) @ per_pressure.T,
-            residual=np.eye(3) * self._calibration.position_residual**2,
-            inside=bool(self._calibration.covers(self._channels, pressures[np.newaxis])[0]),
+            parameters=found.parameters[0],
+            hysteresis=found.hysteresis[0],
+            discrepancy=found.discrepancy[0],
+            residual=found.residual[0],
+            inside=not extrapolation,
+            extrapolation=extrapolation,
             _source=self,
             _pressures=pressures,
         )
+
+    def errors(
+        self,
+        pressures: Vector,
+        *,
+        effective: Vector | None = None,
+        moving: NDArray[np.bool_] | None = None,
+    ) -> PositionErrors:
+        """Errors of predictions.
+
+        Parameters
+        ----------
+        pressures : commanded (N, n), in Pa.
+        effective : pressures (N, n) in Pa that a known history makes of them; without these the
+            prediction is `tip_pose` at the commanded ones.
+        moving : which rows (N,) are not held; none if absent.
+        """
+        u = pressures if effective is None else effective
+        position, per_number, per_pressure = self._slopes.at(u)
+        transposed = np.swapaxes(per_pressure, 1, 2)
+        acting = np.zeros_like(pressures)
+        if effective is None:
+            still = moving if moving is not None else np.zeros(len(pressures), dtype=bool)
+            acting = self._hysteresis(pressures, still)
+        errors = self._calibration.errors
+        residual = self._calibration.position_residual if errors is None else errors.residual
+        return PositionErrors(
+            position=position,
+            parameters=per_number @ self._covariance @ np.swapaxes(per_number, 1, 2),
+            hysteresis=(per_pressure * acting[:, np.newaxis]) @ transposed,
+            discrepancy=(per_pressure * self._discrepancy(pressures)[:, np.newaxis]) @ transposed,
+            residual=np.broadcast_to(np.eye(3) * residual**2, (len(u), 3, 3)),
+        )
+
+    def levels(self, errors: Vector, covariance: Vector) -> Vector:
+        """Probability (N,) of the smallest regions that hold errors (N, 3) of the position."""
+        return levels(errors, covariance, self.degrees_of_freedom)
 
     def stiffness_interval(
         self, pressures: Vector, direction: ArrayLike, kind: Kind, boundary: Boundary, frame: Frame
     ) -> tuple[float, float]:
         """See `TipUncertainty.stiffness_interval`."""
         measure = checked_measure(direction, kind, boundary, frame)
-        k, per_pressure, per_coordinate = self._arm.stiffnesses(
-            pressures[np.newaxis], self._rest, measure
+        p = pressures[np.newaxis]
+        k, per_pressure, per_coordinate = self._slopes.arm.stiffnesses(
+            p, self._slopes.rest, measure
         )
         g, h = per_coordinate[0] / k[0], per_pressure[0] / k[0]
-        variance = g @ self._covariance @ g + h**2 @ self._hysteresis(pressures)
+        size = len(g)
+        acting = self._hysteresis(p, np.zeros(1, dtype=bool)) + self._discrepancy(p)
+        variance = g @ self._covariance[:size, :size] @ g + h**2 @ acting[0]
         deviation = float(np.sqrt(max(variance, 0.0)))
         return float(k[0] * np.exp(-_NORMAL * deviation)), float(k[0] * np.exp(_NORMAL * deviation))
 
-    def _hysteresis(self, pressures: Vector) -> Vector:
-        """Mean squares (n,) of effective minus commanded pressures (n,), in Pa^2."""
+    def _discrepancy(self, pressures: Vector) -> Vector:
+        """Variances (N, n) of the effective pressures far from what was recorded, in Pa^2."""
+        errors = self._calibration.errors
+        if errors is None:
+            return np.zeros_like(pressures)
+        return errors.variances(self._channels, pressures)
+
+    def _hysteresis(self, pressures: Vector, moving: NDArray[np.bool_]) -> Vector:
+        """Mean squares (N, n) of effective minus commanded pressures (N, n), in Pa^2."""
+        bounds = np.array([self._even(row) for row in pressures])
+        errors = self._calibration.errors
+        if errors is None:
+            return bounds
+        if errors.settled:
+            bounds = np.minimum(bounds, np.square(errors.settled))
+        if errors.moving:
+            bounds[moving] = np.maximum(bounds, np.square(errors.moving))[moving]
+        return bounds
+
+    def _even(self, pressures: Vector) -> Vector:
+        """Mean squares (n,) if every possible effective pressure is as likely, in Pa^2."""
         robot = self._description
         places = [
             (segment.history or NO_HISTORY, channel)
@@ -172,9 +278,86 @@ class Uncertainty:
             found.append((least**2 + least * most + most**2) / 3)
         return np.array(found)
 
-    @property
-    def _rest(self) -> Vector:
-        return np.zeros(len(self._calibration.parameters))
+
+class ReadingSlopes:
+    """Where a tracker reads the tip, and what the numbers of a calibration move of it.
+
+    Parameters
+    ----------
+    description : RobotDescription
+    parameters : of the robot file, k in number.
+    frames : 0, 6 (twist of the base in the tracker's frame) or 12 (and of the sensor on the tip).
+    tip_load : as in `ParametricArm`.
+    """
+
+    def __init__(
+        self,
+        description: RobotDescription,
+        parameters: Sequence[Parameter],
+        frames: int = 0,
+        tip_load: Sequence[float] = (0.0,) * 12,
+    ) -> None:
+        self.arm = ParametricArm(description, parameters, tip_load)
+        self.rest = np.zeros(len(parameters))
+        self._frames = frames
+        given = description.recordings
+        self._sensor = np.zeros(3)
+        if given is not None:
+            self._sensor = given.registration.tip_in_sensor.inverse()[:3, 3]
+
+    def at(self, pressures: Vector) -> tuple[Vector, Vector, Vector]:
+        """Positions (N, 3) of the tip at effective pressures (N, n), and slopes of the sensor's.
+
+        These are (N, 3, k + frames) by the numbers and (N, 3, n) per Pa; all in base axes and m.
+        """
+        found = self.arm.poses(pressures, self.rest)
+        rotation, tip = found.transforms[:, :3, :3], found.transforms[:, :3, 3]
+
+        def moved(twists: Vector) -> Vector:  # of the sensor, in base axes
+            return np.asarray(rotation @ (twists[:, :3] - _skew(self._sensor) @ twists[:, 3:]))
+
+        per_number = [moved(found.per_coordinate)]
+        if self._frames:
+            shifted = np.broadcast_to(np.eye(3), rotation.shape)
+            per_number += [shifted, -_skew(tip + rotation @ self._sensor)]
+        if self._frames == 12:
+            per_number += [rotation, -rotation @ _skew(self._sensor)]
+        return tip, np.concatenate(per_number, axis=2), moved(found.per_pressure)
+
+
+def _skew(vectors: Vector) -> Vector:
+    """Matrices (..., 3, 3) of the cross products with vectors (..., 3)."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    o = np.zeros_like(x)
+    rows = [np.stack(row, axis=-1) for row in ((o, -z, y), (z, o, -x), (-y, x, o))]
+    return np.stack(rows, axis=-2)
+
+
+def squared_radius(level: float, degrees_of_freedom: float) -> float:
+    """Squared Mahalanobis distance within which errors of a probability lie, in three dimensions.
+
+    The covariance of a t-distribution with v degrees of freedom is v / (v - 2) times its scale
+    matrix, so that the squared distance by the covariance is (v - 2) / v times 3 F(3, v).
+    """
+    from scipy.special import chdtri, fdtri
+
+    v = degrees_of_freedom
+    if np.isinf(v):
+        return float(chdtri(3, 1 - level))
+    return float(3 * (v - 2) / v * fdtri(3, v, level))
+
+
+def levels(errors: Vector, covariance: Vector, degrees_of_freedom: float) -> Vector:
+    """Probability (N,) of the smallest regions of covariances (N, 3, 3) that hold errors (N, 3)."""
+    from scipy.special import chdtr, fdtr
+
+    v = degrees_of_freedom
+    squares = np.einsum(
+        "ni,ni->n", errors, np.linalg.solve(covariance, errors[..., np.newaxis])[..., 0]
+    )
+    if np.isinf(v):
+        return np.asarray(chdtr(3, squares))
+    return np.asarray(fdtr(3, v, squares * v / (3 * (v - 2))))
 
 
 def settled_range(

@@ -1,0 +1,295 @@
+"""How far a calibrated arm may be from its predictions, from what was held back.
+
+The arm behaves as if the effective pressures of each segment were wrong by a discrepancy delta, a
+Gaussian process in that segment's pressures with covariance ``s^2 exp(-|p - p'| / l)`` for each
+channel.  It acts twice.  Rows near each other err alike, so that a fit to them is less certain
+than their number says: with the normal matrix N of the fit, its weighted slopes A (of all rows, by
+the unknowns) and the slopes J_p of positions by effective pressures, ::
+
+    cov(x) = N^-1 + s^2 N^-1 (A' J_p) K (A' J_p)' N^-1.
+
+And at a distance d from the nearest recorded pressure the discrepancy itself has the variance
+``s^2 (1 - exp(-2 d / l))``, that of the process given its value there.
+
+s, l, the residual and the tail of the errors are those that make what was held back most probable,
+with weak priors; a region of pressures that is alike counts once, however many rows lie in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.identify.fit import Fit
+from stiffopt.identify.problem import CalibrationProblem, Sample
+from stiffopt.identify.results import Errors
+from stiffopt.identify.settings import ERRORS, FIT
+from stiffopt.model.calibration import ErrorModel, nearest_recorded
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+_LEAST_FREEDOM = 4.0  # below it, a covariance says little about a t-distribution
+
+
+@dataclass(frozen=True, eq=False)
+class HeldBack:
+    """Rows of all samples (M,) that were held back, the fit to the others, and its errors there."""
+
+    rows: Rows
+    fit: Fit
+    errors: Errors
+
+
+def error_model(
+    found: Fit, held_back: Mapping[str, HeldBack], recorded: Array | None = None
+) -> ErrorModel:
+    """Fit the error model of a structure to what was held back from it.
+
+    Parameters
+    ----------
+    found : fit to all rows.
+    held_back : of the same problem, by what was held back.
+    recorded : all recorded pressures (N, n), in Pa; by default those of the rows that are fitted.
+    """
+    pressures = commanded(found.problem.samples)
+    reaches = np.array(ERRORS.reaches) * np.ptp(pressures, axis=0).max()
+    folds = [_Fold.of(each, pressures, reaches, found.independent) for each in held_back.values()]
+    best = min((_most_probable(folds, i, found) for i in range(len(reaches))), key=lambda b: b[0])
+    _, index, (discrepancy, residual, tail) = best
+    kept, spacing = representatives(_channels(found), pressures if recorded is None else recorded)
+    settled, moving = _unsettled(found)
+    return ErrorModel(
+        residual=float(f"{residual:.4g}"),
+        discrepancy=float(f"{discrepancy:.4g}"),
+        reach=float(f"{reaches[index]:.4g}"),
+        gain=ERRORS.gain,
+        degrees_of_freedom=float(f"{_LEAST_FREEDOM + tail:.3g}"),
+        settled=settled,
+        moving=moving,
+        recorded=tuple(map(tuple, np.round(kept, -1).tolist())),
+        spacing=float(f"{spacing:.3g}"),
+    )
+
+
+def covariance_with(found: Fit, errors: ErrorModel) -> Array:
+    """Covariance (d, d) of a fit's scaled coordinates, with what the discrepancy adds."""
+    added = _influence(found.problem, found.x, found.covariance, np.array([errors.reach]))[0]
+    return np.asarray(found.covariance + errors.discrepancy**2 * added)
+
+
+def commanded(samples: Sequence[Sample]) -> Array:
+    """Commanded pressures (M, n) of the rows of all samples, in Pa."""
+    return np.concatenate([each.recording.pressures[each.rows] for each in samples])
+
+
+def kept_unknowns(problem: CalibrationProblem) -> NDArray[np.intp]:
+    """Which unknowns a robot file keeps: of the equilibrium, the base and the tip's sensor."""
+    base, sensors, _, _ = problem.unknowns.slices()
+    parameters = [
+        i
+        for i, unknown in enumerate(problem.unknowns.parameters)
+        if unknown.parameter is not None and not unknown.parameter.is_history
+    ]
+    tip = range(sensors[0].start, sensors[0].stop) if sensors else ()
+    return np.array([*parameters, *range(base.start, base.stop), *tip], dtype=np.intp)
+
+
+def representatives(channels: Sequence[int], pressures: Array) -> tuple[Array, float]:
+    """Rows (K, n) of pressures (N, n) that stand for all, and the largest distance from one.
+
+    Of each segment's pressures always the farthest from those that were chosen comes next.
+    """
+    ends = np.cumsum([0, *channels])
+    chosen: list[int] = []
+    spacing = 0.0
+    for begin, end in pairwise(ends):
+        own = pressures[:, begin:end]
+        distance = np.full(len(own), np.inf)
+        for index in chosen:
+            distance = np.minimum(distance, np.linalg.norm(own - own[index], axis=1))
+        for _ in range(ERRORS.representatives):
+            index = int(np.argmax(distance)) if np.isfinite(distance).all() else 0
+            if distance[index] <= ERRORS.spacing * np.ptp(pressures, axis=0).max():
+                break
+            chosen.append(index)
+            distance = np.minimum(distance, np.linalg.norm(own - own[index], axis=1))
+        spacing = max(spacing, float(distance.max()))
+    return pressures[sorted(set(chosen))], spacing
+
+
+# -- the likelihood of what was held back ----------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Fold:
+    """Rows that were held back and seen, N in number.
+
+    Attributes
+    ----------
+    errors : (N, 3), in the frame of the recordings, in m.
+    parameters : mean squares (N, 3, 3) that the parameters' errors cause without discrepancy.
+    through_fit, direct : what a discrepancy of 1 Pa^2 causes, through the fit and by itself, for
+        each reach (R, N, 3, 3).
+    weight : of a row: all of them count as the independent ones among them.
+    """
+
+    errors: Array
+    parameters: Array
+    through_fit: Array
+    direct: Array
+    weight: Array
+
+    @classmethod
+    def of(cls, held: HeldBack, pressures: Array, reaches: Array, independent: float) -> _Fold:
+        fit, problem = held.fit, held.fit.problem
+        predicted, slopes = problem.with_slopes(fit.x)
+        rows = held.rows & np.isfinite(predicted.errors[0]).all(axis=1)
+        counted = np.concatenate([sample.weight for sample in problem.samples]) > 0
+        channels = _channels(fit)
+        _, ways = nearest_recorded(channels, pressures[rows], pressures[counted])
+        distances = np.stack([np.linalg.norm(way, axis=1) for way in ways], axis=1)
+        growth = -np.expm1(-2 * distances / reaches[:, np.newaxis, np.newaxis])
+        acting = predicted.per_pressure[0][rows]
+        direct = np.repeat(growth, channels, axis=2)[:, :, np.newaxis] * acting
+        kept = kept_unknowns(problem)
+        slope = slopes[rows][:, :, kept]
+        added = _influence(problem, fit.x, fit.covariance, reaches)[:, kept[:, np.newaxis], kept]
+        return cls(
+            errors=predicted.errors[0][rows],
+            parameters=_spread(slope, fit.covariance[np.ix_(kept, kept)]),
+            through_fit=np.stack([_spread(slope, each) for each in added]),
+            direct=direct @ np.swapaxes(acting, 1, 2),
+            weight=np.stack([_weights(pressures[rows], reach, independent) for reach in reaches]),
+        )
+
+    def misfit(self, index: int, discrepancy: float, residual: float, tail: float) -> float:
+        """Negative logarithm of the probability density of the errors, up to a constant."""
+        from scipy.special import gammaln
+
+        covariance = (
+            self.parameters
+            + discrepancy**2 * (self.through_fit[index] + self.direct[index])
+            + residual**2 * np.eye(3)
+        )
+        v = _LEAST_FREEDOM + tail
+        squares = np.einsum(
+            "ni,ni->n", self.errors,
+            np.linalg.solve(covariance, self.errors[..., np.newaxis])[..., 0],
+        )  # fmt: skip
+        _, logarithm = np.linalg.slogdet(covariance)
+        norm = gammaln((v + 3) / 2) - gammaln(v / 2) - 1.5 * np.log(v - 2)
+        each = 0.5 * (v + 3) * np.log1p(squares / (v - 2)) + 0.5 * logarithm - norm
+        return float(self.weight[index] @ each)
+
+
+def _spread(slope: Array, covariance: Array) -> Array:
+    """Mean squares (N, 3, 3) of positions with slopes (N, 3, k) by what has a covariance (k, k)."""
+    return np.asarray(slope @ covariance @ np.swapaxes(slope, 1, 2))
+
+
+def _weights(pressures: Array, reach: float, independent: float) -> Array:
+    """Weights (N,) of rows at pressures (N, n): together as many as there are cells among them."""
+    cells = len(np.unique(np.round(pressures / reach), axis=0))
+    most = len(pressures) / independent
+    return np.full(
+        len(pressures), min(max(most, 1.0), ERRORS.per_cell * cells) / max(len(pressures), 1)
+    )
+
+
+def _most_probable(
+    folds: Sequence[_Fold], index: int, found: Fit
+) -> tuple[float, int, tuple[float, float, float]]:
+    """Misfit with the priors, the index of the reach, and discrepancy, residual and tail."""
+    from scipy.optimize import minimize  # a large library; only fits need it
+
+    acting = found.predicted.per_pressure[0]
+    length = found.problem.description.length
+    slope = np.sqrt(np.mean((acting**2).sum(axis=(1, 2))))
+    expected = np.log([
+        ERRORS.discrepancy * length / slope, ERRORS.residual * found.problem.noise.position,
+        ERRORS.tail,
+    ])  # fmt: skip
+
+    def misfit(logarithms: Array) -> float:
+        values = np.exp(np.clip(logarithms, expected - 5, expected + 5)).tolist()
+        data = sum(fold.misfit(index, *values) for fold in folds)
+        return data + 0.5 * float((((logarithms - expected) / ERRORS.deviations) ** 2).sum())
+
+    result: Any = minimize(
+        misfit,
+        expected,
+        method="Nelder-Mead",
+        options={"xatol": 0.01, "fatol": 0.01, "maxiter": 300},
+    )
+    discrepancy, residual, tail = np.exp(result.x).tolist()
+    reach_prior = 0.5 * float(np.log(ERRORS.reaches[index] / ERRORS.reach) ** 2)
+    return float(result.fun) + reach_prior, index, (discrepancy, residual, tail)
+
+
+def _influence(problem: CalibrationProblem, x: Array, covariance: Array, reaches: Array) -> Array:
+    """Covariances (R, d, d) of scaled x that a discrepancy of 1 Pa^2 causes, for each reach."""
+    value, slope = problem.residuals(x)
+    slope = slope / np.sqrt(1 + value**2 / FIT.loss_scale**2)[:, np.newaxis]
+    predicted = problem.predict(x)
+    pressures = commanded(problem.samples)
+    count = len(pressures)
+    weights = np.concatenate([each.weight for each in problem.samples]) / problem.noise.position
+    pulls = np.zeros((count, pressures.shape[1], problem.size))
+    begin = 0
+    for read, acting in zip(predicted.read, predicted.per_pressure, strict=True):
+        own = slope[begin : begin + 3 * count].reshape(count, 3, -1)
+        pulls += np.swapaxes(acting * weights[:, np.newaxis, np.newaxis], 1, 2) @ own
+        begin += 3 * count * (1 if read.turn is None else 2)
+    stride = -(-count // ERRORS.rows)
+    rows = np.flatnonzero(weights > 0)[::stride]
+    pulls, pressures = stride * pulls[rows] @ covariance, pressures[rows]
+    ends = np.cumsum([0, *(segment.n_channels for segment in problem.description.segments)])
+    found = np.zeros((len(reaches), problem.size, problem.size))
+    for first, last in pairwise(ends):
+        own = pressures[:, first:last]
+        distances = np.sqrt(((own[:, np.newaxis] - own) ** 2).sum(axis=2))
+        for r, reach in enumerate(reaches):
+            alike = np.exp(-distances / reach)
+            for channel in range(first, last):
+                found[r] += pulls[:, channel].T @ alike @ pulls[:, channel]
+    return found
+
+
+def _channels(found: Fit) -> list[int]:
+    return [segment.n_channels for segment in found.problem.description.segments]
+
+
+# -- what unknown histories do ---------------------------------------------------------------
+
+
+def _unsettled(found: Fit) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Root mean squares (n,) of effective minus commanded pressures, held and moving; or none."""
+    samples = found.problem.samples
+    moves = np.concatenate([is_moving(each.recording.time, each.recording.pressures)[each.rows]
+                            for each in samples])  # fmt: skip
+    difference = found.predicted.effective - commanded(samples)
+    answer: list[tuple[float, ...]] = []
+    for rows in (~moves, moves):
+        if rows.sum() < ERRORS.least_rows:
+            answer.append(())
+        else:
+            squares = np.sqrt(np.mean(difference[rows] ** 2, axis=0))
+            answer.append(tuple(float(f"{each:.4g}") for each in squares))
+    return answer[0], answer[1]
+
+
+def is_moving(time: Array, pressures: Array) -> Rows:
+    """Rows (N,) at which pressures (N, n) have changed within the last `ERRORS.hold` seconds."""
+    step = ERRORS.still * max(float(np.ptp(pressures, axis=0).max()), 1.0)
+    before = np.searchsorted(time, time - ERRORS.hold)
+    lowest, highest = pressures.copy(), pressures.copy()
+    for row, first in enumerate(before):
+        lowest[row] = pressures[first : row + 1].min(axis=0)
+        highest[row] = pressures[first : row + 1].max(axis=0)
+    return np.asarray((highest - lowest > step).any(axis=1))

@@ -1,0 +1,282 @@
+"""The error model of a calibration, against draws from the process that it describes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stiffopt.errors import FileError, InputError
+from stiffopt.identify.error_model import (
+    covariance_with,
+    error_model,
+    is_moving,
+    kept_unknowns,
+    representatives,
+)
+from stiffopt.identify.fit import fit
+from stiffopt.identify.problem import CalibrationProblem
+from stiffopt.identify.results import LEVELS, Comparison, coverage
+from stiffopt.identify.settings import ERRORS, CalibrationSettings
+from stiffopt.identify.setup import Setup, recordings_of
+from stiffopt.identify.structures import STRUCTURES, held_back
+from stiffopt.logs import Log
+from stiffopt.model.calibration import Calibration, ErrorModel
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.robot_files import load_description, save_robot
+from stiffopt.model.uncertainty import ReadingSlopes, Uncertainty, levels, squared_radius
+
+Array = NDArray[np.float64]
+
+ONE = load_description("stiff-flop-1")
+CIRCLE = 0.5e5 + 0.4e5 * np.stack(
+    [np.cos(np.linspace(0, 2 * np.pi, 60) + k * 2 * np.pi / 3) for k in range(3)], axis=1
+)
+KNOWN = ErrorModel(
+    residual=5e-4, discrepancy=4e3, reach=3e4, gain=0.1, degrees_of_freedom=6.0,
+    settled=(500.0,) * 3, moving=(3e3,) * 3,
+    recorded=tuple(map(tuple, CIRCLE.tolist())), spacing=0.0,
+)  # fmt: skip
+
+
+def problem_of(pressures: Array, rng: np.random.Generator, noise: float) -> CalibrationProblem:
+    """An arm held at some pressures, seen with errors that are independent."""
+    tips = Manipulator(ONE).tip_pose(pressures)[:, :3, 3]
+    log = Log(np.arange(len(tips)) * 10.0, pressures, tips + noise * rng.normal(size=tips.shape))
+    settings = CalibrationSettings()
+    setup = Setup.of(ONE, recordings_of(ONE, [("log", log)], settings), [], settings)
+    return setup.problem(STRUCTURES[0], 400)
+
+
+# -- the distance from what was recorded ------------------------------------------------------
+
+
+def test_what_was_recorded_is_near_and_known() -> None:
+    assert KNOWN.distances([3], CIRCLE).max() == 0
+    assert KNOWN.variances([3], CIRCLE).max() == 0
+    calibration = Calibration(errors=KNOWN)
+    assert calibration.covers([3], CIRCLE).all()
+    assert calibration.extrapolation([3], CIRCLE[3]) == ""
+
+
+def test_the_variance_of_the_discrepancy_grows_with_the_distance_as_is_said() -> None:
+    away = np.array([[1.6e5, 1.4e5, 1.2e5]])
+    distance = np.linalg.norm(away - CIRCLE, axis=1).min()
+    assert KNOWN.distances([3], away)[0, 0] == pytest.approx(distance)
+    out = np.linspace(0, 1, 6)[:, np.newaxis]
+    variances = KNOWN.variances([3], CIRCLE[0] + out * (away - CIRCLE[0]))
+    assert (np.diff(variances[:, 0]) > 0).all()
+    nearest = CIRCLE[np.argmin(np.linalg.norm(away - CIRCLE, axis=1))]
+    weight = np.exp(-((CIRCLE - nearest) ** 2).sum(axis=1) / (2 * KNOWN.reach**2))
+    ways = CIRCLE - nearest
+    spread = (ways.T * weight) @ ways / weight.sum()
+    ridge = (KNOWN.reach / 4) ** 2 * np.eye(3)
+    way = away[0] - nearest
+    untested = way @ (np.eye(3) - spread @ np.linalg.inv(spread + ridge)) @ way
+    expected = KNOWN.discrepancy**2 * (1 - np.exp(-2 * distance / KNOWN.reach))
+    expected += KNOWN.gain**2 * untested
+    assert variances[-1] == pytest.approx(expected)
+
+
+def test_pressures_far_from_all_that_were_recorded_are_told_with_their_distance() -> None:
+    text = Calibration(errors=KNOWN).extrapolation([3], np.full(3, 1.5e5))
+    away = np.linalg.norm(1.5e5 - CIRCLE, axis=1).min() * 1e-3
+    assert text == (
+        f"the calibration saw no such pressures, the nearest are {away:.0f} kPa away: "
+        "the model extrapolates"
+    )
+
+
+def test_each_segment_has_its_own_distance() -> None:
+    two = KNOWN.model_copy(update={"recorded": ((0.0,) * 6, (1e5,) * 3 + (0.0,) * 3)})
+    p = np.array([[1e5, 1e5, 1e5, 3e4, 0.0, 0.0]])
+    assert two.distances([3, 3], p)[0] == pytest.approx([0.0, 3e4])
+    variance = two.variances([3, 3], p)[0]
+    assert (variance[:3] == 0).all()
+    assert (variance[3:] > 0).all()
+
+
+def test_few_pressures_stand_for_all() -> None:
+    pressures = np.random.default_rng(1).uniform(0, 1e5, (3000, 6))
+    kept, spacing = representatives([3, 3], pressures)
+    assert len(kept) <= 2 * ERRORS.representatives
+    for own in (slice(0, 3), slice(3, 6)):
+        apart = np.linalg.norm(pressures[:, np.newaxis, own] - kept[:, own], axis=2).min(axis=1)
+        assert apart.max() <= spacing + 1e-6
+
+
+# -- regions ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("freedom", [4.5, 9.0, np.inf])
+def test_regions_hold_what_they_say(freedom: float) -> None:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(3, 3))
+    covariance = root @ root.T
+    draws = rng.multivariate_normal(np.zeros(3), covariance, 40_000)
+    if np.isfinite(freedom):
+        draws *= np.sqrt((freedom - 2) / rng.chisquare(freedom, len(draws)))[:, np.newaxis]
+    many = np.broadcast_to(covariance, (len(draws), 3, 3))
+    found = levels(draws, many, freedom)
+    squares = np.einsum("ni,ij,nj->n", draws, np.linalg.inv(covariance), draws)
+    for level in LEVELS:
+        assert np.mean(found <= level) == pytest.approx(level, abs=0.01)
+        assert np.mean(squares <= squared_radius(level, freedom)) == pytest.approx(level, abs=0.01)
+
+
+def test_bad_probabilities_are_refused() -> None:
+    known = Manipulator(
+        ONE.model_copy(update={"calibration": Calibration(errors=KNOWN)})
+    ).tip_uncertainty([1e4, 1e4, 1e4])
+    assert (known.semi_axes_at(0.99) > known.semi_axes).all()
+    assert known.semi_axes == pytest.approx(known.semi_axes_at(0.95))
+    for level in (0.0, 1.0, np.nan):
+        with pytest.raises(InputError, match="between 0 and 1"):
+            known.semi_axes_at(level)
+
+
+def test_pressures_that_change_make_a_larger_region() -> None:
+    arm = Manipulator(ONE.model_copy(update={"calibration": Calibration(errors=KNOWN)}))
+    held, moving = (arm.tip_uncertainty(CIRCLE[0], moving=each) for each in (False, True))
+    slopes = arm.tip_pose(CIRCLE[0])[:3, :3] @ arm.tip_jacobian(CIRCLE[0])[:3]
+    np.testing.assert_allclose(moving.hysteresis, 3e3**2 * slopes @ slopes.T, rtol=1e-9)
+    assert not held.hysteresis.any()  # this arm has no play
+
+
+def test_frames_move_what_the_tracker_reads() -> None:
+    """Slopes by the twists of base and sensor, against differences of the readings."""
+    registration = {"tracker_in_base": {"position": [0.01, 0.02, 0.03]},
+                    "tip_in_sensor": {"position": [0.004, -0.003, 0.006]}}  # fmt: skip
+    robot = load_description("stiff-flop-1")
+    robot = type(robot).model_validate(
+        robot.model_dump() | {"recordings": {"registration": registration}}
+    )
+    rng = np.random.default_rng(0)
+    problem = problem_of(CIRCLE, rng, 1e-4)
+    given = robot.recordings
+    assert given is not None
+    place = given.registration.tip_in_sensor.inverse()
+    points = [replace(problem.points[0], sensor=place)]
+    problem = CalibrationProblem(
+        robot, problem.unknowns, problem.samples, points,
+        given.registration.tracker_in_base.inverse(), problem.noise,
+    )  # fmt: skip
+    x = np.zeros(problem.size)
+    base, *_ = problem.unknowns.slices()
+    _, slopes = problem.with_slopes(x)
+    _, found, acting = ReadingSlopes(robot, [], 6).at(problem.predict(x).effective)
+    per_twist = slopes[:, :, base] / problem.scale[base]
+    np.testing.assert_allclose(problem.base_in_tracker[:3, :3] @ found, per_twist, atol=1e-12)
+    np.testing.assert_allclose(
+        problem.base_in_tracker[:3, :3] @ acting, problem.predict(x).per_pressure[0], atol=1e-15
+    )
+
+
+# -- the fit ----------------------------------------------------------------------------------
+
+
+def test_what_a_discrepancy_does_to_a_fit_is_that_of_draws() -> None:
+    """Fits of arms whose pressures are wrong by drawn discrepancies, around one and the same."""
+    rng = np.random.default_rng(5)
+    reach, size = 3e4, 1.5e3
+    p = rng.uniform(0.1e5, 0.9e5, (60, 3))
+    alike = np.exp(-np.linalg.norm(p[:, np.newaxis] - p, axis=2) / reach)
+    root = np.linalg.cholesky(alike + 1e-9 * np.eye(len(p)))
+    plain = problem_of(p, rng, 0.0)
+    begin = np.zeros(plain.size)
+    true = fit(plain, [begin], rounds=0)
+    moves = []
+    for _ in range(80):
+        wrong = p + size * root @ rng.normal(size=p.shape)
+        tips = Manipulator(ONE).tip_pose(wrong)[:, :3, 3]
+        track = replace(plain.samples[0].recording.tracks[0], position=tips)
+        recording = replace(plain.samples[0].recording, tracks=(track,))
+        drawn = CalibrationProblem(
+            plain.description, plain.unknowns, [replace(plain.samples[0], recording=recording)],
+            plain.points, plain.base_in_tracker, plain.noise,
+        )  # fmt: skip
+        moves.append(fit(drawn, [true.x], rounds=0).x - true.x)
+    known = KNOWN.model_copy(update={"discrepancy": size, "reach": reach})
+    expected = covariance_with(true, known) - true.covariance
+    values, axes = np.linalg.eigh(expected)
+    found = np.var(np.array(moves) @ axes[:, -6:], axis=0)
+    assert found == pytest.approx(values[-6:], rel=0.5)
+
+
+def test_an_arm_that_is_as_the_model_has_no_discrepancy_and_the_residual_of_its_noise() -> None:
+    rng = np.random.default_rng(7)
+    problem = problem_of(rng.uniform(0, 1e5, (300, 3)), rng, 3e-4)
+    found = fit(problem, [np.zeros(problem.size)], rounds=1)
+    parts = held_back(found, 2.0, lambda: None)
+    known = error_model(found, parts)
+    assert known.residual == pytest.approx(3e-4, rel=0.2)
+    slope = np.sqrt(np.mean(found.predicted.per_pressure[0] ** 2))
+    assert known.discrepancy * slope < 2e-4
+    assert known.moving == ()  # every row was held for 10 s
+    assert known.settled == (0.0, 0.0, 0.0)
+
+
+def test_a_robot_file_keeps_its_error_model(tmp_path: object) -> None:
+    from pathlib import Path
+
+    path = Path(str(tmp_path)) / "arm.yaml"
+    save_robot(path, ONE.model_copy(update={"calibration": Calibration(errors=KNOWN)}))
+    read = load_description(path).calibration
+    assert read is not None
+    assert read.errors is not None
+    assert np.array(read.errors.recorded) == pytest.approx(CIRCLE)
+    assert read.errors.model_copy(update={"recorded": KNOWN.recorded}) == KNOWN
+    text = path.read_text().replace("moving: [", "moving: [1 kPa, ")
+    path.write_text(text)
+    with pytest.raises(FileError, match=r"errors\.moving: has 4 values; expected 3, one for each"):
+        load_description(path)
+
+
+def test_unknowns_that_a_file_keeps_are_parameters_and_base() -> None:
+    problem = problem_of(CIRCLE, np.random.default_rng(0), 1e-4)
+    kept = kept_unknowns(problem)
+    assert len(kept) == len(problem.unknowns.parameters) + 6
+    assert len(set(kept.tolist())) == len(kept)
+
+
+# -- coverage ---------------------------------------------------------------------------------
+
+
+def test_rows_move_until_pressures_were_held() -> None:
+    time = np.arange(0, 20, 0.5)
+    pressures = np.where(time < 5, 0.0, 1e5)[:, np.newaxis]
+    moving = is_moving(time, pressures)
+    expected = (time >= 5) & (time < 5 + ERRORS.hold)
+    assert moving[time < 5 + ERRORS.hold - 0.5].tolist() == (
+        expected[time < 5 + ERRORS.hold - 0.5].tolist()
+    )
+    assert not moving[time > 5 + ERRORS.hold + 0.5].any()
+
+
+def test_coverage_is_told_by_what_is_known() -> None:
+    n = 100
+    levels = (np.arange(n) + 0.5) / n
+    moving = np.arange(n) % 2 == 0
+    one = Comparison(
+        "a", levels, np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3)), None,
+        inside=np.arange(n) < 60, moving=moving, levels=levels, unsettled_levels=levels**2,
+        remarks=(),
+    )  # fmt: skip
+    found = coverage([one, replace(one, levels=None)])
+    assert found["with history"].n == 100
+    assert found["with history"].shares == pytest.approx(LEVELS, abs=0.006)
+    assert found["settled"].n == 50
+    assert found["with history, inside"].n == 60
+    assert found["with history, outside"].shares[0] == 0
+    assert found["moving"].by_level[0.5] == pytest.approx(np.sqrt(0.5), abs=0.02)
+
+
+def test_uncertainty_of_a_batch_is_that_of_each() -> None:
+    robot = ONE.model_copy(update={"calibration": Calibration(errors=KNOWN)})
+    source = Uncertainty(robot)
+    p = np.array([[1e4, 2e4, 3e4], [9e4, 0.0, 0.0]])
+    many = source.errors(p).covariance
+    for row, own in zip(p, many, strict=True):
+        np.testing.assert_allclose(source.at(row).covariance, own, rtol=1e-9)
