@@ -127,12 +127,12 @@ def test_direction_and_objects_are_dragged(browser_page: Any, compiled: Path) ->
         assert (x, y, z) == (pytest.approx(0.83, abs=0.1), 0.0, pytest.approx(0.55, abs=0.15))
         value = bench.answer.solution.stiffness
         page.wait_for_selector(f"text={value:#.4g} N/m")
-        assert value > 1.6  # along the arm it is stiffer
+        assert value > 1.5  # along the arm it is stiffer
 
         page.get_by_role("tab", name="scene").click()
         page.get_by_role("button", name="add an object").click()
         until(lambda: len(bench.design.objects) == 1)
-        page.wait_for_timeout(500)
+        page.wait_for_timeout(2500)  # until its handle is drawn; software renders slowly
         before = bench.design.objects[0].shape
         handle = view.object_position
         drag(page, client, handle + 0.025 * X, handle + 0.045 * X)
