@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.text import Text
 
@@ -18,27 +19,35 @@ from stiffopt.experiments import (
     StiffnessResult,
 )
 from stiffopt.experiments.slope import SlopeEstimate
+from stiffopt.logs import StiffnessTable
 from stiffopt.model.manipulator import Manipulator
+from stiffopt.rig.settings import Published
 
 
 @dataclass(frozen=True)
 class ExperimentReport:
-    """What an experiment found: a title, lines with a label each, and a table."""
+    """What an experiment found: a title, labelled lines, and tables; one beside the published."""
 
     title: str
     lines: tuple[tuple[str, str], ...]
     table: TextTable
+    published: TextTable | None = None
 
     def renderable(self, folder: str) -> RenderableType:
         """Return the report for the terminal."""
         lines = [(label, printable(text)) for label, text in (*self.lines, ("folder", folder))]
-        return Group(title(self.title), labelled(lines), Text(""), self.table.renderable())
+        blocks = [title(self.title), labelled(lines), Text(""), self.table.renderable()]
+        if self.published is not None:
+            blocks += [Text(""), self.published.renderable()]
+        return Group(*blocks)
 
     def write(self, folder: Path) -> None:
         """Write the report as a Markdown page into a folder."""
         page = MarkdownPage(folder, self.title)
         page.bullets([f"{label}: {text}" for label, text in self.lines])
         page.table(self.table)
+        if self.published is not None:
+            page.table(self.published)
         page.write()
 
 
@@ -47,6 +56,7 @@ def kinematics_report(
     coverage: CoverageResult | None,
     settings: KinematicsSettings,
     model: Manipulator,
+    published: Published | None = None,
 ) -> ExperimentReport:
     """Return the report of a kinematics experiment, and of its combined poses if there are any."""
     found: list[KinematicsResult | CoverageResult] = [result]
@@ -100,6 +110,38 @@ def kinematics_report(
             ),
             remark,
         ),
+        published=_errors_beside(result, published) if published is not None else None,
+    )
+
+
+def _errors_beside(result: KinematicsResult, published: Published) -> TextTable | None:
+    """Errors along each axis beside what was published of them."""
+    if published.tip_error is None:
+        return None
+    length = display_units().length
+    within = published.tip_error
+    most = "-"
+    if published.largest_tip_error is not None:
+        most = length.number(published.largest_tip_error, "g")
+    rows = []
+    for axis, name in enumerate("xyz"):
+        errors = np.abs(result.component_error[:, axis])
+        errors = errors[np.isfinite(errors)]
+        rows.append(
+            (
+                name,
+                length.number(float(np.quantile(errors, 0.95)), ".2f"),
+                length.number(float(errors.max()), ".2f"),
+                f"{np.mean(errors <= within) * 100:.0f} %",
+                length.number(within, "g"),
+                most,
+            )
+        )
+    return TextTable(
+        f"Error of the model's tip along each axis in {length}, beside what was published",
+        ("axis", "95 % below", "largest", "within", "published: mostly", "at most"),
+        tuple(rows),
+        "within: share of the time in which the error is not above what was mostly published",
     )
 
 
@@ -138,8 +180,10 @@ def kinematics_record(
     }
 
 
-def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentReport:
-    """Return the report of a stiffness experiment."""
+def stiffness_report(
+    result: StiffnessResult, model: Manipulator, published: StiffnessTable | None = None
+) -> ExperimentReport:
+    """Return the report of a stiffness experiment, beside a table that was published of the arm."""
     settings = result.settings
     names = [direction_name(direction) for direction in settings.directions]
     unit, pressure_unit = display_units().stiffness, display_units().pressure
@@ -166,6 +210,42 @@ def stiffness_report(result: StiffnessResult, model: Manipulator) -> ExperimentR
             tuple(rows),
             "+-: 95 % confidence interval of the mean over the repetitions",
         ),
+        published=_stiffness_beside(result, published) if published is not None else None,
+    )
+
+
+def _stiffness_beside(result: StiffnessResult, published: StiffnessTable) -> TextTable | None:
+    """Stiffness that was measured and modelled beside what was published."""
+    rows = []
+    units = display_units()
+    spread = published.others.get("repeatability_n_per_m", published.sigma)
+    for row, cell in result.beside(published):
+        known = float(published.stiffness[row])
+
+        def off(value: float, known: float = known) -> str:
+            return f"{(value / known - 1) * 100:+.0f} %"
+
+        here = ("no contact", "-")
+        if cell.estimate is not None:
+            here = (_estimate(cell.estimate), off(cell.estimate.value))
+        rows.append(
+            (
+                units.pressure.number(cell.pressure, "g"),
+                direction_name(tuple(published.directions[row])),
+                f"{units.stiffness.number(known)} +- {units.stiffness.number(float(spread[row]))}",
+                *here,
+                units.stiffness.number(cell.model, FIGURES),
+                off(cell.model),
+            )
+        )
+    if not rows:
+        return None
+    return TextTable(
+        f"Stiffness in {units.stiffness}, beside what was published",
+        (f"{units.pressure}", "along", "published", "measured here", "off by", "model", "off by"),
+        tuple(rows),
+        "off by: relative to the published value",
+        words=("along",),
     )
 
 

@@ -1,5 +1,7 @@
 """Run `stiffopt experiment`: check all files and options, move the arm, vent it, report."""
 
+from __future__ import annotations
+
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -47,9 +49,10 @@ from stiffopt.experiments.kinematics import (
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
-from stiffopt.logs import write_stiffness_table
+from stiffopt.logs import StiffnessTable, read_stiffness_table, write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
+from stiffopt.rig.settings import Published
 
 Settings = KinematicsSettings | StiffnessSettings
 
@@ -64,6 +67,8 @@ class _Plan:
     settings: Settings
     model: Manipulator
     is_new: bool
+    published: Published | None
+    table: StiffnessTable | None
 
     @property
     def is_complete(self) -> bool:
@@ -136,6 +141,7 @@ def _planned(
     model_name: str | None,
 ) -> _Plan:
     rig, name, rate, log_folder = _rig(rig_file)
+    published, table = _published(rig, rig_file)
     if resume is None:
         about = {"rig": name, "robot": rig.robot.name, "channels": rig.supply.n}
         schema = KinematicsSettings if experiment == "kinematics" else StiffnessSettings
@@ -167,7 +173,9 @@ def _planned(
             raise InputError("this probe is mounted by hand; run the experiment at a terminal")
     if resume is None:
         create_folder(folder, settings)
-    return _Plan(rig, rate, folder, settings, model, is_new=resume is None)
+    return _Plan(
+        rig, rate, folder, settings, model, is_new=resume is None, published=published, table=table
+    )
 
 
 def _rig(path: str) -> tuple[Rig, str, float, str]:
@@ -177,6 +185,14 @@ def _rig(path: str) -> tuple[Rig, str, float, str]:
 
     description = load_rig_description(path)
     return open_rig(path), description.name, description.rate, description.log.folder
+
+
+def _published(rig: Rig, path: str) -> tuple[Published | None, StiffnessTable | None]:
+    """What a rig file says was published of its arm, with the table of stiffness that it names."""
+    published = None if rig.settings is None else rig.settings.published
+    if published is None or published.stiffness is None:
+        return published, None
+    return published, read_stiffness_table(Path(path).parent / published.stiffness)
 
 
 def _new_name(experiment: str, rig: str) -> str:
@@ -297,13 +313,15 @@ def _report_kinematics(
     folder, model = plan.folder, plan.model
     result = evaluate_kinematics(read_recordings(folder, settings), model)
     coverage = evaluate_coverage(read_rounds(folder, round_count(settings.poses)), model)
-    report = experiment_report.kinematics_report(result, coverage, settings, model)
+    report = experiment_report.kinematics_report(result, coverage, settings, model, plan.published)
     report.write(folder)
     if plot:
         from stiffopt.plots import save_figure
         from stiffopt.plots.experiments import plot_coverage, plot_kinematics
 
-        save_figure(plot_kinematics(result, title=report.title), folder / "figure.png")
+        within = None if plan.published is None else plan.published.tip_error
+        figure = plot_kinematics(result, title=report.title, published=within)
+        save_figure(figure, folder / "figure.png")
         if coverage is not None:
             title = f"{report.title}, combined poses"
             save_figure(plot_coverage(coverage, title=title), folder / "poses.png")
@@ -318,12 +336,13 @@ def _report_stiffness(plan: _Plan, settings: StiffnessSettings, *, plot: bool, q
     folder, model = plan.folder, plan.model
     result = evaluate_stiffness(folder, settings, model)
     write_stiffness_table(folder / "stiffness.csv", result.table())
-    report = experiment_report.stiffness_report(result, model)
+    report = experiment_report.stiffness_report(result, model, plan.table)
     report.write(folder)
     if plot:
         from stiffopt.plots import save_figure
         from stiffopt.plots.experiments import plot_stiffness
 
-        save_figure(plot_stiffness(result, title=report.title), folder / "figure.png")
+        figure = plot_stiffness(result, title=report.title, published=plan.table)
+        save_figure(figure, folder / "figure.png")
     if not quiet:
         show(report.renderable(str(folder)))
