@@ -191,3 +191,32 @@ def stiffness(
     experiment_run.run(
         "stiffness", rig, given, out=out, resume=resume, model=model, plot=not no_plot, quiet=quiet
     )
+
+
+POSES_HELP = """\
+Go through the pressures of a file on a rig, hold each, and record the tip.
+
+FILE (format: stiffopt-experiment/1) has the keys rig, a rig file relative to it; hold, a time; and
+pressures, one value a channel for each pose. The arm goes there gently, through the safety gate,
+begins and ends at nothing, and the recording (log v1 as CSV, and MCAP) can be calibrated with.
+"""
+
+_POSES_EPILOG = f"""\
+\b
+Examples:
+  stiffopt experiment poses next.yaml
+  stiffopt experiment poses next.yaml --out more
+{_CODES}"""
+
+
+@experiment_app.command("poses", help=POSES_HELP, epilog=_POSES_EPILOG)
+@with_exit_code
+def poses(
+    file: Annotated[str, typer.Argument(metavar="FILE", show_default=False)],
+    out: Out = None,
+    quiet: Quiet = False,
+) -> None:
+    """Go through poses."""
+    from stiffopt.cli import experiment_run
+
+    experiment_run.run_poses_file(file, out=out, quiet=quiet)

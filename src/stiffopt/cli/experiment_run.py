@@ -48,7 +48,9 @@ from stiffopt.experiments.kinematics import (
     sequence_for,
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
+from stiffopt.experiments.poses import POSES, PosesFile, poses_for, run_poses
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
+from stiffopt.files import read_file
 from stiffopt.logs import StiffnessTable, read_stiffness_table, write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
@@ -123,6 +125,31 @@ def run(
                 f"stiffopt experiment {experiment} {rig} --resume {plan.folder}"
             )
         raise
+
+
+def run_poses_file(file: str, *, out: str | None, quiet: bool) -> None:
+    """Go through the poses of a file on the rig that it names, and record it."""
+    require_package("foxglove-sdk", "log", "foxglove")
+    settings = read_file(file, "experiment", PosesFile)
+    with interruptible(), warnings_as_notes(quiet=quiet):
+        rig, name, rate, log_folder = _rig(str(Path(file).parent / settings.rig))
+        if rig.tracker is None:
+            raise InputError("this rig has no tracker; the experiments need one")
+        rig.supply.check_arming()
+        poses_for(rig, settings)
+        folder = Path(log_folder) / _new_name("poses", name) if out is None else Path(out)
+        create_folder(folder, settings)
+    interrupt, bar = InterruptBetweenSteps(), ProgressBar(quiet=quiet)
+
+    def work() -> list[str]:
+        run_poses(rig, folder, settings, rate=rate, progress=bar.report, check=interrupt.check)
+        return []
+
+    with warnings_as_notes(quiet=quiet), alone_in(folder), interrupt.handled(), bar:
+        _open(rig, folder)
+        _on_rig(rig, work, interrupt)
+    if not quiet:
+        report_note(f"{len(settings.pressures)} poses are recorded in {folder / POSES}.csv")
 
 
 class _StoppedError(RigFaultError):
@@ -266,20 +293,20 @@ def _do(plan: _Plan, *, quiet: bool) -> None:
         )
 
     with alone_in(plan.folder), interrupt.handled(), bar:
-        _open(plan)
+        _open(plan.rig, plan.folder if plan.is_new else None)
         notes = _on_rig(plan.rig, work, interrupt)
     if not quiet:
         for note in notes:
             report_note(note)
 
 
-def _open(plan: _Plan) -> None:
-    """Open the rig; leave no folder behind if there is none."""
+def _open(rig: Rig, new: Path | None) -> None:
+    """Open the rig; leave no new folder behind if there is none."""
     try:
-        plan.rig.open()
+        rig.open()
     except StiffoptError as error:
-        if plan.is_new:
-            remove_folder(plan.folder)
+        if new is not None:
+            remove_folder(new)
         raise RigFaultError(str(error)) if isinstance(error, DeviceError) else error from error
 
 

@@ -1,0 +1,97 @@
+"""Poses of a file, recorded one after another: `format: stiffopt-experiment/1`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from stiffopt.errors import InputError
+from stiffopt.experiments.conductor import Array, Conductor, check_pressures
+from stiffopt.experiments.folder import Progress, recorded
+from stiffopt.rig.interface import Rig
+from stiffopt.schema import Items, Schema
+from stiffopt.units import Duration, Pressure
+
+POSES = "poses"
+"""Name of the recording, without ending."""
+
+
+class PosesFile(Schema):
+    """What is done on which rig.
+
+    Attributes
+    ----------
+    rig : path of a rig file, relative to this one.
+    hold : time for which each pose is held, in s.
+    pressures : of each pose, one value a channel, in Pa.
+    """
+
+    rig: Annotated[str, Field(min_length=1)]
+    hold: Annotated[Duration, Field(gt=0, le=3600)] = 7.0
+    pressures: Annotated[Items[Items[Pressure]], Field(min_length=1)]
+
+
+def poses_for(rig: Rig, settings: PosesFile) -> Array:
+    """Return the poses (N, n) in Pa; `InputError` if the rig cannot do one of them."""
+    for number, pose in enumerate(settings.pressures, start=1):
+        if len(pose) != rig.supply.n:
+            raise InputError(
+                f"pose {number} has {len(pose)} pressures; the rig has {rig.supply.n} channels"
+            )
+        for channel, p in enumerate(pose):
+            check_pressures(rig, [p], [channel])
+        force = rig.force(np.array(pose))
+        if rig.max_force is not None and force > rig.max_force:
+            raise InputError(
+                f"pose {number} is {force:.3g} N, above safety.max_force, {rig.max_force:g} N"
+            )
+    return np.array(settings.pressures, dtype=float)
+
+
+def run_poses(
+    rig: Rig,
+    folder: Path,
+    settings: PosesFile,
+    *,
+    rate: float,
+    progress: Progress = lambda done, total, text: None,
+    check: Callable[[], None] = lambda: None,
+) -> None:
+    """Go from nothing through all poses and back, gently, and record it as ``poses.csv``.
+
+    Parameters
+    ----------
+    rig : Rig
+        Open.
+    folder : Path
+        Gets ``poses.csv`` (log v1) and ``poses.mcap``.
+    settings : PosesFile
+    rate : float
+        Rate of the commands, in Hz.
+    progress : callable
+        Called with the number of poses done, of all, and what goes on.
+    check : callable
+        Called often; raises to stop.
+
+    Raises
+    ------
+    InputError
+        The rig cannot do it; nothing has moved.
+    DeviceError
+        A device fails.
+    """
+    poses = poses_for(rig, settings)
+    limits = rig.supply.limits
+    base = limits.clamp(np.clip(0.0, limits.low, limits.high))
+    conductor = Conductor(rig, rate, check)
+    conductor.start()
+    conductor.ramp(base)
+    with recorded(conductor, folder, POSES, {"experiment": POSES}):
+        for number, pose in enumerate([*poses, base]):
+            progress(number, len(poses) + 1, f"pose {min(number + 1, len(poses))} of {len(poses)}")
+            conductor.ramp(pose)
+            conductor.settle(pose, lambda rows: False, settings.hold)
