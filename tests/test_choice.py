@@ -10,14 +10,15 @@ import pytest
 from numpy.typing import NDArray
 
 from made_logs import course, made_log
-from stiffopt.identify import structures
+from stiffopt.identify import folds as held
 from stiffopt.identify.error_model import HeldBack
 from stiffopt.identify.fit import fit
+from stiffopt.identify.folds import held_back, is_region
 from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
-from stiffopt.identify.structures import STRUCTURES, Candidate, best, held_back
+from stiffopt.identify.structures import STRUCTURES, Candidate, best
 from stiffopt.logs import Log
 from stiffopt.model.robot_files import load_description
 
@@ -82,9 +83,12 @@ def problem_of(
 
 def test_parts_and_highest_pressures_of_few_logs_are_held_back() -> None:
     problem = problem_of([("a", log_of(1)), ("b", log_of(2))])
-    folds = structures._folds(problem)
+    folds = held.folds(problem)
     parts = [f"part {i} of 4" for i in (1, 2, 3, 4)]
-    assert list(folds) == [*parts, "highest pressures"]
+    levels = ["highest pressures", "lowest pressures", "rising pressures"]
+    regions = [f"pressures, region {i} of 3" for i in (1, 2, 3)]
+    assert list(folds) == [*parts, *levels, *regions]
+    assert [name for name in folds if is_region(name)] == [*levels, *regions]
     for k in range(2):
         together = np.array([folds[part][k] for part in parts])
         assert (together.sum(axis=0) == 1).all()  # every row once
@@ -94,11 +98,36 @@ def test_parts_and_highest_pressures_of_few_logs_are_held_back() -> None:
     norms = np.linalg.norm(pressures, axis=1)
     assert high.mean() == pytest.approx(0.2, abs=0.03)
     assert norms[high].min() >= norms[~high].max()
+    low = np.concatenate(folds["lowest pressures"])
+    assert norms[low].max() <= norms[~low].min()
+    of_regions = np.array([np.concatenate(folds[name]) for name in regions])
+    assert (of_regions.sum(axis=0) == 1).all()
+    middles = np.array([pressures[rows].mean(axis=0) for rows in of_regions])
+    squared = ((pressures[:, np.newaxis] - middles) ** 2).sum(axis=2)
+    assert (squared.argmin(axis=1) == of_regions.argmax(axis=0)).all()
+    rising = folds["rising pressures"][0]
+    change = np.diff(pressures[: len(rising)].sum(axis=1), prepend=pressures[0].sum())
+    assert (rising == (change > 0)).all()
+
+
+def test_a_simpler_model_is_as_good_within_what_was_recorded_and_beyond() -> None:
+    names = [*(f"part {i} of 4" for i in (1, 2, 3, 4)), "highest pressures", "lowest pressures"]
+
+    def with_means(index: int, means: list[float]) -> Candidate:
+        named = dict(zip(names, candidate(index, means).held_back.values(), strict=True))
+        nothing: Any = Nothing()
+        return Candidate(STRUCTURES[index], nothing, named)
+
+    rich = with_means(1, [0.8e-3] * 4 + [4e-3, 2e-3])
+    scattered_beyond = [5e-3, 1.2e-3]
+    assert best([with_means(0, [1e-3] * 4 + scattered_beyond), rich]) is rich
+    simple = with_means(0, [0.81e-3] * 4 + scattered_beyond)
+    assert best([simple, rich]) is simple
 
 
 def test_logs_are_held_back_one_by_one() -> None:
     problem = problem_of([(name, log_of(i)) for i, name in enumerate("abc")])
-    folds = structures._folds(problem)
+    folds = held.folds(problem)
     assert list(folds) == ["a", "b", "c"]
     assert [[bool(rows.all()) for rows in away] for away in folds.values()] == np.eye(3).tolist()
     assert [[bool(rows.any()) for rows in away] for away in folds.values()] == np.eye(3).tolist()
@@ -127,12 +156,12 @@ def test_the_beginning_of_a_log_in_an_unknown_state_is_for_its_state() -> None:
     problem = problem_of(logs, structure="hysteresis")
     assert problem.samples[0].begin == "unknown"
     everything = np.ones(len(problem.samples[0].rows), dtype=bool)
-    kept = structures._without_beginning(everything, problem, 0, 2.0)
+    kept = held._without_beginning(everything, problem, 0, 2.0)
     time = problem.samples[0].recording.time[problem.samples[0].rows]
     assert kept.tolist() == (time > time[0] + 2.0).tolist()
     part = everything.copy()
     part[:10] = False
-    assert structures._without_beginning(part, problem, 0, 2.0) is part
+    assert held._without_beginning(part, problem, 0, 2.0) is part
 
 
 def test_coordinates_by_name_go_from_model_to_model() -> None:
@@ -165,6 +194,6 @@ def test_what_these_logs_cannot_tell_is_not_tried() -> None:
     assert tells("creep", steps)
     assert not tells("creep", circle)
     assert tells("hysteresis", circle)
-    for every, fine in ((1, True), (3, False)):
+    for every, fine in ((1, True), (3, True), (12, False)):
         unknowns = problem_of([recorded(steps, every)], structure="lag").unknowns.all
         assert any(unknown.name.startswith("dead time") for unknown in unknowns) == fine

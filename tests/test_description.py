@@ -104,8 +104,10 @@ def test_built_in_robots_are_the_papers(name: str) -> None:
     assert arm.tip_mass == (0.02 if hanging else 0)
 
 
-def test_there_are_the_papers_robots_a_calibrated_one_and_two_of_recorded_arms() -> None:
-    others = ("stiff-flop-1-calibrated", "ucl-stiff-flop", "asu-two-segment")
+def test_there_are_the_papers_robots_and_those_of_recorded_arms() -> None:
+    modules = ("ucl-55", "ucl-2x55")
+    others = ("stiff-flop-1-calibrated", "ucl-stiff-flop", "asu-two-segment", *modules)
+    others += tuple(f"{name}-calibrated" for name in modules)
     assert builtin_robots() == tuple(sorted((*PAPERS, *others)))
 
 

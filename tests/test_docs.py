@@ -16,6 +16,7 @@ from pydantic import BaseModel
 
 import stiffopt
 from examples import run_examples
+from stiffopt.identify.bench import load_bench
 from stiffopt.logs import read_log
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.description import (
@@ -48,7 +49,7 @@ from stiffopt.rig.config import (
     load_rig_description,
 )
 from stiffopt.rig.registry import KINDS, driver_class, driver_names
-from stiffopt.rig.settings import ControlSettings, ServiceSettings
+from stiffopt.rig.settings import ControlSettings, Published, ServiceSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -86,7 +87,7 @@ SCHEMAS: list[type[BaseModel]] = [
     *(Scene, SceneObject, AllowedContact, *OBSTACLES.values()),
     *schemas_of(PathDescription, "stiffopt.paths."),
     *(RigDescription, Safety, LogSettings, Registration, Placement),
-    *(ControlSettings, ServiceSettings, Trajectory, Waypoint),
+    *(ControlSettings, Published, ServiceSettings, Trajectory, Waypoint),
     *schemas_of(simulated.PlantSettings, "stiffopt.plant"),
     simulated.LabSettings,
     *driver_schemas(),
@@ -141,6 +142,8 @@ def test_yaml_example_loads(text: str, tmp_path: Path) -> None:
     elif "stiffopt-path/" in text:
         followed = stiffopt.load_path(path)
         followed.end_pressures(followed.resolve_robot())
+    elif "stiffopt-bench/" in text:
+        assert load_bench(str(path))[0].arms[0].train
     elif "stiffopt-scene/" in text:
         stiffopt.load_scene(path).check_against(stiffopt.load_robot("stiff-flop-2").description)
     else:

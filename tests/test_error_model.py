@@ -17,11 +17,12 @@ from stiffopt.identify.error_model import (
     representatives,
 )
 from stiffopt.identify.fit import fit
+from stiffopt.identify.folds import held_back
 from stiffopt.identify.problem import CalibrationProblem
 from stiffopt.identify.results import LEVELS, Comparison, coverage
 from stiffopt.identify.settings import ERRORS, CalibrationSettings
 from stiffopt.identify.setup import Setup, recordings_of
-from stiffopt.identify.structures import STRUCTURES, held_back
+from stiffopt.identify.structures import STRUCTURES
 from stiffopt.logs import Log
 from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.model.manipulator import Manipulator

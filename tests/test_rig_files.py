@@ -23,8 +23,9 @@ from stiffopt.rig.settings import ServiceSettings
 from stiffopt.safety.rigs import open_rig
 
 RIGS = sorted((Path(__file__).parent.parent / "rig").glob("*.yaml"))
+SIMULATED = ("sim", "sim-two-segment", "paper")
 EXPECTED = {
-    *("sim", "sim-two-segment", "virtual-lab"),
+    *("sim", "sim-two-segment", "paper", "virtual-lab"),
     *("modbus-aurora", "nidaq-aurora", "openigtlink"),
 }
 
@@ -46,9 +47,7 @@ def test_every_rig_file_loads_and_survives_writing(path: Path, tmp_path: Path) -
         assert not re.search(r"plant:", text) or "lab" in path.stem
 
 
-@pytest.mark.parametrize(
-    "path", [p for p in RIGS if p.stem.startswith("sim")], ids=lambda p: p.stem
-)
+@pytest.mark.parametrize("path", [p for p in RIGS if p.stem in SIMULATED], ids=lambda p: p.stem)
 def test_every_simulated_rig_runs(path: Path) -> None:
     with open_rig(path) as rig:
         tracker = rig.tracker
@@ -173,7 +172,7 @@ def test_a_robot_that_cannot_correct_a_tracker_says_so(
 
 
 @pytest.mark.parametrize(
-    "path", [p for p in RIGS if p.stem in EXPECTED and "sim" not in p.stem], ids=lambda p: p.stem
+    "path", [p for p in RIGS if p.stem in EXPECTED - {*SIMULATED}], ids=lambda p: p.stem
 )
 def test_real_rigs_without_their_hardware_say_so(path: Path) -> None:
     """No device answers here: one clear sentence, in bounded time, and nothing stays open."""

@@ -405,3 +405,12 @@ def test_a_map_becomes_a_coloured_cloud() -> None:
     check_map(found, robot.description)
     with pytest.raises(InputError, match="another arm than 'stiff-flop-2'"):
         check_map(found, stiffopt.load_robot("stiff-flop-2").description)
+
+
+def test_an_object_that_was_checked_can_be_moved() -> None:
+    item = objects.new_object("sphere", (), 0.18)
+    assert item.sphere is not None
+    _ = item.sphere.from_base  # which is kept in the object
+    moved = objects.moved(item, (0.05, 0.0, 0.1))
+    assert moved.sphere is not None
+    assert moved.sphere.centre == (0.05, 0.0, 0.1)

@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parent.parent
 TASK = ROOT / "problems" / "two_segment_stiff_x.yaml"
 SOFTWARE = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
             "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]  # fmt: skip
-X = np.array([1.0, 0.0, 0.0])
+X, Z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 PATIENCE = 50_000  # ms
 
 
@@ -72,15 +72,7 @@ def test_the_arm_follows_a_target_that_is_dragged(browser_page: Any, compiled: P
         view, bench = studio.view, studio.view.bench
         start = view.target_position
 
-        grip = on_screen(client, start + X * 0.03)  # the arrow along x
-        way = on_screen(client, start + X * 0.045) - grip
-        page.mouse.move(*grip)
-        page.wait_for_timeout(500)
-        page.mouse.down()
-        for share in np.linspace(0.1, 1.0, 10):
-            page.mouse.move(*(grip + share * way))
-            page.wait_for_timeout(60)
-        page.mouse.up()
+        drag(page, client, start + X * 0.03, start + X * 0.045)  # its arrow along x
 
         until(lambda: bench.answer.is_best and bench.answer.design == bench.design)
         target = np.asarray(bench.design.task.target.position)
@@ -99,6 +91,55 @@ def test_the_arm_follows_a_target_that_is_dragged(browser_page: Any, compiled: P
         copied = page.locator("textarea").input_value()
         assert copied.startswith("format: stiffopt-task/1")
         assert not mistakes
+    finally:
+        studio.close()
+
+
+def drag(page: Any, client: Any, start: np.ndarray, end: np.ndarray) -> None:
+    """Drag from one point in space to another, as a hand does: in steps."""
+    grip, goal = on_screen(client, start), on_screen(client, end)
+    page.mouse.move(*grip)
+    page.wait_for_timeout(500)
+    page.mouse.down()
+    for share in np.linspace(0.1, 1.0, 10):
+        page.mouse.move(*(grip + share * (goal - grip)))
+        page.wait_for_timeout(60)
+    page.mouse.up()
+
+
+def test_direction_and_objects_are_dragged(browser_page: Any, compiled: Path) -> None:
+    from stiffopt.studio.opening import open_studio
+
+    studio, page = open_studio(str(TASK)), browser_page
+    page.set_viewport_size({"width": 1200, "height": 460})  # the panel covers no handle
+    try:
+        page.goto(studio.url)
+        page.wait_for_selector("text=1.445 N/m")
+        (client,) = studio.page.server.get_clients().values()
+        view, bench = studio.view, studio.view.bench
+
+        handle = view.direction_position
+        np.testing.assert_allclose(handle - view.arm_end, 0.045 * X, atol=1e-6)
+        drag(page, client, handle + 0.016 * Z, handle + 0.046 * Z)  # its arrow along z
+        until(lambda: bench.design.measure.direction[2] > 0)
+        until(lambda: bench.answer.is_best and bench.answer.design == bench.design)
+        x, y, z = bench.design.measure.direction
+        assert (x, y, z) == (pytest.approx(0.83, abs=0.1), 0.0, pytest.approx(0.55, abs=0.15))
+        value = bench.answer.solution.stiffness
+        page.wait_for_selector(f"text={value:#.4g} N/m")
+        assert value > 1.5  # along the arm it is stiffer
+
+        page.get_by_role("tab", name="scene").click()
+        page.get_by_role("button", name="add an object").click()
+        until(lambda: len(bench.design.objects) == 1)
+        page.wait_for_timeout(2500)  # until its handle is drawn; software renders slowly
+        before = bench.design.objects[0].shape
+        handle = view.object_position
+        drag(page, client, handle + 0.025 * X, handle + 0.045 * X)
+        until(lambda: bench.design.objects[0].shape != before)
+        moved = view.object_position - handle
+        np.testing.assert_allclose(moved, 0.02 * X, atol=0.005)
+        page.wait_for_selector("text=clearance")
     finally:
         studio.close()
 

@@ -17,6 +17,7 @@ from stiffopt.control.state import Alarm, State
 from stiffopt.daemon.server import Server
 from stiffopt.daemon.service import create_app
 from stiffopt.errors import DeviceError, InputError
+from stiffopt.model.manipulator import load_robot
 from stiffopt.model.robot_files import load_description
 from stiffopt.studio import rig_watch, texts
 from stiffopt.studio.rig_watch import RigWatch, pressures_now
@@ -84,6 +85,21 @@ def test_without_the_token_it_only_reads(
     watch.go(Workbench(watch.design))
     assert not watch.in_control
     assert loop.names == []
+
+
+def test_a_preview_begins_where_the_arm_is(
+    watching: Callable[..., RigWatch], loop: FakeLoop
+) -> None:
+    watch, robot = watching(TOKEN), load_robot("stiff-flop-2")
+    assert watch.present_design(robot) == watch.design  # nobody has answered yet
+    pressures = np.array([0.2, 0, 0, 0.4, 0, 0]) * 1e5
+    loop.now = replace(loop.now, measured=pressures, target_position=None)
+    watch.poll()
+    begun = watch.present_design(robot).task.target.position
+    np.testing.assert_allclose(begun, robot.tip_pose(pressures)[:3, 3], atol=5.1e-6)
+    loop.now = replace(loop.now, target_position=np.array([-0.02, np.nan, 0.19]))
+    watch.poll()
+    assert watch.present_design(robot).task.target.position == (-0.02, None, 0.19)
 
 
 def test_with_token_and_control_a_preview_is_sent(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import typer
 
+from stiffopt.cli.bench import bench_app
 from stiffopt.cli.calibrate import (
     CALIBRATE_EPILOG,
     CALIBRATE_HELP,
@@ -91,6 +92,7 @@ app.command(
     help=VALIDATE_HELP,
     epilog=VALIDATE_EPILOG,
 )(validate)
+app.add_typer(bench_app, name="bench")
 app.command(
     "lab",
     short_help="Start a simulated arm behind real protocols.",

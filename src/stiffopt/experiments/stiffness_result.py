@@ -65,6 +65,17 @@ class StiffnessResult:
         found = [cell for cell in self.cells if cell.direction == tuple(direction)]
         return sorted(found, key=lambda cell: cell.pressure)
 
+    def beside(self, table: StiffnessTable) -> list[tuple[int, StiffnessCell]]:
+        """Rows of a table with the cells of the same pressures and line of action, tip free."""
+        return [
+            (row, cell)
+            for row in range(len(table.stiffness))
+            for cell in self.cells
+            if table.boundaries[row] == "free"
+            and np.allclose(self.settings.pressures_at(cell.pressure), table.pressures[row], atol=1)
+            and abs(np.dot(cell.direction, table.directions[row])) > 1 - 1e-6
+        ]
+
     def table(self) -> StiffnessTable:
         """Return the results as a table, for `write_stiffness_table`."""
         cells = self.cells

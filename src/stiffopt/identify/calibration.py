@@ -18,6 +18,7 @@ from stiffopt.errors import CancelledError, InputError, PressureError
 from stiffopt.identify.detection import Comparer, Hypothesis, found_wrong
 from stiffopt.identify.error_model import covariance_with, error_model, kept_unknowns
 from stiffopt.identify.fit import Fit, fit
+from stiffopt.identify.folds import held_back
 from stiffopt.identify.results import (
     Comparison,
     Errors,
@@ -43,7 +44,6 @@ from stiffopt.identify.structures import (
     Candidate,
     ModelStructure,
     best,
-    held_back,
     other_laws,
 )
 from stiffopt.identify.tracker_faults import CUBE_ROTATIONS

@@ -45,7 +45,7 @@ def on_one_clock(recording: Recording, span: Array) -> Recording:
     time, tip = recording.time, recording.tracks[0].position
     seen = np.flatnonzero(whole(tip))
     rows = seen[np.linspace(0, len(seen) - 1, min(len(seen), DETECTION.clock_rows)).astype(int)]
-    followed = _lagged(time, recording.pressures / span, DETECTION.clock_lag)
+    followed = lagged(time, recording.pressures / span, DETECTION.clock_lag)
 
     def misfits(shifts: Array) -> Array:
         moved = (
@@ -77,7 +77,7 @@ def on_one_clock(recording: Recording, span: Array) -> Recording:
     )
 
 
-def _lagged(time: Array, pressures: Array, lag: float) -> Array:
+def lagged(time: Array, pressures: Array, lag: float) -> Array:
     """Pressures (N, n) behind a first-order lag, in s."""
     followed = pressures.copy()
     for i, share in enumerate(-np.expm1(-np.diff(time) / lag), start=1):
@@ -209,7 +209,7 @@ class Comparer:
         for each in recordings:
             seen = np.flatnonzero(np.logical_and.reduce([whole(t.position) for t in each.tracks]))
             rows = seen[np.unique(np.linspace(0, len(seen) - 1, count).astype(int))]
-            self._pressures.append(_lagged(each.time, each.pressures, DETECTION.clock_lag)[rows])
+            self._pressures.append(lagged(each.time, each.pressures, DETECTION.clock_lag)[rows])
             self._measured.append(np.stack([t.position[rows] for t in each.tracks], axis=1))
         self._from_frame = to_base[:3, :3], to_base[:3, 3]
         self._kept: dict[tuple[int, ...], list[list[Array]]] = {}

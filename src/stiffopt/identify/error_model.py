@@ -79,7 +79,7 @@ def error_model(
 
 def covariance_with(found: Fit, errors: ErrorModel) -> Array:
     """Covariance (d, d) of a fit's scaled coordinates, with what the discrepancy adds."""
-    added = _influence(found.problem, found.x, found.covariance, np.array([errors.reach]))[0]
+    added = _influence(found.problem, found.x, found.gain, np.array([errors.reach]))[0]
     return np.asarray(found.covariance + errors.discrepancy**2 * added)
 
 
@@ -159,7 +159,7 @@ class _Fold:
         direct = np.repeat(growth, channels, axis=2)[:, :, np.newaxis] * acting
         kept = kept_unknowns(problem)
         slope = slopes[rows][:, :, kept]
-        added = _influence(problem, fit.x, fit.covariance, reaches)[:, kept[:, np.newaxis], kept]
+        added = _influence(problem, fit.x, fit.gain, reaches)[:, kept[:, np.newaxis], kept]
         return cls(
             errors=predicted.errors[0][rows],
             parameters=_spread(slope, fit.covariance[np.ix_(kept, kept)]),
@@ -232,7 +232,7 @@ def _most_probable(
     return float(result.fun) + reach_prior, index, (discrepancy, residual, tail)
 
 
-def _influence(problem: CalibrationProblem, x: Array, covariance: Array, reaches: Array) -> Array:
+def _influence(problem: CalibrationProblem, x: Array, gain: Array, reaches: Array) -> Array:
     """Covariances (R, d, d) of scaled x that a discrepancy of 1 Pa^2 causes, for each reach."""
     value, slope = problem.residuals(x)
     slope = slope / np.sqrt(1 + value**2 / FIT.loss_scale**2)[:, np.newaxis]
@@ -248,7 +248,7 @@ def _influence(problem: CalibrationProblem, x: Array, covariance: Array, reaches
         begin += 3 * count * (1 if read.turn is None else 2)
     stride = -(-count // ERRORS.rows)
     rows = np.flatnonzero(weights > 0)[::stride]
-    pulls, pressures = stride * pulls[rows] @ covariance, pressures[rows]
+    pulls, pressures = stride * pulls[rows] @ gain, pressures[rows]
     ends = np.cumsum([0, *(segment.n_channels for segment in problem.description.segments)])
     found = np.zeros((len(reaches), problem.size, problem.size))
     for first, last in pairwise(ends):

@@ -1,9 +1,11 @@
 """Robust nonlinear least squares with priors, and the covariance of the result.
 
 Residuals of real arms are not white noise: what a model cannot describe changes slowly, so that
-neighbouring rows err alike.  Rows are therefore weighted by the number of independent rows among
-them, from the autocorrelation of the residuals, and residuals are divided by their own robust
-spread.  Only then do priors and covariance mean what they say.
+neighbouring rows err alike.  Where the model is wrong, all rows at nearby pressures err alike
+(`stiffopt.identify.discrepancy`).  Rows are weighted by the number of independent rows among them,
+from the autocorrelation of what is left, and that is divided by its own robust spread.  Only then
+do priors and covariance mean what they say: what a curve in pressure space cannot tell stays near
+the robot file, however often the curve was run.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ class Fit:
     problem : with the noise and the weights that were used at last.
     x : scaled coordinates (d,).
     cost : half the sum of the squared residuals, with the loss and the prior.
-    covariance : of x, (d, d): unknowns that nothing was learnt of have the variance one.
+    covariance : of x, (d, d), by noise and prior: unknowns that nothing was learnt of have the
+        variance one.
+    gain : inverse (d, d) of the normal matrix: x moves by ``gain @ slopes.T @ residuals``.
     independent : how many rows are one independent one.
     """
 
@@ -40,6 +44,7 @@ class Fit:
     x: Array
     cost: float
     covariance: Array
+    gain: Array
     independent: float
 
     @property
@@ -78,7 +83,7 @@ def fit(
     for _ in range(rounds):
         problem, independent = _reweighted(problem, x, independent)
         x, cost = _minimum(problem, x, tell, most)
-    return Fit(problem, x, cost, _covariance(problem, x), independent)
+    return Fit(problem, x, cost, *_covariance(problem, x), independent)
 
 
 def _minimum(
@@ -145,13 +150,15 @@ def _reweighted(
     if not problem.samples:
         return problem, 1.0
     predicted = problem.predict(x)
-    position = _spread(np.concatenate(predicted.errors), FIT.least_position)
-    turns = [read.turn for read in predicted.read if read.turn is not None]
+    moves = [problem.unshared(errors, "position") for errors in predicted.errors]
+    position = _spread(np.concatenate(moves), FIT.least_position)
+    read = [read.turn for read in predicted.read if read.turn is not None]
+    turns = [problem.unshared(turn, "angle") for turn in read]
     angle = _spread(np.concatenate(turns), FIT.least_angle) if turns else problem.noise.angle
-    found = _rows_per_independent(problem, predicted)
+    found = _rows_per_independent(problem, moves[0])
     factor = np.sqrt(independent / found)
     samples = [replace(sample, weight=sample.weight * factor) for sample in problem.samples]
-    return problem.with_samples(samples, Noise(position, angle)), found
+    return problem.with_samples(samples, Noise(position, angle, FIT.systematic)), found
 
 
 def _spread(errors: Array, least: float) -> float:
@@ -164,13 +171,13 @@ def _spread(errors: Array, least: float) -> float:
     return max(float(np.sqrt(np.mean(kept**2))), least)
 
 
-def _rows_per_independent(problem: CalibrationProblem, predicted: Predicted) -> float:
-    """Integrated autocorrelation of the tip's errors along the rows, at least 1."""
+def _rows_per_independent(problem: CalibrationProblem, moves: Array) -> float:
+    """Integrated autocorrelation of the tip's errors (M, 3) along the rows, at least 1."""
     starts = problem.starts
     longest = max(1, max(len(sample.rows) for sample in problem.samples) // 3)
     total: Array = np.zeros(longest)
     for begin, end in pairwise(starts):
-        errors = predicted.errors[0][begin:end]
+        errors = moves[begin:end]
         known = np.where(np.isfinite(errors), errors, 0.0)
         size = len(known) + longest  # so that nothing comes round
         spectrum = np.abs(np.fft.rfft(known, size, axis=0)) ** 2
@@ -184,10 +191,15 @@ def _rows_per_independent(problem: CalibrationProblem, predicted: Predicted) -> 
     return float(max(1.0, 1 + 2 * correlation[1:stop].sum()))
 
 
-def _covariance(problem: CalibrationProblem, x: Array) -> Array:
-    """Inverse of the normal matrix with the weights of the loss; the prior is part of it."""
+def _covariance(problem: CalibrationProblem, x: Array) -> tuple[Array, Array]:
+    """Covariance by noise and prior, with the weights of the loss, and the normal matrix's inverse.
+
+    The former is ``N^-1 (N - S'S) N^-1`` with the normal matrix N and the slopes S of what rows
+    share: how large that is, is told by what was held back (`stiffopt.identify.error_model`).
+    """
     value, slope = problem.residuals(x)
-    weight = 1 / np.sqrt(1 + value**2 / FIT.loss_scale**2)
-    normal = slope.T @ (slope * weight[:, np.newaxis]) + np.eye(problem.size)
-    found = np.linalg.inv(normal)
-    return np.asarray((found + found.T) / 2, dtype=float)
+    slope = slope / np.sqrt(np.sqrt(1 + value**2 / FIT.loss_scale**2))[:, np.newaxis]
+    inverse = np.linalg.inv(slope.T @ slope + np.eye(problem.size))
+    rows = slope[: len(slope) - problem.n_shared]
+    found = inverse @ (rows.T @ rows + np.eye(problem.size)) @ inverse
+    return np.asarray((found + found.T) / 2, dtype=float), np.asarray(inverse, dtype=float)

@@ -17,6 +17,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.identify.discrepancy import Systematic, smooth_functions
 from stiffopt.identify.past import Past, Start
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.sensing import Readings, readings
@@ -37,6 +38,8 @@ Array = NDArray[np.float64]
 
 Begin = Literal["rest", "previous", "unknown"]
 """State in which a log begins: after a rise from no pressure, as the last one ended, or unknown."""
+Kind = Literal["position", "angle"]
+"""Of a residual."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +80,20 @@ class TrackedPoint:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of the residuals: of each axis of a position in m, of an angle in rad."""
+    """Standard deviations of the residuals.
+
+    Attributes
+    ----------
+    position : of each axis of a row's position, in m.
+    angle : of a row's angle, in rad.
+    systematic : of the errors that rows at nearby pressures share, as a share of the arm's length;
+        of angles twice that in rad, as an arm that bends too far by a misses by a / 2 of its
+        length.
+    """
 
     position: float
     angle: float
+    systematic: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +157,7 @@ class CalibrationProblem:
         self._index = {parameter.key: i for i, parameter in enumerate(self._parameters)}
         self._measured = [self._measurements(point) for point in self.points]
         self._weights = np.concatenate([sample.weight for sample in self.samples] or [np.zeros(0)])
+        self._of_rows: dict[tuple[Kind, bytes], Systematic] = {}
 
     @property
     def size(self) -> int:
@@ -165,6 +179,14 @@ class CalibrationProblem:
         pairs = zip(self.unknowns.all, x, strict=True)
         return {unknown.name: float(value) for unknown, value in pairs}
 
+    @property
+    def n_shared(self) -> int:
+        """How many of the residuals, the last ones, are coefficients of errors that rows share."""
+        if not (self.noise.systematic and self.samples):
+            return 0
+        kinds = sum(1 + (rotation is not None) for _, rotation in self._measured)
+        return int(3 * kinds * self._functions.shape[1])
+
     def without(self, held_back: Sequence[NDArray[np.bool_]]) -> CalibrationProblem:
         """The same problem, in which some rows of its samples do not count."""
         samples = [
@@ -178,6 +200,7 @@ class CalibrationProblem:
         other = copy(self)
         other.samples, other.noise = tuple(samples), noise
         other._weights = np.concatenate([sample.weight for sample in samples])
+        other._of_rows = {}
         return other
 
     def robot(self, x: Array) -> RobotDescription:
@@ -194,18 +217,25 @@ class CalibrationProblem:
     def residuals(self, x: Array) -> tuple[Array, Array]:
         """Residuals (m,) of samples and tables at scaled coordinates, and their Jacobian (m, d).
 
-        Rows without a measurement are zero.  The prior is not among them.
+        Rows without a measurement are zero.  The prior is not among them.  Of errors that rows
+        share, the rows have what is left, and how large these errors are comes last.
         """
         predicted, slopes = self._predict(x)
         values: list[Array] = []
         jacobians: list[Array] = []
+        shared: list[tuple[Array, Array]] = []
         for error, read, (moved, turned) in zip(
             predicted.errors, predicted.read, slopes, strict=True
         ):
-            self._append(values, jacobians, error, -moved, self.noise.position)
+            found = [self._divided(error, -moved, "position")]
             turn = read.turn
             if turn is not None and turned is not None:
-                self._append(values, jacobians, -turn, -turned, self.noise.angle)
+                found.append(self._divided(-turn, -turned, "angle"))
+            rows = 3 * len(error)
+            for value, slope in found:
+                values.append(value[:rows])
+                jacobians.append(slope[:rows])
+                shared.append((value[rows:], slope[rows:]))
         for table in self.tables:
             value, jacobian = self.of_table(table, x)
             values.append(value)
@@ -213,8 +243,8 @@ class CalibrationProblem:
         excess, per_parameter, *_ = self._of_parameters(x)
         jacobian = np.zeros((len(excess), self.size))
         jacobian[:, : len(self._parameters)] = per_parameter
-        values.append(excess[:, 0])
-        jacobians.append(jacobian)
+        values += [excess[:, 0], *(value for value, _ in shared)]
+        jacobians += [jacobian, *(slope for _, slope in shared)]
         return np.concatenate(values), np.concatenate(jacobians) * self.scale
 
     def _of_parameters(self, x: Array) -> list[Array]:
@@ -253,15 +283,48 @@ class CalibrationProblem:
         predicted, slopes = self._predict(x)
         return predicted, slopes[0][0] * self.scale
 
-    def _append(
-        self, values: list[Array], jacobians: list[Array], error: Array, slope: Array, scale: float
-    ) -> None:
-        """Add weighted residuals (M, 3) and their slopes (M, 3, d) by unscaled coordinates."""
+    def _divided(self, error: Array, slope: Array, kind: Kind) -> tuple[Array, Array]:
+        """Residuals (3 M + 3 m,) of errors (M, 3) of rows, and their slopes by coordinates.
+
+        Of errors that rows share, what is left and the m coefficients of these.
+        """
         known = ~np.isnan(error.sum(axis=1))
-        weight = (np.where(known, self._weights, 0.0) / scale)[:, np.newaxis]
-        values.append((np.where(known[:, np.newaxis], error, 0.0) * weight).ravel())
-        slope = np.where(known[:, np.newaxis, np.newaxis], slope, 0.0)
-        jacobians.append((slope * weight[..., np.newaxis]).reshape(-1, self.size))
+        systematic, weight = self._systematic(known, kind)
+        value = np.where(known[:, np.newaxis], error, 0.0) * weight
+        slope = np.where(known[:, np.newaxis, np.newaxis], slope, 0.0) * weight[..., np.newaxis]
+        if systematic is not None:
+            value = systematic.residuals(value)
+            slope = systematic.residuals(slope.reshape(len(slope), -1))
+        return value.ravel(), slope.reshape(-1, self.size)
+
+    def unshared(self, error: Array, kind: Kind) -> Array:
+        """Errors (M, 3) of rows less the part that rows at nearby pressures share."""
+        known = ~np.isnan(error.sum(axis=1))
+        systematic, weight = self._systematic(known, kind)
+        if systematic is None:
+            return error
+        part = systematic.part(np.where(known[:, np.newaxis], error, 0.0) * weight)
+        return np.asarray(
+            error - np.divide(part, weight, out=np.zeros_like(part), where=weight > 0)
+        )
+
+    def _systematic(self, known: NDArray[np.bool_], kind: Kind) -> tuple[Systematic | None, Array]:
+        """Systematic errors of the rows (M,) that are known, and the weights (M, 1) of all."""
+        noise = self.noise
+        own = noise.position if kind == "position" else noise.angle
+        shared = noise.systematic * (self.description.length if kind == "position" else 2.0)
+        weight = (np.where(known, self._weights, 0.0) / own)[:, np.newaxis]
+        if not (shared and len(known)):
+            return None, weight
+        key = (kind, known.tobytes())
+        if key not in self._of_rows:
+            self._of_rows[key] = Systematic.of(self._functions * (shared * weight))
+        return self._of_rows[key], weight
+
+    @cached_property
+    def _functions(self) -> Array:
+        rows = [sample.recording.pressures[sample.rows] for sample in self.samples]
+        return smooth_functions(np.concatenate(rows))
 
     def _predict(self, x: Array) -> tuple[Predicted, list[tuple[Array, Array | None]]]:
         """Prediction, and the slopes (M, 3, d) of each point's position and turn."""

@@ -113,7 +113,7 @@ class SamplingSettings:
     loaded_fit_rows: int = 300
     loaded_rows: int = 400
     rows: int = 50_000
-    dead_time_step: float = 0.1
+    dead_time_step: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -167,6 +167,9 @@ class FitSettings:
         less); and the excess that counts as one deviation.
     side : prior deviation of the side of its plays on which a channel begins, from -1 to 1.
     between_logs : time at the last pressures between two logs of a sequence, in s.
+    systematic : deviation of the errors that rows at nearby pressures share, in lengths of the arm.
+    near : what is near, as a share of the highest recorded pressure.
+    centres_apart, most_centres : of these errors, in units of what is near, and their number.
     """
 
     loss_scale: float = 2.0
@@ -182,6 +185,10 @@ class FitSettings:
     modulus_slack: float = 0.005
     side: float = 0.6
     between_logs: float = 60.0
+    systematic: float = 0.005
+    near: float = 0.3
+    centres_apart: float = 0.7
+    most_centres: int = 80
 
 
 @dataclass(frozen=True)
@@ -192,7 +199,10 @@ class ChoiceSettings:
     ----------
     logs : as many logs or more are held back one by one; of fewer, parts are.
     parts : number of these parts.
-    top : share of the rows, those with the highest pressures, that are held back too.
+    top : share of the rows, those with the highest pressures, that are held back too; and of those
+        with the lowest.
+    regions, rounds : number of regions of pressure that are held back, and of the steps that look
+        for them.
     evaluations : most evaluations of a fit without what is held back, which begins near its end.
     no_worse : relative error by which a simpler model may be worse.
     held, held_still, held_for : creep can be told if pressures are held for this share of the time;
@@ -202,8 +212,10 @@ class ChoiceSettings:
     logs: int = 3
     parts: int = 4
     top: float = 0.2
+    regions: int = 3
+    rounds: int = 10
     evaluations: int = 20
-    no_worse: float = 0.02
+    no_worse: float = 0.04
     held: float = 0.2
     held_still: float = 1e-3
     held_for: float = 1.0

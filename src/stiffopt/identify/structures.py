@@ -5,7 +5,7 @@ Models are compared by their errors in logs, or parts of logs, to which they wer
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.identify.error_model import HeldBack
-from stiffopt.identify.fit import Fit, fit
-from stiffopt.identify.problem import CalibrationProblem
+from stiffopt.identify.fit import Fit
+from stiffopt.identify.folds import is_region
 from stiffopt.identify.recording import Recording
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import CHOICE, START
@@ -24,7 +24,6 @@ from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.laws import law_class, strain_laws
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -216,50 +215,24 @@ class Candidate:
         return float(np.mean([errors.mean for errors in self.folds.values()]))
 
 
-def held_back(found: Fit, settle: float, tell: Callable[[], None]) -> dict[str, HeldBack]:
-    """Hold back logs or parts of logs, fit the others, and predict what was held back.
-
-    Parameters
-    ----------
-    found : to all of them; the other fits begin there.
-    settle : of a log that begins in an unknown state this many s at its beginning still count, as
-        they would if it were predicted.
-    """
-    problem = found.problem
-    parts = {}
-    for name, away in _folds(problem).items():
-        kept = [_without_beginning(each, problem, i, settle) for i, each in enumerate(away)]
-        if not any(each.any() for each in kept):
-            continue  # a log that ends before its beginning does
-        rows = np.concatenate(kept)
-        others = fit(problem.without(kept), [found.x], tell, rounds=0, most=CHOICE.evaluations)
-        distances = np.linalg.norm(others.predicted.errors[0], axis=1)
-        errors = Errors.of(distances[rows], None)
-        if errors.n:
-            parts[name] = HeldBack(rows, others, errors)
-    if not parts:
-        raise InputError(
-            "there is nothing left to compare models with; expected longer logs, or name a model"
-        )
-    return parts
-
-
 def best(candidates: Sequence[Candidate]) -> Candidate:
     """Return the simplest model of those that predict about as well as the best.
 
     About as well means within one standard error of the difference over what was held back, or
-    within the share `ChoiceSettings.no_worse`.
+    within the share `ChoiceSettings.no_worse`; of logs and stretches of them as well as of regions
+    of pressure, since errors of the latter are larger and vary more.
 
     Parameters
     ----------
     candidates : the simplest first.
     """
     leader = min(candidates, key=lambda candidate: candidate.score)
+    beyond = np.array([is_region(name) for name in leader.folds])
+    groups = [rows for rows in (~beyond, beyond) if rows.any()]
     reference = _means(leader)
     for candidate in candidates:  # the simplest first
-        worse = _means(candidate) - reference
-        error = float(np.std(worse, ddof=1) / np.sqrt(len(worse))) if len(worse) > 1 else 0.0
-        if worse.mean() <= max(error, CHOICE.no_worse * reference.mean()):
+        means = _means(candidate)
+        if all(_no_worse(means[rows], reference[rows]) for rows in groups):
             return candidate
     return leader
 
@@ -268,32 +241,11 @@ def _means(candidate: Candidate) -> Array:
     return np.array([errors.mean for errors in candidate.folds.values()])
 
 
-def _folds(problem: CalibrationProblem) -> dict[str, list[Rows]]:
-    """Rows of each sample that are held back together, by a name of them."""
-    samples = problem.samples
-    none = [np.zeros(len(each.rows), dtype=bool) for each in samples]
-    folds: dict[str, list[Rows]] = {}
-    if len(samples) >= CHOICE.logs:
-        for i, each in enumerate(samples):
-            folds[each.recording.name] = [*none[:i], ~none[i], *none[i + 1 :]]
-        return folds
-    for part in range(CHOICE.parts):
-        folds[f"part {part + 1} of {CHOICE.parts}"] = [
-            np.arange(len(rows)) * CHOICE.parts // len(rows) == part for rows in none
-        ]
-    norms = [np.linalg.norm(each.recording.pressures[each.rows], axis=1) for each in samples]
-    high = np.quantile(np.concatenate(norms), 1 - CHOICE.top)
-    folds["highest pressures"] = [norm > high for norm in norms]
-    return folds
-
-
-def _without_beginning(away: Rows, problem: CalibrationProblem, i: int, settle: float) -> Rows:
-    sample = problem.samples[i]
-    estimated = sample.begin == "unknown" or problem.unknowns.zeros[i]
-    if not (estimated and away.all()):
-        return away
-    time = sample.recording.time[sample.rows]
-    return np.asarray(away & (time > time[0] + settle))
+def _no_worse(means: Array, reference: Array) -> bool:
+    """Whether errors (k,) are about as small as others, as far as can be told."""
+    worse = means - reference
+    error = float(np.std(worse, ddof=1) / np.sqrt(len(worse))) if len(worse) > 1 else 0.0
+    return bool(worse.mean() <= max(error, CHOICE.no_worse * reference.mean()))
 
 
 def _held(recordings: Sequence[Recording]) -> float:

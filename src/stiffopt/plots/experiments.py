@@ -10,6 +10,7 @@ from stiffopt.directions import direction_name
 from stiffopt.display import display_units
 from stiffopt.experiments.kinematics_result import CoverageResult, KinematicsResult
 from stiffopt.experiments.stiffness_result import StiffnessResult
+from stiffopt.logs import StiffnessTable
 from stiffopt.plots.style import (
     AXES,
     DARK,
@@ -32,8 +33,13 @@ _BAND = 0.55  # opacity
 _BAND_EDGE = 4.0  # points: a thin band must be seen beside the line
 
 
-def plot_kinematics(result: KinematicsResult, *, title: str = "kinematics") -> Figure:
-    """Draw pressures, the tip against the model, and the error, over time."""
+def plot_kinematics(
+    result: KinematicsResult, *, title: str = "kinematics", published: float | None = None
+) -> Figure:
+    """Draw pressures, the tip against the model, and the error, over time.
+
+    `published` is an error along each axis, in m, that lines in the last panel show.
+    """
     figure, grid = stacked_panels(
         (1.95, 1.95, 1.95, 1.95, 2.15), left=0.93, right=1.98, gap=0.28, sharex=True
     )
@@ -41,7 +47,7 @@ def plot_kinematics(result: KinematicsResult, *, title: str = "kinematics") -> F
     _draw_pressures(panels[0], result)
     for axis, axes in enumerate(panels[1:4]):
         _draw_tip(axes, result, axis)
-    _draw_error(panels[4], result)
+    _draw_error(panels[4], result, published)
     panels[4].set_xlabel("time (s)")
     panels[4].set_xlim(0, result.time[-1])
     draw_head(
@@ -92,7 +98,7 @@ def _draw_tip(axes: Any, result: KinematicsResult, axis: int) -> None:
     tidy(axes)
 
 
-def _draw_error(axes: Any, result: KinematicsResult) -> None:
+def _draw_error(axes: Any, result: KinematicsResult, published: float | None) -> None:
     unit = display_units().length
     for axis in range(3):
         axes.plot(
@@ -103,6 +109,11 @@ def _draw_error(axes: Any, result: KinematicsResult) -> None:
         result.time, unit.of(result.error), color=DARK, linewidth=1.4, label="distance\n(largest)"
     )
     axes.axhline(0, color=GREY, linewidth=0.7)
+    for sign in (1, -1) if published is not None else ():
+        label = "published, mostly\nwithin (each axis)" if sign > 0 else None
+        axes.axhline(
+            sign * unit.of(published), color=GREY, linewidth=1.1, linestyle="--", label=label
+        )
     axes.set_ylabel(f"model - measured ({unit})")
     legend_beside(axes)
     tidy(axes)
@@ -151,8 +162,10 @@ def plot_coverage(result: CoverageResult, *, title: str = "combined poses") -> F
     return figure
 
 
-def plot_stiffness(result: StiffnessResult, *, title: str = "stiffness") -> Figure:
-    """Draw stiffness over pressure, a panel for each direction, measured and modelled."""
+def plot_stiffness(
+    result: StiffnessResult, *, title: str = "stiffness", published: StiffnessTable | None = None
+) -> Figure:
+    """Draw stiffness over pressure: measured, modelled and published, a panel a direction."""
     directions = result.settings.directions
     columns = min(len(directions), 3)
     rows = -(-len(directions) // columns)
@@ -164,7 +177,7 @@ def plot_stiffness(result: StiffnessResult, *, title: str = "stiffness") -> Figu
     )  # fmt: skip
     for number in range(len(directions)):
         axes = figure.add_subplot(grid[number // columns, number % columns])
-        _draw_stiffness(axes, result, number)
+        _draw_stiffness(axes, result, number, published)
         if number == 0:
             axes.legend(fontsize=9, frameon=False)
     settings = result.settings
@@ -177,7 +190,9 @@ def plot_stiffness(result: StiffnessResult, *, title: str = "stiffness") -> Figu
     return figure
 
 
-def _draw_stiffness(axes: Any, result: StiffnessResult, number: int) -> None:
+def _draw_stiffness(
+    axes: Any, result: StiffnessResult, number: int, published: StiffnessTable | None
+) -> None:
     direction = result.settings.directions[number]
     cells = [cell for cell in result.along(direction) if cell.estimate is not None]
     unit, pressure = display_units().stiffness, display_units().pressure
@@ -198,10 +213,21 @@ def _draw_stiffness(axes: Any, result: StiffnessResult, number: int) -> None:
             color=MEASURED, marker="s", markersize=4.5, capsize=3, linestyle="none",
             label="measured",
         )  # fmt: skip
+    beside = [] if published is None else result.beside(published)
+    mine = [(row, cell) for row, cell in beside if cell.direction == direction]
+    if published is not None and mine:
+        rows = [row for row, _ in mine]
+        spread = published.others.get("repeatability_n_per_m", published.sigma)
+        axes.errorbar(
+            [pressure.of(cell.pressure) for _, cell in mine], unit.of(published.stiffness[rows]),
+            yerr=unit.of(spread[rows]), color=DARK, marker="D", markersize=6, capsize=4,
+            markerfacecolor="none", linestyle="none", label="published",
+        )  # fmt: skip
     axes.set_title(f"along {direction_name(direction)}", loc="left", fontsize=11, weight="bold")
     axes.set_xlabel(f"pressure ({pressure})")
     axes.set_ylabel(f"stiffness ({unit})")
     shown = [*(unit.of(each.value) for each in estimates), *curve]
+    shown += [unit.of(float(published.stiffness[row])) for row, _ in mine if published is not None]
     if max(shown) > 8 * min(shown) > 0:
         make_logarithmic(axes)
     else:

@@ -23,7 +23,7 @@ from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.pressure import SupplySettings
 from stiffopt.rig.probing import ProbeSettings
 from stiffopt.rig.registry import built_in_drivers, driver_class, driver_names, load, one_of
-from stiffopt.rig.settings import ControlSettings, LogSettings, Safety, ServiceSettings
+from stiffopt.rig.settings import ControlSettings, LogSettings, Published, Safety, ServiceSettings
 from stiffopt.rig.tracking import TrackerSettings
 from stiffopt.schema import BadKeyError, Schema, explain
 from stiffopt.units import Frequency, read_from_file
@@ -124,6 +124,7 @@ class RigDescription(Schema):
     control : how the daemon's loop steers.
     service : where the daemon listens.
     log : recordings.
+    published : of this arm, which experiments compare themselves with; None for nothing.
     scene : what is around the arm, or None; checked against the robot, see `stiffopt.model.scene`.
     plant : the arm behind simulated devices, and in the virtual lab; a
         `stiffopt.plant.settings.PlantSettings`.
@@ -146,6 +147,7 @@ class RigDescription(Schema):
     control: ControlSettings = ControlSettings()
     service: ServiceSettings = ServiceSettings()
     log: LogSettings = LogSettings()
+    published: Published | None = None
     scene: SceneOrFile | None = None
     plant: Annotated[
         SerializeAsAny[RigSection] | None, _section("plant"), _SectionJsonSchema("plant")

@@ -118,3 +118,18 @@ class LogSettings(Schema):
     """
 
     folder: Annotated[str, Field(min_length=1)] = "runs"
+
+
+class Published(Schema):
+    """What was published of this arm: experiments show it beside what they find.
+
+    Attributes
+    ----------
+    stiffness : path of a table of stiffness, relative to the rig file.
+    tip_error : error of a model's tip along each axis that most of the time was not exceeded, in m.
+    largest_tip_error : the largest along an axis, in m.
+    """
+
+    stiffness: str | None = None
+    tip_error: Annotated[Length, Field(gt=0)] | None = None
+    largest_tip_error: Annotated[Length, Field(gt=0)] | None = None

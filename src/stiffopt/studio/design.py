@@ -38,7 +38,8 @@ def _rounded(values: ArrayLike) -> tuple[float, ...]:
 
 def changed(schema: SchemaT, **update: Any) -> SchemaT:
     """Return a description with other values, checked as a new one is."""
-    return type(schema)(**{**dict(schema), **update})
+    given = {name: getattr(schema, name) for name in type(schema).model_fields}  # no cached values
+    return type(schema)(**{**given, **update})
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,8 @@ class RigView:
         self.server, self.watch = server, watch
         description = watch.design.description
         self._robot = Manipulator(description)
-        self.bench = Workbench(watch.design)
+        watch.poll()  # so that a preview begins where the arm is
+        self.bench = Workbench(watch.present_design(self._robot))
         self._preview = TaskView(server, self.bench, is_preview=True) if watch.may_command else None
         if self._preview is None:
             add_surroundings(server, description)

@@ -23,6 +23,7 @@ from stiffopt.control.state import Event, Snapshot
 from stiffopt.daemon.client import Client
 from stiffopt.daemon.secret import bracketed
 from stiffopt.errors import CommandError, InputError, StiffoptError
+from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.robot_files import load_description, robot_path
 from stiffopt.optimise.task import PressureRange
 from stiffopt.rig.config import limits_of, load_rig_description
@@ -97,6 +98,22 @@ class RigWatch:
     def in_control(self) -> bool:
         """Whether the studio has control of the arm."""
         return self._client.in_control
+
+    def present_design(self, robot: Manipulator) -> Design:
+        """The rig's design with the target that it has now, or where the model has its tip.
+
+        That is the design with its usual target where the daemon has not answered yet.
+        """
+        state = self.state
+        position = None if state is None else state.target_position
+        if state is not None and (position is None or not np.isfinite(position).any()):
+            pressures = pressures_now(state)
+            with suppress(StiffoptError):  # an arm that has no equilibrium there
+                position = None if pressures is None else robot.tip_pose(pressures)[:3, 3]
+        if position is None or not np.isfinite(position).any():
+            return self.design
+        axes = (round(float(x), 5) if np.isfinite(x) else None for x in position)
+        return self.design.with_target(position=tuple(axes))
 
     def poll(self) -> None:
         """Read the state and what has happened; keep control while somebody looks."""

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
+from stiffopt.display import display_units
 from stiffopt.errors import StiffoptError
 from stiffopt.model.scene import SceneObject
 from stiffopt.plots import style
 from stiffopt.studio import objects, texts
 from stiffopt.studio.design import Design
-from stiffopt.studio.drawing import place, rgb
+from stiffopt.studio.drawing import Vector, place, rgb
+from stiffopt.studio.task_inputs import add_slider, show_on_slider
 
 _NONE = "(none)"
 _SHADES = {"inside_tube": 0.15, "half_space": 0.25}
@@ -45,13 +49,19 @@ class SceneView:
         )  # fmt: skip
         self._handle.on_update(self._moved)
 
+    @property
+    def handle_position(self) -> Vector:
+        """Where the handle of the chosen object is (3,), in m."""
+        return np.asarray(self._handle.position)
+
     def add_inputs(self, gui: Any) -> None:
         """Add the inputs to the panel."""
         self._chosen = gui.add_dropdown("object", (_NONE,), hint="It gets a handle to drag.")
         self._chosen.on_update(lambda event: self.show() if event.client is not None else None)
-        self._size = gui.add_slider("size (mm)", 1.0, round(1e3 * self._length), 0.5, 10.0)
+        unit = self._unit = display_units().length
+        self._size = add_slider(gui, "size", unit, 1e-3, round(self._length, 3), 5e-4, 1e-2)
         self._size.on_update(self._resized)
-        self._clearance = gui.add_slider("clearance (mm)", 0.0, 20.0, 0.1, 0.0)
+        self._clearance = add_slider(gui, "clearance", unit, 0.0, 2e-2, 1e-4, 0.0)
         self._clearance.on_update(self._cleared)
         remove = gui.add_button("remove this object")
         remove.on_click(self._removed)
@@ -77,11 +87,12 @@ class SceneView:
     def _resized(self, event: Any) -> None:
         item = self._item()
         if event.client is not None and item is not None:
-            self._replace(objects.resized(item, self._size.value / 1e3), f"size of {item.name}")
+            size = float(self._unit.to_si(self._size.value))
+            self._replace(objects.resized(item, size), f"size of {item.name}")
 
     def _cleared(self, event: Any) -> None:
         if event.client is not None:
-            clearance = self._clearance.value / 1e3
+            clearance = float(self._unit.to_si(self._clearance.value))
             self._change("clearance", lambda design: design.with_clearance(clearance))
 
     def _removed(self, _: Any) -> None:
@@ -132,9 +143,8 @@ class SceneView:
             kept = self._chosen.value
             self._chosen.options = (*names, _NONE)
             self._chosen.value = kept if kept in names else _NONE
-        clearance = 0.0 if design.task.scene is None else 1e3 * design.task.scene.clearance
-        if self._clearance.value != clearance:
-            self._clearance.value = min(20.0, clearance)
+        clearance = 0.0 if design.task.scene is None else design.task.scene.clearance
+        show_on_slider(self._clearance, self._unit, clearance)
         self._show_handle()
 
     def _show_handle(self) -> None:
@@ -144,8 +154,8 @@ class SceneView:
             return
         place(self._handle, objects.place_of(item.shape))
         size = objects.size_of(item.shape)
-        if size is not None and self._size.value != 1e3 * size:
-            self._size.value = min(self._size.max, max(1.0, 1e3 * size))
+        if size is not None:
+            show_on_slider(self._size, self._unit, size)
 
     def _draw(self, item: SceneObject) -> None:
         before = self._drawn.get(item.name)
