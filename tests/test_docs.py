@@ -16,6 +16,7 @@ from pydantic import BaseModel
 
 import stiffopt
 from examples import run_examples
+from stiffopt.experiments.poses import load_poses
 from stiffopt.identify.bench import load_bench
 from stiffopt.logs import read_log
 from stiffopt.model.calibration import Calibration, FittedParameter
@@ -142,6 +143,8 @@ def test_yaml_example_loads(text: str, tmp_path: Path) -> None:
     elif "stiffopt-path/" in text:
         followed = stiffopt.load_path(path)
         followed.end_pressures(followed.resolve_robot())
+    elif "stiffopt-experiment/" in text:
+        assert load_poses(path).pressures
     elif "stiffopt-bench/" in text:
         assert load_bench(str(path))[0].arms[0].train
     elif "stiffopt-scene/" in text:

@@ -1,26 +1,20 @@
-"""Experiments of given poses, and which poses a calibration suggests."""
+"""Which poses a calibration suggests to record next, and the files that it writes."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from stiffopt.cli.main import app
-from stiffopt.errors import FileError, InputError
-from stiffopt.experiments.poses import PosesSettings, load_poses, poses_for, save_poses
+from stiffopt.errors import InputError
+from stiffopt.experiments.poses import load_poses, save_poses
 from stiffopt.identify.suggestion import suggest_poses
-from stiffopt.logs import read_log
 from stiffopt.model.calibration import Calibration, ErrorModel, FittedParameter
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.robot_files import load_description
-from stiffopt.rig.config import load_rig_description
-from stiffopt.safety.rigs import rig_for_programs
 
 RIG = Path(__file__).resolve().parent.parent / "rig" / "sim.yaml"
 KEYS = ("segments[0].material.youngs_modulus", "segments[0].corrections.gain[1]")
@@ -112,66 +106,3 @@ def test_a_file_of_poses_is_read_as_it_was_written(tmp_path: Path) -> None:
     read = load_poses(path)
     assert read.pressures == ((1e4, 2e4, 0.0), (0.0, 0.0, 5e4))
     assert (tmp_path / read.rig).resolve() == RIG
-    assert read.hold == 10.0
-
-
-@pytest.mark.parametrize(
-    ("pressures", "words"),
-    [
-        ("[[1 bar, 0 bar], [1 bar]]", r"pressures\[1\]: has 1 values; expected 2, as the first"),
-        ("[[1, 0, 0]]", r"pressures\[0\]\[0\]"),
-        ("[]", "pressures: "),
-    ],
-)
-def test_bad_files_of_poses_are_told(tmp_path: Path, pressures: str, words: str) -> None:
-    path = tmp_path / "next.yaml"
-    path.write_text(f"format: stiffopt-experiment/1\nrig: r.yaml\npressures: {pressures}\n")
-    with pytest.raises(FileError, match=words):
-        load_poses(path)
-
-
-# -- on a rig ---------------------------------------------------------------------------------
-
-
-def test_poses_beyond_the_rig_are_refused_before_anything_moves(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    description = load_rig_description(RIG)
-    with rig_for_programs(description, load_description("stiff-flop-1")) as rig:
-        high = rig.supply.limits.high
-
-        def refused(*pose: float) -> str:
-            settings = PosesSettings(channels=3, pressures=[pose])
-            with pytest.raises(InputError) as raised:
-                poses_for(rig, settings)
-            return str(raised.value)
-
-        assert refused(1e4, 1e4).startswith("the poses have 2 pressures; expected 3")
-        assert refused(0.0, high[1] + 1e3, 0.0).startswith("pose 1: channel 2 has 0 to ")
-        monkeypatch.setattr(rig, "max_force", 1e-3)
-        assert "pose 1 would push with " in (text := refused(5e4, 0.0, 0.0))
-        assert text.endswith("safety.max_force of the rig is 0.001 N")
-
-
-def test_each_pose_is_held_and_recorded(tmp_path: Path) -> None:
-    wanted = [[3e4, 0.0, 1e4], [0.0, 2e4, 2e4]]
-    path, out = tmp_path / "next.yaml", tmp_path / "second"
-    save_poses(path, str(RIG), wanted)
-    path.write_text(path.read_text().replace("hold: 10 s", "hold: 3 s"))
-    result = CliRunner().invoke(
-        app, ["experiment", "poses", str(path), "--out", str(out), "--no-plot", "--json"]
-    )
-    assert result.exit_code == 0, result.output
-    record = json.loads(result.stdout)
-    assert record["poses"] == 2
-    assert np.array(record["pressures_pa"]) == pytest.approx(np.array(wanted), abs=2e3)
-    log = read_log(out / "kinematics_poses_1.csv")
-    for pose in wanted:
-        at = np.abs(log.commanded - pose).max(axis=1) < 1.0
-        assert np.ptp(log.time[at]) == pytest.approx(3.0, abs=0.2)
-    assert np.abs(log.commanded[-1]).max() < 1.0
-    again = CliRunner().invoke(
-        app, ["experiment", "poses", str(path), "--resume", str(out), "--no-plot"]
-    )
-    assert again.exit_code == 0
-    assert "is complete; nothing was left to do" in again.stderr

@@ -48,9 +48,8 @@ from stiffopt.experiments.kinematics import (
     sequence_for,
 )
 from stiffopt.experiments.kinematics_result import read_recordings, read_rounds
-from stiffopt.experiments.poses import POSES, PosesFile, poses_for, run_poses
+from stiffopt.experiments.poses import POSES, load_poses, poses_for, run_poses
 from stiffopt.experiments.stiffness import check_stiffness, missing_series
-from stiffopt.files import read_file
 from stiffopt.logs import StiffnessTable, read_stiffness_table, write_stiffness_table
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.rig.interface import Rig
@@ -130,7 +129,7 @@ def run(
 def run_poses_file(file: str, *, out: str | None, quiet: bool) -> None:
     """Go through the poses of a file on the rig that it names, and record it."""
     require_package("foxglove-sdk", "log", "foxglove")
-    settings = read_file(file, "experiment", PosesFile)
+    settings = load_poses(file)
     with interruptible(), warnings_as_notes(quiet=quiet):
         rig, name, rate, log_folder = _rig(str(Path(file).parent / settings.rig))
         if rig.tracker is None:

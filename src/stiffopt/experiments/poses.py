@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from stiffopt.errors import InputError
 from stiffopt.experiments.conductor import Array, Conductor, check_pressures
 from stiffopt.experiments.folder import Progress, recorded
+from stiffopt.files import read_file, save_file
 from stiffopt.rig.interface import Rig
 from stiffopt.schema import Items, Schema
 from stiffopt.units import Duration, Pressure
@@ -33,6 +36,18 @@ class PosesFile(Schema):
     rig: Annotated[str, Field(min_length=1)]
     hold: Annotated[Duration, Field(gt=0, le=3600)] = 7.0
     pressures: Annotated[Items[Items[Pressure]], Field(min_length=1)]
+
+
+def load_poses(path: str | os.PathLike[str]) -> PosesFile:
+    """Read a file of poses; `FileError` with the line and the key of the first mistake."""
+    return read_file(path, "experiment", PosesFile)
+
+
+def save_poses(path: str | os.PathLike[str], rig: str, pressures: ArrayLike) -> None:
+    """Write a file of poses (N, n), in Pa, for a rig file."""
+    rows = tuple(map(tuple, np.asarray(pressures, dtype=float).tolist()))
+    relative = os.path.relpath(Path(rig).resolve(), Path(path).resolve().parent)
+    save_file(path, "experiment", PosesFile(rig=relative, pressures=rows))
 
 
 def poses_for(rig: Rig, settings: PosesFile) -> Array:
