@@ -14,7 +14,8 @@ import pytest
 import stiffopt as so
 from stiffopt.control.controller import TipController
 from stiffopt.errors import InputError
-from stiffopt.model.robot_files import load_description
+from stiffopt.model.calibration import Calibration, ErrorModel
+from stiffopt.model.robot_files import load_description, save_robot
 from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
@@ -290,6 +291,23 @@ def test_regulators_that_end_beside_their_set_points():
     bench = Bench(HANGING, supply={"leak": 3.0})
     position = bench.settled(duration=3.0)
     assert bench.run(1.0, position).mean() < 3e-4
+
+
+def test_a_plan_where_the_calibration_saw_nothing_is_said(tmp_path):
+    errors = ErrorModel(
+        residual=1e-3, discrepancy=2e3, reach=3e4, gain=0.1, degrees_of_freedom=8.0,
+        recorded=[[0.0] * 6, [1e3] * 6],
+    )  # fmt: skip
+    known = load_description(HANGING).model_copy(update={"calibration": Calibration(errors=errors)})
+    save_robot(tmp_path / "arm.yaml", known)
+    bench = Bench(str(tmp_path / "arm.yaml"))
+    bench.controller.set_task(bench.task(position=middle(bench)))
+    bench.run(1.0)
+    (notice,) = bench.controller.notices()
+    assert (notice.kind, notice.standing) == ("extrapolating", True)
+    assert notice.text.startswith("the calibration saw no such pressures, the nearest are ")
+    plan = bench.controller.replanner.plan
+    assert notice.text == known.extrapolation(plan.pressures)
 
 
 def test_target_out_of_reach_is_said():

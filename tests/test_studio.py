@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 import stiffopt
 from stiffopt.cli.path_records import csv_text
 from stiffopt.errors import FileError, InputError
+from stiffopt.model.calibration import Calibration, ErrorModel
 from stiffopt.studio import objects, texts
 from stiffopt.studio.cloud import StiffnessCloud, check_map
 from stiffopt.studio.design import Design
@@ -110,6 +112,22 @@ def test_answers_are_those_of_the_solver(bench: Workbench) -> None:
     assert "1.445 N/m" in html
     assert "plain pressures: 1.308 (+10 %)" in html
     assert "segment 1: 1, 2, 3 at min" in html
+
+
+def test_an_answer_where_the_calibration_saw_nothing_says_so() -> None:
+    errors = ErrorModel(
+        residual=1e-3, discrepancy=2e3, reach=3e4, gain=0.1, degrees_of_freedom=8.0,
+        recorded=[[0.0] * 6, [1e3] * 6],
+    )  # fmt: skip
+    robot = stiffopt.load_robot("stiff-flop-2").description
+    known = robot.model_copy(update={"calibration": Calibration(errors=errors)})
+    design = Design.of_task(stiffopt.load_task(TASK))
+    bench = Workbench(replace(design, description=known))
+    bench.answer_best(never)
+    assert bench.answer is not None
+    text = known.extrapolation(bench.answer.pressures)
+    assert text.endswith("kPa away: the model extrapolates")
+    assert text in texts.answer_html(bench)
 
 
 def test_an_answer_follows_a_drag_and_says_what_limits_it(bench: Workbench) -> None:

@@ -88,10 +88,7 @@ class Planning:
         if request.task is None or request.target is None:
             return self._checked(request)
         plan = self._planned(request, request.task, request.target)
-        known = self._robot.description.calibration
-        if known is not None:
-            channels = [each.n_channels for each in self._robot.description.segments]
-            plan = replace(plan, doubt=known.extrapolation(channels, plan.pressures))
+        plan = replace(plan, doubt=self._robot.description.extrapolation(plan.pressures))
         if self._ways is None or not len(request.way):
             return plan
         blocked = self._ways.blocked(np.vstack([request.way, plan.pressures]))

@@ -13,6 +13,8 @@ import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import (
     BeforeValidator,
     Discriminator,
@@ -469,6 +471,12 @@ class RobotDescription(Schema):
             for segment in self.segments
             for chambers in segment.channels
         )
+
+    def extrapolation(self, pressures: NDArray[np.float64]) -> str:
+        """Say that the calibration saw nothing like pressures (n,) in Pa; else an empty text."""
+        if self.calibration is None:
+            return ""
+        return self.calibration.extrapolation([s.n_channels for s in self.segments], pressures)
 
     def channel_name(self, index: int) -> str:
         """Return the name of a channel (counted from 0) in messages: ``segment 2 channel 1``."""

@@ -178,7 +178,7 @@ class Uncertainty:
         """Uncertainty at commanded pressures (n,), held or `moving`, of an unknown history."""
         p = pressures[np.newaxis]
         found = self.errors(p, moving=np.array([moving]))
-        extrapolation = self._calibration.extrapolation(self._channels, pressures)
+        extrapolation = self._description.extrapolation(pressures)
         return TipUncertainty(
             parameters=found.parameters[0],
             hysteresis=found.hysteresis[0],

@@ -94,6 +94,9 @@ def _rows(answer: StudioAnswer) -> Iterable[tuple[str, str]]:
     if answer.design.task.scene is not None:
         clearance = answer.robot.clearance(answer.pressures, answer.design.task.scene)
         yield "clearance", units.length.text(clearance, ".3g")
+    doubt = answer.robot.description.extrapolation(answer.pressures)
+    if doubt:
+        yield "doubt", doubt
     yield "answer", _BEST if answer.is_best else _LOCAL
 
 
