@@ -486,7 +486,7 @@ class Broken:
     """A problem of one unknown that is a line, but not finite beyond a limit."""
 
     size, low, high = 1, np.full(1, -np.inf), np.full(1, np.inf)
-    description = ONE
+    description, n_shared = ONE, 0
 
     def __init__(self, limit: float, slope: float = 3.0) -> None:
         self.limit, self.slope = limit, slope

@@ -74,7 +74,8 @@ def rows_below(text: str, heading: str) -> list[list[str]]:
 
 def command() -> list[str]:
     """Return the words of the command that the page gives."""
-    (block,) = re.findall(r"^```sh\n(.*?)^```", PAGE, re.M | re.S)
+    blocks = re.findall(r"^```sh\n(.*?)^```", PAGE, re.M | re.S)
+    (block,) = (each for each in blocks if "stiffopt calibrate" in each)
     assert block in SOURCES
     words = shlex.split(block.replace("\\\n", " "))
     assert words[0] == "stiffopt"
