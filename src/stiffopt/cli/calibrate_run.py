@@ -149,7 +149,7 @@ def run_calibrate(
 
 @dataclass(frozen=True, eq=False)
 class _RigLimits:
-    """What may be commanded on a rig."""
+    """Limits of the pressures that a rig accepts."""
 
     low: NDArray[np.float64]
     high: NDArray[np.float64]

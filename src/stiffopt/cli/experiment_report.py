@@ -115,7 +115,7 @@ def kinematics_report(
 
 
 def _errors_beside(result: KinematicsResult, published: Published) -> TextTable | None:
-    """Errors along each axis beside what was published of them."""
+    """Errors along each axis, next to the published ones."""
     if published.tip_error is None:
         return None
     length = display_units().length

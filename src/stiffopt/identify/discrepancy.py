@@ -10,6 +10,7 @@ found along with the residuals; these are what it leaves, and b itself.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,7 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-6  # of a correlation, that keeps the centres' matrix regular
 
 
-def centres(points: Array, apart: float, most: int) -> list[int]:
+def centres(points: Array, apart: float, most: int, chosen: Sequence[int] = (0,)) -> list[int]:
     """Rows of points (M, k), each as far as can be from those before it, until all are near one.
 
     Parameters
@@ -30,13 +31,14 @@ def centres(points: Array, apart: float, most: int) -> list[int]:
     points : (M, k)
     apart : distance that counts as near.
     most : of them.
+    chosen : rows to begin with.
     """
-    chosen = [0]
-    nearest = ((points - points[0]) ** 2).sum(axis=1)
-    while len(chosen) < most and nearest.max() > apart**2:
-        chosen.append(int(nearest.argmax()))
-        nearest = np.minimum(nearest, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
-    return chosen
+    found = list(chosen)
+    nearest = np.min([((points - points[row]) ** 2).sum(axis=1) for row in found], axis=0)
+    while len(found) < most and nearest.max() > apart**2:
+        found.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, ((points - points[found[-1]]) ** 2).sum(axis=1))
+    return found
 
 
 def smooth_functions(pressures: Array) -> Array:

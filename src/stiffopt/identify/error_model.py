@@ -25,11 +25,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.identify.discrepancy import centres
 from stiffopt.identify.fit import Fit
 from stiffopt.identify.problem import CalibrationProblem, Sample
 from stiffopt.identify.results import Errors
 from stiffopt.identify.settings import ERRORS, FIT
-from stiffopt.model.calibration import ErrorModel, nearest_recorded
+from stiffopt.model.calibration import ErrorModel, distances_from, growth
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -105,22 +106,13 @@ def representatives(channels: Sequence[int], pressures: Array) -> tuple[Array, f
 
     Of each segment's pressures always the farthest from those that were chosen comes next.
     """
-    ends = np.cumsum([0, *channels])
-    chosen: list[int] = []
-    spacing = 0.0
-    for begin, end in pairwise(ends):
-        own = pressures[:, begin:end]
-        distance = np.full(len(own), np.inf)
-        for index in chosen:
-            distance = np.minimum(distance, np.linalg.norm(own - own[index], axis=1))
-        for _ in range(ERRORS.representatives):
-            index = int(np.argmax(distance)) if np.isfinite(distance).all() else 0
-            if distance[index] <= ERRORS.spacing * np.ptp(pressures, axis=0).max():
-                break
-            chosen.append(index)
-            distance = np.minimum(distance, np.linalg.norm(own - own[index], axis=1))
-        spacing = max(spacing, float(distance.max()))
-    return pressures[sorted(set(chosen))], spacing
+    apart = ERRORS.spacing * float(np.ptp(pressures, axis=0).max())
+    chosen, most = [0], ERRORS.representatives
+    for begin, end in pairwise(np.cumsum([0, *channels])):
+        chosen = centres(pressures[:, begin:end], apart, most, chosen)
+        most = len(chosen) + ERRORS.representatives
+    kept = pressures[sorted(chosen)]
+    return kept, float(distances_from(channels, pressures, kept).max())
 
 
 # -- the likelihood of what was held back ----------------------------------------------------
@@ -152,11 +144,10 @@ class _Fold:
         rows = held.rows & np.isfinite(predicted.errors[0]).all(axis=1)
         counted = np.concatenate([sample.weight for sample in problem.samples]) > 0
         channels = _channels(fit)
-        _, ways = nearest_recorded(channels, pressures[rows], pressures[counted])
-        distances = np.stack([np.linalg.norm(way, axis=1) for way in ways], axis=1)
-        growth = -np.expm1(-2 * distances / reaches[:, np.newaxis, np.newaxis])
+        distances = distances_from(channels, pressures[rows], pressures[counted])
+        share = growth(distances, reaches[:, np.newaxis, np.newaxis])
         acting = predicted.per_pressure[0][rows]
-        direct = np.repeat(growth, channels, axis=2)[:, :, np.newaxis] * acting
+        direct = np.repeat(share, channels, axis=2)[:, :, np.newaxis] * acting
         kept = kept_unknowns(problem)
         slope = slopes[rows][:, :, kept]
         added = _influence(problem, fit.x, fit.gain, reaches)[:, kept[:, np.newaxis], kept]

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.errors import InputError
 from stiffopt.identify.settings import SUGGESTION
-from stiffopt.model.calibration import Calibration, ErrorModel
+from stiffopt.model.calibration import Calibration, ErrorModel, growth
 from stiffopt.model.description import RobotDescription
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.uncertainty import ReadingSlopes
@@ -137,8 +137,8 @@ class _Design:
     def _variance(self, distances: Array) -> Array:
         """Variance of a channel's discrepancy at distances from what was recorded, in Pa^2."""
         known = self._errors
-        growth = -np.expm1(-2 * distances / known.reach)
-        return np.asarray(known.discrepancy**2 * growth + (known.gain * distances) ** 2)
+        share = growth(distances, known.reach)
+        return np.asarray(known.discrepancy**2 * share + (known.gain * distances) ** 2)
 
     def _reading(self, index: int) -> Array:
         """Covariance (3, 3) of what a candidate's reading tells of the numbers, in m^2."""
@@ -146,13 +146,18 @@ class _Design:
         own = self._acting[index]
         return np.asarray(self._errors.residual**2 * np.eye(3) + (own * variance) @ own.T)
 
+    def _seen(self, index: int) -> tuple[Array, Array]:
+        """Slopes times covariance (3, k) of a candidate, and the inverse of its reading's (3, 3)."""
+        slope = self._slopes[index]
+        seen = slope @ self._covariance
+        return seen, np.linalg.inv(seen @ slope.T + self._reading(index))
+
     def _gains(self) -> Array:
         """By how much each candidate would lower the mean variance (N,), in m^2."""
         now = self._variance(self._distances)
         found = np.zeros(len(self._candidates))
-        for index, slope in enumerate(self._slopes):
-            seen = slope @ self._covariance
-            inverse = np.linalg.inv(seen @ slope.T + self._reading(index))
+        for index in range(len(self._candidates)):
+            seen, inverse = self._seen(index)
             then = self._variance(np.minimum(self._distances, self._between[index]))
             found[index] = np.trace(inverse @ seen @ self._mean @ seen.T)
             found[index] += np.mean((self._weights * (now - then)).sum(axis=1))
@@ -160,9 +165,7 @@ class _Design:
 
     def _record(self, index: int) -> None:
         """Take a candidate as recorded."""
-        slope = self._slopes[index]
-        seen = slope @ self._covariance
-        inverse = np.linalg.inv(seen @ slope.T + self._reading(index))
+        seen, inverse = self._seen(index)
         self._covariance = self._covariance - seen.T @ inverse @ seen
         self._distances = np.minimum(self._distances, self._between[index])
 

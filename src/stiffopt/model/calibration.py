@@ -111,8 +111,7 @@ class ErrorModel(Schema):
         pressures : (N, n)
             In Pa.
         """
-        _, ways = nearest_recorded(channels, pressures, np.array(self.recorded))
-        found = np.stack([np.linalg.norm(way, axis=1) for way in ways], axis=1)
+        found = distances_from(channels, pressures, np.array(self.recorded))
         return np.asarray(np.maximum(found - self.spacing, 0.0))
 
     def variances(self, channels: Sequence[int], pressures: Array) -> Array:
@@ -127,7 +126,7 @@ class ErrorModel(Schema):
             way = way * (beyond / np.maximum(distance, 1.0))[:, np.newaxis]
             share = self._untested(recorded[:, begin:end])[index]
             untested = np.maximum(np.einsum("ni,nij,nj->n", way, share, way), 0.0)
-            variance = self.discrepancy**2 * -np.expm1(-2 * beyond / self.reach)
+            variance = self.discrepancy**2 * growth(beyond, self.reach)
             found[:, begin:end] = (variance + self.gain**2 * untested)[:, np.newaxis]
         return found
 
@@ -145,6 +144,17 @@ class ErrorModel(Schema):
     def near(self) -> float:
         """Distance in Pa up to which a pressure counts as recorded."""
         return float(_NEAR * np.ptp(np.array(self.recorded), axis=0).max())
+
+
+def growth(distances: Array, reach: float | Array) -> Array:
+    """Share of the discrepancy's variance at distances from what was recorded, all in Pa."""
+    return np.asarray(-np.expm1(-2 * distances / reach))
+
+
+def distances_from(channels: Sequence[int], pressures: Array, recorded: Array) -> Array:
+    """Distance (N, segments) in Pa of each segment's pressures; see `nearest_recorded`."""
+    _, ways = nearest_recorded(channels, pressures, recorded)
+    return np.stack([np.linalg.norm(way, axis=1) for way in ways], axis=1)
 
 
 def nearest_recorded(
