@@ -147,7 +147,7 @@ class _Design:
         return np.asarray(self._errors.residual**2 * np.eye(3) + (own * variance) @ own.T)
 
     def _seen(self, index: int) -> tuple[Array, Array]:
-        """Slopes times covariance (3, k) of a candidate, and the inverse of its reading's (3, 3)."""
+        """A candidate's slopes times covariance (3, k), and the inverse of its reading's (3, 3)."""
         slope = self._slopes[index]
         seen = slope @ self._covariance
         return seen, np.linalg.inv(seen @ slope.T + self._reading(index))
