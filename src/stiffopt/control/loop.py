@@ -144,9 +144,13 @@ class ControlLoop:
             with refusing("request"):
                 self._supervisor.controller.check_ahead(request)
 
-    def hold(self, reason: str = "asked to") -> None:
-        """Keep the pressures as they are until the next task, target or trajectory."""
-        self._request(lambda now: self._supervisor.hold(now, reason))
+    def hold(self, reason: str = "asked to", *, lasting: bool = True) -> None:
+        """Keep the pressures as they are until the next task, target or trajectory.
+
+        A hold that is not `lasting`, because nobody is there who would end it, ends after
+        `Safety.hold_timeout`: the pressures are let down then.
+        """
+        self._request(lambda now: self._supervisor.hold(now, reason, lasting=lasting))
 
     def vent(self, reason: str = "asked to") -> None:
         """Vent at once; it is inactive then, or still in fault.
