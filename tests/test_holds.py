@@ -151,3 +151,30 @@ def test_a_way_down_that_would_take_too_long_to_find_is_straight_and_says_so() -
     taken, warning = watch.way_down(BENT)
     assert len(taken) == 2
     assert "was not looked at" in warning
+
+
+def test_arming_says_what_to_change_on_a_computer_that_is_late() -> None:
+    arm = Lab(ready=False)
+    arm.loop.configure()
+    for late in (0.03, 0.028, 0.026, 0.0, 0.2):  # one tick that is very late is no habit
+        arm.rig.clock.sleep(late)
+        arm.loop.tick(arm.now - late)
+        arm.loop.tick(arm.now)  # an overrun has an end
+    arm.arm()
+    (said,) = [event for event in arm.loop.events.since(0)[0] if event.kind == "timing"]
+    assert "ticks began 28 ms late" in said.text
+    assert "guard_timeout: 100 ms" in said.text
+
+
+def test_a_computer_that_is_too_late_is_not_armed() -> None:
+    arm = Lab(ready=False)
+    arm.loop.configure()
+    for _ in range(3):
+        arm.rig.clock.sleep(0.08)
+        arm.loop.tick(arm.now - 0.08)
+        arm.loop.tick(arm.now)
+    with pytest.raises(InputError, match=r"timing: ticks began 80 ms late.*guard_timeout: 200 ms"):
+        arm.arm()
+    for _ in range(3000):  # half a minute
+        arm.loop.tick(arm.now)
+    arm.arm()

@@ -12,7 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.checks import check_rig, check_vented_arm, highest_pressures, refusing
+from stiffopt.control.checks import (
+    check_rig,
+    check_vented_arm,
+    highest_pressures,
+    late_ticks,
+    refusing,
+)
 from stiffopt.control.interface import Controller, ControlOutput
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.state import Severity, State
@@ -476,8 +482,13 @@ class Supervisor:
             self.lifecycle.change(State.INACTIVE)
             self.events.add(now, "configured", "everything answers; vented")
 
-    def arm(self, now: float, unwanted: Callable[[], bool] = lambda: False) -> None:
-        """Check the arm and arm it, unless that is unwanted by then; see `ControlLoop.arm`."""
+    def arm(
+        self, now: float, unwanted: Callable[[], bool] = lambda: False, lateness: float = 0.0
+    ) -> None:
+        """Check the arm and arm it, unless that is unwanted by then; see `ControlLoop.arm`.
+
+        `lateness` is how late ticks began lately, in s.
+        """
         self.lifecycle.permit("arm")
         with refusing("arming"):
             reading = self.outlet.read()
@@ -486,6 +497,9 @@ class Supervisor:
                 now, self.rig, self.controller, self._monitor, reading, self._tracker,
                 self._tuning.vented_offset,
             )  # fmt: skip
+            late = late_ticks(lateness, self._safety.guard_timeout)
+            if lateness >= self._safety.guard_timeout:
+                problems.append(late)
         if problems:
             raise CommandError("; ".join(problems))
         if unwanted():
@@ -510,6 +524,8 @@ class Supervisor:
         self._holds.clear()
         self.lifecycle.change(State.ACTIVE)
         self.events.add(now, "armed", "armed: pressures may change from now on")
+        if late:
+            self.events.add(now, "timing", late, Severity.WARNING)
 
     def disarm(self, now: float, reason: str = "disarmed") -> None:
         """Begin to let down; see `ControlLoop.disarm`."""
