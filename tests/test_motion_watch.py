@@ -147,3 +147,11 @@ def test_nothing_is_doubted_while_nobody_steers() -> None:
     for k in range(400):
         watch.take(k * FRAME, 0.005 * k * FRAME * X, np.zeros(3))
     assert watch.doubt is None
+
+
+def test_nothing_is_doubted_after_steering_has_ended() -> None:
+    watch = MotionWatch(LENGTH, MotionTuning())
+    watch.intend(0.0, np.zeros(3))
+    for k in range(400):
+        watch.take(k * FRAME, 0.02 * np.sin(k) * X, np.zeros(3))
+    assert watch.doubt is None

@@ -100,7 +100,7 @@ class MotionWatch:
     def _intended_at(self, time: float) -> Array | None:
         for moment, position in reversed(self._intended):
             if moment <= time:
-                return position
+                return position if time - moment < self._tuning.longest_pause else None
         return None
 
     def _since(self, duration: float) -> Array:

@@ -184,6 +184,7 @@ class MotionTuning:
     """What in the tip's motion is doubted (`MotionWatch`)."""
 
     spacing: float = 0.02  # least time between two samples that are compared, in s
+    longest_pause: float = 0.1  # since the arm was steered, after which none is compared, in s
     # by what share of each motion the model may be wrong
     model_error: float = 0.35
     # way from which on a response is looked at: a length in m, and a share of the arm's length
