@@ -175,6 +175,7 @@ COMMANDS = [
     ("POST", "/v1/disarm", None),
     ("POST", "/v1/reset", None),
     ("POST", "/v1/hold", None),
+    ("POST", "/v1/channels", {"without": [2]}),
     ("POST", "/v1/target", TARGET),
     ("POST", "/v1/task", {"target": TARGET}),
     ("POST", "/v1/trajectory", {"waypoints": [{"time_s": 1, "target": TARGET}]}),
