@@ -222,7 +222,8 @@ def test_with_token_and_control_the_loop_is_asked(
 ) -> None:
     answer = pilot(method, path, body)
     assert answer.status_code == 200, answer.text
-    name = {"target": "set_target", "task": "set_task", "trajectory": "follow_trajectory"}
+    name = {"trajectory": "follow_trajectory"}
+    name |= {word: f"set_{word}" for word in ("target", "task", "channels")}
     word = path.removeprefix("/v1/")
     assert pilot.loop.names == [name.get(word, word)]
     assert answer.json()["state"] == pilot.loop.now.state

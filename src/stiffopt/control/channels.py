@@ -141,9 +141,10 @@ class Channels:
     def compensated(self, offset: Array) -> Array:
         """The part of settled pressures relative to commands (n,) that commands make up for."""
         if self._quiet:
-            return np.minimum(np.maximum(offset, -self._least), self._least)
-        most = np.where(self.limited, np.inf, self._allowed)
-        above = np.where(self.limited, np.inf, self._least)
+            most = above = self._least
+        else:
+            most = np.where(self.limited, np.inf, self._allowed)
+            above = np.where(self.limited, np.inf, self._least)
         part: Array = np.minimum(np.maximum(offset, -most), above)
         return part
 
