@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
+from stiffopt.control.channels import Channels
 from stiffopt.control.checks import check_rates, limited_range, refusing
 from stiffopt.control.course import Course
 from stiffopt.control.estimator import TipEstimator
@@ -102,8 +103,10 @@ class TipController:
         if control.vibration != "auto":
             vibrates = control.vibration == "modelled"
         mode = BendingMode.of(robot.description) if vibrates else None
+        tolerance = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
+        self._channels = Channels(limits, slew, tolerance, tuning.regulators)
         self._pressures = PressureEstimator(
-            robot.description, control, period, slew, tuning.regulators
+            robot.description, control, period, slew, tuning.regulators, self._channels
         )
         lag, dead_time = self._pressures.lag, self._pressures.dead_time
         filter_tuning = replace(
@@ -166,7 +169,7 @@ class TipController:
         self._reference.begin(np.concatenate([zero, np.zeros(6)]))
         self._corrected_offset = np.zeros(6)
         self._saturated = np.zeros(len(zero), dtype=bool)
-        self._allocation.limit(self.limits.low, self.limits.high)
+        self._permitted = self.limits.low, self.limits.high  # commands (n,), by the task
         self._tip: TipAt | None = None
         if self._model is not None:
             self._tip = self._model.at(zero)
@@ -194,6 +197,10 @@ class TipController:
             estimate = self._estimator.estimate
             course = Course(trajectory, now, estimate.position, estimate.rotation)
             self._pursue_target(course.at(now), course)
+
+    def set_channels(self, without: Sequence[int]) -> None:
+        """Do without some channels; see `Controller.set_channels`."""
+        self._channels.take_out(without)
 
     def _follow_posture(self, trajectory: Trajectory, pressures: Array, now: float) -> None:
         """Follow a trajectory of pressures (k, n) as the posture.
@@ -247,7 +254,7 @@ class TipController:
         limited = _within_limits(task, self.robot, self.limits)
         lower, upper = limited.pressure_bounds(self.robot.description)
         self.replanner.pursue(Pursuit.of(task, limited, course))
-        self._allocation.limit(lower, upper)  # last, since it cannot fail: the pursuit has changed
+        self._permitted = lower, upper  # last, since it cannot fail: the pursuit has changed
 
     def _pursue_target(self, target: Target, course: Course | PostureCourse | None = None) -> None:
         """Go to a target, with goal and limits of the task, if there is one."""
@@ -329,7 +336,8 @@ class TipController:
         estimate, replanner = self._estimator.estimate, self.replanner
         return Present(
             replanner.pursuit, replanner.plan, self._way(now), self._estimator.offset,
-            self._pressures.command_offset, estimate.position, estimate.rotation,
+            self._pressures.command_offset, self._channels.available(), estimate.position,
+            estimate.rotation,
         )  # fmt: skip
 
     def _way(self, now: float) -> Array:
@@ -351,7 +359,8 @@ class TipController:
         last, n = pressures.command, len(pressures.command)
         if plan is None:  # nothing to do, or no plan yet
             self._at_rest = True
-            return ControlOutput(last.copy(), True, np.zeros(n, dtype=bool))
+            _, high = self._channels.commands(last, *self._permitted)
+            return ControlOutput(np.minimum(last, high), True, np.zeros(n, dtype=bool))
         if self._at_rest:
             self.resume(now)
         if self._model_is_wrong():
@@ -368,6 +377,7 @@ class TipController:
         self._update_corrected_offset(omega)
         correction = reference.path[n:] - self._corrected_offset
         prescribed = self.replanner.pursuit.prescribed
+        self._allocation.limit(*self._channels.commands(reference.path[:n], *self._permitted))
         command, held, residual = self._allocation.solve(
             (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs()),
             reference.command - command_offset,
@@ -390,7 +400,7 @@ class TipController:
         way = None if self.forecast is None else self._way(now)
         return replanner.update(
             now, estimator.offset, self._pressures.command_offset, estimator.omega,
-            reference.delay, way,
+            reference.delay, self._channels.available(), way,
         )  # fmt: skip
 
     def _set_reference_rate(self) -> None:
@@ -436,11 +446,13 @@ class TipController:
             task=pursuit.kind,
             stiffness_unit=pursuit.unit,
             model_position=estimate.static,
+            lost=self._channels.lost,
+            shortfall=self._channels.shortfall,
         )
 
     def notices(self) -> tuple[Notice, ...]:
         """Return what is wrong."""
-        notices = self.replanner.notices()
+        notices = (*self.replanner.notices(self._away()), *self._channels.notices())
         if self._model_is_wrong():
             away = 1e3 * float(np.linalg.norm(self._estimator.offset[:3]))
             text = (
@@ -451,6 +463,20 @@ class TipController:
         if doubt := self._watch.doubt:
             notices = (*notices, Notice(doubt.kind, doubt.text, Severity.ERROR, True, hold=True))
         return notices
+
+    def _away(self) -> tuple[float, float] | None:
+        """Distance and angle of a tip that rests on its plan from its target; else None."""
+        reference, plan, pursuit = self._reference, self.replanner.plan, self.replanner.pursuit
+        if plan is None or plan.reached or pursuit.course is not None:
+            return None
+        n = len(plan.pressures)
+        ways = np.stack([reference.path[:n], reference.goal[:n]]) - plan.pressures
+        speed = np.abs(reference.motion[1, :n]).max()
+        tuning = self._tuning.reference
+        if np.abs(ways).max() > tuning.there or speed > tuning.at_rest:
+            return None
+        estimate = self._estimator.estimate
+        return self._errors.at(pursuit.target, estimate.position, estimate.rotation)
 
     def close(self) -> None:
         """End the planners."""

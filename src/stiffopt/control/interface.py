@@ -72,6 +72,9 @@ class Controller(Protocol):
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory that begins now; the same errors."""
 
+    def set_channels(self, without: Sequence[int]) -> None:
+        """Do without some channels, counted from 0, from now on, and without no others."""
+
     def check_ahead(self, request: Task | Target | Trajectory) -> None:
         """Raise `InputError` if the way there is not clear of the rig's scene.
 

@@ -7,7 +7,7 @@ import threading
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from stiffopt.control.supervisor import Supervisor
 from stiffopt.control.tuning import SupervisionTuning
 from stiffopt.control.ways import ClearanceWatch
 from stiffopt.errors import CommandError, InputError
+from stiffopt.model.arguments import checked_integer
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import Task
 from stiffopt.paths.trajectory import Trajectory
@@ -146,6 +147,14 @@ class ControlLoop:
         if self._supervisor.lifecycle.armed:  # or else it is refused for that
             with refusing("request"):
                 self._supervisor.controller.check_ahead(request)
+
+    def set_channels(self, without: Sequence[int]) -> None:
+        """Take some channels, counted from 0, out of use, and give all others back.
+
+        A channel that is out is let down while the controller steers; plans do without it.
+        """
+        chosen = [checked_integer("a channel", channel, 0) for channel in without]
+        self._request(lambda now: self._supervisor.controller.set_channels(chosen))
 
     def hold(self, reason: str = "asked to", *, lasting: bool = True) -> None:
         """Keep the pressures as they are until the next task, target or trajectory.

@@ -38,6 +38,8 @@ _IDLE = 1.0  # s without a request, after which compiled code is asked for
 _ARRAYS = (
     "offset",
     "pressure_offset",
+    "low",
+    "high",
     "way",
 )  # of a request: compared and sent by value, every time
 _OBJECTS = ("serial", "task", "target", "search", "last")  # immutable: compared by identity
@@ -253,7 +255,7 @@ class PlanningEnd:
     def answer(self, answer: Plan | str | None) -> None:
         """Send the plan for the last request, or why there is none; None: the process is ready."""
         if isinstance(answer, Plan):
-            names = ("reached", "stiffness", "message", "blocked", "doubt")
+            names = ("reached", "stiffness", "message", "far", "blocked", "doubt")
             own = {name: getattr(answer, name) for name in names}
             self.connection.send({"pressures": answer.pressures.tolist(), **own})
         else:

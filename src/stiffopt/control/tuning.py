@@ -42,11 +42,27 @@ class EstimatorTuning:
 
 @dataclass(frozen=True)
 class RegulatorTuning:
-    """Observer gains of the regulators' model, and how much of its offset is compensated."""
+    """Observer gains of the regulators' model, and what is done about those that do not follow.
+
+    `Channels` says what limited and stuck channels are.
+    """
 
     pressure_gain: float = 30.0  # rate at which a reading corrects the pressure, in 1/s
     offset_gain: float = 225.0  # rate at which it corrects the offset, in 1/s^2
-    max_compensation: float = 3e3  # largest offset of a regulator that commands make up for, in Pa
+    # largest offset of a regulator that commands make up for at once, in Pa
+    max_compensation: float = 3e3
+    # largest shortfall that they make up for in time, as a share of `Safety.max_pressure_error`
+    make_up_share: float = 0.8
+    # time constant of that, in s: slower than the pressure monitor, which finds sudden leaks
+    make_up_time: float = 1.0
+    told_share: float = 0.5  # share of that shortfall from which there is an alarm
+    reading_time: float = 0.1  # time constant that takes the noise from readings, in s
+    patience: float = 0.5  # time for which a channel must be short, or above, in s
+    follows: float = 3e3  # distance from a command, in Pa, at which a regulator follows
+    # distance of a command below the pressure of a channel that does not fall, as a share of
+    # `Safety.max_pressure_error`
+    probe_share: float = 0.5
+    let_down_share: float = 0.1  # share of the slew with which a channel is let down on request
 
 
 @dataclass(frozen=True)
@@ -62,6 +78,9 @@ class ReferenceTuning:
     # change of pressure (norm over all channels) over which the model's derivatives along the
     # reference are not evaluated again, in Pa
     model_range: float = 3e3
+    # distance from the plan at which it has arrived, in Pa, and speed at which it rests, in Pa/s
+    there: float = 1e3
+    at_rest: float = 1e4
 
 
 @dataclass(frozen=True)
@@ -96,6 +115,8 @@ class ReplanningTuning:
     # change of a target, in m, after which all configurations are searched
     far_position: float = 5e-3
     far_angle: float = math.radians(5)  # the same of its orientation or pointing, in rad
+    # change of a pressure that a channel can have, in Pa, after which they are searched too
+    other_pressure: float = 1e4
 
 
 @dataclass(frozen=True)

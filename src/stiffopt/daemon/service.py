@@ -17,6 +17,7 @@ from pydantic import WrapValidator
 
 from stiffopt.control.loop import ControlLoop
 from stiffopt.daemon.messages import (
+    ChannelsRequest,
     ControlRequest,
     HoldRequest,
     TargetMessage,
@@ -272,6 +273,12 @@ def _moving(operations: Operations) -> APIRouter:
         return await operations.command(
             lease, lambda: loop.follow_trajectory(trajectory_of(request))
         )
+
+    @router.post("/channels")
+    async def set_channels(request: ChannelsRequest, lease: LeaseHeader = None) -> DoneReport:
+        """Take channels out of use, and give all others back; plans do without them."""
+        without = [channel - 1 for channel in request.without]
+        return await operations.command(lease, partial(loop.set_channels, without))
 
     @router.post("/hold")
     async def hold(request: HoldRequest | None = None, lease: LeaseHeader = None) -> DoneReport:

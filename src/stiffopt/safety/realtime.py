@@ -56,7 +56,8 @@ def real_time(priority: int = 80) -> Iterator[RealTimeReport]:
 
     The thread gets a `SCHED_FIFO` priority and exact timers. For the whole process, until the last
     such context ends, memory is locked, other threads run before other programs, threads switch
-    more often, and garbage is collected only by `tidy`. What is not permitted is left out and reported; nothing is raised.
+    more often, and garbage is collected only by `tidy`. What is not permitted is left out and
+    reported; nothing is raised.
 
     Parameters
     ----------
