@@ -174,7 +174,11 @@ class MotionWatch:
         )
         suspects = np.flatnonzero(meant & wrong & (distance > self._least))
         off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
-        missed = suspects[off > self._explained(ways[suspects], jacobian) + tuning.noise]
+        steps = np.diff(rows, axis=0)
+        speeds = np.sqrt((steps[:, _PREDICTED] ** 2).sum(axis=1)) / steps[:, _TIME]
+        late = tuning.late * (speeds[suspects] + speeds[-1:])  # y than s, in m
+        explained = self._explained(ways[suspects], jacobian) + late + tuning.noise
+        missed = suspects[off > explained]
         self._misses = self._misses + 1 if len(missed) else 0
         if self._misses < tuning.misses:
             return None
