@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from independent import FLOP, Arm, turn_z
 from references import free_tip
+from stiffopt.control.channels import Channels
 from stiffopt.control.regulators import PressureEstimator
 from stiffopt.control.tuning import RegulatorTuning
 from stiffopt.lie import log
@@ -19,6 +20,7 @@ from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.plant.plant import Plant, SimulationError
 from stiffopt.plant.settings import Discretisation, Mismatch, PlantSettings, Silicone
+from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.settings import ControlSettings
 
 Vector = NDArray[np.float64]
@@ -117,8 +119,10 @@ def test_deflated_chambers_stay_stretched_and_the_daemon_makes_up_for_it() -> No
     described = robot(ONE, history=history)
     plant = make(described)
     control = ControlSettings(regulator_lag=0.0, regulator_dead_time=0.0)
-    fast = np.full(3, 1e9)
-    estimator = PressureEstimator(described, control, 0.1, fast, RegulatorTuning())
+    fast, tuning = np.full(3, 1e9), RegulatorTuning()
+    limits = PressureLimits(np.zeros(3), np.full(3, 2 * BAR))
+    channels = Channels(limits, fast, np.full(3, 1e4), tuning)
+    estimator = PressureEstimator(described, control, 0.1, fast, tuning, channels)
 
     def command(p: Vector) -> None:
         plant.advance(0.1, p)
