@@ -34,6 +34,7 @@ from stiffopt.rig.settings import ControlSettings, Safety
 from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.gate import Outlet, let_down
 from stiffopt.safety.monitors import PressureMonitor, Trouble
+from stiffopt.safety.realtime import load_of_processors
 
 Array = NDArray[np.float64]
 
@@ -497,7 +498,8 @@ class Supervisor:
                 now, self.rig, self.controller, self._monitor, reading, self._tracker,
                 self._tuning.vented_offset,
             )  # fmt: skip
-            late = late_ticks(lateness, self._safety.guard_timeout)
+            load = load_of_processors() if self.lifecycle.in_real_time else 0.0
+            late = late_ticks(lateness, self._safety.guard_timeout, load)
             if lateness >= self._safety.guard_timeout:
                 problems.append(late)
         if problems:
