@@ -98,6 +98,9 @@ class IntegralFeedback:
         times = self._way[0]
         return np.array([np.interp(now, times, column) for column in values.T])
 
+    def set_channels(self, without: Sequence[int]) -> None:
+        """Not served."""
+
     def check_ahead(self, request: Any) -> None:
         """Nothing to do: there is no scene."""
 

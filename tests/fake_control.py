@@ -64,6 +64,10 @@ class FakeController:
         self.accident("follow")
         self.calls.append("follow")
 
+    def set_channels(self, without: Sequence[int]) -> None:
+        self.accident("set_channels")
+        self.calls.append("set_channels")
+
     def check_ahead(self, request: Task | Target | Trajectory) -> None:
         self.accident("check_ahead")
 

@@ -89,7 +89,10 @@ class FakeLoop:
     def follow_trajectory(self, trajectory: Any) -> None:
         self._do("follow_trajectory", State.ACTIVE, trajectory)
 
-    def hold(self, reason: str = "asked to") -> None:
+    def set_channels(self, without: Any) -> None:
+        self._do("set_channels", self.now.state, without)
+
+    def hold(self, reason: str = "asked to", *, lasting: bool = True) -> None:
         self._do("hold", State.HOLDING, reason)
 
     def vent(self, reason: str = "asked to") -> None:

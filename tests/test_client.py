@@ -324,6 +324,7 @@ def test_commands_reach_the_loop(loop: FakeLoop, client: Client) -> None:
     line = Trajectory(waypoints=[Waypoint(time=t, target=target) for t in (0, 2)])
     client.follow_trajectory(line)
     client.follow_trajectory(times=[0.5, 1], positions=np.array([[0, 0, 0.2], [0, 0.01, 0.2]]))
+    client.set_channels(without=[2, 5])
     client.hold("lunch")
     client.vent()
     client.reset()
@@ -331,14 +332,16 @@ def test_commands_reach_the_loop(loop: FakeLoop, client: Client) -> None:
     names, given = zip(*loop.calls, strict=True)
     assert names == (
         *("arm", "set_task", "set_task", "set_target", "set_target"),
-        *("follow_trajectory", "follow_trajectory", "hold", "vent", "reset", "disarm"),
+        *("follow_trajectory", "follow_trajectory", "set_channels", "hold", "vent", "reset"),
+        "disarm",
     )
     assert given[1] == given[2] == task.model_copy(update={"robot": ROBOT.name})
     assert given[3] == target
     assert given[4].orientation == (1, 0, 0, 0)
     assert given[5] == line
     assert given[6].waypoints[1].target.position == (0, 0.01, 0.2)
-    assert given[7] == "lunch"
+    assert given[7] == [1, 4]
+    assert given[8] == "lunch"
 
 
 def test_a_task_file_of_this_machine_may_be_given(

@@ -60,6 +60,7 @@ def assert_same(one: PlanRequest, other: PlanRequest) -> None:
     assert one.offset.dtype == other.offset.dtype == np.float64
     assert one.offset.tobytes() == other.offset.tobytes()
     assert one.pressure_offset.tobytes() == other.pressure_offset.tobytes()
+    assert (one.low.tolist(), one.high.tolist()) == (other.low.tolist(), other.high.tolist())
 
 
 def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
@@ -72,6 +73,7 @@ def test_requests_arrive_as_they_were_whatever_changes(ends: Ends) -> None:
         {"search": True},
         {"offset": 2 * OFFSET},
         {"pressure_offset": 2 * BESIDE},
+        {"low": BESIDE, "high": 3 * BESIDE},
         {"search": False},
         elsewhere,
         {"serial": 2, "task": second},
@@ -103,7 +105,7 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
         del line.connection.send_bytes
         return set(pickle.loads(sent.pop()))
 
-    arrays = {"offset", "pressure_offset", "way"}
+    arrays = {"offset", "pressure_offset", "low", "high", "way"}
     everything = {"serial", "task", "target", "search", "last", *arrays}
     assert news(ends.ours, first) == everything
     assert news(ends.ours, replace(first, offset=0 * OFFSET)) == arrays

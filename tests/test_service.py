@@ -175,6 +175,7 @@ COMMANDS = [
     ("POST", "/v1/disarm", None),
     ("POST", "/v1/reset", None),
     ("POST", "/v1/hold", None),
+    ("POST", "/v1/channels", {"without": [2]}),
     ("POST", "/v1/target", TARGET),
     ("POST", "/v1/task", {"target": TARGET}),
     ("POST", "/v1/trajectory", {"waypoints": [{"time_s": 1, "target": TARGET}]}),
@@ -221,7 +222,8 @@ def test_with_token_and_control_the_loop_is_asked(
 ) -> None:
     answer = pilot(method, path, body)
     assert answer.status_code == 200, answer.text
-    name = {"target": "set_target", "task": "set_task", "trajectory": "follow_trajectory"}
+    name = {"trajectory": "follow_trajectory"}
+    name |= {word: f"set_{word}" for word in ("target", "task", "channels")}
     word = path.removeprefix("/v1/")
     assert pilot.loop.names == [name.get(word, word)]
     assert answer.json()["state"] == pilot.loop.now.state

@@ -118,5 +118,5 @@ def does_no_harm(case: schemathesis.Case) -> None:
 def test_there_were_good_and_bad_requests() -> None:
     """Else the test above, which must have run, shows nothing."""
     assert [name for name, answers in SEEN.items() if 2 not in answers] == []
-    for name in ("lease", "target", "task", "trajectory", "hold"):
+    for name in ("lease", "target", "task", "trajectory", "channels", "hold"):
         assert SEEN[f"POST /v1/{name}"] == {2, 4}, name

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stiffopt.control.allocation import Allocation
+from stiffopt.control.channels import Channels
 from stiffopt.control.checks import check_rates, limited_range, refusing
 from stiffopt.control.course import Course
 from stiffopt.control.estimator import TipEstimator
@@ -24,6 +25,7 @@ from stiffopt.control.feedback import GainSchedule, tracking_rows
 from stiffopt.control.forecast import Forecast, Present
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LinearisedTip
+from stiffopt.control.motion_watch import MotionWatch
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.posture import PostureCourse
 from stiffopt.control.reference import Reference
@@ -101,8 +103,10 @@ class TipController:
         if control.vibration != "auto":
             vibrates = control.vibration == "modelled"
         mode = BendingMode.of(robot.description) if vibrates else None
+        tolerance = np.broadcast_to(np.asarray(safety.max_pressure_error, dtype=float), n)
+        self._channels = Channels(limits, slew, tolerance, tuning.regulators)
         self._pressures = PressureEstimator(
-            robot.description, control, period, slew, tuning.regulators
+            robot.description, control, period, slew, tuning.regulators, self._channels
         )
         lag, dead_time = self._pressures.lag, self._pressures.dead_time
         filter_tuning = replace(
@@ -133,6 +137,7 @@ class TipController:
             self.forecast = Forecast(Planner(robot, scene), tuning.forecast)
         self._lead = dead_time + 0.5 * period
         self._errors = TipErrors()
+        self._watch = MotionWatch(robot.length, tuning.motion)
         self._model: LinearisedTip | None = None  # at the effective pressures
         self._path_model: LinearisedTip | None = None  # on the reference's path
         self._waypoint_model: TipModel | None = None  # at a trajectory's waypoints
@@ -159,11 +164,12 @@ class TipController:
         self.replanner.begin()
         self._pressures.begin()
         self._estimator.begin()
+        self._watch.begin()
         zero = self._pressures.command
         self._reference.begin(np.concatenate([zero, np.zeros(6)]))
         self._corrected_offset = np.zeros(6)
         self._saturated = np.zeros(len(zero), dtype=bool)
-        self._allocation.limit(self.limits.low, self.limits.high)
+        self._permitted = self.limits.low, self.limits.high  # commands (n,), by the task
         self._tip: TipAt | None = None
         if self._model is not None:
             self._tip = self._model.at(zero)
@@ -191,6 +197,10 @@ class TipController:
             estimate = self._estimator.estimate
             course = Course(trajectory, now, estimate.position, estimate.rotation)
             self._pursue_target(course.at(now), course)
+
+    def set_channels(self, without: Sequence[int]) -> None:
+        """Do without some channels; see `Controller.set_channels`."""
+        self._channels.take_out(without)
 
     def _follow_posture(self, trajectory: Trajectory, pressures: Array, now: float) -> None:
         """Follow a trajectory of pressures (k, n) as the posture.
@@ -244,7 +254,7 @@ class TipController:
         limited = _within_limits(task, self.robot, self.limits)
         lower, upper = limited.pressure_bounds(self.robot.description)
         self.replanner.pursue(Pursuit.of(task, limited, course))
-        self._allocation.limit(lower, upper)  # last, since it cannot fail: the pursuit has changed
+        self._permitted = lower, upper  # last, since it cannot fail: the pursuit has changed
 
     def _pursue_target(self, target: Target, course: Course | PostureCourse | None = None) -> None:
         """Go to a target, with goal and limits of the task, if there is one."""
@@ -290,6 +300,7 @@ class TipController:
         if isinstance(course, PostureCourse) and pause > 0:
             course.wait(pause)
         self._computed_at = now
+        self._watch.begin()
         offset, pressures = self._estimator.offset, self._pressures
         self._corrected_offset = offset
         self._reference.begin(
@@ -314,6 +325,9 @@ class TipController:
             moment = now - (steps - 1 - step) * self._period
             self._estimator.advance(moment, effective, tip)
         counts = self._estimator.take(samples)
+        sample = self._estimator.sample
+        if counts.used and sample is not None:
+            self._watch.take(sample.time, sample.position, self._estimator.predicted)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
@@ -322,7 +336,8 @@ class TipController:
         estimate, replanner = self._estimator.estimate, self.replanner
         return Present(
             replanner.pursuit, replanner.plan, self._way(now), self._estimator.offset,
-            self._pressures.command_offset, estimate.position, estimate.rotation,
+            self._pressures.command_offset, self._channels.available(), estimate.position,
+            estimate.rotation,
         )  # fmt: skip
 
     def _way(self, now: float) -> Array:
@@ -344,7 +359,8 @@ class TipController:
         last, n = pressures.command, len(pressures.command)
         if plan is None:  # nothing to do, or no plan yet
             self._at_rest = True
-            return ControlOutput(last.copy(), True, np.zeros(n, dtype=bool))
+            _, high = self._channels.commands(last, *self._permitted)
+            return ControlOutput(np.minimum(last, high), True, np.zeros(n, dtype=bool))
         if self._at_rest:
             self.resume(now)
         if self._model_is_wrong():
@@ -353,6 +369,7 @@ class TipController:
         reference.omega = omega
         reference.advance(plan)
         tip = self._models()[1].at(reference.path[:n])
+        self._watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         course = self.replanner.pursuit.course
         self._led_to = None
         if isinstance(course, PostureCourse):
@@ -360,6 +377,7 @@ class TipController:
         self._update_corrected_offset(omega)
         correction = reference.path[n:] - self._corrected_offset
         prescribed = self.replanner.pursuit.prescribed
+        self._allocation.limit(*self._channels.commands(reference.path[:n], *self._permitted))
         command, held, residual = self._allocation.solve(
             (tip.pose, tip.jacobian, prescribed, correction, *self._vibration_inputs()),
             reference.command - command_offset,
@@ -382,7 +400,7 @@ class TipController:
         way = None if self.forecast is None else self._way(now)
         return replanner.update(
             now, estimator.offset, self._pressures.command_offset, estimator.omega,
-            reference.delay, way,
+            reference.delay, self._channels.available(), way,
         )  # fmt: skip
 
     def _set_reference_rate(self) -> None:
@@ -428,11 +446,13 @@ class TipController:
             task=pursuit.kind,
             stiffness_unit=pursuit.unit,
             model_position=estimate.static,
+            lost=self._channels.lost,
+            shortfall=self._channels.shortfall,
         )
 
     def notices(self) -> tuple[Notice, ...]:
         """Return what is wrong."""
-        notices = self.replanner.notices()
+        notices = (*self.replanner.notices(self._away()), *self._channels.notices())
         if self._model_is_wrong():
             away = 1e3 * float(np.linalg.norm(self._estimator.offset[:3]))
             text = (
@@ -440,7 +460,23 @@ class TipController:
                 "registration and sensor, the tubes, and that the robot file is this arm's"
             )
             notices = (*notices, Notice("implausible", text, Severity.ERROR, standing=True))
+        if doubt := self._watch.doubt:
+            notices = (*notices, Notice(doubt.kind, doubt.text, Severity.ERROR, True, hold=True))
         return notices
+
+    def _away(self) -> tuple[float, float] | None:
+        """Distance and angle of a tip that rests on its plan from its target; else None."""
+        reference, plan, pursuit = self._reference, self.replanner.plan, self.replanner.pursuit
+        if plan is None or plan.reached or pursuit.course is not None:
+            return None
+        n = len(plan.pressures)
+        ways = np.stack([reference.path[:n], reference.goal[:n]]) - plan.pressures
+        speed = np.abs(reference.motion[1, :n]).max()
+        tuning = self._tuning.reference
+        if np.abs(ways).max() > tuning.there or speed > tuning.at_rest:
+            return None
+        estimate = self._estimator.estimate
+        return self._errors.at(pursuit.target, estimate.position, estimate.rotation)
 
     def close(self) -> None:
         """End the planners."""

@@ -36,6 +36,7 @@ class Present:
     way: Array  # effective pressures (2, n): on the reference's path, and where that leads
     offset: Array  # of the tip (6,), see `PlanRequest`
     pressure_offset: Array  # (n,), likewise
+    available: tuple[Array, Array]  # lowest and highest (n,), likewise
     position: Array  # of the tip (3,)
     rotation: Array  # (3, 3)
 
@@ -114,7 +115,7 @@ class Forecast:
         search = pursuit.course is None and is_far(here.pursuit.target, target, position, angle)
         request = PlanRequest(
             self._serial, pursuit.task, target, here.offset.copy(), here.pressure_offset,
-            search=search or fresh or last is None, way=way, last=last,
+            search or fresh or last is None, *here.available, way=way, last=last,
         )  # fmt: skip
         plan = self._answer(request)
         _refuse_blocked(plan)

@@ -51,6 +51,7 @@ class Notice:
     text: str  # a sentence for people
     severity: Severity = Severity.WARNING  # how bad it is
     standing: bool = False  # an alarm while the controller repeats it; otherwise an event
+    hold: bool = False  # whether the pressures are to be held until there is a new task
 
 
 class Controller(Protocol):
@@ -70,6 +71,9 @@ class Controller(Protocol):
 
     def follow(self, trajectory: Trajectory, now: float) -> None:
         """Follow a trajectory that begins now; the same errors."""
+
+    def set_channels(self, without: Sequence[int]) -> None:
+        """Do without some channels, counted from 0, from now on, and without no others."""
 
     def check_ahead(self, request: Task | Target | Trajectory) -> None:
         """Raise `InputError` if the way there is not clear of the rig's scene.

@@ -38,6 +38,8 @@ _IDLE = 1.0  # s without a request, after which compiled code is asked for
 _ARRAYS = (
     "offset",
     "pressure_offset",
+    "low",
+    "high",
     "way",
 )  # of a request: compared and sent by value, every time
 _OBJECTS = ("serial", "task", "target", "search", "last")  # immutable: compared by identity
@@ -188,11 +190,12 @@ def _set_batch_policy(process: int) -> None:
     """Schedule a process as SCHED_BATCH, where the system has that.
 
     A request wakes it. It would otherwise pre-empt the control loop in the middle of that tick and
-    plan for milliseconds on the same processor. It also gives up the loop's real-time priority,
-    which it inherits if the loop started it.
+    plan for milliseconds on the same processor. It also gives up the loop's priorities, which it
+    inherits if the loop started it.
     """
     with suppress(AttributeError, OSError):
         os.sched_setscheduler(process, os.SCHED_BATCH, os.sched_param(0))
+        os.setpriority(os.PRIO_PROCESS, process, max(0, os.getpriority(os.PRIO_PROCESS, process)))
 
 
 class PlannerEnd:
@@ -252,7 +255,7 @@ class PlanningEnd:
     def answer(self, answer: Plan | str | None) -> None:
         """Send the plan for the last request, or why there is none; None: the process is ready."""
         if isinstance(answer, Plan):
-            names = ("reached", "stiffness", "message", "blocked", "doubt")
+            names = ("reached", "stiffness", "message", "far", "blocked", "doubt")
             own = {name: getattr(answer, name) for name in names}
             self.connection.send({"pressures": answer.pressures.tolist(), **own})
         else:

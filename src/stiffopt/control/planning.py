@@ -27,12 +27,13 @@ from stiffopt.model.scene import Scene
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target, Tolerance
-from stiffopt.optimise.task import Task
+from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.optimise.tip import TipModel
 
 Array = NDArray[np.float64]
 
 _BAR = 1e5
+_SLACK = 100.0  # Pa, by which an answer may be beyond limits
 _EXACT = Tolerance(position=PlanningTuning.position_tolerance, angle=PlanningTuning.angle_tolerance)
 
 
@@ -46,6 +47,10 @@ class PlanRequest:
     offset: Array  # tip pose relative to the model's (6,), m and rad (rotation vector), base axes
     pressure_offset: Array  # effective pressures relative to commands (n,), in Pa
     search: bool = False  # whether all configurations are to be searched, as for a new target
+    # lowest and highest effective pressures (n,) that the channels can have, in Pa, within the
+    # task's limits; empty: these
+    low: Array = field(default_factory=lambda: np.zeros(0))
+    high: Array = field(default_factory=lambda: np.zeros(0))
     # where a scene is to be kept: effective pressures (k, n) on the way before the plan, in Pa
     way: Array = field(default_factory=lambda: np.zeros((0, 0)))
     last: Plan | None = None  # takes the place of the planner's own last plan
@@ -64,6 +69,7 @@ class Plan:
     message: str  # why it is not reached
     blocked: str = ""  # why the way there is not clear of the scene
     doubt: str = ""  # that the model extrapolates there
+    far: bool = False  # whether `message` is of `nearest_words`
 
 
 class Planning:
@@ -109,7 +115,7 @@ class Planning:
             self._is_compiled = self._solver.compile()
             self._serial, self._last = request.serial, None
         target = model_target(asked, request.offset)
-        self._limits = self._effective_limits(request.pressure_offset)
+        self._limits = self._effective_limits(request)
         last = self._last = request.last or self._last
         if last is None or request.search:
             self._searched_at = request.offset
@@ -126,14 +132,19 @@ class Planning:
             self._last = self._nearest(request, task, target)
         return self._last
 
-    def _effective_limits(self, offset: Array) -> tuple[Array, Array]:
+    def _effective_limits(self, request: PlanRequest) -> tuple[Array, Array]:
         """Limits (n,) of effective pressures that some permitted command has, in Pa.
 
         The offset never widens the task's limits, beyond which the model does not hold.
         """
         lower, upper = self._solver.task.pressure_bounds(self._robot.description)
+        offset = request.pressure_offset
         shifted = np.maximum(lower, lower + offset), np.minimum(upper, upper + offset)
-        return (lower, upper) if (shifted[0] > shifted[1]).any() else shifted
+        if (shifted[0] > shifted[1]).any():
+            shifted = lower, upper
+        if not request.low.size:
+            return shifted
+        return np.clip(request.low, *shifted), np.clip(request.high, *shifted)
 
     def _next_to(self, last: Plan, target: Target) -> PressureSolution | None:
         """The optimum next to the last plan; another one once it has stayed the answer for long."""
@@ -179,6 +190,14 @@ class Planning:
         if self._is_compiled:
             return self._solver.solve_at_once(target, guess, self._limits)
         solution = self._solver.solve(target, guess)
+        if not solution.found or solution.pressures is None:
+            return None
+        low, high = self._limits
+        p = np.asarray(solution.pressures)
+        if (p < low - _SLACK).any() or (p > high + _SLACK).any():
+            pressure = PressureRange(min=tuple(low.tolist()), max=tuple(high.tolist()))
+            task = self._solver.task.model_copy(update={"target": target, "pressure": pressure})
+            solution = PressureSolver(self._robot, task).solve(guess=np.clip(p, low, high))
         return solution if solution.found else None
 
     def _nearest(self, request: PlanRequest, task: Task, target: Target) -> Plan:
@@ -188,15 +207,14 @@ class Planning:
             start = np.clip(self._last.pressures, *self._limits)
         pressures, distance, angle = self._search.find(target, self._limits, start)
         tolerance = task.target.tolerance
-        if distance <= tolerance.position and angle <= tolerance.angle:
-            message = "the pose can be reached, but not with the stiffness that is asked for"
-        else:
-            message = f"the nearest pose is {1e3 * distance:.1f} mm away"
-            if angle > tolerance.angle:
-                message += f" and {math.degrees(angle):.1f} deg"
+        far = distance > tolerance.position or angle > tolerance.angle
+        message = "the pose can be reached, but not with the stiffness that is asked for"
+        if far:
+            message = nearest_words(distance, angle, tolerance)
         return Plan(
-            request.serial, pressures, request.offset, request.target, False, math.nan, message
-        )
+            request.serial, pressures, request.offset, request.target, False, math.nan, message,
+            far=far,
+        )  # fmt: skip
 
     def _displacement(self, last: Plan, target: Target) -> Array:
         """Displacement (3,) of the model's target from that of the last plan, in m."""
@@ -207,6 +225,14 @@ class Planning:
             return np.zeros(3)
         pairs = zip(before, target.position, strict=True)
         return np.array([0.0 if a is None or b is None else b - a for a, b in pairs])
+
+
+def nearest_words(distance: float, angle: float, tolerance: Tolerance) -> str:
+    """Say how far from its target a tip is, in m and rad."""
+    words = f"the nearest pose is {1e3 * distance:.1f} mm away"
+    if angle > tolerance.angle:
+        words += f" and {math.degrees(angle):.1f} deg"
+    return words
 
 
 def model_target(target: Target, offset: Array) -> Target:

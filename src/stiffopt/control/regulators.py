@@ -23,6 +23,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.control.channels import Channels
 from stiffopt.control.formula import Formula
 from stiffopt.control.tuning import RegulatorTuning
 from stiffopt.model.description import RobotDescription
@@ -87,11 +88,11 @@ class PressureEstimator:
         period: float,
         slew: Array,
         tuning: RegulatorTuning,
+        channels: Channels,
     ) -> None:
         lag, self.dead_time = _regulation(robot, control)
         self.lag = float(np.mean(lag))  # of all channels, in s
-        self._robot, self._period = robot, period
-        self._max_compensation = tuning.max_compensation
+        self._robot, self._period, self.channels = robot, period, channels
         self._regulators = RegulatorModel(period, lag, self.dead_time, slew, tuning)
         self.begin()
 
@@ -100,6 +101,7 @@ class PressureEstimator:
         zero = np.zeros(self._robot.n_pressures)
         self._memory = _memory(self._robot)
         self._regulators.begin(zero)
+        self.channels.begin()
         self.command = zero  # pressures that were commanded last, in Pa
         self.chamber = zero  # those in the chambers
         self.effective = zero  # those that would give a settled arm its present shape
@@ -108,6 +110,8 @@ class PressureEstimator:
         """Take steps with commands (n,) and readings (n,) in Pa; NaN: not measured."""
         for _ in range(steps):
             self.chamber = self._regulators.advance(commanded, reading)
+        elapsed, offset = steps * self._period, self._regulators.offset
+        self.channels.update(elapsed, commanded, reading, offset)
         self.command = commanded.copy()
         self.effective = self.chamber
         if self._memory is not None:
@@ -124,9 +128,7 @@ class PressureEstimator:
 
         The offset of a regulator is part of it as far as commands may compensate it.
         """
-        most = self._max_compensation
-        regulators = np.minimum(np.maximum(self._regulators.offset, -most), most)
-        return self.history_offset + regulators
+        return self.history_offset + self.channels.compensated(self._regulators.offset)
 
     @property
     def effective_ahead(self) -> Array:

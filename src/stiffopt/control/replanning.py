@@ -13,7 +13,7 @@ from stiffopt.control.course import Course
 from stiffopt.control.feedback import prescribed_components
 from stiffopt.control.interface import Notice
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
-from stiffopt.control.planning import Plan, PlanRequest
+from stiffopt.control.planning import Plan, PlanRequest, nearest_words
 from stiffopt.control.posture import PostureCourse
 from stiffopt.control.tip_errors import stiffness_function, target_arrays
 from stiffopt.control.tuning import ReplanningTuning
@@ -90,6 +90,7 @@ class Replanner:
         self.pursuit = Pursuit()
         self.plan: Plan | None = None  # the newest, which may be of the task before
         self._offset = np.zeros(6)
+        self._available: Array | None = None  # (2, n), see `update`
         self._renew()
 
     def pursue(self, pursuit: Pursuit) -> None:
@@ -118,6 +119,7 @@ class Replanner:
         pressure_offset: Array,
         omega: float,
         delay: float,
+        available: tuple[Array, Array],
         way: Array | None = None,
     ) -> Array | None:
         """Request a plan when it is time, and take the newest.
@@ -132,6 +134,9 @@ class Replanner:
             Angular frequency of the vibration, in rad/s.
         delay :
             Of the reference behind the plan, in s.
+        available :
+            Lowest and highest pressures (n,) that the channels can have, in Pa; when they change
+            by more than a little, all configurations are searched.
         way :
             See `PlanRequest`; None without a scene.
 
@@ -141,6 +146,7 @@ class Replanner:
         """
         task, target = self.pursuit.task, self.pursuit.target
         interval = self._tuning.interval
+        self._note_available(available)
         if task is not None and target is not None and now - self._requested_at >= interval - 1e-6:
             search = self._search and self.pursuit.course is None
             self._requested_at, self._search = now, False
@@ -151,10 +157,18 @@ class Replanner:
             share = 1.0 if search else -math.expm1(-interval / time)
             self._offset = self._offset + share * (offset - self._offset)
             request = PlanRequest(
-                self._serial, task, target, self._offset.copy(), pressure_offset, search
+                self._serial, task, target, self._offset.copy(), pressure_offset, search, *available
             )
             self._planner.request(request if way is None else replace(request, way=way))
         return self.latest()
+
+    def _note_available(self, available: tuple[Array, Array]) -> None:
+        """Have all configurations searched where the channels have become others."""
+        now = np.stack(available)
+        if self._available is None:
+            self._available = now
+        elif (np.abs(now - self._available) > self._tuning.other_pressure).any():
+            self._available, self._search = now, True
 
     def latest(self) -> Array | None:
         """Take the newest plan, unless the way there is blocked; see `update`."""
@@ -167,11 +181,18 @@ class Replanner:
             return None
         return np.concatenate([self.plan.pressures, self.plan.offset])
 
-    def notices(self) -> tuple[Notice, ...]:
-        """Return what is wrong with the planner and with its plan."""
+    def notices(self, away: tuple[float, float] | None = None) -> tuple[Notice, ...]:
+        """Return what is wrong with the planner and with its plan.
+
+        `away` are distance and angle of the tip from its target, in m and rad, where it is at rest
+        on its plan; else the plan's own count.
+        """
         notices, plan = self._planner.notices(), self.plan
         if plan is not None and plan.serial == self._serial and not plan.reached:
-            text = f"the target cannot be reached: {plan.message}"
+            message, task = plan.message, self.pursuit.task
+            if plan.far and away is not None and task is not None:
+                message = nearest_words(*away, task.target.tolerance)
+            text = f"the target cannot be reached: {message}"
             notices = (*notices, Notice("unreachable", text, standing=True))
         if plan is not None and plan.doubt:
             notices = (*notices, Notice("extrapolating", plan.doubt, standing=True))

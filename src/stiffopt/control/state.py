@@ -219,6 +219,18 @@ class ControllerStatus:
             key="wrench",
         ),
     ] = field(default_factory=_nan6)
+    lost: Annotated[
+        Flags,
+        Shown(
+            "channels that are stuck, have no more pressure or were taken out, which the plan does "
+            "without",
+            topic="/pressure",
+        ),
+    ] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    shortfall: Annotated[
+        Array,
+        _pressure("pressures below their commands at rest", topic="/pressure", label="shortfall"),
+    ] = field(default_factory=lambda: np.zeros(0))
     task: Annotated[str, _state("what is being done, in a word or two")] = ""
     model_position: Annotated[
         Array | None, Shown("where the model alone has the tip", "m", size=3, json=())

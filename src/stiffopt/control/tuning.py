@@ -42,11 +42,27 @@ class EstimatorTuning:
 
 @dataclass(frozen=True)
 class RegulatorTuning:
-    """Observer gains of the regulators' model, and how much of its offset is compensated."""
+    """Observer gains of the regulators' model, and what is done about those that do not follow.
+
+    `Channels` says what limited and stuck channels are.
+    """
 
     pressure_gain: float = 30.0  # rate at which a reading corrects the pressure, in 1/s
     offset_gain: float = 225.0  # rate at which it corrects the offset, in 1/s^2
-    max_compensation: float = 3e3  # largest offset of a regulator that commands make up for, in Pa
+    # largest offset of a regulator that commands make up for at once, in Pa
+    max_compensation: float = 3e3
+    # largest shortfall that they make up for in time, as a share of `Safety.max_pressure_error`
+    make_up_share: float = 0.8
+    # time constant of that, in s: slower than the pressure monitor, which finds sudden leaks
+    make_up_time: float = 1.0
+    told_share: float = 0.5  # share of that shortfall from which there is an alarm
+    reading_time: float = 0.1  # time constant that takes the noise from readings, in s
+    patience: float = 0.5  # time for which a channel must be short, or above, in s
+    follows: float = 3e3  # distance from a command, in Pa, at which a regulator follows
+    # distance of a command below the pressure of a channel that does not fall, as a share of
+    # `Safety.max_pressure_error`
+    probe_share: float = 0.5
+    let_down_share: float = 0.1  # share of the slew with which a channel is let down on request
 
 
 @dataclass(frozen=True)
@@ -62,6 +78,9 @@ class ReferenceTuning:
     # change of pressure (norm over all channels) over which the model's derivatives along the
     # reference are not evaluated again, in Pa
     model_range: float = 3e3
+    # distance from the plan at which it has arrived, in Pa, and speed at which it rests, in Pa/s
+    there: float = 1e3
+    at_rest: float = 1e4
 
 
 @dataclass(frozen=True)
@@ -96,6 +115,8 @@ class ReplanningTuning:
     # change of a target, in m, after which all configurations are searched
     far_position: float = 5e-3
     far_angle: float = math.radians(5)  # the same of its orientation or pointing, in rad
+    # change of a pressure that a channel can have, in Pa, after which they are searched too
+    other_pressure: float = 1e4
 
 
 @dataclass(frozen=True)
@@ -159,12 +180,51 @@ class SupervisionTuning:
     # time for which the alarm of the total force outlasts the last command that was shortened, in s
     force_alarm: float = 0.5
     max_failures: int = 3  # failures of the controller in a row after which pressures are held
+    chamber_lag: float = 0.3  # by which the pressures in the chambers may lag behind commands, in s
+    # time after a doubt in which another one lets the pressures down at once, in s
+    doubt_memory: float = 30.0
     vent_attempts: int = 3  # to vent when the loop ends
     # time after the ramp in which the ending loop goes on trying to vent, in s
     stop_margin: float = 0.5
     # distance of the vented tip from the model's, as a share of the arm's length, beyond which the
     # arm is not armed
     vented_offset: float = 0.1
+
+
+@dataclass(frozen=True)
+class DriftScale:
+    """A drift that counts: in so many intervals, each in s, faster than a speed in m/s."""
+
+    interval: float
+    count: int
+    least_speed: float
+
+
+@dataclass(frozen=True)
+class MotionTuning:
+    """What in the tip's motion is doubted (`MotionWatch`)."""
+
+    spacing: float = 0.02  # least time between two samples that are compared, in s
+    longest_pause: float = 0.1  # since the arm was steered, after which none is compared, in s
+    # by what share of each motion the model may be wrong
+    model_error: float = 0.35
+    # way from which on a response is looked at: a length in m, and a share of the arm's length
+    least_motion: float = 3e-3
+    least_motion_share: float = 0.025
+    response_window: float = 0.6  # in which the tip must have moved as the model has it, in s
+    least_response: float = 0.25  # share of that way by which it must have moved along it
+    most_across: float = 0.85  # share of that way by which it may have moved across it
+    misses: int = 2  # samples in a row that show no response
+    scales: tuple[DriftScale, ...] = (
+        DriftScale(0.25, 5, 2e-3),
+        DriftScale(1.0, 5, 6e-4),
+        DriftScale(2.5, 4, 3.5e-4),
+    )
+    turn: float = 1e-3  # way back after which a swing has turned, in m
+    swings: int = 4  # between turns, one after the other
+    least_swing: float = 2.5e-3  # from one turn to the next, in m
+    decay: float = 0.75  # a last swing that is a smaller share of the largest decays
+    swing_window: float = 6.0  # in which they must be, in s
 
 
 @dataclass(frozen=True)
@@ -189,3 +249,4 @@ class ControlTuning:
     replanning: ReplanningTuning = field(default_factory=ReplanningTuning)
     posture: PostureTuning = field(default_factory=PostureTuning)
     forecast: ForecastTuning = field(default_factory=ForecastTuning)
+    motion: MotionTuning = field(default_factory=MotionTuning)

@@ -336,6 +336,13 @@ class Client:
         body = TrajectoryMessage.of(trajectory).model_dump()
         self._ask("POST", "trajectory", body=body)
 
+    def set_channels(self, without: Sequence[int]) -> None:
+        """Take channels, counted from 1, out of use, and give all others back.
+
+        Those that are out are let down, and plans do without them; an empty list gives all back.
+        """
+        self._ask("POST", "channels", body={"without": list(without)})
+
     def hold(self, reason: str = "asked to") -> None:
         """Keep the pressures as they are."""
         self._ask("POST", "hold", body={"reason": reason[:200] or "asked to"})

@@ -84,6 +84,12 @@ class HoldRequest(_Message):
     reason: Annotated[str, Field(min_length=1, max_length=200)] = "a client asked for it"
 
 
+class ChannelsRequest(_Message):
+    """The channels to do without, counted from 1; all others are given back."""
+
+    without: Annotated[list[Annotated[int, Field(ge=1)]], Field(max_length=_MAX_NUMBERS)]
+
+
 def _valid(adapter: TypeAdapter[ModelT], given: Any, place: Loc) -> ModelT:
     try:
         return adapter.validate_python(given)

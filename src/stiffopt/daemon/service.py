@@ -17,6 +17,7 @@ from pydantic import WrapValidator
 
 from stiffopt.control.loop import ControlLoop
 from stiffopt.daemon.messages import (
+    ChannelsRequest,
     ControlRequest,
     HoldRequest,
     TargetMessage,
@@ -227,8 +228,11 @@ def _control(operations: Operations) -> APIRouter:
 
     @router.delete("/lease", status_code=204)
     async def release(lease: LeaseHeader = None) -> None:
-        """Give control back. The arm goes on with what it does; hold or disarm it before."""
-        operations.lease.release(lease)
+        """Give control back. The arm goes on with what it does; disarm it before.
+
+        A hold ends after `safety.hold_timeout`: the pressures are let down then.
+        """
+        await operations.release(lease)
 
     return router
 
@@ -269,6 +273,12 @@ def _moving(operations: Operations) -> APIRouter:
         return await operations.command(
             lease, lambda: loop.follow_trajectory(trajectory_of(request))
         )
+
+    @router.post("/channels")
+    async def set_channels(request: ChannelsRequest, lease: LeaseHeader = None) -> DoneReport:
+        """Take channels out of use, and give all others back; plans do without them."""
+        without = [channel - 1 for channel in request.without]
+        return await operations.command(lease, partial(loop.set_channels, without))
 
     @router.post("/hold")
     async def hold(request: HoldRequest | None = None, lease: LeaseHeader = None) -> DoneReport:

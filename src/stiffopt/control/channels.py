@@ -1,0 +1,194 @@
+"""What each channel can have, where its regulator does not follow: shortfalls and lost channels.
+
+A channel that stays below its command by s has a leak, which its regulator may be able to feed, or
+no more pressure. Its command is raised by s, slowly, up to `most`, a share of what the pressure
+monitor tolerates. If it is still short by more, it is *limited*: the plan gets what the channel has
+as its upper bound, and the command stays just above that, where more pressure shows as soon as it
+is there. If a limited channel does not follow its command down either, it is *stuck*: the plan gets
+its pressure as a fixed value, and the command stays just below it. What the pressure monitor makes
+a fault remains one: none of these commands is above the limits, nor farther from what is read than
+it tolerates.
+
+A channel that was *taken out* by request is let down and stays without pressure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.interface import Notice
+from stiffopt.control.state import Severity
+from stiffopt.control.tuning import RegulatorTuning
+from stiffopt.errors import InputError
+from stiffopt.rig.interface import PressureLimits
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+class Channels:
+    """Finds channels that do not follow their commands, and says what is left of them.
+
+    Parameters
+    ----------
+    limits :
+        Of the commands.
+    slew :
+        Greatest rate of change (n,), in Pa/s.
+    tolerance :
+        Of the pressure monitor (n,), in Pa.
+    tuning :
+        Of the regulators.
+
+    Attributes
+    ----------
+    limited, stuck, out : channels (n,) that have no more pressure; that keep theirs; that were
+        taken out by request.
+    shortfall : pressures (n,) relative to commands, in Pa, positive where they are less.
+    """
+
+    def __init__(
+        self, limits: PressureLimits, slew: Array, tolerance: Array, tuning: RegulatorTuning
+    ) -> None:
+        self._limits, self._tuning = limits, tuning
+        self._least = np.full(limits.n, tuning.max_compensation)
+        self._most = np.maximum(self._least, tuning.make_up_share * tolerance)
+        self._below = tuning.probe_share * tolerance
+        self._let_down = tuning.let_down_share * slew
+        self._empty = np.clip(0.0, limits.low, limits.high)
+        self.out: Flags = np.zeros(limits.n, dtype=bool)
+        self.begin()
+
+    def begin(self) -> None:
+        """Start anew with a vented arm; what was taken out stays so."""
+        n = self._limits.n
+        self.limited: Flags = np.zeros(n, dtype=bool)
+        self.stuck: Flags = np.zeros(n, dtype=bool)
+        self.shortfall: Array = np.zeros(n)
+        self._allowed: Array = self._least.copy()  # to be made up for, in Pa
+        self._has: Array = np.zeros(n)  # pressure of a limited or stuck channel, in Pa
+        self._for: Array = np.zeros((2, n))  # s for which short, and for which above
+        self._read: Array = np.zeros(n)  # without noise
+        self._ceiling: Array = np.where(self.out, self._empty, self._limits.high)
+        self._quiet = True  # whether no channel is or was short
+
+    def take_out(self, channels: Iterable[int]) -> None:
+        """Do without these channels, counted from 0, from now on, and without no others."""
+        chosen, n = set(channels), self._limits.n
+        if wrong := sorted(c for c in chosen if not 0 <= c < n):
+            raise InputError(f"there is no channel {wrong[0] + 1}; this arm has {n}")
+        if len(chosen) == n:
+            raise InputError("all channels cannot be taken out; disarm or vent instead")
+        out = np.isin(np.arange(n), sorted(chosen))
+        now = np.clip(self._read, self._empty, self._limits.high)
+        falling = np.where(self.out, self._ceiling, now)
+        self._ceiling = np.where(out, falling, self._limits.high)
+        self.out = out
+
+    @property
+    def lost(self) -> Flags:
+        """Channels (n,) that the plan does without, or with less than they should have."""
+        return self.limited | self.stuck | self.out
+
+    def update(self, elapsed: float, command: Array, reading: Array, offset: Array) -> None:
+        """Look at commands and readings (n,), in Pa; NaN: not measured.
+
+        `offset` (n,) are settled pressures relative to commands, `elapsed` is the time since the
+        last look, in s.
+        """
+        self.shortfall = -offset
+        share = -math.expm1(-elapsed / self._tuning.reading_time)
+        change = np.where(np.isfinite(reading), reading - self._read, 0.0)
+        self._read = self._read + share * change
+        if self.out.any():
+            self._ceiling = np.where(
+                self.out, np.maximum(self._ceiling - self._let_down * elapsed, self._empty),
+                self._limits.high,
+            )  # fmt: skip
+        short = self.shortfall
+        if self._quiet and (short <= self._least).all():
+            return
+        share = -math.expm1(-elapsed / self._tuning.make_up_time)
+        wanted = np.minimum(np.maximum(short, self._least), self._most)
+        self._allowed = self._allowed + share * (wanted - self._allowed)
+        self._judge(elapsed, short, command)
+        self._quiet = not (
+            self._for.any() or self.limited.any() or (self._allowed > self._least + 1.0).any()
+        )
+
+    def _judge(self, elapsed: float, short: Array, command: Array) -> None:
+        """Find channels that are limited or stuck, and those that follow again."""
+        follows, patience = self._tuning.follows, self._tuning.patience
+        wrong = np.stack([short > self._most, self.limited & (-short > follows)])
+        self._for = np.clip(self._for + np.where(wrong, elapsed, -elapsed), 0.0, patience)
+        lasting = self._for >= patience
+        moved = self._read - self._has
+        again = np.where(self.stuck, np.abs(moved) > follows, (moved > follows) & (short < follows))
+        before, self.limited = self.limited, (self.limited | lasting[0]) & ~again
+        found = self.limited & ~before
+        self._has = np.where(found, self._read, self._has)
+        pressed = np.minimum(short, command - self._read) > self._most
+        pressed &= self.limited & ~self.stuck
+        self._has = np.where(pressed, np.minimum(self._has, self._read), self._has)
+        stuck = self.limited & lasting[1] & ~self.stuck
+        self._has = np.where(stuck, self._read, self._has)
+        self.stuck = (self.stuck | stuck) & self.limited
+
+    def compensated(self, offset: Array) -> Array:
+        """The part of settled pressures relative to commands (n,) that commands make up for."""
+        if self._quiet:
+            most = above = self._least
+        else:
+            most = np.where(self.limited, np.inf, self._allowed)
+            above = np.where(self.limited, np.inf, self._least)
+        part: Array = np.minimum(np.maximum(offset, -most), above)
+        return part
+
+    def available(self) -> tuple[Array, Array]:
+        """Lowest and highest pressures (n,) that channels can settle at, in Pa."""
+        low, high = self._limits.low, self._limits.high
+        if not self.lost.any():
+            return low, high
+        has = np.clip(self._has, low, high)
+        high = np.where(self.out, self._empty, np.where(self.limited, has, high))
+        low = np.where(self.out, self._empty, np.where(self.stuck, has, low))
+        return low, high
+
+    def commands(self, path: Array, low: Array, high: Array) -> tuple[Array, Array]:
+        """Lowest and highest commands (n,) on the way along a path (n,), within others, in Pa."""
+        if self.limited.any():
+            above, below = self._has + self._most, self._read - self._below
+            pressed = path > self._has - self._tuning.follows
+            least = np.where(self.stuck, self._has - self._below, np.where(pressed, above, below))
+            greatest = np.where(self.stuck, least, above)
+            low, high = (
+                np.where(self.limited, np.clip(bound, low, high), limit)
+                for bound, limit in ((least, low), (greatest, high))
+            )
+        if self.out.any():
+            high = np.maximum(np.minimum(high, self._ceiling), low)
+        return low, high
+
+    def notices(self) -> Iterator[Notice]:
+        """Say which channels are not what they should be."""
+        if self.lost.any():
+            each = ", ".join(self._words(int(c)) for c in np.flatnonzero(self.lost))
+            yield Notice("lost-channel", f"{each}; the plan goes on with the others", standing=True)
+        fed = ~self.limited & (self._allowed > self._tuning.told_share * self._most)
+        if not self._quiet and fed.any():
+            names = ", ".join(str(c + 1) for c in np.flatnonzero(fed))
+            text = (
+                f"channel {names} stays below its command, by "
+                f"{self.shortfall[fed].max() * 1e-5:.2f} bar, which is made up for; look for a leak"
+            )
+            yield Notice("shortfall", text, Severity.WARNING, standing=True)
+
+    def _words(self, channel: int) -> str:
+        name, has = f"channel {channel + 1}", f"{self._has[channel] * 1e-5:.2f} bar"
+        if self.out[channel]:
+            return f"{name} was taken out"
+        return f"{name} is stuck at {has}" if self.stuck[channel] else f"{name} has {has} at most"

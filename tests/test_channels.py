@@ -1,0 +1,242 @@
+"""Channels that do not follow their commands: shortfalls made up for, lost ones done without."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import stiffopt as so
+from stiffopt.control.channels import Channels
+from stiffopt.control.planning import Planning, PlanRequest
+from stiffopt.control.regulators import PressureEstimator
+from stiffopt.control.tuning import RegulatorTuning
+from stiffopt.errors import InputError
+from stiffopt.model.robot_files import load_description
+from stiffopt.optimise.goal import StiffnessGoal, StiffnessMeasure
+from stiffopt.optimise.target import Target
+from stiffopt.optimise.task import Task
+from stiffopt.rig.interface import PressureLimits
+from stiffopt.rig.settings import ControlSettings
+from test_controller import Bench
+from test_monitors import PERIOD, SAFETY, Regulators
+
+BAR = 1e5
+HANGING = "stiff-flop-2-hanging"
+N = 3
+TOLERANCE = SAFETY.max_pressure_error
+
+
+class Line(Regulators):
+    """Three regulators commanded as the controller does; the monitor must not be tripped."""
+
+    def __init__(self) -> None:
+        super().__init__(n=N)
+        limits = PressureLimits(np.zeros(N), np.full(N, 1.5 * BAR))
+        tuning, slew = RegulatorTuning(), np.full(N, 5 * BAR)
+        self.channels = Channels(limits, slew, np.full(N, TOLERANCE), tuning)
+        robot = load_description("stiff-flop-1")
+        self.estimator = PressureEstimator(
+            robot, ControlSettings(), PERIOD, slew, tuning, self.channels
+        )
+        self.held = np.full(N, np.nan)
+        self.command = np.zeros(N)
+        self.noise = np.random.default_rng(0)
+
+    def to(self, *wanted: float, seconds: float = 4.0, planned: bool = True) -> None:
+        """Let the channels go to pressures, as far as they can be had if that is `planned`."""
+        for _ in range(round(seconds / PERIOD)):
+            stuck = np.isfinite(self.held)
+            self.p = np.where(stuck, self.held, self.p)
+            assert self.step(self.command) is None
+            self.p = np.where(stuck, self.held, self.p)
+            reading = self.p + self.noise.normal(0, 150, N)
+            self.estimator.advance(1, self.command, reading)
+            path = np.clip(wanted, *self.channels.available()) if planned else np.array(wanted)
+            low, high = self.channels.commands(path, np.zeros(N), np.full(N, 1.5 * BAR))
+            wished = np.clip(path - self.estimator.command_offset, low, high)
+            step = 5 * BAR * PERIOD
+            self.command = self.command + np.clip(wished - self.command, -step, step)
+            assert np.all(self.command >= 0)
+            assert np.all(self.command <= 1.5 * BAR)
+
+    @property
+    def kinds(self) -> list[str]:
+        return [notice.kind for notice in self.channels.notices()]
+
+
+def test_channels_that_follow_are_left_alone() -> None:
+    line = Line()
+    line.to(0.9 * BAR, 0.3 * BAR, 0.0)
+    assert not line.channels.lost.any()
+    assert line.kinds == []
+    assert line.p == pytest.approx([0.9 * BAR, 0.3 * BAR, 0.0], abs=500)
+    low, high = line.channels.available()
+    assert (low.tolist(), high.tolist()) == ([0.0] * N, [1.5 * BAR] * N)
+
+
+def test_a_leak_that_the_regulator_can_feed_is_fed() -> None:
+    line = Line()
+    line.leak[1] = 1.2  # 1/s: 7 % of the pressure
+    line.to(0.5 * BAR, 1.2 * BAR, 0.2 * BAR, seconds=8.0)
+    assert line.p == pytest.approx([0.5 * BAR, 1.2 * BAR, 0.2 * BAR], abs=500)
+    assert line.channels.shortfall[1] == pytest.approx(line.command[1] - line.p[1], abs=500)
+    assert 6e3 < line.channels.shortfall[1] < TOLERANCE
+    assert line.kinds == ["shortfall"]
+    assert not line.channels.lost.any()
+    line.leak[1] = 0.0
+    line.to(0.5 * BAR, 1.2 * BAR, 0.2 * BAR)
+    assert line.p[1] == pytest.approx(1.2 * BAR, abs=500)
+    assert line.kinds == []
+
+
+def test_a_leak_beyond_that_stays_a_fault() -> None:
+    line = Line()
+    line.leak[1] = 3.0  # it loses 15 %
+    with pytest.raises(AssertionError, match="leak"):
+        line.to(0.5 * BAR, 1.0 * BAR, 0.2 * BAR)
+
+
+def test_a_sudden_leak_stays_a_fault() -> None:
+    line = Line()
+    line.to(0.5 * BAR, 1.0 * BAR, 0.2 * BAR, seconds=2.0)
+    line.leak[1] = 3.0  # it loses 15 %
+    with pytest.raises(AssertionError, match="leak"):
+        line.to(0.5 * BAR, 1.0 * BAR, 0.2 * BAR, seconds=1.0)
+
+
+def test_a_channel_without_more_pressure_bounds_the_plan_until_it_has_more() -> None:
+    line = Line()
+    line.saturation[0] = 0.8 * BAR
+    line.to(0.98 * BAR, 0.5 * BAR, 0.0)
+    assert line.channels.limited.tolist() == [True, False, False]
+    assert not line.channels.stuck.any()
+    assert line.channels.available()[1] == pytest.approx([0.8 * BAR, *[1.5 * BAR] * 2], abs=500)
+    assert line.estimator.chamber[0] == pytest.approx(0.8 * BAR, abs=500)
+    assert 0 < line.command[0] - line.p[0] < TOLERANCE
+    assert "channel 1 has 0.80 bar at most" in next(line.channels.notices()).text
+    line.to(0.4 * BAR, 0.5 * BAR, 0.0)  # it follows down
+    assert line.p[0] == pytest.approx(0.4 * BAR, abs=500)
+    line.to(0.98 * BAR, 0.5 * BAR, 0.0)
+    assert line.p[0] == pytest.approx(0.8 * BAR, abs=500)
+    line.saturation[0] = np.inf
+    line.to(0.98 * BAR, 0.5 * BAR, 0.0, seconds=6.0)
+    assert line.p[0] == pytest.approx(0.98 * BAR, abs=500)
+    assert not line.channels.lost.any()
+    assert line.kinds == []
+
+
+def test_a_channel_that_is_stuck_has_a_fixed_pressure_until_it_moves() -> None:
+    line = Line()
+    line.to(0.5 * BAR, 0.5 * BAR, 0.0, seconds=1.0)
+    line.held[0] = line.p[0]
+    line.to(0.8 * BAR, 0.5 * BAR, 0.0)
+    assert line.channels.limited[0]
+    line.to(0.1 * BAR, 0.5 * BAR, 0.0, seconds=6.0)  # a fault of the monitor without the channels
+    assert line.channels.stuck.tolist() == [True, False, False]
+    low, high = line.channels.available()
+    assert low[0] == high[0] == pytest.approx(0.5 * BAR, abs=500)
+    assert 3e3 < line.p[0] - line.command[0] < TOLERANCE
+    assert "channel 1 is stuck at 0.50 bar" in next(line.channels.notices()).text
+    line.held[0] = np.nan
+    line.to(0.1 * BAR, 0.5 * BAR, 0.0)
+    assert line.p[0] == pytest.approx(0.1 * BAR, abs=500)
+    assert not line.channels.lost.any()
+
+
+def test_a_channel_with_hardly_any_pressure_is_done_without() -> None:
+    line = Line()
+    line.saturation[2] = 0.02 * BAR  # its tube is off
+    line.to(0.9 * BAR, 0.5 * BAR, 0.6 * BAR, seconds=6.0)
+    assert line.channels.available()[1][2] == pytest.approx(0.02 * BAR, abs=500)
+    assert line.command[2] < TOLERANCE
+
+
+def test_a_channel_that_is_taken_out_is_let_down_and_comes_back() -> None:
+    line = Line()
+    line.to(0.6 * BAR, 0.5 * BAR, 0.3 * BAR, seconds=2.0)
+    line.channels.take_out([0])
+    line.to(0.6 * BAR, 0.5 * BAR, 0.3 * BAR, seconds=0.5, planned=False)  # by a trajectory, say
+    assert 0.2 * BAR < line.p[0] < 0.5 * BAR  # not at once
+    line.to(0.6 * BAR, 0.5 * BAR, 0.3 * BAR, seconds=2.0, planned=False)
+    assert line.p == pytest.approx([0.0, 0.5 * BAR, 0.3 * BAR], abs=500)
+    assert line.kinds == ["lost-channel"]
+    line.channels.begin()  # armed again: still out
+    assert line.channels.lost.tolist() == [True, False, False]
+    line.channels.take_out([])
+    line.to(0.6 * BAR, 0.5 * BAR, 0.3 * BAR, seconds=2.0)
+    assert line.p[0] == pytest.approx(0.6 * BAR, abs=500)
+
+
+@pytest.mark.parametrize(
+    ("channels", "says"), [([3], "no channel 4"), ([-1], "no channel 0"), ([0, 1, 2], "all")]
+)
+def test_channels_that_cannot_be_taken_out(channels: list[int], says: str) -> None:
+    line = Line()
+    with pytest.raises(InputError, match=says):
+        line.channels.take_out(channels)
+    assert not line.channels.lost.any()
+
+
+def test_without_gauges_nothing_is_made_up_for() -> None:
+    line = Line()
+    line.gauge = lambda p: np.full(N, np.nan)
+    line.p = np.zeros(N)
+    for _ in range(200):
+        line.estimator.advance(1, np.full(N, BAR), np.full(N, np.nan))
+    assert not line.channels.lost.any()
+    assert not line.channels.shortfall.any()
+
+
+@pytest.mark.usefixtures("compiled")
+def test_the_plan_does_without_a_stuck_channel() -> None:
+    arm = so.load_robot(HANGING)
+    p = np.array([0.5, 0.6, 0.4, 0.3, 0.6, 0.5]) * BAR
+    goal = StiffnessGoal(maximise=StiffnessMeasure(direction=(1.0, 0.0, 0.0)))
+    place = Target(position=tuple(arm.tip_pose(p)[:3, 3]))
+    task = Task(robot=HANGING, target=place, stiffness=goal)
+    low, high = np.array(arm.pressure_min), np.array(arm.pressure_max)
+    low[1] = high[1] = 0.6 * BAR
+    high[4] = 0.55 * BAR
+    request = PlanRequest(1, task, task.target, np.zeros(6), np.zeros(6), True, low, high)
+    planning = Planning(arm)
+    for _ in range(2):  # searched, and next to the last
+        plan = planning.plan(request)
+        assert plan.reached
+        assert plan.pressures[1] == pytest.approx(0.6 * BAR, abs=1.0)
+        assert plan.pressures[4] <= 0.55 * BAR + 1.0
+        request = PlanRequest(1, task, task.target, np.zeros(6), np.zeros(6), False, low, high)
+    far = task.target.model_copy(update={"position": (0.15, 0.0, 0.1)})
+    plan = planning.plan(PlanRequest(1, task, far, np.zeros(6), np.zeros(6), False, low, high))
+    assert not plan.reached
+    assert plan.pressures[1] == pytest.approx(0.6 * BAR, abs=1.0)
+
+
+@pytest.mark.usefixtures("compiled")
+def test_the_tip_arrives_without_a_lost_channel() -> None:
+    bench = Bench(HANGING)
+    position = bench.settled(duration=1.5)
+    channel = int(np.argmax(bench.command))
+    bench.rig.world._regulators.saturation[channel] = 0.8 * bench.command[channel]
+    assert bench.run(3.0, position)[-30:].mean() < 3e-4  # 7 mm without
+    assert [notice.kind for notice in bench.controller.notices()] == ["lost-channel"]
+    status = bench.controller.status(bench.rig.clock.now())
+    assert np.flatnonzero(status.lost).tolist() == [channel]
+    bench.rig.world._regulators.saturation[channel] = np.inf
+    bench.controller.set_channels([4])
+    assert bench.run(2.0, position)[-30:].mean() < 3e-4
+    assert bench.rig.world.pressures[4] < 500
+
+
+@pytest.mark.usefixtures("compiled")
+def test_a_distance_is_that_of_the_tip_itself() -> None:
+    """The supply ends far below what the plan needs."""
+    bench = Bench(HANGING)
+    bench.rig.world._regulators.saturation[:] = 1.1 * BAR
+    pose = so.load_robot(HANGING).tip_pose(np.array([0.0, 1.5, 1.5, 0.0, 1.4, 1.4]) * BAR)
+    position = tuple(map(float, pose[:3, 3]))
+    bench.controller.set_task(bench.task(position=position))
+    away = bench.run(2.5, position)[-1]
+    (said,) = (n.text for n in bench.controller.notices() if n.kind == "unreachable")
+    assert away > 5e-3
+    told = 1e-3 * float(said.split(" mm")[0].split()[-1])
+    assert told == pytest.approx(away, abs=max(1e-3, 0.1 * away))
