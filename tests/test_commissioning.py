@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from simulated_loop import Lab
 from stiffopt import lie
 from stiffopt.cli import commission_run
 from stiffopt.cli.main import main
@@ -24,13 +26,21 @@ from stiffopt.commissioning.correction import corrections, write_corrected
 from stiffopt.commissioning.expected import ExpectedSteps, expected_steps, rotation_vectors
 from stiffopt.commissioning.explanation import Explainer, SetupExplanation
 from stiffopt.commissioning.findings import Finding, findings_of
-from stiffopt.commissioning.record import fingerprints, load_record
+from stiffopt.commissioning.record import (
+    CommissioningRecord,
+    RecordedFinding,
+    fingerprints,
+    load_record,
+    save_record,
+)
 from stiffopt.commissioning.responses import Responses
 from stiffopt.commissioning.timing import Delays, Swing, fit_swing
+from stiffopt.control.state import State
 from stiffopt.documents import read_document
+from stiffopt.errors import InputError
 from stiffopt.model.robot_files import load_description
 from stiffopt.plant.plant import Plant
-from stiffopt.plant.settings import Mismatch, PlantSettings
+from stiffopt.plant.settings import Mismatch, PlantLoad, PlantSettings
 from stiffopt.registration import Placement, Registration
 from stiffopt.rig.config import RigDescription, load_rig_description
 from stiffopt.rig.interface import PressureLimits, Rig
@@ -70,6 +80,7 @@ def seen_by(
     mismatch: Mismatch | None = None,
     sensor: Placement | None = None,
     wiring: dict[int, tuple[int, ...]] | None = None,
+    load: PlantLoad | None = None,
     turns: bool = True,
     seed: int = 0,
 ) -> Responses:
@@ -80,7 +91,7 @@ def seen_by(
     """
     e, mismatch = expected_of(robot), mismatch or Mismatch()
     rng = np.random.default_rng([seed, 20])
-    plant = Plant(e.description, PlantSettings(mismatch=mismatch, discretisation=COARSE))
+    plant = Plant(e.description, PlantSettings(mismatch=mismatch, discretisation=COARSE, load=load))
     to_seen = mismatch.registration.inverse()
     on_tip = (sensor or Placement()).transform()
 
@@ -214,13 +225,18 @@ def test_positions_alone_do_not_tell_an_order_from_a_turn() -> None:
     assert only_wrong(findings).text == "channels 1 and 2 seem swapped"  # no turn mirrors an arm
 
 
-def test_positions_alone_do_not_tell_a_push_from_a_slipped_sensor() -> None:
-    seen = seen_by(sensor=Placement(position=(0.007, 0, 0)), turns=False)
-    _, findings = explained(seen)
+def test_steps_tell_a_slipped_sensor_from_a_push() -> None:
+    """At rest they look alike to a tracker of positions; a step swings a sensor that is aside."""
+    _, findings = explained(seen_by(sensor=Placement(position=(0.007, 0, 0)), turns=False))
+    assert only_wrong(findings).cause == "sensor moved"
+    push = PlantLoad(force=(0.1, 0.0, 0.0))
+    _, findings = explained(seen_by(load=push, turns=False))
     text = only_wrong(findings).text
-    assert "sensor" in text, text
-    assert "load" in text, text
-    assert "does not tell these apart" in text
+    assert "the tracker's frame is turned" in text
+    assert "or a load of" in text
+    assert "or a base tilted by" in text
+    assert "sensor" not in text
+    assert "spirit level" in only_wrong(findings).advice
 
 
 def test_nothing_moves() -> None:
@@ -418,18 +434,7 @@ def test_danger_ends_it(tmp_path: Path, touched: Any, capsys: pytest.CaptureFixt
 
 
 def test_a_shaken_arm_is_not_moved(tmp_path: Path, touched: Any) -> None:
-    def shaken(rig: Any) -> None:
-        camera = rig.tracker._world.camera
-        pose = camera.sensor_in_tracker
-
-        def moved(noise: Array) -> Array:
-            T = pose(noise)
-            T[0, 3] += 0.012 * np.sin(2 * np.pi * 3 * rig.clock.now())
-            return T
-
-        camera.sensor_in_tracker = moved
-
-    touched(shaken)
+    touched(lambda rig: rig.tracker._world.inject("tracker", "shaking"))
     assert commissioned(rig_file(tmp_path), "--no-plot") == 5
     finding = load_record(tmp_path / "rig.commissioning.yaml").findings[0]
     assert "though the arm is vented" in finding.text
@@ -498,3 +503,97 @@ def test_a_registration_is_corrected() -> None:
     found = Placement(position=tuple(block["position"]), orientation=tuple(block["orientation"]))
     wanted = turned("z", 10.0).transform() @ turned("y", 80.0).transform()
     np.testing.assert_allclose(found.transform()[:3, :3], wanted[:3, :3], atol=0.02)
+
+
+# -- arming ----------------------------------------------------------------------------------------
+
+
+class Armed:
+    """A loop that may be armed, on a rig that was commissioned, and its record."""
+
+    def __init__(self, folder: Path, **record: Any) -> None:
+        self.path = folder / "record.yaml"
+        self.lab = Lab(ready=False, commissioning={"record": str(self.path), "required": True})
+        rig_hash, robot_hash = fingerprints(self.lab.rig.robot, self.lab.rig.settings)
+        place = tuple(self.lab.world.plant.tip_pose()[:3, 3].tolist())
+        tracker = {"position": place, "noise": 3e-5, "rate": 40.0, "latency": 0.025, "missing": 0.0}
+        channel = {
+            "displacement": (0, 0, 0), "expected": (0, 0, 0), "deviation": 0.0,
+            "gauge_offset": 0.0, "gauge_noise": 150.0,
+        }  # fmt: skip
+        values: dict[str, Any] = {
+            "date": datetime.now(UTC).isoformat(), "rig": "rig", "robot": "stiff-flop-1",
+            "rig_hash": rig_hash, "robot_hash": robot_hash, "fits": True,
+            "tracker": tracker, "channels": [channel] * 3,
+        }  # fmt: skip
+        for key, value in record.items():
+            old = values.get(key)
+            values[key] = {**(old or {}), **value} if isinstance(value, dict) else value
+        save_record(self.path, CommissioningRecord(**values))
+
+    def refused(self) -> str:
+        with pytest.raises(InputError) as refusal:
+            self.lab.arm()
+        return str(refusal.value)
+
+
+def test_arming_asks_for_a_record_that_fits(tmp_path: Path) -> None:
+    armed = Armed(tmp_path)
+    armed.lab.arm()
+    assert armed.lab.state is State.ACTIVE
+    armed = Armed(tmp_path)
+    armed.path.unlink()
+    assert "there is no record" in armed.refused()
+    assert "run 'stiffopt commission'" in armed.refused()
+    finding = RecordedFinding(text="channels 1 and 2 seem swapped", fits=False)
+    assert "seem swapped" in Armed(tmp_path, fits=False, findings=(finding,)).refused()
+    old = (datetime.now(UTC) - timedelta(hours=30)).isoformat()
+    assert "is 30 h old; at most 24 h" in Armed(tmp_path, date=old).refused()
+    assert "another robot file" in Armed(tmp_path, robot_hash="0" * 16).refused()
+    assert "another supply, tracker" in Armed(tmp_path, rig_hash="0" * 16).refused()
+    armed = Armed(tmp_path)
+    armed.path.write_text("format: stiffopt-commissioning/1\n", encoding="utf-8")
+    assert "cannot be read" in armed.refused()
+
+
+def test_arming_compares_the_vented_arm_with_the_record(tmp_path: Path) -> None:
+    assert "from where it was" in Armed(tmp_path, tracker={"position": (0.01, 0, 0.09)}).refused()
+    armed = Armed(tmp_path)
+    armed.lab.world.camera.settings = armed.lab.world.camera.settings.model_copy(
+        update={"noise": 2e-4}
+    )
+    assert "mm and was 0.030 mm" in armed.refused()
+    armed = Armed(tmp_path)
+    armed.lab.world.inject("tracker", "slow")
+    assert "ms old when they come" in armed.refused()
+    armed = Armed(tmp_path)
+    measured = armed.lab.world.measured
+    armed.lab.world.measured = lambda: measured() + 6e3
+    assert "the gauge of channel 1 reads 0.06 bar" in armed.refused().replace("0.060", "0.06")
+
+
+def test_nobody_arms_with_dead_gauges(tmp_path: Path) -> None:
+    lab = Lab(ready=False)
+    lab.world.measured = lambda: np.full(3, np.nan)
+    with pytest.raises(InputError, match="gauges of channels 1, 2, 3 read nothing"):
+        lab.arm()
+    lab = Lab(ready=False)
+    lab.world.measured = lambda: np.full(3, 1234.5)
+    with pytest.raises(InputError, match="the very same number 60 times"):
+        lab.arm()
+    lab = Lab(ready=False, supply={"noise": 0.0, "ripple": 0.0})
+    lab.arm()  # reads exactly 0, as a converter does that cannot say less
+    armed = Armed(tmp_path)
+    armed.lab.world.measured = lambda: np.zeros(3)
+    assert "the very same number" in armed.refused()  # it had noise when it was commissioned
+
+
+def test_a_record_that_is_not_required_counts_if_it_is_of_this_rig(tmp_path: Path) -> None:
+    for hashes, is_refused in (({}, True), ({"rig_hash": "0" * 16}, False)):
+        armed = Armed(tmp_path, fits=False, **hashes)
+        free = armed.lab.rig.settings.commissioning.model_copy(update={"required": None})
+        armed.lab.rig.settings = armed.lab.rig.settings.model_copy(update={"commissioning": free})
+        if is_refused:
+            assert "did not fit" in armed.refused()
+        else:
+            armed.lab.arm()

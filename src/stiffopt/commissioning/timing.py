@@ -165,7 +165,7 @@ def _delay(r: StepReadings, channel: int, begin: float, end: float) -> tuple[flo
     moments, command = r.tick[history], r.commanded[history, channel]
     off = y[known] - y[known].mean()
 
-    def miss(parameters: Array) -> float:
+    def miss(parameters: Sequence[float] | Array) -> float:
         dead, lag = float(parameters[0]), float(max(parameters[1], 0.0))
         x = np.interp(time[known] - dead, moments, _followed(moments, command, lag))
         x -= x.mean()
