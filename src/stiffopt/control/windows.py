@@ -1,0 +1,74 @@
+"""Windows: the tip at rest, averaged, from which the arm's numbers are adapted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.adaptation import Window
+from stiffopt.control.tuning import WindowTuning
+
+Array = NDArray[np.float64]
+
+
+class WindowWatch:
+    """Collects windows while the arm rests: one of each posture, the newest of it.
+
+    Attributes
+    ----------
+    windows : those that are known; a new tuple when it changes.
+    """
+
+    def __init__(self, tuning: WindowTuning) -> None:
+        self._tuning = tuning
+        self.windows: tuple[Window, ...] = ()
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin to wait for rest; windows stay."""
+        self._rested: float | None = None  # since when
+        self._since = 0.0  # since when the next window is waited for
+        self._count = 0
+        self._first: Array | None = None
+
+    def has_rested(self, now: float) -> bool:
+        """Whether the arm has rested for long enough to be looked at."""
+        return self._rested is not None and now - self._rested >= self._tuning.wait
+
+    def look(
+        self, now: float, resting: bool, pressures: Array, position: Array, rotation: Array | None
+    ) -> None:
+        """Take in the tip of a tick: effective pressures (n,), position (3,), rotation (3, 3)."""
+        t = self._tuning
+        if not resting:
+            self.begin()
+            return
+        if self._rested is None:
+            self._rested = self._since = now
+        if now - self._since < t.wait:
+            return
+        values = np.concatenate([pressures, position])
+        n = len(pressures)
+        if self._first is None:
+            self._first, self._sum, self._begun = values, np.zeros_like(values), now
+        moved = np.abs(values - self._first)
+        if moved[:n].max() > t.drift_pressure or moved[n:].max() > t.drift_position:
+            self._first = None  # it creeps still
+            self._count = 0
+            return
+        self._sum += values
+        self._count += 1
+        if now - self._begun < t.duration:
+            return
+        mean = self._sum / self._count
+        self._add(Window(now, mean[:n], mean[n:], rotation))
+        self._first, self._count, self._since = None, 0, now + t.again
+
+    def _add(self, window: Window) -> None:
+        """Add a window in place of those of its posture, or of the oldest one if there are many."""
+        others = [
+            other
+            for other in self.windows
+            if np.linalg.norm(other.pressures - window.pressures) > self._tuning.same
+        ]
+        self.windows = (*others[-(self._tuning.most - 1) :], window)
