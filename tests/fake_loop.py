@@ -92,7 +92,7 @@ class FakeLoop:
     def set_channels(self, without: Any) -> None:
         self._do("set_channels", self.now.state, without)
 
-    def hold(self, reason: str = "asked to") -> None:
+    def hold(self, reason: str = "asked to", *, lasting: bool = True) -> None:
         self._do("hold", State.HOLDING, reason)
 
     def vent(self, reason: str = "asked to") -> None:

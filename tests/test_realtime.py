@@ -51,13 +51,24 @@ class FakeC:
 def system(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
     """A system that permits everything, and remembers; nothing real is changed."""
     state = SimpleNamespace(
-        c=FakeC(), policy=os.SCHED_OTHER, priority=0, limits=(-1, -1), capable=False
+        c=FakeC(),
+        policy=os.SCHED_OTHER,
+        priority=0,
+        limits=(-1, -1),
+        capable=False,
+        nice={},
     )
 
     def set_scheduler(pid: int, policy: int, param: Any) -> None:
         assert pid == 0
         state.policy, state.priority = policy, param.sched_priority
 
+    def set_nice(which: int, thread: int, nice: int) -> None:
+        assert which == os.PRIO_PROCESS
+        state.nice[thread] = nice
+
+    monkeypatch.setattr(os, "getpriority", lambda which, thread: state.nice.get(thread, 0))
+    monkeypatch.setattr(os, "setpriority", set_nice)
     monkeypatch.setattr(os, "sched_getscheduler", lambda pid: state.policy)
     monkeypatch.setattr(os, "sched_getparam", lambda pid: os.sched_param(state.priority))
     monkeypatch.setattr(os, "sched_setscheduler", set_scheduler)
@@ -73,6 +84,7 @@ def system(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
     assert gc.isenabled() == enabled
     assert gc.get_freeze_count() == 0
     assert (state.policy, state.priority) == (os.SCHED_OTHER, 0)
+    assert not any(state.nice.values())
     if state.c is not None:
         assert state.c.locked is None
         assert state.c.slack == 50000
@@ -83,13 +95,14 @@ def test_all_that_is_permitted_is_done(system: SimpleNamespace) -> None:
         assert (system.policy, system.priority) == (os.SCHED_FIFO, 70)
         assert system.c.locked == 7  # now, in future, once it is used
         assert system.c.slack == 1
+        assert set(system.nice.values()) == {-10}
         assert not gc.isenabled()
         assert gc.get_freeze_count() > 0
         assert sys.getswitchinterval() == pytest.approx(5e-4)
     assert report == RealTimeReport(
-        ("SCHED_FIFO 70", "memory locked", "garbage collector held"), ()
+        ("SCHED_FIFO 70", "other threads favoured", "memory locked", "garbage collector held"), ()
     )
-    assert report.notice == "real-time: SCHED_FIFO 70, memory locked, garbage collector held"
+    assert report.notice.startswith("real-time: SCHED_FIFO 70, other threads favoured, memory")
 
 
 def test_what_is_not_permitted_is_told(
@@ -99,6 +112,7 @@ def test_what_is_not_permitted_is_told(
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "setpriority", refuse)
     system.limits = LIMITS
     with real_time() as report:
         assert not gc.isenabled()
@@ -108,6 +122,7 @@ def test_what_is_not_permitted_is_told(
         "not real-time: SCHED_FIFO is not permitted (EPERM); allow it by LimitRTPRIO=99 in the "
         "systemd unit, or"
     )
+    assert "; its other threads get no priority over other programs (EPERM)" in report.notice
     assert "; memory cannot be locked (only 64 KiB may be); allow it by LimitMEM" in report.notice
 
 

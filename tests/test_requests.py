@@ -529,8 +529,8 @@ def test_a_controller_takes_a_task_at_the_limits_but_for_rounding(
     off = 0.1  # Pa
     asked = PressureRange(min=-off, max=1.5e5 + off)
     controller.set_task(TASK.model_copy(update={"pressure": asked}))
-    np.testing.assert_array_equal(controller._allocation._high, 1.5)
-    np.testing.assert_array_equal(controller._allocation._low, 0.0)
+    np.testing.assert_array_equal(controller._permitted[1], 1.5e5)
+    np.testing.assert_array_equal(controller._permitted[0], 0.0)
     above = PressureRange(min=1.5e5 + off)
     controller.set_task(TASK.model_copy(update={"pressure": above}))
-    np.testing.assert_array_equal(controller._allocation._low, 1.5)
+    np.testing.assert_array_equal(controller._permitted[0], 1.5e5)

@@ -33,7 +33,6 @@ _LOOK = 0.05  # s, between two checks of whether it is over
 _LAST_OUTPUT = 1.0  # s, for what is shown at the end
 _FLUSH = 0.3  # s
 _LATE = "error: the daemon did not end in time and is left as it is; its guard vents"
-_PRIORITY = -10  # niceness, where permitted: see `_raise_priority`
 _log = logging.getLogger(__name__)
 
 
@@ -71,7 +70,6 @@ def run(
         raise InputError("--duration: expected a time above 0 s")
     load_rig_description(rig)  # its mistakes are told before anything is loaded
     with _Signals().handled() as signals:
-        _raise_priority()
         from stiffopt.daemon.daemon import TIMES, Daemon
 
         daemon = Daemon(rig, service=service, log_folder=log_folder, json_lines=style == "json")
@@ -255,17 +253,6 @@ def _display(style: str, daemon: Daemon) -> LiveStatus | Lines:
         names = [robot.channel_name(k) for k in range(robot.n_pressures)]
         return LiveStatus(daemon.description.name, names)
     return Lines(as_json=style == "json")
-
-
-def _raise_priority() -> None:
-    """Raise the priority of this process, where that is permitted.
-
-    The control thread is real-time, but must wait for the thread that has the interpreter, which
-    should not in turn wait for other programs.
-    """
-    with suppress(OSError, AttributeError):
-        if os.getpriority(os.PRIO_PROCESS, 0) > _PRIORITY:
-            os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
 
 
 class Screen:

@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy.linalg import LinAlgError
 from numpy.typing import NDArray
 
 from stiffopt import lie
@@ -112,7 +113,7 @@ class Learning:
         adaptation = self._adaptation
         if windows is not before[0]:
             self._measured = None
-            with suppress(StiffoptError):  # of numbers with which no arm stands
+            with suppress(StiffoptError, LinAlgError):  # of numbers with which no arm stands
                 adaptation.take(windows, tip)
         applied = adaptation.none_applied if adapted is None else adapted.applied
         return Estimate(adaptation.report(), adaptation.step_from(applied))

@@ -6,6 +6,7 @@ They apply to all requests: of a program in Python, a client of the daemon or th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -224,6 +225,23 @@ def check_vented_arm(
             f"the model has it, ({model}) mm; check the tracker's registration and the robot file "
             "('stiffopt calibrate' makes one)"
         )
+
+
+def late_ticks(lateness: float, guard_timeout: float) -> str:
+    """What to change where ticks began so late that the guard may vent; empty where it will not.
+
+    Both times are in s. A computer on which ticks are late by half of the guard's patience within
+    half a minute may exceed it within minutes.
+    """
+    if lateness < guard_timeout / 2:
+        return ""
+    patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
+    return (
+        f"timing: ticks began {1e3 * lateness:.0f} ms late in the last half minute, and the guard "
+        f"vents after {1e3 * guard_timeout:.0f} ms; give this program real-time rights ('stiffopt "
+        "run' says how when it starts), give the computer less to do, or set safety.guard_timeout: "
+        f"{1e3 * patience:.0f} ms"
+    )
 
 
 # what a request holds ---------------------------------------------------------------------------

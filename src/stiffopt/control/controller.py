@@ -26,6 +26,7 @@ from stiffopt.control.feedback import GainSchedule, tracking_rows
 from stiffopt.control.forecast import Forecast, Present
 from stiffopt.control.interface import ControlOutput, Notice, SampleCounts
 from stiffopt.control.linearised_tip import LinearisedTip
+from stiffopt.control.motion_watch import MotionWatch
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.posture import PostureCourse
 from stiffopt.control.reference import Reference
@@ -141,6 +142,7 @@ class TipController:
         self._errors = TipErrors()
         self._windows = WindowWatch(tuning.windows)
         self._adapts = control.adaptation != "none"
+        self._watch = MotionWatch(robot.length, tuning.motion)
         self._model: LinearisedTip | None = None  # at the effective pressures
         self._path_model: LinearisedTip | None = None  # on the reference's path
         self._waypoint_model: TipModel | None = None  # at a trajectory's waypoints
@@ -169,6 +171,7 @@ class TipController:
         self.replanner.begin()
         self._pressures.begin()
         self._estimator.begin()
+        self._watch.begin()
         zero = self._pressures.command
         self._reference.begin(np.concatenate([zero, np.zeros(6)]))
         self._corrected_offset = np.zeros(6)
@@ -308,6 +311,7 @@ class TipController:
         if isinstance(course, PostureCourse) and pause > 0:
             course.wait(pause)
         self._computed_at = now
+        self._watch.begin()
         offset, pressures = self._estimator.offset, self._pressures
         self._corrected_offset = offset
         self._reference.begin(
@@ -332,6 +336,9 @@ class TipController:
             moment = now - (steps - 1 - step) * self._period
             self._estimator.advance(moment, effective, tip)
         counts = self._estimator.take(samples)
+        sample = self._estimator.sample
+        if counts.used and sample is not None:
+            self._watch.take(sample.time, sample.position, self._estimator.predicted)
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts
@@ -375,6 +382,7 @@ class TipController:
         reference.omega = omega
         reference.advance(plan)
         tip = self._models()[1].at(reference.path[:n])
+        self._watch.intend(now, tip.pose[:3, 3] + reference.path[n : n + 3])
         course = self.replanner.pursuit.course
         self._led_to = None
         if isinstance(course, PostureCourse):
@@ -453,6 +461,7 @@ class TipController:
         self._robot, self._tip, self._adapted_at = robot, after, self._now
         change = self._estimator.change_model(before, after)
         self._corrected_offset = self._corrected_offset + change
+        self._watch.change_model(-change[:3])
         self._reference.shift(change)
         self.replanner.go_on_with(adapted, change)
 
@@ -527,6 +536,8 @@ class TipController:
                 "registration and sensor, the tubes, and that the robot file is this arm's"
             )
             notices = (*notices, Notice("implausible", text, Severity.ERROR, standing=True))
+        if doubt := self._watch.doubt:
+            notices = (*notices, Notice(doubt.kind, doubt.text, Severity.ERROR, True, hold=True))
         return notices
 
     def _away(self) -> tuple[float, float] | None:

@@ -113,6 +113,7 @@ class TipEstimator:
         self._used_until = -math.inf
         self._ticks = 0
         self.sample: PoseSample | None = None  # the latest that was used
+        self.predicted: Array = np.zeros(3)  # for the moment of its capture, offset left out
         self._first: PoseSample | None = None
         self._unchanged: tuple[Array, Array] | None = None  # a sample, and the model's tip with it
         self._last_sample, self._rejected = -math.inf, 0
@@ -202,6 +203,7 @@ class TipEstimator:
         ]
         self._past.clear()
         self._past.extend(past)
+        self.predicted = self.predicted + shift
         if self._unchanged is not None:
             self._unchanged = self._unchanged[0], self._unchanged[1] + shift
         return change
@@ -288,6 +290,7 @@ class TipEstimator:
         self._displacements = np.zeros(2)
         self._used_until = sample.time
         self.sample, self._rejected = sample, 0
+        self.predicted = past.static + past.driven[0]
 
 
 def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:

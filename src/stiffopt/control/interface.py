@@ -51,6 +51,7 @@ class Notice:
     text: str  # a sentence for people
     severity: Severity = Severity.WARNING  # how bad it is
     standing: bool = False  # an alarm while the controller repeats it; otherwise an event
+    hold: bool = False  # whether the pressures are to be held until there is a new task
 
 
 class Controller(Protocol):

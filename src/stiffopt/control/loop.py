@@ -6,6 +6,7 @@ import math
 import threading
 import time
 from bisect import bisect_left
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -111,7 +112,9 @@ class ControlLoop:
         refusal names the check that failed, as that of `configure`.
         """
         requester = current_requester()  # checks may take long
-        self._request(lambda now: self._supervisor.arm(now, lambda: requester.gone))
+        self._request(
+            lambda now: self._supervisor.arm(now, lambda: requester.gone, self._timing.latest)
+        )
 
     def disarm(self) -> None:
         """Begin to let the pressures down; after `Safety.ramp_time` it is vented and inactive."""
@@ -153,9 +156,13 @@ class ControlLoop:
         chosen = [checked_integer("a channel", channel, 0) for channel in without]
         self._request(lambda now: self._supervisor.controller.set_channels(chosen))
 
-    def hold(self, reason: str = "asked to") -> None:
-        """Keep the pressures as they are until the next task, target or trajectory."""
-        self._request(lambda now: self._supervisor.hold(now, reason))
+    def hold(self, reason: str = "asked to", *, lasting: bool = True) -> None:
+        """Keep the pressures as they are until the next task, target or trajectory.
+
+        A hold that is not `lasting`, because nobody is there who would end it, ends after
+        `Safety.hold_timeout`: the pressures are let down then.
+        """
+        self._request(lambda now: self._supervisor.hold(now, reason, lasting=lasting))
 
     def vent(self, reason: str = "asked to") -> None:
         """Vent at once; it is inactive then, or still in fault.
@@ -327,6 +334,9 @@ _EDGES = tuple(float(f"{m}e{e}") for e in range(-6, 0) for m in (1, 2, 5))
 """Upper edges of the histogram of lateness, from 1 us to 0.5 s, three per decade."""
 
 
+_WATCHED = 30.0  # s, over which the lateness of ticks is looked at before arming
+
+
 class TickTiming:
     """When ticks of a period, in s, are due, and how late and how long they were."""
 
@@ -335,6 +345,8 @@ class TickTiming:
         self._lateness = [0] * (len(_EDGES) + 1)  # the last bin has no upper edge
         self._ticks = self._overruns = 0
         self._tick_time = 0.0
+        # lateness of the latest ticks, in s, but of those that followed an overrun
+        self._latest: deque[float] = deque(maxlen=round(_WATCHED / period))
         self.overruns_in_a_row = 0  # the last ticks that ended after the next one was due
         self.missed = 0  # ticks that were skipped because they were overdue
 
@@ -342,6 +354,16 @@ class TickTiming:
         """Note when a tick begins, and when it was due, if it was."""
         if due is not None:
             self._lateness[bisect_left(_EDGES, now - due)] += 1
+            if not self.overruns_in_a_row:
+                self._latest.append(now - due)
+
+    @property
+    def latest(self) -> float:
+        """How late ticks began lately because the computer was busy, in s: the third worst.
+
+        Single ones are late when other threads of this program start.
+        """
+        return ([0.0, 0.0, 0.0, *sorted(self._latest)])[-3]
 
     def end(self, due: float, now: float, tick_time: float) -> None:
         """Note when a tick ends, when it was due, and how long it took, in s."""

@@ -198,11 +198,12 @@ def _set_batch_policy(process: int) -> None:
     """Schedule a process as SCHED_BATCH, where the system has that.
 
     A request wakes it. It would otherwise pre-empt the control loop in the middle of that tick and
-    plan for milliseconds on the same processor. It also gives up the loop's real-time priority,
-    which it inherits if the loop started it.
+    plan for milliseconds on the same processor. It also gives up the loop's priorities, which it
+    inherits if the loop started it.
     """
     with suppress(AttributeError, OSError):
         os.sched_setscheduler(process, os.SCHED_BATCH, os.sched_param(0))
+        os.setpriority(os.PRIO_PROCESS, process, max(0, os.getpriority(os.PRIO_PROCESS, process)))
 
 
 class PlannerEnd:

@@ -5,13 +5,20 @@ It has no threads and no time of its own: `ControlLoop` calls it, one call at a 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stiffopt.control.checks import check_rig, check_vented_arm, highest_pressures, refusing
+from stiffopt.control.checks import (
+    check_rig,
+    check_vented_arm,
+    highest_pressures,
+    late_ticks,
+    refusing,
+)
 from stiffopt.control.interface import Controller, ControlOutput
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.state import Severity, State
@@ -32,20 +39,42 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class _Hold:
+    """Why pressures are held since a time, in s; a `lasting` one ends only by a request."""
+
+    reason: str
+    since: float
+    lasting: bool = False
+
+
+@dataclass(frozen=True)
 class _Ramp:
-    """Pressures (n,) that are let down from a time on, within a duration in s, and why."""
+    """Pressures (n,) that are let down from a time on, within a duration in s, and why.
+
+    `ways` are the shares of them (k, n) that are left, one after the other, from 1 to 0.
+    """
 
     begin: float
     duration: float
     pressures: Array
     reason: str
+    ways: Array
 
-    def share(self, now: float) -> float:
-        """Return the share of the pressures that is left at a time, from 1 to 0.
+    def progress(self, now: float) -> float:
+        """How far it is at a time, from 0 to 1.
 
-        A request may begin the ramp during a tick, later than that tick's `now`: then it is 1.
+        A request may begin the ramp during a tick, later than that tick's `now`: then it is 0.
         """
-        return min(max(1 - (now - self.begin) / self.duration, 0.0), 1.0)
+        return min(max((now - self.begin) / self.duration, 0.0), 1.0)
+
+    def share(self, now: float) -> Array:
+        """Return the share (n,) of the pressures that is left at a time."""
+        last = len(self.ways) - 1
+        place = self.progress(now) * last
+        before = min(int(place), last - 1)
+        after = place - before
+        left: Array = (1 - after) * self.ways[before] + after * self.ways[before + 1]
+        return left
 
 
 class Supervisor:
@@ -84,6 +113,9 @@ class Supervisor:
         self._zero: Array = np.zeros(n)
         self.commanded: Array = self._zero  # set-points (n,) that the supply has, in Pa
         self._requested: Array = self._zero  # before the outlet limited it
+        # the latest set-points, over the time that the chambers may lag behind them
+        lag = int(np.ceil(tuning.chamber_lag / period))
+        self._recent: deque[Array] = deque([self._zero], maxlen=max(2, lag))
         self._held: Array | None = None
         # the latest; NaN before the first, and where it is impossible
         self.reading = PressureReading(float("nan"), np.full(n, np.nan))
@@ -91,13 +123,14 @@ class Supervisor:
         self.rejected = 0  # of these
         self.saturated = self._no_channels  # (n,) at a limit that keeps them from their goal
         self._exchanged: PressureReading | None = None  # with the last command
-        self._holds: dict[str, str] = {}  # reason of each kind
+        self._holds: dict[str, _Hold] = {}  # of each kind
         self._ramp: _Ramp | None = None
         self.vented = True  # the supply has accepted the command to vent, and no pressure since
         self._trouble: Trouble | None = None
         self._failures = 0  # of the controller, in a row
         self._force_limited_at = -np.inf
         self._alarm_kinds: frozenset[str] = frozenset()
+        self._doubted_at = -np.inf
         self._ticked_at = self._clock.now()
 
     # -- a tick ---------------------------------------------------------------------------------
@@ -161,6 +194,7 @@ class Supervisor:
 
     def _note_commanded(self, now: float, pressures: Array) -> None:
         self.commanded = pressures
+        self._recent.append(pressures)
         self._monitor.tell(now, pressures)
 
     def _measure(self, now: float) -> None:
@@ -272,17 +306,39 @@ class Supervisor:
 
     def _hold_or_ramp(self, now: float) -> None:
         """Command the held pressures, or those that are left on the ramp."""
+        self._end_a_long_hold(now)
         ramp = self._ramp
         if ramp is None:
             if self._held is None:  # once: a late reply must not change them
-                self._held = np.minimum(self._requested, self.commanded)
+                self._held = self._present_pressures()
             self._command(now, self._held)
             return
-        share = ramp.share(now)
-        if not share > 1e-9:
+        if not ramp.progress(now) < 1 - 1e-9:
             self._stop(now, ramp.reason)
             return
-        self._command(now, let_down(ramp.pressures, share, self.outlet.limits))
+        self._command(now, let_down(ramp.pressures, ramp.share(now), self.outlet.limits))
+
+    def _present_pressures(self) -> Array:
+        """Pressures (n,) that stop the arm: those in the chambers, which lag behind the commands.
+
+        They are within what was commanded lately, whatever the gauges read.
+        """
+        recent = np.array(self._recent)
+        low, high = recent.min(axis=0), recent.max(axis=0)
+        measured = self.reading.pressures
+        last = np.minimum(self._requested, self.commanded)
+        return np.where(np.isfinite(measured), np.clip(measured, low, high), last)
+
+    def _end_a_long_hold(self, now: float) -> None:
+        """Let down what is held for longer than the rig permits, but for a client's own hold."""
+        most = self._safety.hold_timeout
+        if self._ramp is not None or most is None:
+            return
+        for hold in self._holds.values():
+            if not hold.lasting and now - hold.since >= most:
+                text = f"held for {most:g} s, and still: {hold.reason}"
+                self._let_down(now, "hold-timeout", text)
+                return
 
     def _command(self, now: float, pressures: Array, *, controlled: bool = False) -> bool:
         """Hand pressures (n,) to the outlet; return whether it accepted them."""
@@ -322,16 +378,23 @@ class Supervisor:
                 self.alarms.set(now, notice.kind, notice.text, notice.severity)
             else:
                 self.events.add(now, notice.kind, notice.text, notice.severity)
+            if notice.hold and self.lifecycle.armed and "doubt" not in self._holds:
+                self._hold(now, "doubt", notice.text)
+                if now - self._doubted_at < self._tuning.doubt_memory:
+                    self._let_down(now, "doubt-again", f"again: {notice.text}")
+                self._doubted_at = now
         for kind in self._alarm_kinds - standing:
             self.alarms.clear(now, kind)
         self._alarm_kinds = standing
 
     # -- transitions --------------------------------------------------------------------------
 
-    def _hold(self, now: float, kind: str, reason: str) -> None:
-        if kind not in self._holds:
+    def _hold(self, now: float, kind: str, reason: str, *, lasting: bool = False) -> None:
+        before = self._holds.get(kind)
+        if before is None:
             self.events.add(now, f"hold-{kind}", f"pressures are held: {reason}", Severity.WARNING)
-        self._holds[kind] = reason
+        since = now if before is None or before.lasting else before.since
+        self._holds[kind] = _Hold(reason, since, lasting)
         if self.lifecycle.state is State.ACTIVE:
             self._held = None
             self.lifecycle.change(State.HOLDING, reason)
@@ -341,7 +404,7 @@ class Supervisor:
         if self._ramp is not None or self.lifecycle.state is not State.HOLDING:
             return
         if self._holds:
-            self.lifecycle.reason = next(iter(self._holds.values()))
+            self.lifecycle.reason = next(iter(self._holds.values())).reason
             return
         self.controller.resume(now)
         self._failures = 0
@@ -352,12 +415,19 @@ class Supervisor:
         """Begin to let the pressures down; a ramp under way goes on."""
         if self._ramp is not None:
             return
-        self._ramp = _Ramp(now, self._safety.ramp_time, self.commanded, reason)
+        shares, warning = np.array([self._zero + 1, self._zero]), ""
+        if self._clearance is not None:
+            shares, warning = self._clearance.way_down(self.commanded)
+        self._ramp = _Ramp(now, self._safety.ramp_time, self.commanded, reason, shares)
         if self.lifecycle.state is State.ACTIVE:
             self.lifecycle.change(State.HOLDING, f"letting down: {reason}")
         else:
             self.lifecycle.reason = f"letting down: {reason}"
         self.events.add(now, kind, f"pressures are let down: {reason}", Severity.WARNING)
+        if warning:
+            self.events.add(
+                now, "way-down", f"{warning}; they are let down all the same", Severity.WARNING
+            )
 
     def _stop(self, now: float, reason: str) -> None:
         """Vent and become inactive."""
@@ -412,8 +482,13 @@ class Supervisor:
             self.lifecycle.change(State.INACTIVE)
             self.events.add(now, "configured", "everything answers; vented")
 
-    def arm(self, now: float, unwanted: Callable[[], bool] = lambda: False) -> None:
-        """Check the arm and arm it, unless that is unwanted by then; see `ControlLoop.arm`."""
+    def arm(
+        self, now: float, unwanted: Callable[[], bool] = lambda: False, lateness: float = 0.0
+    ) -> None:
+        """Check the arm and arm it, unless that is unwanted by then; see `ControlLoop.arm`.
+
+        `lateness` is how late ticks began lately, in s.
+        """
         self.lifecycle.permit("arm")
         with refusing("arming"):
             reading = self.outlet.read()
@@ -422,6 +497,9 @@ class Supervisor:
                 now, self.rig, self.controller, self._monitor, reading, self._tracker,
                 self._tuning.vented_offset,
             )  # fmt: skip
+            late = late_ticks(lateness, self._safety.guard_timeout)
+            if lateness >= self._safety.guard_timeout:
+                problems.append(late)
         if problems:
             raise CommandError("; ".join(problems))
         if unwanted():
@@ -440,10 +518,14 @@ class Supervisor:
             raise
         self._note_commanded(now, self._zero)
         self._monitor.clear()
+        self._tracker.begin(now)
+        self._doubted_at = -np.inf
         self._exchanged, self._failures, self._ticked_at = None, 0, now
         self._holds.clear()
         self.lifecycle.change(State.ACTIVE)
         self.events.add(now, "armed", "armed: pressures may change from now on")
+        if late:
+            self.events.add(now, "timing", late, Severity.WARNING)
 
     def disarm(self, now: float, reason: str = "disarmed") -> None:
         """Begin to let down; see `ControlLoop.disarm`."""
@@ -456,6 +538,7 @@ class Supervisor:
         self._permit_motion("set a task")
         highest = highest_pressures(task, self.outlet.limits)
         self.controller.set_task(task)
+        self._recent = deque([self.commanded], maxlen=self._recent.maxlen)
         try:
             self.outlet.restrict(highest)
         except DeviceError as error:  # the controller has the task, and the gate has not
@@ -485,18 +568,20 @@ class Supervisor:
             self.events.add(now, event, text)
         for kind in ("asked", "solver", "clearance"):
             self._holds.pop(kind, None)
+        if event != "target":  # a stream of them must not end a doubt that stands
+            self._holds.pop("doubt", None)
         try:
             self._resume(now)
         except Exception as error:  # the request is pursued already: too late to refuse it
             self.fault(now, "internal", f"unexpected {type(error).__name__}: {error}")
             raise CommandError(self.lifecycle.reason) from error
 
-    def hold(self, now: float, reason: str) -> None:
+    def hold(self, now: float, reason: str, *, lasting: bool = True) -> None:
         """Keep the pressures; see `ControlLoop.hold`."""
         self._permit_motion("hold")
         if not isinstance(reason, str):
             raise CommandError(f"expected text as the reason, not {type(reason).__name__}")
-        self._hold(now, "asked", reason)
+        self._hold(now, "asked", reason, lasting=lasting)
         self.lifecycle.reason = reason
 
     def vent(self, now: float, reason: str) -> None:

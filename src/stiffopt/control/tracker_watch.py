@@ -61,6 +61,11 @@ class TrackerWatch:
         self._ages.clear()
         self._positions.clear()
 
+    def begin(self, now: float) -> None:
+        """Start anew from a time at which the tip is seen, in s: the first samples take a while."""
+        self.jumps = 0
+        self._latest = max(self._latest, now - self.usual[1])
+
     def new(self, samples: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """Return the samples without repetitions of a frame."""
         if not samples:

@@ -183,6 +183,8 @@ class WindowTuning:
     vibration: float = 3e-4  # above which the tip is not at rest, in m
     seen: float = 0.3  # age of the latest sample above which it is not known, in s
     same: float = 1e4  # distance in pressure below which it is the same posture, in Pa
+    # distance of the tips of two windows of one posture, in m, at which the load is another one
+    changed: float = 2e-3
     most: int = 10  # windows that are kept
 
 
@@ -223,12 +225,51 @@ class SupervisionTuning:
     # time for which the alarm of the total force outlasts the last command that was shortened, in s
     force_alarm: float = 0.5
     max_failures: int = 3  # failures of the controller in a row after which pressures are held
+    chamber_lag: float = 0.3  # by which the pressures in the chambers may lag behind commands, in s
+    # time after a doubt in which another one lets the pressures down at once, in s
+    doubt_memory: float = 30.0
     vent_attempts: int = 3  # to vent when the loop ends
     # time after the ramp in which the ending loop goes on trying to vent, in s
     stop_margin: float = 0.5
     # distance of the vented tip from the model's, as a share of the arm's length, beyond which the
     # arm is not armed
     vented_offset: float = 0.1
+
+
+@dataclass(frozen=True)
+class DriftScale:
+    """A drift that counts: in so many intervals, each in s, faster than a speed in m/s."""
+
+    interval: float
+    count: int
+    least_speed: float
+
+
+@dataclass(frozen=True)
+class MotionTuning:
+    """What in the tip's motion is doubted (`MotionWatch`)."""
+
+    spacing: float = 0.02  # least time between two samples that are compared, in s
+    longest_pause: float = 0.1  # since the arm was steered, after which none is compared, in s
+    # by what share of each motion the model may be wrong
+    model_error: float = 0.35
+    # way from which on a response is looked at: a length in m, and a share of the arm's length
+    least_motion: float = 3e-3
+    least_motion_share: float = 0.025
+    response_window: float = 0.6  # in which the tip must have moved as the model has it, in s
+    least_response: float = 0.25  # share of that way by which it must have moved along it
+    most_across: float = 0.85  # share of that way by which it may have moved across it
+    misses: int = 2  # samples in a row that show no response
+    scales: tuple[DriftScale, ...] = (
+        DriftScale(0.25, 5, 2e-3),
+        DriftScale(1.0, 5, 6e-4),
+        DriftScale(2.5, 4, 3.5e-4),
+    )
+    turn: float = 1e-3  # way back after which a swing has turned, in m
+    swings: int = 4  # between turns, one after the other
+    least_swing: float = 2.5e-3  # from one turn to the next, in m
+    decay: float = 0.75  # a last swing that is a smaller share of the largest decays
+    swing_window: float = 6.0  # in which they must be, in s
 
 
 @dataclass(frozen=True)
@@ -255,3 +296,4 @@ class ControlTuning:
     forecast: ForecastTuning = field(default_factory=ForecastTuning)
     adaptation: AdaptationTuning = field(default_factory=AdaptationTuning)
     windows: WindowTuning = field(default_factory=WindowTuning)
+    motion: MotionTuning = field(default_factory=MotionTuning)

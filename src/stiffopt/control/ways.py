@@ -6,6 +6,7 @@ effective ones, and an arm that differs from its model is as much nearer or fart
 
 from __future__ import annotations
 
+import time
 from itertools import pairwise
 
 import numpy as np
@@ -27,6 +28,8 @@ _EXACT = 5e-4  # m, to which a shortfall is found
 _STATIONS = 13  # along the body, whose ways are measured
 _SAMPLES = 64  # pressures at which the body's speed is measured
 _FASTER = 1.5  # than there, it may be elsewhere
+_DOWN = 8  # states on each piece of a way down
+_MOST_COST = 3e-3  # s, of looking for a way down, which a tick has to wait for
 
 
 class Ways:
@@ -91,6 +94,8 @@ class ClearanceWatch:
         self._robot, self._scene = robot, scene
         self._least = scene.clearance / 2
         self._speed = np.full(robot.n_pressures, np.inf)  # of the body per pressure, in m/Pa
+        self._ways_down = _ways_down(robot)
+        self._cost = np.inf  # of the clearance at one state, in s
         self.begin()
 
     def prepare(self) -> None:
@@ -103,6 +108,10 @@ class ClearanceWatch:
         at = np.linspace(0.0, robot.length, _STATIONS)
         jacobians = robot.body_jacobian(samples, at)[:, :, :3]  # (N, stations, 3, n)
         self._speed = _FASTER * np.linalg.norm(jacobians, axis=2).max(axis=(0, 1))
+        robot.clearance(samples[:1], self._scene)
+        begin = time.perf_counter()
+        robot.clearance(samples[:_DOWN], self._scene)
+        self._cost = (time.perf_counter() - begin) / _DOWN
 
     def begin(self) -> None:
         """Start anew: nothing is known of where the body is."""
@@ -129,6 +138,50 @@ class ClearanceWatch:
             return shortfall(robot, self._scene, within)
         self._at, self._clearance = pressures.copy(), clearance
         return ""
+
+    def way_down(self, pressures: Array) -> tuple[Array, str]:
+        """How to let pressures (n,), in Pa, down past the scene.
+
+        All channels together, or one segment after the other: the first of these ways on which the
+        body does not come nearer to the scene than half of its clearance, or than it is; or else
+        the one on which it keeps farthest from it.
+
+        Returns
+        -------
+        shares :
+            Of the pressures (k, n), from 1 to 0.
+        warning :
+            That the body comes too near all the same, or that it was not looked at; empty if not.
+        """
+        ways = self._ways_down
+        if self._cost * _DOWN * sum(len(way) - 1 for way in ways) > _MOST_COST:
+            return ways[0], "whether the body keeps clear on the way down was not looked at"
+        best = ways[0], -np.inf, np.zeros_like(pressures)
+        robot = self._robot
+        try:
+            for way in ways:
+                steps = np.linspace(0, len(way) - 1, _DOWN * (len(way) - 1) + 1)
+                shares = np.stack([np.interp(steps, np.arange(len(way)), c) for c in way.T], axis=1)
+                states = np.clip(shares * pressures, robot.pressure_min, robot.pressure_max)
+                clearance = np.asarray(robot.clearance(states, self._scene))
+                if clearance.min() >= min(self._least, float(clearance[0])) - _FORGIVEN:
+                    return way, ""
+                if clearance.min() > best[1]:
+                    best = way, float(clearance.min()), states[int(clearance.argmin())]
+        except StiffoptError as error:
+            return ways[0], f"the model has no answer on the way down: {error}"
+        return best[0], f"on the way down {shortfall(robot, self._scene, best[2])}"
+
+
+def _ways_down(robot: Manipulator) -> list[Array]:
+    """Shares of the pressures (k, n): of all at once, the distal segment first, or last."""
+    segments = robot.description.segments
+    owner = np.repeat(np.arange(len(segments)), [s.n_channels for s in segments])
+    ways = [np.array([np.ones(len(owner)), np.zeros(len(owner))])]
+    if len(segments) > 1:
+        up = np.array([owner >= k for k in range(len(segments) + 1)], dtype=float)
+        ways += [1 - up[::-1], up]
+    return ways
 
 
 def shortfall(robot: Manipulator, scene: Scene, pressures: Array) -> str:

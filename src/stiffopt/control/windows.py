@@ -48,6 +48,8 @@ class WindowWatch:
         if now - self._since < t.wait:
             return
         values = np.concatenate([pressures, position])
+        if not np.isfinite(values).all():
+            return
         n = len(pressures)
         if self._first is None:
             self._first, self._sum, self._begun = values, np.zeros_like(values), now
@@ -65,10 +67,16 @@ class WindowWatch:
         self._first, self._count, self._since = None, 0, now + t.again
 
     def _add(self, window: Window) -> None:
-        """Add a window in place of those of its posture, or of the oldest one if there are many."""
-        others = [
-            other
-            for other in self.windows
-            if np.linalg.norm(other.pressures - window.pressures) > self._tuning.same
-        ]
-        self.windows = (*others[-(self._tuning.most - 1) :], window)
+        """Add a window in place of those of its posture, or of the oldest one if there are many.
+
+        Where the tip is elsewhere in the same posture, all that was seen before is void.
+        """
+        t, others = self._tuning, list(self.windows)
+        for other in self.windows:
+            if np.linalg.norm(other.pressures - window.pressures) > t.same:
+                continue
+            others.remove(other)
+            if np.linalg.norm(other.position - window.position) > t.changed:
+                others = []  # a load has been put on, or taken off
+                break
+        self.windows = (*others[-(t.most - 1) :], window)

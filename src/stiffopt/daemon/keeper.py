@@ -216,7 +216,7 @@ class Keeper:
             self._held = True
             self._loop.add_alarm(_SERVICE, "the control interface has ended; restart the daemon")
             with suppress(StiffoptError):  # there may be nothing to hold
-                self._loop.hold("the control interface has ended")
+                self._loop.hold("the control interface has ended", lasting=False)
 
     def _run(self) -> None:
         while not self._enough.wait(_LOOK):

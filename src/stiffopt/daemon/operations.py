@@ -112,6 +112,15 @@ class Operations:
         beat = self.lease.heartbeat
         return GrantReport(lease=identity, heartbeat_s=beat, renew_every_s=beat / 4)
 
+    async def release(self, identity: str | None) -> None:
+        """Take control back from a client; a hold of its own has nobody left who would end it."""
+        holder = self.lease.holder
+        self.lease.release(identity)
+        if holder is not None and self.loop.snapshot().state is State.HOLDING:
+            reason = f"'{holder.client}' held, and gave control back"
+            with suppress(StiffoptError):  # it is let down already
+                await self._call(partial(self.loop.hold, reason, lasting=False), urgent=True)
+
     async def watch(self) -> None:
         """Hold the arm if the client in control is not heard any more; to be called repeatedly."""
         client = self.lease.check(self._clock.now())
@@ -124,7 +133,7 @@ class Operations:
     async def _hold_after(self, client: str) -> None:
         """Hold the arm; control is free after the loop has held it or has refused to."""
         reason = f"nothing was heard from '{client}', which had control"
-        call = call_in_thread("command", partial(self.loop.hold, reason))
+        call = call_in_thread("command", partial(self.loop.hold, reason, lasting=False))
         await _ended(call)
         try:
             call.result()

@@ -228,8 +228,11 @@ def _control(operations: Operations) -> APIRouter:
 
     @router.delete("/lease", status_code=204)
     async def release(lease: LeaseHeader = None) -> None:
-        """Give control back. The arm goes on with what it does; hold or disarm it before."""
-        operations.lease.release(lease)
+        """Give control back. The arm goes on with what it does; disarm it before.
+
+        A hold ends after `safety.hold_timeout`: the pressures are let down then.
+        """
+        await operations.release(lease)
 
     return router
 

@@ -149,6 +149,8 @@ class Camera:
         self._rng = rng
         self._sent: deque[Frame] = deque(maxlen=_KEPT)
         self._last: Frame | None = None
+        self._seen: deque[Array] = deque(maxlen=_KEPT)  # poses (4, 4), one a frame
+        self._fault, self._began = "ok", 0.0  # the last fault, and since when
 
     def next_step(self) -> int:
         """Step of the plant in which the next frame is captured."""
@@ -173,7 +175,7 @@ class Camera:
         noise = self._rng.standard_normal(6)
         if fault == "off" or chances[0] < settings.missing:
             return
-        T = self.sensor_in_tracker(noise)
+        T = self._creeping(fault, noise)
         position, q = T[:3, 3].copy(), np.asarray(lie.quaternion_from_rotation(T[:3, :3]))
         if fault == "missing" or chances[1] < settings.dropouts:
             position, q = np.full(3, np.nan), np.full(4, np.nan)
@@ -194,11 +196,39 @@ class Camera:
         self._last = frame
         self._sent.append(frame)
 
+    def _creeping(self, fault: str, noise: Array) -> Array:
+        """Pose (4, 4) of the sensor as it is seen with a fault that grows since it began."""
+        now, sizes = self._plant.time, FAULT_SIZES
+        if fault != self._fault:
+            self._fault, self._began = fault, now
+        elapsed = now - self._began
+        if fault == "loose":  # lies where it fell, and is seen with its noise
+            return self._noisy(self._seen[-1], noise)
+        self._seen.append(self._sensor_in_tracker())
+        if fault == "lagging":  # an older pose, told as new
+            age = round(sizes.lag_growth * elapsed * self.settings.rate)
+            return self._noisy(self._seen[max(-1 - age, -len(self._seen))], noise)
+        T = self._noisy(self._seen[-1], noise)
+        if fault == "drifting":
+            T[:3, 3] += elapsed * np.array(sizes.drift)
+        elif fault == "turning":
+            T = lie.exp(np.array([0, 0, 0, *sizes.turn]) * elapsed) @ T
+        elif fault == "shaking":
+            T[:3, 3] += np.array(sizes.shake) * math.sin(2 * math.pi * sizes.shake_rate * elapsed)
+        return T
+
     def sensor_in_tracker(self, noise: Array) -> Array:
         """Pose (4, 4) of the sensor in the tracker's frame; `noise` (6,) in standard deviations."""
-        settings = self.settings
+        return self._noisy(self._sensor_in_tracker(), noise)
+
+    def _sensor_in_tracker(self) -> Array:
         off = self._plant.mismatch.registration.inverse()
-        T = settings.registration.sensor_in_tracker(off @ self._plant.tip_pose())
+        return np.asarray(
+            self.settings.registration.sensor_in_tracker(off @ self._plant.tip_pose())
+        )
+
+    def _noisy(self, pose: Array, noise: Array) -> Array:
+        settings, T = self.settings, pose.copy()
         T[:3, 3] += settings.noise * noise[:3]
         small = np.concatenate(([1.0], 0.5 * settings.angular_noise * noise[3:]))
         turn = lie.rotation_from_quaternion(small / np.linalg.norm(small))

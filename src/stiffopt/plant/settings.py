@@ -333,6 +333,10 @@ class FaultSizes:
     reading_gain, reading_offset : of a supply that reads wrong pressures, and in Pa.
     frame_delay : by which the frames of a slow tracker arrive later, in s.
     tracker_offset : by which a wrong tracker is off (3,), in m.
+    drift : speed of a tracker that drifts (3,), in m/s.
+    turn : speed at which a turning tracker's frame turns about its origin (3,), in rad/s.
+    shake, shake_rate : amplitude (3,) and frequency with which a tracker shakes, in m and Hz.
+    lag_growth : by how much a lagging tracker is later every second, in s.
     stage_speed : of a slow stage, as a share of its speed.
     force_gain, force_offset : of a force sensor that reads wrong forces, and in N.
     """
@@ -343,6 +347,11 @@ class FaultSizes:
     reading_offset: float = 2e4
     frame_delay: float = 0.5
     tracker_offset: tuple[float, float, float] = (0.02, -0.015, 0.01)
+    drift: tuple[float, float, float] = (0.004, 0.003, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.05, 0.0)
+    shake: tuple[float, float, float] = (0.01, 0.0, 0.0)
+    shake_rate: float = 3.0
+    lag_growth: float = 0.1
     stage_speed: float = 0.1
     force_gain: float = 0.5
     force_offset: float = 0.1

@@ -37,11 +37,16 @@ Array = NDArray[np.float64]
 
 FAULTS = {
     "supply": ("ok", "off", "stuck", "garbage", "wrong", "slow", "leak", "high"),
-    "tracker": ("ok", "off", "stuck", "garbage", "wrong", "slow", "missing", "flip"),
+    "tracker": (
+        *("ok", "off", "stuck", "garbage", "wrong", "slow", "missing", "flip"),
+        *("loose", "drifting", "turning", "shaking", "lagging"),
+    ),
     "probe": ("ok", "off", "stuck", "garbage", "wrong", "slow"),
 }
 """What can be injected, by device. ``stuck`` holds the last value, ``wrong`` is plausible but off,
-``garbage`` is not plausible at all; ``high`` is a regulator stuck at its highest pressure."""
+``garbage`` is not plausible at all; ``high`` is a regulator stuck at its highest pressure; a
+``loose`` sensor has come off and lies still; a ``lagging`` tracker tells older and older poses as
+new."""
 
 _LONG = 1_000_000  # steps; there is no need to stop for this long
 _LONGEST = 30.0  # s of real time that is caught up with at once; more than that is skipped

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from stiffopt.model.description import PerChannelPressure, PerChannelRate
-from stiffopt.schema import Schema
+from stiffopt.schema import BadKeyError, Schema
 from stiffopt.units import Duration, Force, Length, Ratio, Speed
 
 
@@ -17,6 +17,10 @@ def _none(value: Any) -> Any:
 
 
 _Port = Annotated[int, Field(ge=0, le=65535, strict=True)]
+_Time = Annotated[Duration, Field(gt=0, le=3600)]
+_TimeOrNone = Annotated[
+    _Time | None, BeforeValidator(_none, json_schema_input_type=_Time | Literal["none"])
+]
 _PortOrNone = Annotated[
     _Port | None, BeforeValidator(_none, json_schema_input_type=_Port | Literal["none"])
 ]
@@ -43,6 +47,11 @@ class Safety(Schema):
     max_overruns : ticks in a row that came too late, which are a fault.
     ramp_time : in which pressures are let down in a controlled way, in s.
     heartbeat : a client that has not been heard for this long has lost control, in s.
+    hold_timeout : pressures that the loop holds by itself are let down after this long, in s; a
+        client's own hold lasts while its heartbeat does. None, in a file ``none``: never, which
+        `unlimited_hold` has to accept.
+    unlimited_hold : ``accepted``: the loop may hold pressures for ever, also of an arm that it does
+        not understand; ``refused``: it may not.
     unprotected_supply : ``accepted``: a supply may be armed although it has neither a watchdog nor
         a dump valve, so that nothing vents the arm when this computer fails; ``refused``: it may
         not. Simulated supplies are exempt.
@@ -62,7 +71,19 @@ class Safety(Schema):
     max_overruns: Annotated[int, Field(ge=1)] = 10
     ramp_time: Annotated[Duration, Field(gt=0, le=10)] = 1.0
     heartbeat: Annotated[Duration, Field(gt=0, le=60)] = 1.0
+    hold_timeout: _TimeOrNone = 10.0
+    unlimited_hold: Literal["refused", "accepted"] = "refused"
     unprotected_supply: Literal["refused", "accepted"] = "refused"
+
+    @model_validator(mode="after")
+    def _is_accepted(self) -> Safety:
+        if self.hold_timeout is None and self.unlimited_hold != "accepted":
+            raise BadKeyError(
+                "hold_timeout",
+                "without one, pressures may be held for ever on an arm that is not understood; "
+                "give a time, or say 'unlimited_hold: accepted' as well",
+            )
+        return self
 
 
 class ControlSettings(Schema):

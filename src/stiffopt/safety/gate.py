@@ -84,12 +84,13 @@ class Outlet(Protocol):
         """Return the measured pressures; raise `DeviceError` if the supply does not answer."""
 
 
-def let_down(pressures: Array, share: float, limits: PressureLimits) -> Array:
+def let_down(pressures: Array, share: float | Array, limits: PressureLimits) -> Array:
     """Return a share, clipped to 0 to 1, of pressures (n,), in Pa, while they are let down.
 
-    A channel that would fall below a low limit above 0 goes to 0.
+    The share is one for all channels, or (n,). A channel that would fall below a low limit above 0
+    goes to 0.
     """
-    down: Array = pressures * min(max(share, 0.0), 1.0)
+    down: Array = pressures * np.minimum(np.maximum(share, 0.0), 1.0)
     low = limits.low
     return np.where((low > 0) & (down < low), 0.0, down)
 

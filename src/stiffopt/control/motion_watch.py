@@ -1,0 +1,228 @@
+"""Whether the tip moves as the pressures say: what makes the loop doubt its tracker or its arm.
+
+The tip is seen at y, the model predicts it at s, and the reference intends it to be at r. Three
+tests look for what no push, payload or error of a model explains:
+
+* response: r has moved, and y not along with s, but elsewhere or not at all;
+* drift: y - s moves on and on, faster than the model's error can change on the way of s;
+* swing: y - r swings, and the swings do not decay.
+
+A push or a payload moves y - s too, but then it rests. What creeps is seen at three time scales.
+The model may be wrong by a share of each motion.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.tuning import DriftScale, MotionTuning
+
+Array = NDArray[np.float64]
+
+_TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # of a row
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Why the loop does not trust what it sees.
+
+    Attributes
+    ----------
+    kind : ``no-response``, ``drift`` or ``swing``.
+    text : the likeliest causes and what to do, for people.
+    """
+
+    kind: str
+    text: str
+
+
+class MotionWatch:
+    """Compares the tip's motion with that of the model and of the reference.
+
+    Parameters
+    ----------
+    length :
+        Of the arm, in m.
+    tuning :
+        Sizes and times of the tests.
+
+    Attributes
+    ----------
+    doubt : what is doubted; it stands until `begin`.
+    """
+
+    def __init__(self, length: float, tuning: MotionTuning) -> None:
+        self._tuning = tuning
+        self._least = max(tuning.least_motion, tuning.least_motion_share * length)
+        longest = max(scale.interval * scale.count for scale in tuning.scales)
+        self._kept = round(longest / tuning.spacing) + 2
+        self._rows: Array = np.empty((2 * self._kept, 10))  # samples: see `_SEEN` and the others
+        self.begin()
+
+    def begin(self) -> None:
+        """Start anew."""
+        self._count = self._misses = 0
+        self._path = 0.0  # that r has gone, in m
+        self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
+        self._swings = [_Swings(self._tuning) for _ in range(3)]
+        self.doubt: Doubt | None = None
+
+    def change_model(self, change: Array) -> None:
+        """Go on with a model that predicts the tip elsewhere, by a change (3,)."""
+        self._rows[: self._count, _PREDICTED] += change
+
+    def intend(self, now: float, position: Array) -> None:
+        """Note where the reference intends the tip to be (3,), in each tick that is steered."""
+        self._intended.append((now, position))
+
+    def take(self, time: float, seen: Array, predicted: Array) -> None:
+        """Take in a sample (3,) and the model's prediction (3,) for the moment of its capture."""
+        intended = self._intended_at(time)
+        if intended is None or self._is_early(time) or self.doubt is not None:
+            return
+        if self._count == len(self._rows):
+            self._rows[: self._kept] = self._rows[-self._kept :]
+            self._count = self._kept
+        self._rows[self._count] = (time, *seen, *predicted, *intended)
+        self._count += 1
+        if self._count > 1:
+            self._path += float(np.linalg.norm(intended - self._rows[self._count - 2, _INTENDED]))
+        for swings, error in zip(self._swings, (seen - intended).tolist(), strict=True):
+            swings.take(_Turn(time, error, self._path))
+        self.doubt = self._no_response() or self._drift() or self._swing()
+
+    def _is_early(self, time: float) -> bool:
+        last = self._rows[self._count - 1, _TIME] if self._count else -np.inf
+        return bool(time < last + self._tuning.spacing)
+
+    def _intended_at(self, time: float) -> Array | None:
+        for moment, position in reversed(self._intended):
+            if moment <= time:
+                return position if time - moment < self._tuning.longest_pause else None
+        return None
+
+    def _since(self, duration: float) -> Array:
+        """Samples (k, 10) of the last so many seconds."""
+        rows = self._rows[: self._count]
+        return rows[np.searchsorted(rows[:, _TIME], rows[-1, _TIME] - duration) :]
+
+    def _no_response(self) -> Doubt | None:
+        """The tip was to move, and the model has it moved, but it is not seen to."""
+        tuning, rows = self._tuning, self._since(self._tuning.response_window)
+        ways = rows[-1] - rows[:-1]
+        way, seen = ways[:, _PREDICTED], ways[:, _SEEN]
+        distance = np.sqrt((way**2).sum(axis=1))
+        meant = (ways[:, _INTENDED] * way).sum(axis=1) > distance**2 / 2
+        along = (seen * way).sum(axis=1) / np.maximum(distance, 1e-9)
+        across = np.sqrt(np.maximum((seen**2).sum(axis=1) - along**2, 0.0))
+        wrong = (along < tuning.least_response * distance) | (
+            across > tuning.most_across * distance
+        )
+        missed = np.flatnonzero(meant & wrong & (distance > self._least))
+        self._misses = self._misses + 1 if len(missed) else 0
+        if self._misses < tuning.misses:
+            return None
+        row = missed[0]
+        most, moved = 1e3 * float(distance[row]), 1e3 * float(np.linalg.norm(seen[row]))
+        text = f"the tip should have moved by {most:.1f} mm and was seen to move by {moved:.1f} mm"
+        if moved < most / 2:
+            causes = (
+                "its sensor has come off, the tracker is late, the arm is blocked, or it does not "
+                "get its pressures; look at the sensor and the tubes"
+            )
+        else:
+            causes = (
+                "another way: channels are swapped, the tracker's frame is turned, the sensor has "
+                "slipped, or something pushes the arm; run 'stiffopt commission'"
+            )
+        return Doubt("no-response", f"{text}{':' if moved < most / 2 else ''} {causes}")
+
+    def _drift(self) -> Doubt | None:
+        """The tip moves on without a cause in the pressures."""
+        for scale in self._tuning.scales:
+            if speed := self._drift_speed(scale):
+                return Doubt(
+                    "drift",
+                    f"the tip seems to move on at {1e3 * speed:.1f} mm/s although its pressures do "
+                    "not explain it: the sensor slips or has come off, the tracker drifts, or "
+                    "something pushes the arm; look at it, then set the task again",
+                )
+        return None
+
+    def _drift_speed(self, scale: DriftScale) -> float:
+        """Speed of a drift that has lasted for all intervals of a scale, in m/s, or 0."""
+        duration = scale.interval * scale.count
+        first = self._rows[0, _TIME] if self._count else np.inf
+        if self._rows[self._count - 1, _TIME] - duration < first:
+            return 0.0
+        rows = self._since(duration)
+        ends = rows[-1, _TIME] - scale.interval * np.arange(scale.count, -1, -1)
+        marks = rows[np.minimum(np.searchsorted(rows[:, _TIME], ends), len(rows) - 1)]
+        offsets, ways = (
+            marks[:, _SEEN] - marks[:, _PREDICTED],
+            np.diff(marks[:, _PREDICTED], axis=0),
+        )
+        drift = offsets[-1] - offsets[0]
+        size = float(np.linalg.norm(drift))
+        along = np.diff(offsets, axis=0) @ drift / max(size, 1e-9)
+        explained = self._tuning.model_error * np.linalg.norm(ways, axis=1)
+        if (along - explained < scale.least_speed * scale.interval).any():
+            return 0.0
+        return size / duration
+
+    def _swing(self) -> Doubt | None:
+        for swings in self._swings:
+            if size := swings.lasting():
+                return Doubt(
+                    "swing",
+                    f"the tip swings by {1e3 * size:.1f} mm and does not come to rest: the tracker "
+                    "is later than the rig file says, something shakes the arm or the sensor, or "
+                    "the model's frequency is far off; run 'stiffopt commission'",
+                )
+        return None
+
+
+class _Turn(NamedTuple):
+    """A value y - r of one axis, in m, when, and how far r had gone by then, in m."""
+
+    time: float
+    error: float
+    path: float
+
+
+class _Swings:
+    """Turning points of y - r along one axis, and whether its swings last."""
+
+    def __init__(self, tuning: MotionTuning) -> None:
+        self._tuning = tuning
+        self._turns: deque[_Turn] = deque(maxlen=tuning.swings + 1)
+        self._extreme = _Turn(-np.inf, 0.0, 0.0)
+        self._rising = True
+
+    def take(self, now: _Turn) -> None:
+        """Take in the next value."""
+        beyond = now.error - self._extreme.error
+        if (beyond > 0) is self._rising:
+            self._extreme = now
+        elif abs(beyond) > self._tuning.turn:
+            self._turns.append(self._extreme)
+            self._extreme, self._rising = now, not self._rising
+
+    def lasting(self) -> float:
+        """Size of swings that do not decay, in m; 0 if there are none."""
+        tuning, turns = self._tuning, self._turns
+        if len(turns) <= tuning.swings or turns[-1].time - turns[0].time > tuning.swing_window:
+            return 0.0
+        sizes = [
+            abs(after.error - before.error) - tuning.model_error * (after.path - before.path)
+            for before, after in pairwise(turns)
+        ]
+        if min(sizes) < tuning.least_swing or sizes[-1] < tuning.decay * max(sizes):
+            return 0.0
+        return sizes[-1]

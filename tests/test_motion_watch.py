@@ -1,0 +1,157 @@
+"""What the watch of the tip's motion doubts, on motions made up here, and what it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stiffopt.control.motion_watch import Doubt, MotionWatch
+from stiffopt.control.tuning import MotionTuning
+
+Array = NDArray[np.float64]
+
+LENGTH = 0.18  # m
+FRAME = 0.025  # s
+NOISE = 5e-5  # m
+X, Y = np.eye(3)[:2]
+
+
+def watched(
+    duration: float,
+    seen: Callable[[float], Array],
+    predicted: Callable[[float], Array],
+    intended: Callable[[float], Array],
+) -> tuple[float, Doubt | None]:
+    """When and what the watch doubts of a tip that is sampled for so many seconds."""
+    rng = np.random.default_rng(1)
+    watch = MotionWatch(LENGTH, MotionTuning())
+    for time in np.arange(0.0, duration, FRAME):
+        watch.intend(time, intended(time))
+        noise = NOISE * rng.standard_normal(3)
+        watch.take(time, seen(time) + noise, predicted(time))
+        if watch.doubt is not None:
+            return float(time), watch.doubt
+    return np.inf, None
+
+
+def step(size: float, at: float = 1.0, lag: float = 0.1) -> Callable[[float], float]:
+    return lambda t: size * (1 - np.exp(-max(t - at, 0.0) / lag))
+
+
+def still(t: float) -> Array:
+    return np.zeros(3)
+
+
+@pytest.mark.parametrize("wrong", [0.7, 1.0, 1.3])
+def test_a_step_that_the_model_has_wrong_by_a_third_is_not_doubted(wrong: float) -> None:
+    moved = step(0.04)
+    _, doubt = watched(
+        4, lambda t: wrong * moved(t) * X, lambda t: moved(t) * X, lambda t: moved(t) * X
+    )
+    assert doubt is None
+
+
+def test_a_push_and_what_the_loop_does_about_it_are_not_doubted() -> None:
+    push, back = step(0.015), step(0.015, at=1.05, lag=0.2)
+    _, doubt = watched(6, lambda t: (push(t) - back(t)) * X, lambda t: -back(t) * X, still)
+    assert doubt is None
+
+
+def test_a_vibration_that_decays_is_not_doubted() -> None:
+    def ringing(t: float) -> float:
+        return 0.02 * np.exp(-0.06 * 2 * np.pi * 1.7 * t) * np.cos(2 * np.pi * 1.7 * t)
+
+    assert watched(6, lambda t: ringing(t) * X, still, still)[1] is None
+
+
+def test_the_lag_of_a_fast_periodic_path_is_no_swing() -> None:
+    def path(t: float) -> Array:
+        return 0.02 * np.array([np.sin(2 * np.pi * t / 3), np.sin(4 * np.pi * t / 3), 0.0])
+
+    assert watched(12, lambda t: path(t - 0.08), lambda t: path(t - 0.08), path)[1] is None
+
+
+def test_creep_after_a_step_is_no_drift() -> None:
+    moved = step(0.04)
+
+    def crept(t: float) -> float:
+        return moved(t) + 0.002 * (1 - np.exp(-t / 2)) + 0.002 * (1 - np.exp(-t / 20))
+
+    found = watched(30, lambda t: crept(t) * X, lambda t: moved(t) * X, lambda t: moved(t) * X)
+    assert found[1] is None
+
+
+def test_a_tip_that_does_not_move_when_it_should_is_doubted_after_a_few_millimetres() -> None:
+    moved = step(0.04)
+    time, doubt = watched(4, still, lambda t: moved(t) * X, lambda t: moved(t) * X)
+    assert doubt is not None
+    assert doubt.kind == "no-response"
+    assert "sensor has come off" in doubt.text
+    assert moved(time) < 0.018
+
+
+@pytest.mark.parametrize("way", [-X, Y, -0.5 * X + 0.8 * Y])
+def test_a_tip_that_moves_another_way_is_doubted(way: Array) -> None:
+    moved = step(0.04, lag=0.2)
+    time, doubt = watched(
+        4, lambda t: moved(t) * way, lambda t: moved(t) * X, lambda t: moved(t) * X
+    )
+    assert doubt is not None
+    assert doubt.kind == "no-response"
+    assert "channels are swapped" in doubt.text
+    assert moved(time) < 0.014
+
+
+@pytest.mark.parametrize(("speed", "within"), [(5e-3, 2.0), (2e-3, 6.0), (7e-4, 12.0)])
+def test_a_drift_that_the_loop_follows_is_doubted(speed: float, within: float) -> None:
+    time, doubt = watched(20, still, lambda t: -speed * max(t - 1, 0.0) * X, still)
+    assert doubt is not None
+    assert doubt.kind == "drift"
+    assert time - 1 < within
+    assert speed * (time - 1) < 0.0105
+
+
+def test_a_tip_that_shakes_is_doubted_within_a_second() -> None:
+    time, doubt = watched(3, lambda t: 0.01 * np.sin(6 * np.pi * t) * X, still, still)
+    assert doubt is not None
+    assert doubt.kind == "swing"
+    assert time < 1.0
+
+
+def test_swings_that_grow_are_doubted_while_they_are_small() -> None:
+    def growing(t: float) -> float:
+        return 1e-3 * np.exp(0.3 * t) * np.sin(2 * np.pi * t / 1.6)
+
+    time, doubt = watched(30, lambda t: growing(t) * X, still, still)
+    assert doubt is not None
+    assert doubt.kind == "swing"
+    assert 1e-3 * np.exp(0.3 * time) < 5e-3
+
+
+def test_a_doubt_stands_until_it_begins_anew() -> None:
+    watch = MotionWatch(LENGTH, MotionTuning())
+    for k in range(200):
+        time = k * FRAME
+        watch.intend(time, np.zeros(3))
+        watch.take(time, 0.005 * time * X, np.zeros(3))
+    assert watch.doubt is not None
+    watch.begin()
+    assert watch.doubt is None
+
+
+def test_nothing_is_doubted_while_nobody_steers() -> None:
+    watch = MotionWatch(LENGTH, MotionTuning())
+    for k in range(400):
+        watch.take(k * FRAME, 0.005 * k * FRAME * X, np.zeros(3))
+    assert watch.doubt is None
+
+
+def test_nothing_is_doubted_after_steering_has_ended() -> None:
+    watch = MotionWatch(LENGTH, MotionTuning())
+    watch.intend(0.0, np.zeros(3))
+    for k in range(400):
+        watch.take(k * FRAME, 0.02 * np.sin(k) * X, np.zeros(3))
+    assert watch.doubt is None
