@@ -16,8 +16,8 @@ posture tell no more than one. The estimate is the most likely z, by Gauss-Newto
 Windows age: sigma grows, and an arm that shows nothing new returns to its prior. z stays within
 three prior deviations in each coordinate.
 
-Of these, moduli, the mass and, where the robot file has gains, the gains are *applied*: they replace
-the numbers of the model that plans and controls. All else is left to the offset of the tip.
+Of these, moduli, the mass and, where the robot file has gains, the gains are *applied*: they
+replace the numbers of the model that plans and controls. All else is left to the tip's offset.
 """
 
 from __future__ import annotations

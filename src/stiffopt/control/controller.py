@@ -184,6 +184,7 @@ class TipController:
         self._at_rest = True  # the reference begins at the present pressures
         self._computed_at = now
         self._adapted_at = -math.inf  # when the model changed; not since the last request
+        self._watched_at = -math.inf  # when it was last looked whether the tip rests
         self._windows.begin()
         self._led_to: Target | None = None  # by a trajectory of pressures, now
 
@@ -420,24 +421,28 @@ class TipController:
 
     def _adapt(self, now: float) -> None:
         """Watch the tip at rest, and go on with other numbers of the arm when it is time."""
-        estimator, t = self._estimator, self._tuning.windows
-        estimate, sample, replanner = estimator.estimate, estimator.sample, self.replanner
-        resting = (
-            not self._is_held(now)
-            and replanner.pursuit.course is None
-            and self._has_arrived()
-            and sample is not None
-            and now - sample.time < t.seen
-            and float(np.abs(estimator.vibration[0]).max()) < t.vibration
-        )
-        rotation = estimate.rotation if estimator.turn_known else None
-        position = estimate.static + estimate.offset
-        self._windows.look(now, resting, self._pressures.effective, position, rotation)
-        known = replanner.known
-        if known is None or known.proposal is None or not self._windows.has_rested(now):
+        if now - self._watched_at < self._tuning.windows.every:
             return
-        if now - self._adapted_at > self._tuning.adaptation.calm_time:
+        self._watched_at = now
+        windows, known = self._windows, self.replanner.known
+        if self._rests(now):
+            windows.look(now, self._pressures.effective, self._estimator)
+        else:
+            windows.begin()
+        if known is None or known.proposal is None or not windows.has_rested(now):
+            return
+        if now - self._adapted_at > self._tuning.adaptation.interval:
             self._go_on_with(known.proposal)
+
+    def _rests(self, now: float) -> bool:
+        """Whether the arm is at rest, steered, and seen."""
+        estimator, t = self._estimator, self._tuning.windows
+        sample = estimator.sample
+        if sample is None or now - sample.time > t.seen or self._is_held(now):
+            return False
+        if self.replanner.pursuit.course is not None or not self._has_arrived():
+            return False
+        return float(np.abs(estimator.vibration[0]).max()) < t.vibration
 
     def _go_on_with(self, adapted: Adapted) -> None:
         """Go on with other numbers of the arm, so that nothing moves at this moment.
@@ -471,9 +476,10 @@ class TipController:
         if plan is None:
             return False
         n, tuning = len(plan.pressures), self._tuning.reference
-        ways = np.stack([reference.path[:n], reference.goal[:n]]) - plan.pressures
-        speed = np.abs(reference.motion[1, :n]).max()
-        return bool(np.abs(ways).max() <= tuning.there and speed <= tuning.at_rest)
+        for place in (reference.path, reference.goal):
+            if np.abs(place[:n] - plan.pressures).max() > tuning.there:
+                return False
+        return bool(np.abs(reference.motion[1, :n]).max() <= tuning.at_rest)
 
     def _set_reference_rate(self) -> None:
         tuning, rate = self._tuning.reference, self._tuning.reference.rigid_rate

@@ -129,6 +129,11 @@ class TipEstimator:
         )
 
     @property
+    def position(self) -> Array:
+        """Estimated position (3,) without the vibration, in m."""
+        return self._past[-1].static + self.offset[:3]
+
+    @property
     def vibration(self) -> Array:
         """Vibration and its speed (2, 3), in m and m/s."""
         return self._past[-1].driven + self._free

@@ -79,8 +79,8 @@ class ReferenceTuning:
     # reference are not evaluated again, in Pa
     model_range: float = 3e3
     # distance from the plan at which it has arrived, in Pa, and speed at which it rests, in Pa/s
-    there: float = 1e3
-    at_rest: float = 1e4
+    there: float = 5e3
+    at_rest: float = 5e4
 
 
 @dataclass(frozen=True)
@@ -160,9 +160,9 @@ class AdaptationTuning:
     memory: float = 1800.0  # time in which the deviation of a window's error grows e-fold, in s
     # change of an applied number, in prior deviations, below which it stays; largest one in a step
     least_step: float = 0.05
-    step: float = 0.5
-    # after a change of the model: time in s in which the plan is followed slowly, and with which
-    # share of the slew; the next change comes later, or with another target
+    step: float = 1.0
+    interval: float = 10.0  # between two changes of the model, in s, or until another target
+    # after such a change, time in s in which the plan is followed slowly, and share of the slew
     calm_time: float = 4.0
     slew_share: float = 0.1
     # distance in pressure after which the deviation of the stiffness is computed anew, in Pa
@@ -174,11 +174,12 @@ class AdaptationTuning:
 class WindowTuning:
     """When the tip is at rest, and how long it is averaged (`WindowWatch`)."""
 
-    wait: float = 1.0  # time at rest before a window, in s
-    duration: float = 1.5  # of a window, in s
+    every: float = 0.04  # between two looks, in s
+    wait: float = 0.6  # time at rest before a window, in s
+    duration: float = 0.8  # of a window, in s
     again: float = 10.0  # from a window to the next one of the same rest, in s
     # changes within a window above which it begins anew: of a pressure, in Pa, of the tip, in m
-    drift_pressure: float = 2e3
+    drift_pressure: float = 4e3
     drift_position: float = 3e-4
     vibration: float = 3e-4  # above which the tip is not at rest, in m
     seen: float = 0.3  # age of the latest sample above which it is not known, in s

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.adaptation import Window
+from stiffopt.control.estimator import TipEstimator
 from stiffopt.control.tuning import WindowTuning
 
 Array = NDArray[np.float64]
@@ -28,43 +29,36 @@ class WindowWatch:
         """Begin to wait for rest; windows stay."""
         self._rested: float | None = None  # since when
         self._since = 0.0  # since when the next window is waited for
-        self._count = 0
         self._first: Array | None = None
 
     def has_rested(self, now: float) -> bool:
         """Whether the arm has rested for long enough to be looked at."""
         return self._rested is not None and now - self._rested >= self._tuning.wait
 
-    def look(
-        self, now: float, resting: bool, pressures: Array, position: Array, rotation: Array | None
-    ) -> None:
-        """Take in the tip of a tick: effective pressures (n,), position (3,), rotation (3, 3)."""
+    def look(self, now: float, pressures: Array, estimator: TipEstimator) -> None:
+        """Look at an arm at rest, at effective pressures (n,), and at its estimated tip."""
         t = self._tuning
-        if not resting:
-            self.begin()
-            return
         if self._rested is None:
             self._rested = self._since = now
         if now - self._since < t.wait:
             return
-        values = np.concatenate([pressures, position])
+        n, values = len(pressures), np.concatenate([pressures, estimator.position])
         if not np.isfinite(values).all():
             return
-        n = len(pressures)
         if self._first is None:
-            self._first, self._sum, self._begun = values, np.zeros_like(values), now
+            self._first, self._sum, self._count, self._begun = values, 0 * values, 0, now
         moved = np.abs(values - self._first)
         if moved[:n].max() > t.drift_pressure or moved[n:].max() > t.drift_position:
             self._first = None  # it creeps still
-            self._count = 0
             return
         self._sum += values
         self._count += 1
         if now - self._begun < t.duration:
             return
         mean = self._sum / self._count
+        rotation = estimator.estimate.rotation if estimator.turn_known else None
         self._add(Window(now, mean[:n], mean[n:], rotation))
-        self._first, self._count, self._since = None, 0, now + t.again
+        self._first, self._since = None, now + t.again
 
     def _add(self, window: Window) -> None:
         """Add a window in place of those of its posture, or of the oldest one if there are many.
