@@ -36,6 +36,7 @@ Array = NDArray[np.float64]
 REST, BEFORE, AFTER = 3.0, 4.0, 16.0  # s: at the first target, with the fault there, and after
 DOUBTS = (
     "no-response",
+    "slip",
     "drift",
     "swing",
     "implausible",
@@ -75,6 +76,27 @@ def _push(*force: float) -> Callable[[LoopRun], object]:
     return lambda run: run.rig.world.plant.set_load(PlantLoad(force=force))
 
 
+def _push_halfway(force: float) -> Callable[[LoopRun], object]:
+    def push(run: LoopRun) -> None:
+        at = run.rig.robot.length / 2
+        run.rig.world.plant.set_load(PlantLoad(force=(force, 0.0, 0.0), at=at))
+
+    return push
+
+
+def _slipped(*way: float) -> Callable[[LoopRun], object]:
+    """Move the sensor on the tip, in its own axes."""
+
+    def slip(run: LoopRun) -> None:
+        camera = run.rig.world.camera
+        see = camera._sensor_in_tracker
+        moved = np.eye(4)
+        moved[:3, 3] = way
+        camera._sensor_in_tracker = lambda: see() @ moved
+
+    return slip
+
+
 def _nothing(run: LoopRun) -> None:
     pass
 
@@ -96,10 +118,12 @@ ROWS = (
     Row("channels 1 and 4 swapped", _swapped(3, 1, 2, 0), at_once=True),
     Row("sensor has come off, lies still", _tracker("loose"), shows_in_motion=True),
     Row("tracker drifts by 5 mm/s", _tracker("drifting")),
+    Row("sensor slips by 10 mm", _slipped(0.006, -0.008, 0.0)),
     Row("tracker's frame turns by 3 deg/s", _tracker("turning")),
     Row("tracker is 0.1 s later every second", _tracker("lagging"), shows_in_motion=True),
     Row("tip shakes by 10 mm at 3 Hz", _tracker("shaking")),
     Row("a push of 20 mN", _push(0.02, 0.0, 0.0), is_fault=False),
+    Row("a push of 30 mN halfway along", _push_halfway(0.03), is_fault=False),
     Row("a push of 50 mN", _push(0.0, -0.05, 0.0), is_fault=False),
     Row("a payload of 10 g", _push(0.0, 0.0, 0.0981), is_fault=False),
     Row("tracker noise of 0.15 mm", _nothing, is_fault=False, noise=1.5e-4),

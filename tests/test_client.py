@@ -554,7 +554,9 @@ def test_a_program_that_fails_leaves_the_arm_held(loop: FakeLoop, server: Server
 
     with pytest.raises(ZeroDivisionError):
         program()
-    assert loop.calls[1:] == [("hold", "the client ended by ZeroDivisionError")]
+    assert loop.calls[1] == ("hold", "the client ended by ZeroDivisionError")
+    assert loop.calls[2][0] == "hold"  # one that ends, since nobody is left who would end it
+    assert "has given control back" in loop.calls[2][1]
     with Client(server.url, TOKEN) as other:
         other.take_control()  # it is free
 

@@ -22,7 +22,7 @@ from stiffopt.identify.structures import STRUCTURES
 from stiffopt.identify.validation import validate
 from stiffopt.logs import Log, StiffnessTable
 from stiffopt.model.description import RobotDescription, Tolerances
-from stiffopt.model.history import History, Play
+from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.robot_files import load_description
@@ -109,6 +109,26 @@ def test_it_predicts_another_day(kind: str) -> None:
     assert found.errors.n == 400
     (before,) = validate(ONE, [("b.csv", log_of(kind, seed=2, duration=40.0))])
     assert before.errors.mean > 5e-3
+
+
+def test_play_of_elongation_is_found_and_chosen() -> None:
+    """An arm that keeps more of its elongation than of its bending, and creeps."""
+    plays = (Play(width=10 * KPA, share=0.15), Play(width=40 * KPA, share=0.4, of="elongation"))
+    history = History(lag=0.5, lag_falling=0.8, play=plays, creep=(Creep(time=20.0, share=0.1),))
+    robot = with_history(true_robot("static"), history)
+    first, second = (
+        ("log.csv", made_log(robot, *course(3, 60.0, seed, rate=5.0), base=BASE, noise=3e-4))
+        for seed in (1, 2)
+    )
+    errors = []
+    for name in ("creep", "elongation-hysteresis"):
+        few = settings(name, holds_back=False, rows=150, start_rows=50, rounds=1)
+        result = calibrate(ONE, [first], settings=few)
+        errors.append(validate(result.robot, [second])[0].errors.mean)
+    assert errors[1] < 0.8e-3
+    assert errors[1] < 0.5 * errors[0]
+    (found,) = (p for p in result.robot.segments[0].history.play if p.of == "elongation")
+    assert found.share == pytest.approx(0.4, abs=0.1)
 
 
 def test_registration_is_found_with_orientations() -> None:

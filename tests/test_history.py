@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from independent import FLOP
 from stiffopt.errors import InputError
 from stiffopt.model.description import Segment
-from stiffopt.model.history import NO_HISTORY, Creep, History, Memory, Play
+from stiffopt.model.history import NO_HISTORY, Creep, History, Memory, Part, Play
 
 Vector = NDArray[np.float64]
 
@@ -312,6 +312,98 @@ def test_a_copy_goes_its_own_way() -> None:
     assert memory.advance(0.3, [80 * KPA]) == same.advance(0.3, [80 * KPA])
 
 
+# -- elongation and bending -------------------------------------------------------------------
+
+
+def of_part(of: Part, **others: Any) -> History:
+    plays = [play.model_copy(update={"of": of}) for play in PLAYS]
+    creeps = [creep.model_copy(update={"of": of}) for creep in CREEPS]
+    return History(play=plays, creep=creeps, **others)
+
+
+def of_segment(history: History, path: Vector, step: float = 1.0) -> Vector:
+    """Effective pressures (m, c) of the channels of one segment, from rest."""
+    channels = path.shape[1]
+    return Memory([history] * channels, range(channels)).run(step, path)
+
+
+PATH = np.random.default_rng(6).uniform(0, 100 * KPA, (40, 3))
+AWAY = PATH - PATH.mean(axis=1, keepdims=True)
+
+
+def test_each_part_has_its_own_memory() -> None:
+    """Of pressures that are all alike, and of such whose mean is zero."""
+    alike = np.repeat(PATH[:, :1], 3, axis=1)
+    own = of_segment(of_part("pressure"), alike)
+    assert of_segment(of_part("elongation"), alike) == pytest.approx(own)
+    assert of_segment(of_part("bending"), alike) == pytest.approx(alike)
+    assert of_segment(of_part("elongation"), AWAY) == pytest.approx(AWAY)
+    bent = of_segment(of_part("bending"), AWAY)
+    assert np.abs(bent - AWAY).max() > 5 * KPA
+    own = of_segment(of_part("pressure"), AWAY)
+    assert bent == pytest.approx(own - own.mean(axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("of", ["elongation", "bending"])
+def test_neither_part_moves_the_other(of: Part) -> None:
+    held = of_segment(of_part(of), PATH) - PATH
+    mean = held.mean(axis=1, keepdims=True)
+    none = mean if of == "bending" else held - mean
+    assert np.abs(none).max() < 1e-6
+    history = of_part(of)
+    most = history.largest_memory + 100 * KPA * 0.15 * (1 + (of == "bending"))  # and creep's share
+    assert 5 * KPA < np.abs(held).max() < most
+
+
+def test_creep_of_all_parts_is_that_of_pressure() -> None:
+    """Being linear, unlike play."""
+    every = of_segment(History(lag=0.3, creep=CREEPS), PATH)
+    creeps = [c.model_copy(update={"of": of}) for c in CREEPS for of in ("elongation", "bending")]
+    assert of_segment(History(lag=0.3, creep=creeps), PATH) == pytest.approx(every)
+
+
+def test_deflated_chambers_stay_stretched() -> None:
+    """All of 90, then two at none, then none: with a play of 10 of elongation, half of it."""
+    history = History(play=[Play(width=10, share=0.5, of="elongation")])
+    found = of_segment(history, np.array([[90.0, 90, 90], [90, 0, 0], [0, 0, 0]]))
+    # the operator is at 80, 40 and 10; half of what it is away from the mean acts on all
+    assert found == pytest.approx(np.array([[85.0, 85, 85], [95, 5, 5], [5, 5, 5]]))
+
+
+def test_parts_may_be_cut_into_any_steps_and_settle_in_the_middle() -> None:
+    histories = [of_part(of, lag=0.3, dead_time=0.37) for of in ("elongation", "bending")]
+    path, places = np.hstack([PATH[:8], PATH[8:16]]), [0, 1, 2, 0, 1, 2]
+    each = [histories[0]] * 3 + [histories[1]] * 3
+    whole, cut = Memory(each, places), Memory(each, places)
+    for p in path:
+        expected = whole.advance(0.9, p)
+        for _ in range(7):
+            found = cut.advance(0.9 / 7, p)
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-6)
+    whole.settle(path[0], 1.0)
+    assert whole.effective == pytest.approx(path[0])
+    assert whole.advance(2.0, path[0]) == pytest.approx(path[0])
+
+
+def test_segments_and_lone_channels_know_nothing_of_each_other() -> None:
+    history = of_part("elongation")
+    path = np.hstack([PATH, PATH[::-1], PATH[:, :1]])
+    found = Memory([history] * 7, [0, 1, 2, 0, 1, 2, 0]).run(1.0, path)
+    assert found[:, :3] == pytest.approx(of_segment(history, PATH))
+    assert found[:, 3:6] == pytest.approx(of_segment(history, PATH[::-1]))
+    alone = Memory([of_part("pressure")]).run(1.0, PATH[:, :1])
+    assert found[:, 6:] == pytest.approx(alone)
+
+
+def test_shares_count_for_what_they_act_on() -> None:
+    parts = [Play(width=1e4, share=0.6, of=of) for of in ("elongation", "bending")]
+    assert History(play=parts).shares == (0.6, 0.6)
+    assert History(play=parts[:1]).quick_share == pytest.approx(1 - 0.6 / 3)
+    assert History(play=parts[1:]).quick_share == pytest.approx(1 - 0.6 * 2 / 3)
+    with pytest.raises(InputError, match=r"add up to 1\.1;"):
+        History(play=[*parts, Play(width=1e4, share=0.5)])
+
+
 # -- mistakes -------------------------------------------------------------------------------
 
 
@@ -344,6 +436,7 @@ def test_what_a_memory_refuses() -> None:
         ({"play": [{"width": 1e4, "share": -0.1}]}, "share: must be at least 0"),
         ({"creep": [{"time": 0, "share": 0.1}]}, "time: must be greater than 0"),
         ({"creep": [{"time": 2, "share": 1}]}, "share: must be less than 1"),
+        ({"play": [{"width": 1e4, "share": 0.1, "of": "twist"}]}, "of: .*bending"),
         ({"lag": -0.1}, "lag: must be at least 0"),
         ({"dead_time": -0.1}, "dead_time: must be at least 0"),
         ({"delay": 0.1}, "delay"),

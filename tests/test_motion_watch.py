@@ -8,15 +8,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from stiffopt import lie
 from stiffopt.control.motion_watch import Doubt, MotionWatch
 from stiffopt.control.tuning import MotionTuning
+from stiffopt.model.manipulator import load_robot
+from stiffopt.optimise.tip import TipModel
 
 Array = NDArray[np.float64]
 
-LENGTH = 0.18  # m
 FRAME = 0.025  # s
 NOISE = 5e-5  # m
 X, Y = np.eye(3)[:2]
+ROBOT = load_robot("stiff-flop-2")
+P = np.array([4e4, 0.0, 2e4, 0.0, 5e4, 0.0])
+TIP = TipModel(ROBOT).at(P)
+J = TIP.pose[:3, :3] @ TIP.jacobian[:3]
+NONE = np.zeros(6)  # no offset
+
+
+def take(watch: MotionWatch, time: float, seen: Array, predicted: Array, offset: Array) -> None:
+    """Have a sample watched, at the least pressures that make the model move as predicted."""
+    pressures = np.linalg.pinv(J) @ predicted
+    watch.take(time, seen, predicted, offset, pressures, TIP, turns=bool(offset.any()))
 
 
 def watched(
@@ -27,11 +40,11 @@ def watched(
 ) -> tuple[float, Doubt | None]:
     """When and what the watch doubts of a tip that is sampled for so many seconds."""
     rng = np.random.default_rng(1)
-    watch = MotionWatch(LENGTH, MotionTuning())
+    watch = MotionWatch(ROBOT.description, MotionTuning())
     for time in np.arange(0.0, duration, FRAME):
         watch.intend(time, intended(time))
         noise = NOISE * rng.standard_normal(3)
-        watch.take(time, seen(time) + noise, predicted(time))
+        take(watch, time, seen(time) + noise, predicted(time), NONE)
         if watch.doubt is not None:
             return float(time), watch.doubt
     return np.inf, None
@@ -132,26 +145,68 @@ def test_swings_that_grow_are_doubted_while_they_are_small() -> None:
 
 
 def test_a_doubt_stands_until_it_begins_anew() -> None:
-    watch = MotionWatch(LENGTH, MotionTuning())
+    watch = MotionWatch(ROBOT.description, MotionTuning())
     for k in range(200):
         time = k * FRAME
         watch.intend(time, np.zeros(3))
-        watch.take(time, 0.005 * time * X, np.zeros(3))
+        take(watch, time, 0.005 * time * X, -0.005 * time * X, NONE)
     assert watch.doubt is not None
     watch.begin()
     assert watch.doubt is None
 
 
 def test_nothing_is_doubted_while_nobody_steers() -> None:
-    watch = MotionWatch(LENGTH, MotionTuning())
+    watch = MotionWatch(ROBOT.description, MotionTuning())
     for k in range(400):
-        watch.take(k * FRAME, 0.005 * k * FRAME * X, np.zeros(3))
+        take(watch, k * FRAME, 0.005 * k * FRAME * X, np.zeros(3), NONE)
     assert watch.doubt is None
 
 
 def test_nothing_is_doubted_after_steering_has_ended() -> None:
-    watch = MotionWatch(LENGTH, MotionTuning())
+    watch = MotionWatch(ROBOT.description, MotionTuning())
     watch.intend(0.0, np.zeros(3))
     for k in range(400):
-        watch.take(k * FRAME, 0.02 * np.sin(k) * X, np.zeros(3))
+        take(watch, k * FRAME, 0.02 * np.sin(k) * X, np.zeros(3), NONE)
+    assert watch.doubt is None
+
+
+def displaced(turned: float) -> Doubt | None:
+    """Doubt of a tip that is displaced by 10 mm and turned by a share of what a push turns it."""
+    force = TIP.pose[:3, :3] @ np.array([0.01, 0.004, 0.0])
+    pushed = ROBOT.loaded_tip_pose(P, [*force, 0.0, 0.0, 0.0])
+    moved = pushed[:3, 3] - TIP.pose[:3, 3]
+    turn = turned * lie.log(pushed @ np.linalg.inv(TIP.pose))[3:]
+    watch = MotionWatch(ROBOT.description, MotionTuning())
+    for time in np.arange(0.0, 3.0, FRAME):
+        offset = step(1.0, lag=0.05)(time) * np.concatenate([moved, turn])
+        watch.intend(time, np.zeros(3))
+        take(watch, time, np.zeros(3), -offset[:3], offset)  # the loop has made up for it
+    assert np.linalg.norm(moved) > 6e-3
+    return watch.doubt
+
+
+@pytest.mark.parametrize("turned", [0.67, 1.0, 1.35])
+def test_a_push_at_the_tip_or_along_the_body_is_no_slip(turned: float) -> None:
+    assert displaced(turned) is None
+
+
+@pytest.mark.parametrize("turned", [0.0, -1.0])
+def test_a_displacement_that_turns_nothing_is_a_slip(turned: float) -> None:
+    doubt = displaced(turned)
+    assert doubt is not None
+    assert doubt.kind == "slip"
+    assert "sensor has slipped" in doubt.text
+
+
+def test_segments_that_move_the_tip_against_each_other_may_miss_by_more() -> None:
+    """A new posture at nearly the same tip: each segment moves it by far more than both do."""
+    watch = MotionWatch(ROBOT.description, MotionTuning())
+    proximal = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+    way = np.linalg.pinv(J * proximal) * 0.03 @ X - np.linalg.pinv(J * (1 - proximal)) @ (0.022 * X)
+    moved = step(1.0)
+    for time in np.arange(0.0, 4.0, FRAME):
+        share = moved(time)
+        watch.intend(time, 0.008 * share * X)
+        seen = share * (0.008 * X + 0.008 * Y - 0.006 * X)
+        watch.take(time, seen, 0.008 * share * X, NONE, share * way, TIP, turns=False)
     assert watch.doubt is None

@@ -26,6 +26,12 @@ FULL = History(
     play=PLAYS,
     creep=CREEPS,
 )
+PARTS = FULL.model_copy(  # of pressure, of elongation and of bending
+    update={
+        "play": (PLAYS[0].model_copy(update={"of": "bending"}), PLAYS[1]),
+        "creep": (CREEPS[0], CREEPS[1].model_copy(update={"of": "elongation"})),
+    }
+)
 KINDS = {
     "none": History(),
     "lag": History(lag=0.3),
@@ -35,6 +41,8 @@ KINDS = {
     "lag and creep": History(lag=0.2, creep=CREEPS),
     "all but dead time": FULL.model_copy(update={"dead_time": 0.0}),
     "all": FULL,
+    "elongation": History(play=[play.model_copy(update={"of": "elongation"}) for play in PLAYS]),
+    "parts": PARTS,
 }
 SHARES = ("play[0].share", "play[1].share", "creep[0].share", "creep[1].share")
 SIDES = np.array([0.5, -0.2, 0.1])
@@ -124,32 +132,35 @@ def almost_everywhere(found: Array, expected: Array, share: float = 0.99) -> Non
     assert np.quantile(error, 0.5) < 1e-7
 
 
-@pytest.fixture(scope="module")
-def log() -> tuple[Array, Array, Start, Effective]:
+@pytest.fixture(scope="module", params=["all", "parts"])
+def log(request: pytest.FixtureRequest) -> tuple[History, Array, Array, Start, Effective]:
+    history = KINDS[request.param]
     time, pressures = course(1500, seed=3)
-    start = Start.settled(FULL, pressures[0] - 7 * KPA, SIDES)
-    return time, pressures, start, run(FULL, time, pressures, start)
+    start = Start.settled(history, pressures[0] - 7 * KPA, SIDES)
+    return history, time, pressures, start, run(history, time, pressures, start)
 
 
 @pytest.mark.parametrize("name", ["lag", "lag_falling", "dead_time"])
-def test_derivatives_by_times(name: str, log: tuple[Array, Array, Start, Effective]) -> None:
-    time, pressures, start, found = log
+def test_derivatives_by_times(
+    name: str, log: tuple[History, Array, Array, Start, Effective]
+) -> None:
+    history, time, pressures, start, found = log
 
     def at(change: float) -> Effective:
-        value = getattr(FULL, name) + change
-        return run(FULL.model_copy(update={name: value}), time, pressures, start)
+        value = getattr(history, name) + change
+        return run(history.model_copy(update={name: value}), time, pressures, start)
 
     almost_everywhere(found.per_number[name], difference(at, 1e-6))
 
 
 @pytest.mark.parametrize("j", range(4))
-def test_derivatives_by_shares(j: int, log: tuple[Array, Array, Start, Effective]) -> None:
-    time, pressures, start, found = log
+def test_derivatives_by_shares(j: int, log: tuple[History, Array, Array, Start, Effective]) -> None:
+    history, time, pressures, start, found = log
 
     def at(change: float) -> Effective:
-        parts: list[Any] = list(FULL.parts)
+        parts: list[Any] = list(history.parts)
         parts[j] = parts[j].model_copy(update={"share": parts[j].share + change})
-        changed = FULL.model_copy(update={"play": tuple(parts[:2]), "creep": tuple(parts[2:])})
+        changed = history.model_copy(update={"play": tuple(parts[:2]), "creep": tuple(parts[2:])})
         return run(changed, time, pressures, start)
 
     # u is linear in the shares
@@ -158,12 +169,12 @@ def test_derivatives_by_shares(j: int, log: tuple[Array, Array, Start, Effective
 
 
 @pytest.mark.parametrize("c", range(3))
-def test_derivatives_by_memory(c: int, log: tuple[Array, Array, Start, Effective]) -> None:
-    time, pressures, start, found = log
+def test_derivatives_by_memory(c: int, log: tuple[History, Array, Array, Start, Effective]) -> None:
+    history, time, pressures, start, found = log
 
     def at(change: float) -> Effective:
-        memory = [factor + change * (i == c) for i, factor in enumerate(FULL.memory)]
-        return run(FULL.model_copy(update={"memory": tuple(memory)}), time, pressures, start)
+        memory = [factor + change * (i == c) for i, factor in enumerate(history.memory)]
+        return run(history.model_copy(update={"memory": tuple(memory)}), time, pressures, start)
 
     expected = np.zeros_like(found.pressures)
     expected[:, c] = found.per_number[f"memory[{c}]"][:, c]

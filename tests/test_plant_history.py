@@ -11,12 +11,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from independent import FLOP, Arm, turn_z
 from references import free_tip
+from stiffopt.control.channels import Channels
+from stiffopt.control.regulators import PressureEstimator
+from stiffopt.control.tuning import RegulatorTuning
 from stiffopt.lie import log
 from stiffopt.model.description import Corrections, RobotDescription
 from stiffopt.model.history import Creep, History, Play
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.plant.plant import Plant, SimulationError
 from stiffopt.plant.settings import Discretisation, Mismatch, PlantSettings, Silicone
+from stiffopt.rig.interface import PressureLimits
+from stiffopt.rig.settings import ControlSettings
 
 Vector = NDArray[np.float64]
 
@@ -106,6 +111,35 @@ def test_the_same_command_from_above_and_from_below() -> None:
     for half in (slice(0, 3), slice(3, 6)):
         error = np.linalg.norm(apart[half] - expected[half])
         assert error < 0.1 * np.linalg.norm(expected[half])
+
+
+def test_deflated_chambers_stay_stretched_and_the_daemon_makes_up_for_it() -> None:
+    """One channel is kept after all were: what was let down of elongation stays by half."""
+    history = History(play=[Play(width=2e4, share=0.5, of="elongation")])
+    described = robot(ONE, history=history)
+    plant = make(described)
+    control = ControlSettings(regulator_lag=0.0, regulator_dead_time=0.0)
+    fast, tuning = np.full(3, 1e9), RegulatorTuning()
+    limits = PressureLimits(np.zeros(3), np.full(3, 2 * BAR))
+    channels = Channels(limits, fast, np.full(3, 1e4), tuning)
+    estimator = PressureEstimator(described, control, 0.1, fast, tuning, channels)
+
+    def command(p: Vector) -> None:
+        plant.advance(0.1, p)
+        estimator.advance(1, p, p)
+
+    full, kept = BAR * np.array([0.9, 0.9, 0.9]), BAR * np.array([0.9, 0.0, 0.0])
+    command(full)
+    assert plant.tip_pose() == pytest.approx(free_tip(ONE, full - 0.5 * 2e4), abs=1e-6)
+    command(kept)
+    assert plant.tip_pose() == pytest.approx(free_tip(ONE, kept + 0.5 * 2e4), abs=1e-6)
+    command(np.zeros(3))
+    assert plant.tip_pose()[2, 3] - free_tip(ONE, np.zeros(3))[2, 3] > 1e-3
+    for wanted in (kept + 0.2 * BAR, full, kept + 0.3 * BAR):
+        for _ in range(20):  # what is held back changes with the command
+            command(wanted - estimator.command_offset)
+        assert estimator.effective == pytest.approx(wanted, abs=1.0)
+        assert plant.tip_pose() == pytest.approx(free_tip(ONE, wanted), abs=1e-5)
 
 
 def test_to_settle_is_to_rise_slowly_from_rest() -> None:

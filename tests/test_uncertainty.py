@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stiffopt.errors import InputError, PressureError
 from stiffopt.model.calibration import Calibration, FittedParameter
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.history import History, Memory, Play
+from stiffopt.model.history import History, Memory, Part, Play
 from stiffopt.model.manipulator import Manipulator, load_robot
 from stiffopt.model.parameters import Parameter, with_values
 from stiffopt.model.robot_files import load_description
@@ -206,6 +206,32 @@ def test_digits_that_the_file_leaves_out_make_no_variance_negative() -> None:
 # Hysteresis --------------------------------------------------------------------------------------
 
 
+def of_channel(
+    channel: int, pressure: float, low: float, high: float, history: History = HYSTERESIS
+) -> tuple[float, float]:
+    ends = settled_range(history, *np.array([[pressure], [low], [high]]), channel)
+    return float(ends[0][0]), float(ends[1][0])
+
+
+@pytest.mark.parametrize("of", ["elongation", "bending"])
+def test_no_way_ends_beyond_what_elongation_or_bending_remembers(of: Part) -> None:
+    plays = [Play(width=w, share=0.2, of=of) for w in (3e3, 12e3, 40e3)]
+    history, rng = History(memory=(0.5, 1.0, 1.5), play=plays), np.random.default_rng(3)
+    memory = Memory([history] * 3, [0, 1, 2])
+    low, high = np.array([0.0, -2e4, 0.0]), np.array([1e5, 6e4, 8e4])
+    for p in rng.uniform(low, high, (5, 3)):
+        least, most = settled_range(history, p, low, high)
+        reached = []
+        for way in rng.uniform(low, high, (60, 5, 3)):
+            corners = np.where(way > (low + high) / 2, high, low)
+            memory.start(np.zeros(3))
+            reached.append(memory.run(1.0, np.vstack([corners, p]))[-1])
+        assert (least <= np.min(reached, axis=0) + 1e-6).all()
+        assert (np.max(reached, axis=0) <= most + 1e-6).all()
+        if of == "elongation":  # two of the corners reach the ends
+            assert np.ptp(reached, axis=0) == pytest.approx(most - least)
+
+
 @pytest.mark.parametrize("limits", [(0.0, 1e5), (0.2e5, 1e5), (-0.3e5, 1e5), (0.0, 0.15e5)])
 @pytest.mark.parametrize("channel", [0, 1, 2])
 def test_no_way_to_a_pressure_ends_beyond_what_is_possible(
@@ -216,7 +242,7 @@ def test_no_way_to_a_pressure_ends_beyond_what_is_possible(
     memory = Memory([HYSTERESIS], [channel])
     for share in (0.0, 0.05, 0.3, 0.8, 1.0):
         p = low + share * (high - low)
-        least, most = settled_range(HYSTERESIS, channel, p, low, high)
+        least, most = of_channel(channel, p, low, high)
         assert least <= most
         ends = []
         for _ in range(60):
@@ -234,12 +260,11 @@ def test_no_way_to_a_pressure_ends_beyond_what_is_possible(
 def test_hysteresis_is_one_sided_at_the_limits_and_whole_between_them() -> None:
     factor, total = 1.5, 0.1 * 3e3 + 0.15 * 12e3 + 0.05 * 40e3
     for p in (41e3, 69e3):  # a width from rest, and two from the upper limit
-        ends = settled_range(HYSTERESIS, 2, p, 0.0, 1.5e5)
+        ends = of_channel(2, p, 0.0, 1.5e5)
         assert ends == pytest.approx((p - factor * total, p + factor * total))
-    assert settled_range(HYSTERESIS, 2, 0.0, 0.0, 1e5) == pytest.approx((0.0, factor * total))
-    least, most = settled_range(HYSTERESIS, 2, 1e5, 0.0, 1e5)
-    assert (least, most) == pytest.approx((1e5 - factor * total,) * 2)
-    assert settled_range(History(), 0, 3e4, 0.0, 1e5) == (3e4, 3e4)
+    assert of_channel(2, 0.0, 0.0, 1e5) == pytest.approx((0.0, factor * total))
+    assert of_channel(2, 1e5, 0.0, 1e5) == pytest.approx((1e5 - factor * total,) * 2)
+    assert of_channel(0, 3e4, 0.0, 1e5, History()) == (3e4, 3e4)
 
 
 @pytest.mark.parametrize("p", [P, np.array([0.02e5, 0.0, 0.6e5]), np.array([1.5e5, 0.0, 0.3e5])])
@@ -251,7 +276,7 @@ def test_hysteresis_moves_the_tip_as_drawn_effective_pressures_do(p: Array) -> N
     rng = np.random.default_rng(2)
     low, high = robot.pressure_min, robot.pressure_max
     u = np.column_stack(
-        [rng.uniform(*settled_range(small, c, p[c], low[c], high[c]), 20_000) for c in range(3)]
+        [rng.uniform(*of_channel(c, p[c], low[c], high[c], small), 20_000) for c in range(3)]
     )
     # channel by channel: the part knows only each one's mean square, about the equilibrium
     expected = np.zeros((3, 3))
@@ -270,7 +295,7 @@ def test_hysteresis_widens_the_interval_of_the_stiffness() -> None:
     low, high = arm.tip_uncertainty(P).stiffness_interval(DIRECTION)
     variance = 0.0
     for c in range(3):
-        least, most = settled_range(HYSTERESIS, c, P[c], 0.0, arm.description.pressure_max[c])
+        least, most = of_channel(c, P[c], 0.0, arm.description.pressure_max[c])
         step = np.eye(3)[c] * 10.0
         slope = np.log(arm.stiffness(P + step, DIRECTION) / arm.stiffness(P - step, DIRECTION)) / 20
         variance += slope**2 * np.mean((np.linspace(least, most, 10_001) - P[c]) ** 2)

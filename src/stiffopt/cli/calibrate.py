@@ -129,7 +129,7 @@ def calibrate(
         typer.Option(
             metavar="NAME",
             help="auto, or one of static, lag, hysteresis, creep, progressive, progressive-creep, "
-            "channel-hysteresis.",
+            "channel-hysteresis, elongation-hysteresis.",
         ),
     ] = "auto",
     strain_law: Annotated[

@@ -142,7 +142,7 @@ class TipController:
         self._errors = TipErrors()
         self._windows = WindowWatch(tuning.windows)
         self._adapts = control.adaptation != "none"
-        self._watch = MotionWatch(robot.length, tuning.motion)
+        self._watch = MotionWatch(robot.description, tuning.motion)
         self._model: LinearisedTip | None = None  # at the effective pressures
         self._path_model: LinearisedTip | None = None  # on the reference's path
         self._waypoint_model: TipModel | None = None  # at a trajectory's waypoints
@@ -339,7 +339,10 @@ class TipController:
         counts = self._estimator.take(samples)
         sample = self._estimator.sample
         if counts.used and sample is not None:
-            self._watch.take(sample.time, sample.position, self._estimator.predicted)
+            self._watch.take(
+                sample.time, sample.position, self._estimator.predicted, self._estimator.offset,
+                effective, tip, turns=self._estimator.turn_known,
+            )  # fmt: skip
         if self.forecast is not None:
             self.forecast.present = self._present(now)
         return counts

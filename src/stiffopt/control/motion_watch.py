@@ -1,14 +1,17 @@
 """Whether the tip moves as the pressures say: what makes the loop doubt its tracker or its arm.
 
-The tip is seen at y, the model predicts it at s, and the reference intends it to be at r. Three
+The tip is seen at y, the model predicts it at s, and the reference intends it to be at r. Four
 tests look for what no push, payload or error of a model explains:
 
 * response: r has moved, and y not along with s, but elsewhere or not at all;
+* slip: the offset d of the estimator has changed, and the orientation's offset has not turned as an
+  arm does that something bends by d: about 3 d / (2 length), or at least two thirds of that;
 * drift: y - s moves on and on, faster than the model's error can change on the way of s;
 * swing: y - r swings, and the swings do not decay.
 
 A push or a payload moves y - s too, but then it rests. What creeps is seen at three time scales.
-The model may be wrong by a share of each motion.
+The model may be wrong by a share of what each segment moves the tip, also where two of them move it
+against each other.
 """
 
 from __future__ import annotations
@@ -21,11 +24,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.tip_errors import turn_of_a_push
 from stiffopt.control.tuning import DriftScale, MotionTuning
+from stiffopt.model.description import RobotDescription
+from stiffopt.optimise.tip import TipAt
 
 Array = NDArray[np.float64]
 
 _TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # of a row
+_OFFSET, _TURN, _PRESSURES = slice(10, 13), slice(13, 16), slice(16, None)
 
 
 @dataclass(frozen=True)
@@ -34,7 +41,7 @@ class Doubt:
 
     Attributes
     ----------
-    kind : ``no-response``, ``drift`` or ``swing``.
+    kind : ``no-response``, ``slip``, ``drift`` or ``swing``.
     text : the likeliest causes and what to do, for people.
     """
 
@@ -47,8 +54,8 @@ class MotionWatch:
 
     Parameters
     ----------
-    length :
-        Of the arm, in m.
+    robot :
+        The arm.
     tuning :
         Sizes and times of the tests.
 
@@ -57,17 +64,21 @@ class MotionWatch:
     doubt : what is doubted; it stands until `begin`.
     """
 
-    def __init__(self, length: float, tuning: MotionTuning) -> None:
+    def __init__(self, robot: RobotDescription, tuning: MotionTuning) -> None:
         self._tuning = tuning
-        self._least = max(tuning.least_motion, tuning.least_motion_share * length)
+        self._least = max(tuning.least_motion, tuning.least_motion_share * robot.length)
+        ends = np.cumsum([segment.n_channels for segment in robot.segments]).tolist()
+        self._segments = [slice(a, b) for a, b in pairwise([0, *ends])]
         longest = max(scale.interval * scale.count for scale in tuning.scales)
         self._kept = round(longest / tuning.spacing) + 2
-        self._rows: Array = np.empty((2 * self._kept, 10))  # samples: see `_SEEN` and the others
+        self._rows: Array = np.empty(
+            (2 * self._kept, 16 + ends[-1])
+        )  # samples: see `_SEEN` and others
         self.begin()
 
     def begin(self) -> None:
         """Start anew."""
-        self._count = self._misses = 0
+        self._count = self._misses = self._slips = 0
         self._path = 0.0  # that r has gone, in m
         self._intended: deque[tuple[float, Array]] = deque(maxlen=self._kept)
         self._swings = [_Swings(self._tuning) for _ in range(3)]
@@ -81,21 +92,51 @@ class MotionWatch:
         """Note where the reference intends the tip to be (3,), in each tick that is steered."""
         self._intended.append((now, position))
 
-    def take(self, time: float, seen: Array, predicted: Array) -> None:
-        """Take in a sample (3,) and the model's prediction (3,) for the moment of its capture."""
+    def take(
+        self,
+        time: float,
+        seen: Array,
+        predicted: Array,
+        offset: Array,
+        pressures: Array,
+        tip: TipAt,
+        *,
+        turns: bool,
+    ) -> None:
+        """Take in a sample of the tracker.
+
+        Parameters
+        ----------
+        time :
+            Of its capture, in s.
+        seen, predicted :
+            Position (3,) in the sample and as the model predicts it for that moment, in m.
+        offset :
+            Of the tip's pose from the model's (6,), in m and rad, as it is estimated.
+        pressures :
+            Effective ones (n,), in Pa.
+        tip :
+            The model's tip at these.
+        turns :
+            Whether the tracker measures orientations.
+        """
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
             return
         if self._count == len(self._rows):
             self._rows[: self._kept] = self._rows[-self._kept :]
             self._count = self._kept
-        self._rows[self._count] = (time, *seen, *predicted, *intended)
+        self._rows[self._count] = (time, *seen, *predicted, *intended, *offset, *pressures)
         self._count += 1
         if self._count > 1:
             self._path += float(np.linalg.norm(intended - self._rows[self._count - 2, _INTENDED]))
         for swings, error in zip(self._swings, (seen - intended).tolist(), strict=True):
             swings.take(_Turn(time, error, self._path))
-        self.doubt = self._no_response() or self._drift() or self._swing()
+        jacobian = tip.pose[:3, :3] @ tip.jacobian[:3]
+        self.doubt = self._no_response(jacobian)
+        if turns:
+            self.doubt = self.doubt or self._slip(jacobian, tip)
+        self.doubt = self.doubt or self._drift(jacobian) or self._swing()
 
     def _is_early(self, time: float) -> bool:
         last = self._rows[self._count - 1, _TIME] if self._count else -np.inf
@@ -108,11 +149,22 @@ class MotionWatch:
         return None
 
     def _since(self, duration: float) -> Array:
-        """Samples (k, 10) of the last so many seconds."""
+        """Samples (k, 16 + n) of the last so many seconds."""
         rows = self._rows[: self._count]
         return rows[np.searchsorted(rows[:, _TIME], rows[-1, _TIME] - duration) :]
 
-    def _no_response(self) -> Doubt | None:
+    def _explained(self, changes: Array, jacobian: Array) -> Array:
+        """Errors (k,) of the model's motion that are no surprise, in m.
+
+        `changes` (k, 16 + n) of samples; Jacobian (3, n) of the tip's position, base axes.
+        """
+        moved = np.zeros(len(changes))
+        for channels in self._segments:
+            motion = changes[:, _PRESSURES][:, channels] @ jacobian[:, channels].T
+            moved += np.sqrt((motion**2).sum(axis=1))
+        return self._tuning.model_error * moved
+
+    def _no_response(self, jacobian: Array) -> Doubt | None:
         """The tip was to move, and the model has it moved, but it is not seen to."""
         tuning, rows = self._tuning, self._since(self._tuning.response_window)
         ways = rows[-1] - rows[:-1]
@@ -124,7 +176,13 @@ class MotionWatch:
         wrong = (along < tuning.least_response * distance) | (
             across > tuning.most_across * distance
         )
-        missed = np.flatnonzero(meant & wrong & (distance > self._least))
+        suspects = np.flatnonzero(meant & wrong & (distance > self._least))
+        off = np.sqrt(((seen - way)[suspects] ** 2).sum(axis=1))
+        steps = np.diff(rows, axis=0)
+        speeds = np.sqrt((steps[:, _PREDICTED] ** 2).sum(axis=1)) / steps[:, _TIME]
+        late = tuning.late * (speeds[suspects] + speeds[-1:])  # y than s, in m
+        explained = self._explained(ways[suspects], jacobian) + late + tuning.noise
+        missed = suspects[off > explained]
         self._misses = self._misses + 1 if len(missed) else 0
         if self._misses < tuning.misses:
             return None
@@ -143,10 +201,32 @@ class MotionWatch:
             )
         return Doubt("no-response", f"{text}{':' if moved < most / 2 else ''} {causes}")
 
-    def _drift(self) -> Doubt | None:
+    def _slip(self, jacobian: Array, tip: TipAt) -> Doubt | None:
+        """The offset has changed as no force, wherever it acts, changes it."""
+        tuning, rows = self._tuning, self._since(self._tuning.slip_window)
+        ways = rows[-1] - rows
+        moved, turned = ways[0, _OFFSET], ways[0, _TURN]
+        wrong = False
+        if float(np.linalg.norm(moved)) > self._least + self._explained(ways, jacobian).max():
+            bent = turn_of_a_push(tip) @ moved
+            missing = float(np.linalg.norm(bent - turned))
+            size = float(np.linalg.norm(bent))
+            wrong = missing > tuning.slip * size and missing > tuning.least_turn
+        self._slips = self._slips + 1 if wrong else 0
+        if self._slips < tuning.slips:
+            return None
+        distance = 1e3 * float(np.linalg.norm(moved))
+        return Doubt(
+            "slip",
+            f"the tip seems to have been displaced by {distance:.1f} mm without being turned, as "
+            "no push or payload does it: the sensor has slipped, or tracker or base have been "
+            "moved; run 'stiffopt commission'",
+        )
+
+    def _drift(self, jacobian: Array) -> Doubt | None:
         """The tip moves on without a cause in the pressures."""
         for scale in self._tuning.scales:
-            if speed := self._drift_speed(scale):
+            if speed := self._drift_speed(scale, jacobian):
                 return Doubt(
                     "drift",
                     f"the tip seems to move on at {1e3 * speed:.1f} mm/s although its pressures do "
@@ -155,7 +235,7 @@ class MotionWatch:
                 )
         return None
 
-    def _drift_speed(self, scale: DriftScale) -> float:
+    def _drift_speed(self, scale: DriftScale, jacobian: Array) -> float:
         """Speed of a drift that has lasted for all intervals of a scale, in m/s, or 0."""
         duration = scale.interval * scale.count
         first = self._rows[0, _TIME] if self._count else np.inf
@@ -164,14 +244,11 @@ class MotionWatch:
         rows = self._since(duration)
         ends = rows[-1, _TIME] - scale.interval * np.arange(scale.count, -1, -1)
         marks = rows[np.minimum(np.searchsorted(rows[:, _TIME], ends), len(rows) - 1)]
-        offsets, ways = (
-            marks[:, _SEEN] - marks[:, _PREDICTED],
-            np.diff(marks[:, _PREDICTED], axis=0),
-        )
+        offsets = marks[:, _SEEN] - marks[:, _PREDICTED]
         drift = offsets[-1] - offsets[0]
         size = float(np.linalg.norm(drift))
         along = np.diff(offsets, axis=0) @ drift / max(size, 1e-9)
-        explained = self._tuning.model_error * np.linalg.norm(ways, axis=1)
+        explained = self._explained(np.diff(marks, axis=0), jacobian)
         if (along - explained < scale.least_speed * scale.interval).any():
             return 0.0
         return size / duration

@@ -147,6 +147,18 @@ def wrench_at(tip: TipAt, offset: Array, turn: Array | None) -> Array:
     return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
 
 
+def turn_of_a_push(tip: TipAt) -> Array:
+    """Turn of the tip per displacement by a force at the tip (3, 3), base axes, in rad/m.
+
+    In the two directions in which the tip is softest; a displacement along the third turns nothing.
+    """
+    rotation = tip.pose[:3, :3]
+    compliances, axes = np.linalg.eigh(tip.compliance[:3, :3])
+    soft = axes[:, 1:]
+    turn: Array = tip.compliance[3:, :3] @ soft / compliances[1:] @ soft.T
+    return rotation @ turn @ rotation.T
+
+
 def target_arrays(target: Target | None) -> tuple[Array | None, Array | None, Array | None]:
     """Position (3,), NaN for free axes, pointing (3,) and quaternion (4,) of a target."""
     if target is None:

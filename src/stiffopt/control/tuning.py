@@ -252,15 +252,22 @@ class MotionTuning:
 
     spacing: float = 0.02  # least time between two samples that are compared, in s
     longest_pause: float = 0.1  # since the arm was steered, after which none is compared, in s
-    # by what share of each motion the model may be wrong
+    # by what share of what each segment moves the tip the model may be wrong
     model_error: float = 0.35
+    noise: float = 1e-3  # of a motion that is seen, in m
     # way from which on a response is looked at: a length in m, and a share of the arm's length
     least_motion: float = 3e-3
     least_motion_share: float = 0.025
     response_window: float = 0.6  # in which the tip must have moved as the model has it, in s
     least_response: float = 0.25  # share of that way by which it must have moved along it
-    most_across: float = 0.85  # share of that way by which it may have moved across it
+    most_across: float = 0.75  # share of what it has moved that may be across that way
+    late: float = 0.01  # by which the tip may move later than the model has it, in s
     misses: int = 2  # samples in a row that show no response
+    slip_window: float = 1.0  # in which a slip is looked for, in s
+    # share of the turn that a push brings along by which the measured turn must miss it
+    slip: float = 0.7
+    least_turn: float = 0.02  # by which it must miss it at least, in rad
+    slips: int = 8  # samples in a row that show a slip
     scales: tuple[DriftScale, ...] = (
         DriftScale(0.25, 5, 2e-3),
         DriftScale(1.0, 5, 6e-4),

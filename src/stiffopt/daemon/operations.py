@@ -114,10 +114,10 @@ class Operations:
 
     async def release(self, identity: str | None) -> None:
         """Take control back from a client; a hold of its own has nobody left who would end it."""
-        holder = self.lease.holder
+        holder, now = self.lease.holder, self.loop.snapshot()
         self.lease.release(identity)
-        if holder is not None and self.loop.snapshot().state is State.HOLDING:
-            reason = f"'{holder.client}' held, and gave control back"
+        if holder is not None and now.state is State.HOLDING:
+            reason = f"{now.reason}; '{holder.client}' has given control back"
             with suppress(StiffoptError):  # it is let down already
                 await self._call(partial(self.loop.hold, reason, lasting=False), urgent=True)
 

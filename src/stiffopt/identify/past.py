@@ -6,7 +6,7 @@ with derivatives by lag, dead time, shares and the state in which the log begins
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import casadi as ca
@@ -17,7 +17,7 @@ from stiffopt.identify.settings import FIT
 from stiffopt.model.batch import CompiledFunction, InterpretedFunction
 from stiffopt.model.codegen import dense
 from stiffopt.model.compiled import compiling_at_once, library
-from stiffopt.model.history import NO_HISTORY, History
+from stiffopt.model.history import NO_HISTORY, History, part_of
 
 Array = NDArray[np.float64]
 
@@ -49,16 +49,15 @@ class Start:
     @classmethod
     def from_rest(cls, history: History, pressures: Array) -> Start:
         """After a rise from no pressure to these (c,)."""
-        states = np.stack([history.from_rest(p) for p in pressures.tolist()], axis=1)
+        states = history.from_rest(pressures)
         return cls(states, np.zeros_like(states), pressures)
 
     @classmethod
     def settled(cls, history: History, pressures: Array, sides: Array) -> Start:
         """Long at these pressures (c,), with each channel on a side (c,) of its plays."""
-        pairs = list(zip(pressures.tolist(), sides.tolist(), strict=True))
-        states = np.stack([history.settled(p, side) for p, side in pairs], axis=1)
-        middle = np.stack([history.settled(p, 0.0) for p, _ in pairs], axis=1)
-        farthest = np.stack([history.settled(p, 1.0) for p, _ in pairs], axis=1)
+        middle = history.settled(pressures, np.zeros_like(sides))
+        farthest = history.settled(pressures, np.ones_like(sides))
+        states = history.settled(pressures, sides)
         return cls(states, farthest - middle, pressures)
 
 
@@ -132,16 +131,18 @@ class Past:
             inside = (wanted >= block.start) & (wanted < block.stop)
             kept[inside] = found[wanted[inside] - block.start]
             state = found[-1]
-        shares = np.array([part.share for part in history.parts])
         memory = np.array([history.memory_of(channel) for channel in range(self._channels)])
         c = self._channels
         values, by_lag, by_falling, by_dead, by_side = (
             kept[:, :, k * c : (k + 1) * c] for k in range(_CARRIED)
         )
 
+        def held(states: Array, j: int) -> Array:
+            return np.asarray(part_of(states[:, 1 + j] - states[:, 0], history.parts[j].of))
+
         def slow(states: Array) -> Array:
-            remembered: Array = np.einsum("j,mjc->mc", shares, states[:, 1:])
-            return remembered - float(shares.sum()) * states[:, 0]
+            parts = enumerate(history.parts)
+            return sum((p.share * held(states, j) for j, p in parts), np.zeros_like(states[:, 0]))
 
         def mixed(states: Array) -> Array:
             return np.asarray(states[:, 0] + memory * slow(states))
@@ -157,7 +158,7 @@ class Past:
         plays = len(history.play)
         for j in range(len(history.parts)):
             name = f"play[{j}]" if j < plays else f"creep[{j - plays}]"
-            per_number[f"{name}.share"] = (values[:, 1 + j] - values[:, 0]) * memory
+            per_number[f"{name}.share"] = held(values, j) * memory
         end = self._rested(self._start(state, pressures[-1]), history)
         return Effective(mixed(values), per_number, mixed(by_side), end)
 
@@ -279,30 +280,26 @@ def _columns(values: Array, count: int) -> Array:
 
 def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Function:
     """One step of `_HistoryRun`: state, pressures, their changes, length and lags in s -> state."""
-    m = history.n_states
-    value, *slopes = (ca.SX.sym(name, m) for name in ("y", "l", "f", "d", "s"))
-    before, now, before_change, now_change = (ca.SX.sym(name) for name in ("a", "b", "da", "db"))
+    state = ca.SX.sym("state", history.n_states, _CARRIED * channels)
+    value, *slopes = ca.horzsplit(state, channels)
+    before, now, before_change, now_change = (ca.SX.sym(name, channels) for name in "abcd")
     step, lag = ca.SX.sym("step"), ca.SX.sym("lag", 2)
     update = {"lag": lag[0] if lags else 0.0, "lag_falling": lag[1] if falls else 0.0}
     end = history.model_copy(update=update).next_state(value, before, now, step)
-    by_lag, by_falling, by_dead, by_side = (ca.jtimes(end, value, slope) for slope in slopes)
-    direct = ca.jacobian(end, lag)
-    moved = ca.jtimes(end, ca.vertcat(before, now), ca.vertcat(before_change, now_change))
-    one = ca.Function(
-        "one",
-        [value, *slopes, before, now, before_change, now_change, step, lag],
-        [end, by_lag + direct[:, 0], by_falling + direct[:, 1], by_dead + moved, by_side],
+
+    def change(of: Sequence[ca.SX], by: Sequence[ca.SX]) -> ca.SX:
+        vectors = [ca.vertcat(*(ca.vec(each) for each in part)) for part in (of, by)]
+        return ca.reshape(ca.jtimes(ca.vec(end), *vectors), *end.shape)
+
+    one, none = ca.SX(1), ca.SX(0)
+    ends = ca.horzcat(
+        end,
+        change([value, lag], [slopes[0], one, none]),
+        change([value, lag], [slopes[1], none, one]),
+        change([value, before, now], [slopes[2], before_change, now_change]),
+        change([value], [slopes[3]]),
     )
-    state = ca.SX.sym("state", m, _CARRIED * channels)
-    pressures = [ca.SX.sym("p", channels) for _ in range(4)]
-    blocks: list[list[ca.SX]] = [[] for _ in range(_CARRIED)]
-    for c in range(channels):
-        parts = [state[:, k * channels + c] for k in range(_CARRIED)]
-        found = one.call([*parts, *(p[c] for p in pressures), step, lag])
-        for block, part in zip(blocks, found, strict=True):
-            block.append(part)
-    all_ends = ca.horzcat(*[part for block in blocks for part in block])
-    return ca.Function("step", [state, *pressures, step, lag], [all_ends])
+    return ca.Function("step", [state, before, now, before_change, now_change, step, lag], [ends])
 
 
 def _delayed(time: Array, pressures: Array, before: Array, dead_time: float) -> tuple[Array, Array]:

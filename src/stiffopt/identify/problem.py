@@ -459,7 +459,7 @@ def _excess(robot: RobotDescription) -> ca.SX:
         corrections = segment.corrections
         assert compensation is not None
         assert corrections is not None
-        shares = sum(part.share for part in history.parts)
+        shares = ca.fmax(*history.shares)
         acting = []
         for c in range(segment.n_channels):
             memory.append((history.memory_of(c) * shares - FIT.most_memory) / FIT.memory_slack)

@@ -123,7 +123,8 @@ class StartSettings:
     Attributes
     ----------
     lag, dead_time : of a history that the robot file does not have, in s.
-    play_widths, play_share : of its plays; widths as shares of the highest recorded pressure.
+    play_widths, elongation_width, play_share : of its plays, and of that of elongation; widths as
+        shares of the highest recorded pressure.
     creep_times, creep_share : of its creep, in s.
     bending_radius : least bending radius, in lengths of the segment.
     dead_band : share of the highest recorded pressure.
@@ -137,6 +138,7 @@ class StartSettings:
     lag: float = 0.3
     dead_time: float = 0.05
     play_widths: tuple[float, ...] = (0.05, 0.12, 0.24, 0.46)
+    elongation_width: float = 0.46
     play_share: float = 0.05
     creep_times: tuple[float, ...] = (2.0, 20.0)
     creep_share: float = 0.02

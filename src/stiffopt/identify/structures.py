@@ -35,8 +35,9 @@ class ModelStructure:
     name : for reports and the command line.
     words : what the model has, in words.
     shape : keys of a segment that are fitted to its equilibria, without indices.
-    lag, falling, play, memory, creep : whether the history has them; a lag comes with a dead time
-        where the logs are fine enough to tell the two apart.
+    lag, falling, play, elongation, memory, creep : whether the history has them; a lag comes with a
+        dead time where the logs are fine enough to tell the two apart, and elongation is play that
+        acts on it alone.
     strain_law : of all segments; empty for that of the robot file.
     as_given : whether the history is that of the robot file.
     after : names of simpler models; this one is tried only if one of them is the best so far.
@@ -48,6 +49,7 @@ class ModelStructure:
     lag: bool = False
     falling: bool = False
     play: bool = False
+    elongation: bool = False
     memory: bool = False
     creep: bool = False
     strain_law: str = ""
@@ -108,6 +110,9 @@ class ModelStructure:
         plays = given.play or tuple(
             Play(width=w * seen, share=START.play_share) for w in START.play_widths
         )
+        if self.elongation and all(play.of == "pressure" for play in plays):
+            width = START.elongation_width * seen
+            plays += (Play(width=width, share=START.play_share, of="elongation"),)
         creeps = given.creep or tuple(
             Creep(time=time, share=START.creep_share) for time in START.creep_times
         )
@@ -167,6 +172,17 @@ STRUCTURES = (
         falling=True,
         play=True,
         memory=True,
+    ),
+    ModelStructure(
+        "elongation-hysteresis",
+        "lags when rising and falling, play, more of it in elongation, and creep",
+        _BASIC,
+        lag=True,
+        falling=True,
+        play=True,
+        elongation=True,
+        creep=True,
+        after=("hysteresis", "creep", "channel-hysteresis"),
     ),
 )
 """Those with the fewest numbers first."""

@@ -12,9 +12,17 @@ for the shape that it has are, in this order,
 
 and ``u = x + sum_j share_j (y_j - x) + sum_k share_k (z_k - x)``.
 
+Silicone holds on to its stretch rather than to pressures, and to its elongation more than to its
+bending, so that chambers stay stretched after they were deflated.  A segment's elongation goes with
+the mean of its pressures and its bending with how far each is from that.  So an operator may act on
+one of these parts instead of each channel by itself: with the projection A on that part (of all
+channels: 1/c in every place; of bending: 1 less that), y_j follows ``A x``, z_k follows it too, and
+what acts is ``share A (y_j - x)``, which neither moves nor knows of the other part.
+
 Settled, and in the middle between loading and unloading, ``u = p``: a history says nothing about
-equilibrium, which the strain law describes.  After a long monotone way u differs from p
-by ``sum_j share_j width_j``, the most that it can.
+equilibrium, which the strain law describes.  After a long monotone way of all pressures u differs
+from p by ``sum_j share_j width_j`` (of what does not act on bending), the most that it can; by
+bending up to twice that.
 
 This module knows nothing of the rest of the model, so that a simulated plant, an estimator and a
 calibration can run the same operators.
@@ -24,7 +32,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import casadi as ca
 import numpy as np
@@ -36,6 +44,9 @@ from stiffopt.schema import BadKeyError, Items, Schema
 from stiffopt.units import Duration, Pressure, Ratio
 
 Array = NDArray[np.float64]
+
+Part = Literal["pressure", "elongation", "bending"]
+"""What an operator acts on: each channel's pressure, their mean, or how far they are from it."""
 
 _Share = Annotated[Ratio, Field(ge=0, lt=1)]
 
@@ -50,10 +61,12 @@ class Play(Schema):
     ----------
     width : half of the way that a pressure must go back before the operator follows, in Pa.
     share : share of the pressure that acts through the operator.
+    of : what of the segment's pressures it acts on.
     """
 
     width: Annotated[Pressure, Field(gt=0)]
     share: _Share
+    of: Part = "pressure"
 
 
 class Creep(Schema):
@@ -63,14 +76,18 @@ class Creep(Schema):
     ----------
     time : its time constant, in s.
     share : share of the pressure that acts through the operator.
+    of : what of the segment's pressures it acts on.
     """
 
     time: Annotated[Duration, Field(gt=0)]
     share: _Share
+    of: Part = "pressure"
 
 
 class History(Schema):
     """How the shape of a segment follows the pressures of its channels, all in the same way.
+
+    Operators of pressure know one channel only, those of elongation and bending all of the segment.
 
     Attributes
     ----------
@@ -92,7 +109,7 @@ class History(Schema):
 
     @model_validator(mode="after")
     def _check(self) -> History:
-        total = sum(part.share for part in self.parts) * max(self.memory, default=1.0)
+        total = max(self.shares) * max(self.memory, default=1.0)
         if total >= 1:
             raise BadKeyError(
                 "play" if self.play else "creep",
@@ -106,12 +123,22 @@ class History(Schema):
         return (*self.play, *self.creep)
 
     @property
+    def shares(self) -> tuple[float, float]:
+        """Shares of elongation and of bending that act through operators, without the memory."""
+        of_elongation, of_bending = (
+            sum(part.share for part in self.parts if part.of != other)
+            for other in ("bending", "elongation")
+        )
+        return of_elongation, of_bending
+
+    @property
     def largest_memory(self) -> float:
         """How far hysteresis can take the shape from equilibrium, as a pressure, in Pa.
 
         Of a channel with another `memory` it is that many times as far.
         """
-        return sum(part.share * part.width for part in self.play)
+        # |A v| <= 2 (1 - 1/c) max |v| for the projection A on bending
+        return sum(part.share * part.width * (1 + (part.of == "bending")) for part in self.play)
 
     @property
     def quick_share(self) -> float:
@@ -119,9 +146,11 @@ class History(Schema):
 
         Play and creep hold on to the rest; what holds against pressure holds against a push too,
         so that such a push meets an arm that is 1 / quick_share times as stiff as in equilibrium.
+        That is a mean over the axis and the two directions across where these are not alike.
         """
         memory = sum(self.memory) / len(self.memory) if self.memory else 1.0
-        return 1 - memory * sum(part.share for part in self.parts)
+        of_elongation, of_bending = self.shares
+        return 1 - memory * (of_elongation + 2 * of_bending) / 3
 
     @property
     def n_states(self) -> int:
@@ -129,75 +158,100 @@ class History(Schema):
         return 1 + len(self.parts)
 
     def next_state(self, state: ca.SX, before: ca.SX, now: ca.SX, step: ca.SX) -> ca.SX:
-        """State (m,) of a channel after a step in which the (delayed) pressure changes linearly.
+        """State (m, c) of a segment's channels after (delayed) pressures have changed linearly.
 
-        Lag and creep are exact however long the step.  So is play while the lagged pressure runs
-        one way, which it does under a constant pressure.
+        Lag and creep are exact however long the step.  So is play while what it follows runs one
+        way, which it does under constant pressures where lags do not depend on the direction.
 
         Parameters
         ----------
-        state : (m,)
-            Before the step: x, every y_j, every z_k.
-        before, now : scalar
-            Delayed pressure before and after the step, in Pa.
+        state : (m, c)
+            Before the step, of each channel: x, every y_j, every z_k.
+        before, now : (c,)
+            Delayed pressures before and after the step, in Pa.
         step : scalar
             In s, positive.
         """
+        before, now = ca.SX(before).T, ca.SX(now).T
         ramp = (now - before) / step
         if ca.SX(self.lag).is_zero():
             start, transient, following = before, None, now
         else:  # x(t) = start + ramp t + transient exp(-t / lag)
             lag = self.lag
             if not ca.SX(self.lag_falling).is_zero():
-                lag = ca.if_else(now < state[0], self.lag_falling, self.lag)
+                lag = ca.if_else(now < state[0, :], self.lag_falling, self.lag)
             start = before - ramp * lag
-            transient = state[0] - start
+            transient = state[0, :] - start
             following = now - ramp * lag + transient * ca.exp(-step / lag)
         end: list[ca.SX] = [following]
         for index, play in enumerate(self.play, start=1):
-            y = state[index]
-            end.append(ca.fmax(following - play.width, ca.fmin(following + play.width, y)))
+            y, x = state[index, :], part_of(following, play.of)
+            end.append(ca.fmax(x - play.width, ca.fmin(x + play.width, y)))
         for index, creep in enumerate(self.creep, start=1 + len(self.play)):
             decay = ca.exp(-step / creep.time)
             late = (1 - decay) * start + ramp * (step - creep.time * (1 - decay))
             if transient is not None:
                 late += transient * _convolution(step / creep.time, step / lag)
-            end.append(decay * state[index] + late)
+            end.append(decay * state[index, :] + part_of(late, creep.of))
         return ca.vertcat(*end)
 
-    def effective(self, state: ca.SX, channel: int = 0) -> ca.SX:
-        """Pressure u at which an arm in equilibrium has the shape of this state (m,)."""
-        x = u = state[0]
+    def effective(self, state: Any, first: int = 0) -> Any:
+        """Pressures u (1, c) at which an arm in equilibrium has the shape of this state (m, c).
+
+        `first` is the index of the first of these channels within its segment, from 0.
+        """
+        x = state[:1, :]
+        channels = range(first, first + x.shape[1])
+        memory = np.array([[self.memory_of(channel) for channel in channels]])
+        slow = 0 * x
         for index, part in enumerate(self.parts, start=1):
-            u = u + self.memory_of(channel) * part.share * (state[index] - x)
-        return u
+            slow += part.share * part_of(state[index, :] - x, part.of)
+        return x + memory * slow
 
     def memory_of(self, channel: int) -> float:
         """Factor on the shares of a channel of the segment, from 0."""
         return self.memory[channel] if len(self.memory) else 1.0
 
-    def settled(self, pressure: float, side: float) -> Array:
-        """State (m,) long after a pressure was reached.
+    def settled(self, pressures: Array, sides: Array) -> Array:
+        """State (m, c) of channels long after pressures (c,) were reached.
 
         Parameters
         ----------
-        pressure :
+        pressures :
             In Pa.
-        side :
-            Where in its play each operator is: -1 after a long rise, 1 after a long fall, 0 in the
-            middle.
+        sides :
+            Where in its play each channel's own operators are (c,): -1 after a long rise, 1 after a
+            long fall, 0 in the middle. Those of elongation and of bending are in the middle.
         """
-        plays = [pressure + side * play.width for play in self.play]
-        return np.array([pressure, *plays, *[pressure] * len(self.creep)])
+        rows = [pressures]
+        for play in self.play:
+            own = play.width if play.of == "pressure" else 0.0
+            rows.append(part_of(pressures, play.of) + sides * own)
+        rows += [part_of(pressures, creep.of) for creep in self.creep]
+        return np.array(rows)
 
-    def from_rest(self, pressure: float) -> Array:
-        """State (m,) long after a rise from no pressure, on an arm that knew none before."""
-        widths = [play.width for play in self.play]
-        plays = [float(np.clip(0.0, pressure - w, pressure + w)) for w in widths]
-        return np.array([pressure, *plays, *[pressure] * len(self.creep)])
+    def from_rest(self, pressures: Array) -> Array:
+        """State (m, c) long after a rise from no pressure, on an arm that knew none before."""
+        rows = [pressures]
+        for play in self.play:
+            x = part_of(pressures, play.of)
+            rows.append(np.clip(0.0, x - play.width, x + play.width))
+        rows += [part_of(pressures, creep.of) for creep in self.creep]
+        return np.array(rows)
 
 
 NO_HISTORY = History()
+
+
+def part_of(pressures: Any, of: Part) -> Any:
+    """What an operator acts on of the pressures (..., c) of a segment, as many."""
+    if of == "pressure":
+        return pressures
+    if isinstance(pressures, np.ndarray):
+        mean = pressures.mean(axis=-1, keepdims=True)
+    else:
+        mean = ca.sum2(pressures) / pressures.shape[1]
+    return mean + 0 * pressures if of == "elongation" else pressures - mean
 
 
 def _convolution(a: ca.SX, b: ca.SX) -> ca.SX:
@@ -219,7 +273,8 @@ class Memory:
     histories : sequence
         One per channel; None for a channel whose shape follows at once.
     places : sequence of int, optional
-        Index of each channel within its segment, from 0; matters where memories differ.
+        Index of each channel within its segment, from 0: channels with the same history are of one
+        segment where their places go on. By default each is a segment of its own.
 
     Attributes
     ----------
@@ -232,9 +287,11 @@ class Memory:
     ) -> None:
         if not histories:
             raise InputError("expected the history of at least one channel")
-        self._places = list(places or [0] * len(histories))
         self._histories = [history or NO_HISTORY for history in histories]
-        self._ends = np.cumsum([history.n_states for history in self._histories])
+        self._places = list(places or [0] * len(histories))
+        self._groups = self._segments()
+        sizes = [h.n_states * (own.stop - own.start) for h, own in self._groups]
+        self._ends = np.cumsum(sizes)
         self._dead_times = np.array([history.dead_time for history in self._histories])
         self._delays = np.unique(self._dead_times)
         self._late = bool(self._dead_times.any())
@@ -245,14 +302,12 @@ class Memory:
     def start(self, pressures: ArrayLike) -> None:
         """Set the state of an arm that was brought from no pressure to these (n,), in Pa."""
         p = self._checked(pressures)
-        self._begin([h.from_rest(v) for h, v in zip(self._histories, p.tolist(), strict=True)], p)
+        self._begin([h.from_rest(p[own]) for h, own in self._groups], p)
 
     def settle(self, pressures: ArrayLike, side: float = 0.0) -> None:
         """Set the state of an arm long at these pressures (n,); `side` as in `History.settled`."""
         p = self._checked(pressures)
-        self._begin(
-            [h.settled(v, side) for h, v in zip(self._histories, p.tolist(), strict=True)], p
-        )
+        self._begin([h.settled(p[own], np.full(len(p[own]), side)) for h, own in self._groups], p)
 
     def advance(self, step: float, pressures: ArrayLike) -> Array:
         """Let time pass at constant commanded pressures (n,) and return the effective ones (n,).
@@ -292,17 +347,28 @@ class Memory:
         self.effective = effective[-1].copy()
         return effective
 
+    def _segments(self) -> list[tuple[History, slice]]:
+        """Histories of the segments and where their channels are among all."""
+        starts = [
+            c
+            for c, place in enumerate(self._places)
+            if c == 0
+            or place != self._places[c - 1] + 1
+            or self._histories[c] != self._histories[c - 1]
+        ]
+        ends = [*starts[1:], len(self._places)]
+        return [(self._histories[a], slice(a, b)) for a, b in zip(starts, ends, strict=True)]
+
     def _begin(self, states: list[Array], pressures: Array) -> None:
-        self._state = np.concatenate(states)
+        self._state = np.concatenate([state.ravel(order="F") for state in states])
         self._time = 0.0
         self._times = np.array([-np.inf])  # from when on each of the commands (k, n) was given
         self._commands = pressures[None, :]
-        self.effective = np.array(
-            [
-                float(h.effective(ca.DM(x), c))
-                for h, x, c in zip(self._histories, states, self._places, strict=True)
-            ]
-        )
+        effective = [
+            h.effective(x, self._places[own.start])[0]
+            for (h, own), x in zip(self._groups, states, strict=True)
+        ]
+        self.effective = np.concatenate(effective)
 
     def _follow_late(self, step: float, pressures: Array) -> Array:
         """Effective pressures (m, n) after equal steps at pressures (m, n), dead times included."""
@@ -354,15 +420,13 @@ class Memory:
         state, delayed = ca.SX.sym("state", self._ends[-1]), ca.SX.sym("p", len(self._histories))
         step = ca.SX.sym("step")
         parts = ca.vertsplit(state, [0, *self._ends.tolist()])
-        ends = [
-            h.next_state(x, delayed[c], delayed[c], step)
-            for c, (h, x) in enumerate(zip(self._histories, parts, strict=True))
-        ]
-        effective = [
-            h.effective(x, c) for h, x, c in zip(self._histories, ends, self._places, strict=True)
-        ]
-        outputs = [ca.densify(ca.vertcat(*ends)), ca.densify(ca.vertcat(*effective))]
-        return ca.Function("advance", [state, delayed, step], outputs)
+        ends, effective = [], []
+        for (h, own), part in zip(self._groups, parts, strict=True):
+            p = delayed[own]
+            ends.append(h.next_state(ca.reshape(part, h.n_states, -1), p, p, step))
+            effective.append(h.effective(ends[-1], self._places[own.start]).T)
+        outputs = [ca.vertcat(*(ca.vec(end) for end in ends)), ca.vertcat(*effective)]
+        return ca.Function("advance", [state, delayed, step], [ca.densify(x) for x in outputs])
 
     def _checked(self, pressures: ArrayLike, *, rows: bool = False) -> Array:
         p = np.array(pressures, dtype=float)

@@ -27,7 +27,7 @@ from stiffopt.model.arguments import checked_measure
 from stiffopt.model.calibration import Calibration
 from stiffopt.model.compliance import Boundary, Frame, Kind
 from stiffopt.model.description import RobotDescription
-from stiffopt.model.history import NO_HISTORY, History
+from stiffopt.model.history import NO_HISTORY, History, part_of
 from stiffopt.model.parameters import Parameter
 from stiffopt.model.parametric import ParametricArm
 
@@ -264,19 +264,15 @@ class Uncertainty:
 
     def _even(self, pressures: Vector) -> Vector:
         """Mean squares (n,) if every possible effective pressure is as likely, in Pa^2."""
-        robot = self._description
-        places = [
-            (segment.history or NO_HISTORY, channel)
-            for segment in robot.segments
-            for channel in range(segment.n_channels)
-        ]
-        found = []
-        for (history, channel), *values in zip(
-            places, pressures.tolist(), robot.pressure_min, robot.pressure_max, strict=True
-        ):
-            least, most = np.subtract(settled_range(history, channel, *values), values[0])
+        robot, first, found = self._description, 0, []
+        limits = np.array([robot.pressure_min, robot.pressure_max])
+        for segment in robot.segments:
+            own = slice(first, first := first + segment.n_channels)
+            p = pressures[own]
+            ends = settled_range(segment.history or NO_HISTORY, p, *limits[:, own])
+            least, most = np.subtract(ends, p)
             found.append((least**2 + least * most + most**2) / 3)
-        return np.array(found)
+        return np.concatenate(found)
 
 
 class ReadingSlopes:
@@ -361,25 +357,32 @@ def levels(errors: Vector, covariance: Vector, degrees_of_freedom: float) -> Vec
 
 
 def settled_range(
-    history: History, channel: int, pressure: float, low: float, high: float
-) -> tuple[float, float]:
-    """Least and largest effective pressure of a channel that settled at a pressure, in Pa.
+    history: History, pressures: Vector, low: Vector, high: Vector, first: int = 0
+) -> tuple[Vector, Vector]:
+    """Least and largest effective pressures (c,) of channels that settled at pressures, in Pa.
 
     The arm began at rest without pressure; of what was commanded since then only the limits are
     known.
 
     Parameters
     ----------
-    history : of the channel's segment.
-    channel : of the segment, from 0.
-    pressure : in Pa.
-    low, high : limits, in Pa.
+    history : of the channels' segment.
+    pressures : of all of its channels (c,), in Pa.
+    low, high : limits (c,), in Pa.
+    first : index of the first of these channels in the segment.
     """
-    low, high = min(low, 0.0, pressure), max(high, 0.0, pressure)
-    ends = np.array([pressure, pressure])
+    low, high = np.minimum(low, np.minimum(pressures, 0)), np.maximum(high, pressures)
+    high = np.maximum(high, 0)
+    memory = np.array([history.memory_of(first + c) for c in range(len(pressures))])
+    least, most = pressures.astype(float), pressures.astype(float)
     for play in history.play:
+        projection = part_of(np.eye(len(pressures)), play.of)
+        forward, backward = np.maximum(projection, 0), np.minimum(projection, 0)
+        x, farthest = projection @ pressures, forward @ high + backward @ low
+        nearest = forward @ low + backward @ high
         # the operator is dragged down to low + width and up to high - width; it began at zero
-        least = max(pressure - play.width, min(low + play.width, 0.0))
-        most = min(pressure + play.width, max(high - play.width, 0.0))
-        ends += history.memory_of(channel) * play.share * (np.array([least, most]) - pressure)
-    return float(ends[0]), float(ends[1])
+        under = np.maximum(x - play.width, np.minimum(nearest + play.width, 0)) - x
+        over = np.minimum(x + play.width, np.maximum(farthest - play.width, 0)) - x
+        least = least + memory * play.share * (forward @ under + backward @ over)
+        most = most + memory * play.share * (forward @ over + backward @ under)
+    return least, most
