@@ -469,7 +469,7 @@ class TipController:
         self._robot, self._tip, self._adapted_at = robot, after, self._now
         change = self._estimator.change_model(before, after)
         self._corrected_offset = self._corrected_offset + change
-        self._watch.change_model(-change[:3])
+        self._watch.change_model(change)
         self._reference.shift(change)
         self.replanner.go_on_with(adapted, change)
 
