@@ -30,6 +30,7 @@ class Lab:
             "supply": {"driver": "simulated", "dump_valve": True, "watchdog": 0.3},
             "tracker": {"driver": "simulated"},
             "safety": {},
+            "commissioning": {},
             "plant": {"dynamics": "quasi-static", "faults": True, "discretisation": STEP},
         }
         for key, value in changes.items():

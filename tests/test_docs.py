@@ -16,6 +16,7 @@ from pydantic import BaseModel
 
 import stiffopt
 from examples import run_examples
+from stiffopt.commissioning.record import CommissioningRecord
 from stiffopt.experiments.poses import load_poses
 from stiffopt.identify.bench import load_bench
 from stiffopt.logs import read_log
@@ -50,7 +51,12 @@ from stiffopt.rig.config import (
     load_rig_description,
 )
 from stiffopt.rig.registry import KINDS, driver_class, driver_names
-from stiffopt.rig.settings import ControlSettings, Published, ServiceSettings
+from stiffopt.rig.settings import (
+    CommissioningSettings,
+    ControlSettings,
+    Published,
+    ServiceSettings,
+)
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [
@@ -88,12 +94,14 @@ SCHEMAS: list[type[BaseModel]] = [
     *(Scene, SceneObject, AllowedContact, *OBSTACLES.values()),
     *schemas_of(PathDescription, "stiffopt.paths."),
     *(RigDescription, Safety, LogSettings, Registration, Placement),
-    *(ControlSettings, Published, ServiceSettings, Trajectory, Waypoint),
+    *(ControlSettings, CommissioningSettings, Published, ServiceSettings, Trajectory, Waypoint),
+    *schemas_of(CommissioningRecord, "stiffopt.commissioning."),
     *schemas_of(simulated.PlantSettings, "stiffopt.plant"),
     simulated.LabSettings,
     *driver_schemas(),
 ]
 SECTIONS = {  # of files.md, by how the module of a schema begins; the first that fits
+    "stiffopt.commissioning": "Commissioning record",
     "stiffopt.rig.drivers.modbus": "Driver modbus",
     "stiffopt.rig.drivers.nidaq": "Driver nidaq",
     "stiffopt.rig.drivers.aurora": "Drivers aurora and openigtlink",

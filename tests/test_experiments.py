@@ -883,7 +883,7 @@ def use(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[Rig], Rig]
     monkeypatch.chdir(tmp_path)
 
     def put(rig: Rig) -> Rig:
-        monkeypatch.setattr(experiment_run, "_rig", lambda path: (rig, "a rig", 50.0, "runs"))
+        monkeypatch.setattr(experiment_run, "rig_of", lambda path: (rig, "a rig", 50.0, "runs"))
         return rig
 
     return put

@@ -245,10 +245,13 @@ def test_a_supply_that_was_vented_behind_its_back_is_a_fault() -> None:
     assert "a command was refused" in lab.loop.snapshot().reason
 
 
-def test_channels_without_gauge_are_an_alarm() -> None:
+def test_channels_without_gauge_are_an_alarm(monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Lab(ready=False)
     measure = lab.world.measured
     lab.world.measured = lambda: measure() * [1.0, np.nan, 1.0]  # type: ignore[method-assign]
+    with pytest.raises(InputError, match="gauges of channels 2 read nothing"):
+        lab.arm()
+    monkeypatch.setattr(type(lab.rig.settings.supply), "measures", lambda self, k: k != 1)
     lab.arm()
     lab.under_pressure()
     assert lab.alarms == {"unsupervised"}

@@ -134,6 +134,12 @@ def _check_experiment(path: str) -> None:
     load_poses(path)
 
 
+def _check_commissioning(path: str) -> None:
+    from stiffopt.commissioning.record import load_record
+
+    load_record(path)
+
+
 def _check_log(path: str) -> None:
     if path.lower().endswith(".mcap"):
         from stiffopt.logs import read_mcap_log
@@ -158,5 +164,6 @@ _CHECKS: dict[str, Callable[[str], None]] = {
     "scene": _check_scene,
     "rig": _check_rig,
     "experiment": _check_experiment,
+    "commissioning": _check_commissioning,
     "log": _check_log,
 }

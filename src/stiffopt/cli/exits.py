@@ -22,6 +22,8 @@ UNREACHABLE = 3
 FAILED = 4
 FAULT = 5
 """The rig failed; it was vented."""
+MISFIT = 6
+"""The rig does not fit its files; what to change was told."""
 INTERRUPTED = 130
 """Ctrl-C."""
 CLOSED_PIPE = 141

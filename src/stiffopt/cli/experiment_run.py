@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +17,9 @@ from stiffopt.cli.console import (
     warnings_as_notes,
     write_json,
 )
-from stiffopt.cli.exits import (
-    InterruptBetweenSteps,
-    RigFaultError,
-    interruptible,
-)
-from stiffopt.errors import DeviceError, InputError, StiffoptError, require_package
+from stiffopt.cli.exits import InterruptBetweenSteps, interruptible
+from stiffopt.cli.rig_work import RigStoppedError, new_name, on_rig, open_rig_for, rig_of
+from stiffopt.errors import InputError, require_package
 from stiffopt.experiments import (
     KinematicsSettings,
     StiffnessSettings,
@@ -117,7 +112,7 @@ def run(
                     _report_kinematics(plan, settings, plot=plot, as_json=as_json, quiet=quiet)
                 else:
                     _report_stiffness(plan, settings, plot=plot, quiet=quiet)
-    except (KeyboardInterrupt, _StoppedError):
+    except (KeyboardInterrupt, RigStoppedError):
         if not quiet:
             report_note(
                 f"what was recorded is in {plan.folder}; go on with: "
@@ -131,12 +126,12 @@ def run_poses_file(file: str, *, out: str | None, quiet: bool) -> None:
     require_package("foxglove-sdk", "log", "foxglove")
     settings = load_poses(file)
     with interruptible(), warnings_as_notes(quiet=quiet):
-        rig, name, rate, log_folder = _rig(str(Path(file).parent / settings.rig))
+        rig, name, rate, log_folder = rig_of(str(Path(file).parent / settings.rig))
         if rig.tracker is None:
             raise InputError("this rig has no tracker; the experiments need one")
         rig.supply.check_arming()
         poses_for(rig, settings)
-        folder = Path(log_folder) / _new_name("poses", name) if out is None else Path(out)
+        folder = Path(log_folder) / new_name("poses", name) if out is None else Path(out)
         create_folder(folder, settings)
     interrupt, bar = InterruptBetweenSteps(), ProgressBar(quiet=quiet)
 
@@ -145,14 +140,10 @@ def run_poses_file(file: str, *, out: str | None, quiet: bool) -> None:
         return []
 
     with warnings_as_notes(quiet=quiet), alone_in(folder), interrupt.handled(), bar:
-        _open(rig, folder)
-        _on_rig(rig, work, interrupt)
+        open_rig_for(rig, lambda: remove_folder(folder))
+        on_rig(rig, work, interrupt)
     if not quiet:
         report_note(f"{len(settings.pressures)} poses are recorded in {folder / POSES}.csv")
-
-
-class _StoppedError(RigFaultError):
-    """Something went wrong after the rig was opened."""
 
 
 # -- before anything moves ------------------------------------------------------------------------
@@ -166,7 +157,7 @@ def _planned(
     resume: str | None,
     model_name: str | None,
 ) -> _Plan:
-    rig, name, rate, log_folder = _rig(rig_file)
+    rig, name, rate, log_folder = rig_of(rig_file)
     published, table = _published(rig, rig_file)
     if resume is None:
         about = {"rig": name, "robot": rig.robot.name, "channels": rig.supply.n}
@@ -174,7 +165,7 @@ def _planned(
         settings: Settings = schema(
             **about, **{key: _read(key, value) for key, value in given.items()}
         )
-        folder = Path(log_folder) / _new_name(experiment, name) if out is None else Path(out)
+        folder = Path(log_folder) / new_name(experiment, name) if out is None else Path(out)
     else:
         folder = Path(resume)
         settings = _old_settings(experiment, folder, given)
@@ -204,28 +195,12 @@ def _planned(
     )
 
 
-def _rig(path: str) -> tuple[Rig, str, float, str]:
-    """The rig of a file, its name, its rate and its log folder."""
-    from stiffopt.rig.config import load_rig_description
-    from stiffopt.safety.rigs import open_rig
-
-    description = load_rig_description(path)
-    return open_rig(path), description.name, description.rate, description.log.folder
-
-
 def _published(rig: Rig, path: str) -> tuple[Published | None, StiffnessTable | None]:
     """What a rig file says was published of its arm, with the table of stiffness that it names."""
     published = None if rig.settings is None else rig.settings.published
     if published is None or published.stiffness is None:
         return published, None
     return published, read_stiffness_table(Path(path).parent / published.stiffness)
-
-
-def _new_name(experiment: str, rig: str) -> str:
-    """Name of the folder of a new experiment: that of the rig, and the time."""
-    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
-    safe = re.sub(r"[^\w.-]+", "-", rig).strip("-.") or "rig"
-    return f"{experiment}_{safe}_{stamp}"
 
 
 def _old_settings(experiment: str, folder: Path, given: Mapping[str, Any]) -> Settings:
@@ -292,42 +267,11 @@ def _do(plan: _Plan, *, quiet: bool) -> None:
         )
 
     with alone_in(plan.folder), interrupt.handled(), bar:
-        _open(plan.rig, plan.folder if plan.is_new else None)
-        notes = _on_rig(plan.rig, work, interrupt)
+        open_rig_for(plan.rig, lambda: remove_folder(plan.folder) if plan.is_new else None)
+        notes = on_rig(plan.rig, work, interrupt)
     if not quiet:
         for note in notes:
             report_note(note)
-
-
-def _open(rig: Rig, new: Path | None) -> None:
-    """Open the rig; leave no new folder behind if there is none."""
-    try:
-        rig.open()
-    except StiffoptError as error:
-        if new is not None:
-            remove_folder(new)
-        raise RigFaultError(str(error)) if isinstance(error, DeviceError) else error from error
-
-
-def _on_rig(rig: Rig, work: Callable[[], list[str]], interrupt: InterruptBetweenSteps) -> list[str]:
-    """Work, and vent and close the rig whatever happens."""
-    failure: BaseException | None = None
-    notes: list[str] = []
-    try:
-        notes = work()
-    except BaseException as error:
-        failure = error
-    interrupt.hold()
-    try:
-        rig.close()
-    except StiffoptError as error:
-        first = f" (after: {failure})" if isinstance(failure, StiffoptError) else ""
-        raise _StoppedError(f"THE ARM MAY STILL BE UNDER PRESSURE: {error}{first}") from error
-    if isinstance(failure, StiffoptError):
-        raise _StoppedError(f"{failure}; the arm is vented") from failure
-    if failure is not None:
-        raise failure
-    return notes
 
 
 # -- afterwards -----------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from stiffopt.cli.calibrate import (
     validate,
 )
 from stiffopt.cli.check import CHECK_EPILOG, CHECK_HELP, check
+from stiffopt.cli.commission import COMMISSION_EPILOG, COMMISSION_HELP, commission
 from stiffopt.cli.console import Closed, report_error, warnings_as_notes
 from stiffopt.cli.exits import BAD_INPUT, CLOSED_PIPE, INTERRUPTED
 from stiffopt.cli.experiment import experiment_app
@@ -68,6 +69,12 @@ app.command(
     epilog=STUDIO_EPILOG,
 )(studio)
 app.command("robots", short_help="List the robots that come with stiffopt.")(robots)
+app.command(
+    "commission",
+    short_help="Find out whether a rig fits its files: the first hour.",
+    help=COMMISSION_HELP,
+    epilog=COMMISSION_EPILOG,
+)(commission)
 app.command(
     "run",
     short_help="Hold an arm at its task: run the daemon of a rig.",

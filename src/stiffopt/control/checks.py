@@ -7,6 +7,7 @@ They apply to all requests: of a program in Python, a client of the daemon or th
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -15,13 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from stiffopt.commissioning.record import CommissioningRecord, load_record, problems_of_record
+from stiffopt.control.gauge_watch import GaugeWatch
 from stiffopt.control.interface import Controller
 from stiffopt.control.tracker_watch import Sight, TrackerWatch
 from stiffopt.errors import CommandError, InputError, StiffoptError
 from stiffopt.optimise.target import Target
 from stiffopt.optimise.task import PressureRange, Task
 from stiffopt.paths.trajectory import Trajectory, Waypoint
-from stiffopt.rig.interface import PressureLimits, PressureReading, Rig
+from stiffopt.rig.interface import PressureLimits, PressureReading, Rig, SupplySettings
+from stiffopt.rig.settings import CommissioningSettings
 from stiffopt.safety.gate import Outlet
 from stiffopt.safety.monitors import PressureMonitor
 from stiffopt.schema import Schema
@@ -32,6 +36,12 @@ ModelT = TypeVar("ModelT", bound=Schema)
 _NOT_CONTENT = frozenset({"source"})  # the file that a description was read from
 _ROUNDING = 1e-6  # of a rate
 _LISTED = 5  # keys that an error names
+
+# how far a vented arm may be from how it was commissioned
+_MOVED = 0.04  # of its length; hysteresis and creep leave about half of that
+_NOISIER, _LEAST_NOISE = 2.5, 2e-5  # factor on the tracker's noise, and the least of it, in m
+_LATER = 0.05  # s
+_GAUGE = 0.3  # of `Safety.max_pressure_error`
 
 
 @contextmanager
@@ -225,6 +235,74 @@ def check_vented_arm(
             f"the model has it, ({model}) mm; check the tracker's registration and the robot file "
             "('stiffopt calibrate' makes one)"
         )
+
+
+def check_commissioned(
+    rig: Rig, gauges: GaugeWatch, tracker: TrackerWatch, reading: PressureReading
+) -> Iterator[str]:
+    """Yield why the record of its commissioning, or its gauges, do not permit to arm a vented arm.
+
+    A rig that was not made from a rig file is not checked.
+    """
+    if rig.settings is None:
+        return
+    settings: CommissioningSettings = rig.settings.commissioning
+    supply: SupplySettings = rig.settings.supply
+    required = not supply.simulated if settings.required is None else settings.required
+    command = "run 'stiffopt commission' on this rig"
+    path, record = settings.record, None
+    if path is not None and os.path.exists(path):
+        try:
+            record = load_record(path)
+        except InputError as error:
+            yield f"commissioning: its record cannot be read, {command}: {error}"
+    elif required:
+        yield f"commissioning: there is no record '{path}'; {command}"
+    noisy = [False] * rig.supply.n
+    if record is not None:
+        problems = list(problems_of_record(record, rig.robot, rig.settings, settings.max_age))
+        is_of_this = len(problems) == (not record.fits)
+        if is_of_this and not problems:
+            noisy = [bool(channel.gauge_noise) for channel in record.channels]
+            problems = list(_changed(record, rig, tracker, reading))
+        if required or is_of_this:
+            yield from (f"commissioning: {problem}; {command}" for problem in problems)
+    measured = [supply.measures(k) for k in range(rig.supply.n)]
+    yield from (f"gauges: {problem}" for problem in gauges.dead(measured, noisy))
+
+
+def _changed(
+    record: CommissioningRecord, rig: Rig, tracker: TrackerWatch, reading: PressureReading
+) -> Iterator[str]:
+    """Yield how a vented arm differs from what it was when it was commissioned."""
+    then = record.tracker
+    if then is None or not tracker.samples:
+        return
+    off = float(np.linalg.norm(tracker.position - then.position))
+    if off > _MOVED * rig.robot.length:
+        yield (
+            f"the vented tip is {1e3 * off:.1f} mm from where it was: a push, a load, a slipped "
+            "sensor or a moved tracker; look at the arm"
+        )
+    if tracker.noise > _NOISIER * max(then.noise, _LEAST_NOISE):
+        yield (
+            f"the tracker's noise is {1e3 * tracker.noise:.3f} mm and was {1e3 * then.noise:.3f} mm"
+        )
+    if tracker.usual[1] > then.latency + _LATER:
+        yield (
+            f"the tracker's samples are {1e3 * tracker.usual[1]:.0f} ms old when they come and "
+            f"were {1e3 * then.latency:.0f} ms old"
+        )
+    tolerance = np.broadcast_to(rig.settings.safety.max_pressure_error, rig.supply.n)
+    for k, channel in enumerate(record.channels):
+        if channel.gauge_offset is None:
+            continue
+        moved = abs(reading.pressures[k] - channel.gauge_offset)
+        if moved > _GAUGE * tolerance[k] + 6 * (channel.gauge_noise or 0.0):
+            yield (
+                f"the gauge of channel {k + 1} reads {reading.pressures[k] * 1e-5:.3f} bar of the "
+                f"vented arm and read {channel.gauge_offset * 1e-5:.3f} bar"
+            )
 
 
 def late_ticks(lateness: float, guard_timeout: float) -> str:

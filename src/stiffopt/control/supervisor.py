@@ -13,12 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stiffopt.control.checks import (
+    check_commissioned,
     check_rig,
     check_vented_arm,
     highest_pressures,
     late_ticks,
     refusing,
 )
+from stiffopt.control.gauge_watch import GaugeWatch
 from stiffopt.control.interface import Controller, ControlOutput
 from stiffopt.control.lifecycle import Alarms, EventBuffer, Lifecycle
 from stiffopt.control.state import Severity, State
@@ -107,6 +109,7 @@ class Supervisor:
         regulation = Regulation.slowest(rig.robot, control, n)
         self._monitor = PressureMonitor(outlet.limits, safety, regulation, rig.slew)
         self._tracker = TrackerWatch(safety, period)
+        self._gauges = GaugeWatch()
         self._no_channels: NDArray[np.bool_] = np.zeros(n, dtype=bool)
         self._stuck_low = self._monitor.saturated
         self._unsupervised: tuple[int, ...] = ()
@@ -218,8 +221,10 @@ class Supervisor:
         self.reading = reading
         seen = self.controller.observe(now, self.commanded, reading, samples)
         self.rejected = seen.rejected
-        if samples and not self.lifecycle.armed:
-            self._tracker.learn(now, samples)
+        if not self.lifecycle.armed:
+            self._gauges.learn(reading)
+            if samples:
+                self._tracker.learn(now, samples)
         self._tracker.update(now, seen)
         self._update_alarms(now)
 
@@ -497,6 +502,7 @@ class Supervisor:
                 now, self.rig, self.controller, self._monitor, reading, self._tracker,
                 self._tuning.vented_offset,
             )  # fmt: skip
+            problems += check_commissioned(self.rig, self._gauges, self._tracker, reading)
             late = late_ticks(lateness, self._safety.guard_timeout)
             if lateness >= self._safety.guard_timeout:
                 problems.append(late)
@@ -518,6 +524,7 @@ class Supervisor:
             raise
         self._note_commanded(now, self._zero)
         self._monitor.clear()
+        self._gauges.forget()
         self._tracker.begin(now)
         self._doubted_at = -np.inf
         self._exchanged, self._failures, self._ticked_at = None, 0, now

@@ -100,6 +100,11 @@ class TrackerWatch:
         """Position of the tip of the vented arm (3,), in m."""
         return np.median(np.array(self._positions), axis=0)
 
+    @property
+    def noise(self) -> float:
+        """Standard deviation of a sample of the vented arm in each axis, in m."""
+        return float(np.sqrt(np.mean(np.var(np.array(self._positions), axis=0))))
+
     def update(self, now: float, seen: SampleCounts) -> None:
         """Take in how many samples of a tick were used or rejected."""
         if self._latest == -np.inf:

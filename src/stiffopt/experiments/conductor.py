@@ -79,7 +79,7 @@ class TrackedFrame:
 
 
 @dataclass(frozen=True)
-class _TickRecord:
+class TickRecord:
     """Set-points and readings of one tick; units as in `TrackedFrame`."""
 
     time: float
@@ -117,6 +117,7 @@ class Conductor:
         self.clock = rig.clock
         self.rows: deque[TrackedFrame] = deque(maxlen=_KEPT)  # the latest
         self.sink: Callable[[TrackedFrame], None] | None = None  # is given every new frame
+        self.watch: Callable[[TickRecord], None] | None = None  # is given every tick; may raise
         self.probing = False  # whether the probe is read in each tick
         self._period = 1.0 / rate
         self._check = check
@@ -130,7 +131,7 @@ class Conductor:
         self._impossible = 0  # readings in a row
         self._valid, self._lost = safety.command_timeout, safety.tracker_timeout
         self._target = self._commanded = np.array(rig.supply.commanded, dtype=float)
-        self._ticks: deque[_TickRecord] = deque(maxlen=_KEPT)
+        self._ticks: deque[TickRecord] = deque(maxlen=_KEPT)
         self._last = self._deadline = self.clock.now()
         self._hidden = False  # somebody may stand in front of the tracker
 
@@ -175,9 +176,11 @@ class Conductor:
         if self.probing and self.rig.probe is not None:
             felt = self.rig.probe.sample()
             force, stage = felt.force, felt.position
-        self._ticks.append(_TickRecord(now, self._commanded, reading.pressures, force, stage))
+        self._ticks.append(TickRecord(now, self._commanded, reading.pressures, force, stage))
         for sample in self.tracker.read():
             self._take(sample)
+        if self.watch is not None:
+            self.watch(self._ticks[-1])
         if self._lost < self.tracker.age() < np.inf and not self._hidden:
             raise DeviceError(f"the tracker has not seen the tip for {self._lost:g} s")
         self._deadline += self._period
@@ -214,14 +217,14 @@ class Conductor:
         if self.sink is not None:
             self.sink(row)
 
-    def _ticks_at(self, time: float) -> tuple[_TickRecord, _TickRecord]:
+    def _ticks_at(self, time: float) -> tuple[TickRecord, TickRecord]:
         """Return the tick whose command held at a time, and the one with the nearest readings."""
         recent = [self._ticks[-k] for k in range(min(len(self._ticks), _RECENT), 0, -1)]
         after = bisect_right(recent, time, key=lambda tick: tick.time)
         around = recent[max(after - 1, 0) : after + 1]
         nearest = min(around, key=lambda tick: abs(tick.time - time))
         if abs(nearest.time - time) > CONDUCTOR.near:
-            nearest = _TickRecord(time, nearest.commanded, np.full(self.n, np.nan), np.nan, np.nan)
+            nearest = TickRecord(time, nearest.commanded, np.full(self.n, np.nan), np.nan, np.nan)
         return around[0], nearest
 
     # -- longer manoeuvres ------------------------------------------------------------------

@@ -31,6 +31,7 @@ MODELS = {
     "scene": "stiffopt.model.scene:Scene",
     "rig": "stiffopt.rig.config:RigDescription",
     "experiment": "stiffopt.experiments.poses:PosesFile",
+    "commissioning": "stiffopt.commissioning.record:CommissioningRecord",
 }
 """The kinds of files that people write, and the models that read them."""
 

@@ -13,6 +13,7 @@ from stiffopt.plant.world import World
 from stiffopt.rig.config import RigDescription, limits_of
 from stiffopt.rig.device import DeviceSettings
 from stiffopt.rig.registry import driver_class, driver_names, load, one_of
+from stiffopt.rig.settings import CommissioningSettings
 
 
 def with_real_devices(
@@ -116,7 +117,9 @@ class VirtualLab:
         InputError
             There is no peer for a driver.
         """
-        addressed: dict[str, Any] = {"plant": None, "lab": None}
+        # behind the protocols is a simulated arm: nobody has to commission it
+        free = CommissioningSettings(required=False)
+        addressed: dict[str, Any] = {"plant": None, "lab": None, "commissioning": free}
         with ExitStack() as stack:
             stack.callback(self.close)
             for name in ("supply", "tracker", "probe"):

@@ -23,7 +23,14 @@ from stiffopt.rig.interface import PressureLimits
 from stiffopt.rig.pressure import SupplySettings
 from stiffopt.rig.probing import ProbeSettings
 from stiffopt.rig.registry import built_in_drivers, driver_class, driver_names, load, one_of
-from stiffopt.rig.settings import ControlSettings, LogSettings, Published, Safety, ServiceSettings
+from stiffopt.rig.settings import (
+    CommissioningSettings,
+    ControlSettings,
+    LogSettings,
+    Published,
+    Safety,
+    ServiceSettings,
+)
 from stiffopt.rig.tracking import TrackerSettings
 from stiffopt.schema import BadKeyError, Schema, explain
 from stiffopt.units import Frequency, read_from_file
@@ -124,6 +131,7 @@ class RigDescription(Schema):
     control : how the daemon's loop steers.
     service : where the daemon listens.
     log : recordings.
+    commissioning : what has to be found before the arm may be armed.
     published : of this arm, which experiments compare themselves with; None for nothing.
     scene : what is around the arm, or None; checked against the robot, see `stiffopt.model.scene`.
     plant : the arm behind simulated devices, and in the virtual lab; a
@@ -147,6 +155,7 @@ class RigDescription(Schema):
     control: ControlSettings = ControlSettings()
     service: ServiceSettings = ServiceSettings()
     log: LogSettings = LogSettings()
+    commissioning: CommissioningSettings = CommissioningSettings()
     published: Published | None = None
     scene: SceneOrFile | None = None
     plant: Annotated[
@@ -179,7 +188,11 @@ def load_rig_description(path: str | os.PathLike[str]) -> RigDescription:
         ) from None
     except InputError as error:
         raise FileError(path, str(error), line=line_of(path, "robot"), key="robot") from None
-    return description
+    if description.commissioning.record is not None:
+        return description
+    record = str(Path(path).absolute().with_suffix(".commissioning.yaml"))
+    settings = description.commissioning.model_copy(update={"record": record})
+    return description.model_copy(update={"commissioning": settings})
 
 
 def _check_against(description: RigDescription, robot: RobotDescription) -> None:

@@ -304,6 +304,10 @@ class SupplySettings(DeviceSettings):
                 raise InputError(f"channel {index + 1}: its limits leave no pressure to command")
         return PressureLimits(low, high)
 
+    def measures(self, channel: int) -> bool:
+        """Whether a channel (from 0) has a gauge; a driver for supplies without says so here."""
+        return True
+
     def _make(self, limits: PressureLimits, clock: Clock | None) -> PressureSupply:
         """Return the supply, not yet open, with these limits."""
         raise NotImplementedError(f"{type(self).__name__} makes no supply")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from stiffopt.model.description import PerChannelPressure, PerChannelRate
 from stiffopt.schema import BadKeyError, Schema
@@ -14,6 +16,12 @@ from stiffopt.units import Duration, Force, Length, Ratio, Speed
 def _none(value: Any) -> Any:
     """Read the word ``none`` as None, which a file cannot say otherwise."""
     return None if value == "none" else value
+
+
+def _beside(value: Any, info: ValidationInfo) -> Any:
+    """Make of a path in a file one that does not depend on where the program runs."""
+    folder = info.context.get("folder") if isinstance(info.context, Mapping) else None
+    return str(Path(folder) / value) if folder is not None and isinstance(value, str) else value
 
 
 _Port = Annotated[int, Field(ge=0, le=65535, strict=True)]
@@ -141,6 +149,24 @@ class LogSettings(Schema):
     """
 
     folder: Annotated[str, Field(min_length=1)] = "runs"
+
+
+class CommissioningSettings(Schema):
+    """What `stiffopt commission` has to have found before the arm may be armed.
+
+    Attributes
+    ----------
+    record : path of its record, relative to the rig file; by default beside it, with its name and
+        the ending ``.commissioning.yaml``.
+    max_age : an older record does not count, in s.
+    required : whether the arm may be armed only with a record that fits; by default so, but not
+        for simulated supplies. A record that is there and says that something does not fit
+        counts in any case.
+    """
+
+    record: Annotated[str, BeforeValidator(_beside)] | None = None
+    max_age: Annotated[Duration, Field(gt=0)] = 24 * 3600.0
+    required: bool | None = None
 
 
 class Published(Schema):

@@ -225,6 +225,10 @@ class ModbusSettings(SupplySettings):
             raise InputError("expected one of the keys 'tcp' and 'serial'")
         return connection
 
+    def measures(self, channel: int) -> bool:
+        """Whether the channel has a register of readings."""
+        return self.channels[channel].reading is not None
+
     def _reach(self, channel: int) -> tuple[float, float]:
         return self.setpoints[channel].pressure_range()
 

@@ -176,6 +176,10 @@ class NidaqSettings(SupplySettings):
                     names[name] = f"channel {index + 1}"
         return self
 
+    def measures(self, channel: int) -> bool:
+        """Whether the channel has an input."""
+        return self.channels[channel].input is not None
+
     def _reach(self, channel: int) -> tuple[float, float]:
         low, high = sorted(self.channels[channel].output.pressures)
         return low, high

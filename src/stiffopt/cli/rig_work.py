@@ -1,0 +1,63 @@
+"""What commands do with a rig: find it, open it, work on it, and vent it whatever happens."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from datetime import datetime
+from typing import TypeVar
+
+from stiffopt.cli.exits import InterruptBetweenSteps, RigFaultError
+from stiffopt.errors import DeviceError, StiffoptError
+from stiffopt.rig.interface import Rig
+
+T = TypeVar("T")
+
+
+class RigStoppedError(RigFaultError):
+    """Something went wrong after the rig was opened."""
+
+
+def rig_of(path: str) -> tuple[Rig, str, float, str]:
+    """The rig of a file, its name, its rate and its log folder."""
+    from stiffopt.rig.config import load_rig_description
+    from stiffopt.safety.rigs import open_rig
+
+    description = load_rig_description(path)
+    return open_rig(path), description.name, description.rate, description.log.folder
+
+
+def new_name(experiment: str, rig: str) -> str:
+    """Name of the folder of a new experiment: that of the rig, and the time."""
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    safe = re.sub(r"[^\w.-]+", "-", rig).strip("-.") or "rig"
+    return f"{experiment}_{safe}_{stamp}"
+
+
+def open_rig_for(rig: Rig, undo: Callable[[], None]) -> None:
+    """Open the rig; if that fails, undo what was prepared."""
+    try:
+        rig.open()
+    except StiffoptError as error:
+        undo()
+        raise RigFaultError(str(error)) if isinstance(error, DeviceError) else error from error
+
+
+def on_rig(rig: Rig, work: Callable[[], T], interrupt: InterruptBetweenSteps) -> T:
+    """Work, and vent and close the rig whatever happens."""
+    failure: BaseException | None = None
+    try:
+        done = work()
+    except BaseException as error:
+        failure = error
+    interrupt.hold()
+    try:
+        rig.close()
+    except StiffoptError as error:
+        first = f" (after: {failure})" if isinstance(failure, StiffoptError) else ""
+        raise RigStoppedError(f"THE ARM MAY STILL BE UNDER PRESSURE: {error}{first}") from error
+    if isinstance(failure, StiffoptError):
+        raise RigStoppedError(f"{failure}; the arm is vented") from failure
+    if failure is not None:
+        raise failure
+    return done

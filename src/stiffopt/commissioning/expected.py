@@ -1,0 +1,186 @@
+"""What the model expects of small steps from rest, and what its numbers change about that."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.commissioning.settings import BELIEF, PROCEDURE
+from stiffopt.errors import InputError
+from stiffopt.model.actuation import SectionGeometry
+from stiffopt.model.description import RobotDescription
+from stiffopt.model.history import Memory
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.parameters import Parameter
+from stiffopt.model.parametric import ParametricArm
+from stiffopt.rig.interface import PressureLimits
+
+Array = NDArray[np.float64]
+Source = tuple[int, ...]
+"""Channels (from 0) whose chambers a line fills: one, none, or two that share it."""
+
+_CANTILEVER = 3 / 8  # of a beam's weight has the effect of a weight at its end
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedSteps:
+    """Poses of the tip at rest and after steps of each channel, and of each pair of channels.
+
+    All in the base's axes and in SI. The numbers of the arm that may be off are, in this order, the
+    force on the tip (3), and as coordinates (see `Parameter`) lengths and moduli of the segments
+    and gains of the channels, k together.
+
+    Attributes
+    ----------
+    size : of the steps, in Pa.
+    rest : pose of the tip (4, 4).
+    rest_slope : twist (6, k) of the tip at rest per number, in the base's axes.
+    sources : channels of each row of the following.
+    shift, turn : displacement and rotation vector (N, 3) of the tip from rest.
+    shift_slope, turn_slope : what the numbers change about them (N, 3, k).
+    lever : change (N, 3, 3) of the tip's axes: what a sensor's offset adds to the displacement.
+    tilt_force : lateral force on the tip that bends the arm as far as a tilt of the base by 1 rad.
+    compliance : displacement of the tip per lateral force.
+    believed : standard deviations (k,) of the numbers.
+    """
+
+    description: RobotDescription
+    size: float
+    rest: Array
+    rest_slope: Array
+    sources: tuple[Source, ...]
+    shift: Array
+    turn: Array
+    shift_slope: Array
+    turn_slope: Array
+    lever: Array
+    tilt_force: float
+    compliance: float
+    believed: Array
+
+    @property
+    def n(self) -> int:
+        """Number of channels."""
+        return self.description.n_pressures
+
+    @property
+    def farthest(self) -> float:
+        """The most that the tip moves by a step of one channel or of two, in m."""
+        return float(np.linalg.norm(self.shift, axis=1).max())
+
+    def row(self, source: Source) -> int:
+        """Row of the steps of these channels."""
+        return self.sources.index(source)
+
+
+def expected_steps(description: RobotDescription, limits: PressureLimits) -> ExpectedSteps:
+    """Choose the size of the steps and compute what they do.
+
+    Raises
+    ------
+    InputError
+        The limits leave no pressure for steps.
+    """
+    n, segments = description.n_pressures, range(description.n_segments)
+    parameters = [
+        *(Parameter(f"segments[{s}].length") for s in segments),
+        *(Parameter(f"segments[{s}].material.youngs_modulus") for s in segments),
+        *(
+            Parameter(f"segments[{s}].corrections.gain[{c}]")
+            for s in segments
+            for c in range(description.segments[s].n_channels)
+        ),
+    ]
+    arm = ParametricArm(description, parameters)
+    zero = np.clip(0.0, limits.low, limits.high)
+    as_drawn = np.zeros(len(parameters))
+    size = _size(arm, as_drawn, zero, limits)
+    sources = [(), *((k,) for k in range(n)), *combinations(range(n), 2)]
+    acting = size * _acting_share(description)
+    pressures = zero + np.array([[acting[k] * (k in each) for k in range(n)] for each in sources])
+    found = arm.poses(pressures, as_drawn)
+    poses, rotation = found.transforms, found.transforms[:, :3, :3]
+    per_number = np.concatenate(
+        [rotation @ found.per_coordinate[:, :3], rotation @ found.per_coordinate[:, 3:]], axis=1
+    )
+    body = Manipulator(description).tip_compliance(zero)
+    turned = np.kron(np.eye(2), rotation[0])
+    per_force = turned @ body[:, :3] @ rotation[0].T  # (6, 3), base axes
+    relative = rotation @ rotation[0].T
+    weight, compliance = _tip_weight(description), float(np.trace(per_force[:2, :2])) / 2
+    still = np.zeros((len(poses), 3, 3))  # what a force changes about steps is left out
+    return ExpectedSteps(
+        description=description,
+        size=size,
+        rest=poses[0],
+        rest_slope=np.hstack([per_force, per_number[0]]),
+        sources=tuple(sources),
+        shift=poses[:, :3, 3] - poses[0, :3, 3],
+        turn=rotation_vectors(relative),
+        shift_slope=np.concatenate([still, (per_number - per_number[0])[:, :3]], axis=2),
+        turn_slope=np.concatenate([still, (per_number - per_number[0])[:, 3:]], axis=2),
+        lever=rotation - rotation[0],
+        tilt_force=weight,
+        compliance=compliance,
+        believed=np.concatenate(
+            [
+                np.full(3, BELIEF.base_tilt * weight + BELIEF.sag / compliance),
+                _believed(description, parameters),
+            ]
+        ),
+    )
+
+
+def _size(arm: ParametricArm, as_drawn: Array, zero: Array, limits: PressureLimits) -> float:
+    """Size of the steps, in Pa: what moves the tip enough by the channel that moves it most."""
+    room = float((limits.high - zero).min())
+    most = PROCEDURE.share * room
+    if not most > 0:
+        raise InputError("the limits leave no pressure for a step; raise safety.max_pressure")
+    tried = zero + np.vstack([np.zeros_like(zero), most * np.eye(len(zero))])
+    tips = arm.poses(tried, as_drawn).transforms[:, :3, 3]
+    farthest = float(np.linalg.norm(tips[1:] - tips[0], axis=1).max())
+    return float(min(most, most * PROCEDURE.motion / max(farthest, 1e-9)))
+
+
+def _acting_share(description: RobotDescription) -> Array:
+    """Share (n,) of a step's pressure that acts at its end: play and creep take the rest."""
+    places = [(s, c) for s in description.segments for c in range(s.n_channels)]
+    if not any(segment.history for segment, _ in places):
+        return np.ones(len(places))
+    memory = Memory([segment.history for segment, _ in places], [c for _, c in places])
+    time, unit = PROCEDURE.first_hold + PROCEDURE.up, 1e4
+    return np.asarray(memory.run(0.1, np.full((round(time / 0.1), len(places)), unit))[-1] / unit)
+
+
+def _tip_weight(description: RobotDescription) -> float:
+    """Weight at the tip, in N, that gravity's sideways part moves the tip by as the whole arm's."""
+    mass = description.tip_mass
+    for segment in description.segments:
+        density = segment.material.density or 0.0
+        mass += _CANTILEVER * density * SectionGeometry.of(segment).area * segment.length
+    return mass * float(np.linalg.norm(description.gravity))
+
+
+def _believed(description: RobotDescription, parameters: Sequence[Parameter]) -> Array:
+    """Standard deviations of the parameters: those of a calibration, if it knows better."""
+    usual = {"length": BELIEF.length, "youngs_modulus": BELIEF.modulus, "gain": BELIEF.gain}
+    fitted = {} if description.calibration is None else {
+        each.key: each.deviation for each in description.calibration.parameters
+    }  # fmt: skip
+    found = []
+    for parameter in parameters:
+        general = usual[str(parameter.number.tolerance)]
+        found.append(min(general, max(general / 3, fitted.get(parameter.key, general))))
+    return np.array(found)
+
+
+def rotation_vectors(rotations: Array) -> Array:
+    """Rotation vectors (N, 3) of rotations (N, 3, 3) by less than a half turn."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())

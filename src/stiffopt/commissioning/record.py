@@ -1,0 +1,229 @@
+"""The record of a commissioning, ``format: stiffopt-commissioning/1``: what was found, and when.
+
+The daemon checks itself against it before it arms: is it recent, of this rig and this robot file,
+did all fit, and is the vented arm still as it was then?
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field
+
+from stiffopt.directions import Quaternion
+from stiffopt.errors import InputError
+from stiffopt.files import read_file, save_file
+from stiffopt.model.description import RobotDescription
+from stiffopt.schema import Items, Schema, Vector
+from stiffopt.units import Angle, Duration, Frequency, Length, Number, Pressure, PressureRate, Ratio
+
+KIND = "commissioning"
+
+Count = Annotated[int, Field(ge=1)]
+Text = Annotated[str, Field(min_length=1)]
+
+
+def _date(value: Any) -> str:
+    try:
+        moment = datetime.fromisoformat(value)
+    except (TypeError, ValueError):
+        moment = None
+    if moment is None or moment.tzinfo is None:
+        raise InputError("expected a date with its time zone, such as 2026-01-31T12:00:00+00:00")
+    return str(value)
+
+
+class RecordedFinding(Schema):
+    """Something that was found.
+
+    Attributes
+    ----------
+    text : what, as a sentence.
+    fits : whether the rig may be armed nevertheless.
+    advice : what to do about it, or what would tell its causes apart; may be absent.
+    keys : of the rig file, that it concerns.
+    """
+
+    text: Text
+    fits: bool
+    advice: str = ""
+    keys: Items[Text] = ()
+
+
+class RecordedNumber(Schema):
+    """A number of the set-up: how far it is from what the files say, in SI.
+
+    Attributes
+    ----------
+    name, unit : what it is; the unit is empty for a relative number.
+    value, deviation : the most probable one, and its standard deviation.
+    """
+
+    name: Text
+    unit: str = ""
+    value: Number
+    deviation: Number
+
+
+class RecordedChannel(Schema):
+    """How the arm answered to the step of one channel; what was not measured is absent.
+
+    Attributes
+    ----------
+    drives : channels (from 1) whose chambers it seems to fill.
+    displacement, expected : of the tip in the base frame, measured and modelled.
+    deviation : of each component that was measured.
+    gauge : rise of its gauge over the step.
+    gauge_offset, gauge_noise : of its gauge at rest.
+    dead_time, lag_up, lag_down, rate_up, rate_down : of its regulator.
+    drift : share of the displacement that was lost while the pressure was held.
+    """
+
+    drives: Items[Count] = ()
+    displacement: Vector[Length]
+    expected: Vector[Length]
+    deviation: Length
+    gauge: Ratio | None = None
+    gauge_offset: Pressure | None = None
+    gauge_noise: Pressure | None = None
+    dead_time: Duration | None = None
+    lag_up: Duration | None = None
+    lag_down: Duration | None = None
+    rate_up: PressureRate | None = None
+    rate_down: PressureRate | None = None
+    drift: Ratio | None = None
+
+
+class RecordedTracker(Schema):
+    """What the tracker said of the vented arm.
+
+    Attributes
+    ----------
+    position, orientation : of the tip in the base frame; no orientation: it was not tracked.
+    noise, angular_noise : standard deviation of a sample, each axis.
+    rate : samples per second.
+    latency : usual age of a sample on arrival.
+    missing : share of the samples that did not see the tip.
+    """
+
+    position: Vector[Length]
+    orientation: Quaternion | None = None
+    noise: Length
+    angular_noise: Angle | None = None
+    rate: Frequency
+    latency: Duration
+    missing: Ratio
+
+
+class RecordedSwing(Schema):
+    """The swing that the steps excited.
+
+    Attributes
+    ----------
+    frequency, damping : of it; the damping is a share of critical damping.
+    frequency_deviation, damping_deviation : standard deviations of these.
+    amplitude : the largest, just after a step.
+    """
+
+    frequency: Frequency
+    frequency_deviation: Frequency
+    damping: Ratio
+    damping_deviation: Ratio
+    amplitude: Length
+
+
+class CommissioningRecord(Schema):
+    """What a commissioning found.
+
+    Attributes
+    ----------
+    date : when it ended, with the time zone.
+    rig, robot : their names.
+    rig_hash, robot_hash : of what matters of their files, see `fingerprints`.
+    quick : whether no step was held for long.
+    fits : whether the rig may be armed.
+    findings : what is wrong or worth knowing, the worst first.
+    step : size of the steps; absent where danger ended them.
+    tracker, channels, swing : what was measured.
+    numbers : of the set-up, with their deviations.
+    unexplained : root mean square of the displacements that nothing explains.
+    log : file of the recording, relative to this one.
+    """
+
+    date: Annotated[str, BeforeValidator(_date)]
+    rig: Text
+    robot: Text
+    rig_hash: Text
+    robot_hash: Text
+    quick: bool = False
+    fits: bool
+    findings: Items[RecordedFinding] = ()
+    step: Pressure | None = None
+    tracker: RecordedTracker | None = None
+    channels: Items[RecordedChannel] = ()
+    swing: RecordedSwing | None = None
+    numbers: Items[RecordedNumber] = ()
+    unexplained: Length | None = None
+    log: str | None = None
+
+    def age(self, now: datetime | None = None) -> float:
+        """Seconds since it was made."""
+        return ((now or datetime.now(UTC)) - datetime.fromisoformat(self.date)).total_seconds()
+
+
+def load_record(path: str | os.PathLike[str]) -> CommissioningRecord:
+    """Read a record; `FileError` with the line and the key of the first mistake."""
+    return read_file(path, KIND, CommissioningRecord)
+
+
+def save_record(path: str | os.PathLike[str], record: CommissioningRecord) -> None:
+    """Write a record, whole or not at all."""
+    save_file(path, KIND, record, ("Written by 'stiffopt commission'; the daemon reads it.",))
+
+
+def fingerprints(robot: RobotDescription, rig: Any) -> tuple[str, str]:
+    """Hashes of a rig and its robot: they change with supply, tracker, registration and robot.
+
+    Parameters
+    ----------
+    robot : RobotDescription
+    rig : RigDescription
+        Or None, for a rig that was not made from a file.
+    """
+    parts = None if rig is None else [_content(rig.supply), _content(rig.tracker)]
+    return _hash(parts), _hash(_content(robot))
+
+
+def _content(schema: Schema | None) -> Any:
+    return None if schema is None else schema.model_dump(mode="json", exclude={"source"})
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def problems_of_record(
+    record: CommissioningRecord, robot: RobotDescription, rig: Any, max_age: float
+) -> Iterator[str]:
+    """Yield why a record does not permit to arm a rig; max_age is in s."""
+    rig_hash, robot_hash = fingerprints(robot, rig)
+    if record.robot_hash != robot_hash:
+        yield f"its record is of another robot file ('{record.robot}')"
+    if record.rig_hash != rig_hash:
+        yield f"its record is of another supply, tracker or registration (rig '{record.rig}')"
+    if not record.fits:
+        wrong = [each.text for each in record.findings if not each.fits]
+        yield f"it did not fit: {'; '.join(wrong) or 'see its record'}"
+    age = record.age()
+    if not -3600 <= age <= max_age:
+        yield f"its record is {_age(age)} old; at most {_age(max_age)} is asked for"
+
+
+def _age(seconds: float) -> str:
+    hours = seconds / 3600
+    return f"{hours:.3g} h" if abs(hours) < 48 else f"{hours / 24:.3g} days"

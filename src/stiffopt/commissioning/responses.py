@@ -1,0 +1,169 @@
+"""What was seen at rest and in each step: poses, gauges, lags, swings and noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.commissioning.expected import rotation_vectors
+from stiffopt.commissioning.procedure import ChannelStep, StepReadings
+from stiffopt.commissioning.timing import Delays, Swing, delays_of, fit_swing, settled
+
+Array = NDArray[np.float64]
+
+_BEGIN = 0.35  # s after a step, until regulators have followed
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """Responses to one step of each of n lines, in SI and in the base's axes.
+
+    Attributes
+    ----------
+    rest_position, rest_rotation : of the tip at rest (3,), and (3, 3) or None.
+    rest_noise : deviation of `rest_position`.
+    shift, turn : displacement and rotation vector (n, 3) by each step; no `turn`: None.
+    shift_noise, turn_noise : deviations (n,) of each axis by the tracker's noise.
+    drift : share (n,) of the displacement by which the tip comes back during the hold; NaN where
+        it was not held for long.
+    noise, angular_noise : of a sample of the tracker at rest, each axis.
+    rate, latency, missing : of the tracker: samples per s, median age on arrival in s, share of
+        the samples in which the tip was not seen.
+    gauge_offset, gauge_noise : of each gauge at rest (n,), in Pa; NaN where none reads.
+    gauge : (n, n): by how much gauge j rises when channel k is commanded, over the step.
+    gauge_deviation : of each of these.
+    size : of the steps, in Pa.
+    delays : of the regulators, by channel.
+    swing : of the tip, or None.
+    """
+
+    rest_position: Array
+    rest_rotation: Array | None
+    rest_noise: float
+    shift: Array
+    turn: Array | None
+    shift_noise: Array
+    turn_noise: Array
+    drift: Array
+    noise: float
+    angular_noise: float
+    rate: float
+    latency: float
+    missing: float
+    gauge_offset: Array
+    gauge_noise: Array
+    gauge: Array
+    gauge_deviation: float
+    size: float
+    delays: Delays
+    swing: Swing | None
+
+
+def responses_of(readings: StepReadings) -> Responses:
+    """Evaluate what was seen."""
+    r = readings
+    seen = np.isfinite(r.position).all(axis=1)
+    resting = seen & (r.time >= r.rest[0]) & (r.time <= r.rest[1])
+    place, noise = _still(r.time[resting], r.position[resting])
+    count = int(resting.sum())
+    rotation, vectors, angular_noise = None, None, 0.0
+    if r.quaternion is not None:
+        mean = r.quaternion[resting].mean(axis=0)
+        rotation = _rotations(mean[np.newaxis] / np.linalg.norm(mean))[0]
+        vectors = np.full_like(r.position, np.nan)
+        vectors[seen] = rotation_vectors(_rotations(r.quaternion[seen]) @ rotation.T)
+        angular_noise = _still(r.time[resting], vectors[resting])[1]
+    swing = fit_swing([_window(r, r.position, begin, end) for begin, end in _holds(r)], noise)
+    shift, turn, drift = [], [], []
+    rows = []
+    for step in r.steps:
+        moved, back, number = _response(r, r.position, step, swing)
+        shift.append(moved)
+        rows.append(number)
+        drift.append(back)
+        if vectors is not None:
+            turn.append(_response(r, vectors, step, swing)[0])
+    gauge_offset, gauge_noise, gauge, deviation = _gauges(r)
+    spread = np.sqrt(2 / np.maximum(rows, 1))
+    steps = np.diff(r.time[seen])
+    return Responses(
+        rest_position=place,
+        rest_rotation=rotation,
+        rest_noise=noise / np.sqrt(count),
+        shift=np.array(shift),
+        turn=None if vectors is None else np.array(turn),
+        shift_noise=noise * spread,
+        turn_noise=angular_noise * spread,
+        drift=np.array(drift),
+        noise=noise,
+        angular_noise=angular_noise,
+        rate=float(1 / np.median(steps)),
+        latency=float(np.median(r.age)),
+        missing=1 - float(seen.mean()),
+        gauge_offset=gauge_offset,
+        gauge_noise=gauge_noise,
+        gauge=gauge,
+        gauge_deviation=deviation,
+        size=r.size,
+        delays=delays_of(r),
+        swing=swing,
+    )
+
+
+def _still(time: Array, values: Array) -> tuple[Array, float]:
+    """Mean (3,) of what hardly moves, and the deviation of a sample in each axis."""
+    slopes = np.polyfit(time - time.mean(), values, 1)[0]
+    rest = values - values.mean(axis=0) - np.outer(time - time.mean(), slopes)
+    return values.mean(axis=0), float(np.sqrt(np.mean(rest**2)))
+
+
+def _holds(r: StepReadings) -> list[tuple[float, float]]:
+    """Begin and end of all times in which a step or its release was held."""
+    return [each for step in r.steps for each in ((step.up, step.down), (step.down, step.end))]
+
+
+def _window(r: StepReadings, values: Array, begin: float, end: float) -> tuple[Array, Array]:
+    """Times (m,) since a step, and what was seen (m, c) from when its regulator had followed."""
+    rows = (r.time > begin + _BEGIN) & (r.time <= end) & np.isfinite(values).all(axis=1)
+    return r.time[rows] - begin, values[rows]
+
+
+def _response(
+    r: StepReadings, values: Array, step: ChannelStep, swing: Swing | None
+) -> tuple[Array, float, int]:
+    """What a step changes (c,), the share of it that comes back in a long hold, and the rows."""
+    since = r.steps[r.steps.index(step) - 1].down if step.channel else r.rest[0] - _BEGIN
+    before = settled(*_window(r, values, since, step.first), swing, last=1.5)
+    after = settled(*_window(r, values, step.down, step.end), swing, last=1.5)
+    time, held = _window(r, values, step.up, step.down)
+    early = time < 3.5
+    up = settled(time[early], held[early], swing, last=2.0)
+    moved = up - (before + after) / 2
+    back = np.nan
+    if step.down - step.up > 8.0:
+        late = settled(time, held, swing, last=3.0)
+        back = 1 - float((late - before) @ (up - before)) / max(float(moved @ moved), 1e-18)
+    return moved, back, int(early.sum())
+
+
+def _gauges(r: StepReadings) -> tuple[Array, Array, Array, float]:
+    """Offsets (n,) and noise (n,) of the gauges, their rise (n, n) in each step, its deviation."""
+    resting = (r.tick >= r.rest[0]) & (r.tick <= r.rest[1])
+    offset, noise = r.measured[resting].mean(axis=0), r.measured[resting].std(axis=0)
+    rises, least = [], np.inf
+    for step in r.steps:
+        held = (r.tick > (step.up + step.down) / 2) & (r.tick <= step.down)
+        free = (r.tick > (step.down + step.end) / 2) & (r.tick <= step.end)
+        least = min(least, float(held.sum()), float(free.sum()))
+        rises.append((r.measured[held].mean(axis=0) - r.measured[free].mean(axis=0)) / r.size)
+    deviation = float(np.sqrt(2 / least) * np.nanmax([0.0, *noise])) / r.size
+    return offset, noise, np.array(rises), deviation
+
+
+def _rotations(quaternions: Array) -> Array:
+    """Rotations (N, 3, 3) of quaternions (N, 4), w first."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(quaternions, scalar_first=True).as_matrix())
