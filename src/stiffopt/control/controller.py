@@ -341,7 +341,7 @@ class TipController:
         if counts.used and sample is not None:
             self._watch.take(
                 sample.time, sample.position, self._estimator.predicted, self._estimator.offset,
-                effective, tip, turns=self._estimator.turn_known,
+                effective, tip, turns=self._estimator.turn_known, swing=self._estimator.swing,
             )  # fmt: skip
         if self.forecast is not None:
             self.forecast.present = self._present(now)

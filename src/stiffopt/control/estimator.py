@@ -114,6 +114,7 @@ class TipEstimator:
         self._ticks = 0
         self.sample: PoseSample | None = None  # the latest that was used
         self.predicted: Array = np.zeros(3)  # for the moment of its capture, offset left out
+        self.swing = 0.0  # amplitudes of both vibrations then, in m
         self._first: PoseSample | None = None
         self._unchanged: tuple[Array, Array] | None = None  # a sample, and the model's tip with it
         self._last_sample, self._rejected = -math.inf, 0
@@ -230,6 +231,10 @@ class TipEstimator:
         turning = rotation @ tip.compliance[3:, :3] @ rotation.T
         self._lean = turning @ axes[:, 1:] @ np.diag(1 / compliances[1:]) @ axes[:, 1:].T
 
+    def _amplitude(self, vibration: Array) -> float:
+        """Amplitude of a vibration (2, 3), in m."""
+        return math.hypot(*vibration[0].tolist(), *(vibration[1] / self.omega).tolist())
+
     def _transition(self, duration: float) -> Array:
         """Transition matrix (2, 2) of the free vibration over a duration in s."""
         if not math.isfinite(self.omega):
@@ -296,6 +301,7 @@ class TipEstimator:
         self._used_until = sample.time
         self.sample, self._rejected = sample, 0
         self.predicted = past.static + past.driven[0]
+        self.swing = self._amplitude(past.driven) + self._amplitude(self._free)
 
 
 def _prediction(mode: BendingMode | None, n: int, damping: float) -> Formula:

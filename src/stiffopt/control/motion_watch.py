@@ -32,7 +32,7 @@ from stiffopt.optimise.tip import TipAt
 Array = NDArray[np.float64]
 
 _TIME, _SEEN, _PREDICTED, _INTENDED = 0, slice(1, 4), slice(4, 7), slice(7, 10)  # of a row
-_OFFSET, _TURN, _PRESSURES = slice(10, 13), slice(13, 16), slice(16, None)
+_OFFSET, _TURN, _SWING, _PRESSURES = slice(10, 13), slice(13, 16), 16, slice(17, None)
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,8 @@ class MotionWatch:
         self._segments = [slice(a, b) for a, b in pairwise([0, *ends])]
         longest = max(scale.interval * scale.count for scale in tuning.scales)
         self._kept = round(longest / tuning.spacing) + 2
-        self._rows: Array = np.empty(
-            (2 * self._kept, 16 + ends[-1])
-        )  # samples: see `_SEEN` and others
+        width = _PRESSURES.start + ends[-1]  # of a sample; see `_SEEN` and the others
+        self._rows: Array = np.empty((2 * self._kept, width))
         self.begin()
 
     def begin(self) -> None:
@@ -105,6 +104,7 @@ class MotionWatch:
         tip: TipAt,
         *,
         turns: bool,
+        swing: float = 0.0,
     ) -> None:
         """Take in a sample of the tracker.
 
@@ -122,6 +122,8 @@ class MotionWatch:
             The model's tip at these.
         turns :
             Whether the tracker measures orientations.
+        swing :
+            Amplitude of the vibration, whose phase may be wrong, in m.
         """
         intended = self._intended_at(time)
         if intended is None or self._is_early(time) or self.doubt is not None:
@@ -129,7 +131,7 @@ class MotionWatch:
         if self._count == len(self._rows):
             self._rows[: self._kept] = self._rows[-self._kept :]
             self._count = self._kept
-        self._rows[self._count] = (time, *seen, *predicted, *intended, *offset, *pressures)
+        self._rows[self._count] = (time, *seen, *predicted, *intended, *offset, swing, *pressures)
         self._count += 1
         if self._count > 1:
             self._path += float(np.linalg.norm(intended - self._rows[self._count - 2, _INTENDED]))
@@ -152,14 +154,14 @@ class MotionWatch:
         return None
 
     def _since(self, duration: float) -> Array:
-        """Samples (k, 16 + n) of the last so many seconds."""
+        """Samples (k, 17 + n) of the last so many seconds."""
         rows = self._rows[: self._count]
         return rows[np.searchsorted(rows[:, _TIME], rows[-1, _TIME] - duration) :]
 
     def _explained(self, changes: Array, jacobian: Array) -> Array:
         """Errors (k,) of the model's motion that are no surprise, in m.
 
-        `changes` (k, 16 + n) of samples; Jacobian (3, n) of the tip's position, base axes.
+        `changes` (k, 17 + n) of samples; Jacobian (3, n) of the tip's position, base axes.
         """
         moved = np.zeros(len(changes))
         for channels in self._segments:
@@ -184,7 +186,8 @@ class MotionWatch:
         steps = np.diff(rows, axis=0)
         speeds = np.sqrt((steps[:, _PREDICTED] ** 2).sum(axis=1)) / steps[:, _TIME]
         late = tuning.late * (speeds[suspects] + speeds[-1:])  # y than s, in m
-        explained = self._explained(ways[suspects], jacobian) + late + tuning.noise
+        swing = rows[suspects, _SWING] + rows[-1, _SWING]
+        explained = self._explained(ways[suspects], jacobian) + late + swing + tuning.noise
         missed = suspects[off > explained]
         self._misses = self._misses + 1 if len(missed) else 0
         if self._misses < tuning.misses:

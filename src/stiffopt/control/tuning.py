@@ -275,8 +275,8 @@ class MotionTuning:
     )
     turn: float = 1e-3  # way back after which a swing has turned, in m
     swings: int = 4  # between turns, one after the other
-    least_swing: float = 2.5e-3  # from one turn to the next, in m
-    decay: float = 0.75  # a last swing that is a smaller share of the largest decays
+    least_swing: float = 4.5e-3  # from one turn to the next, in m
+    decay: float = 0.8  # a last swing that is a smaller share of the largest decays
     swing_window: float = 6.0  # in which they must be, in s
 
 
