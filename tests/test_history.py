@@ -380,9 +380,13 @@ def test_parts_may_be_cut_into_any_steps_and_settle_in_the_middle() -> None:
         for _ in range(7):
             found = cut.advance(0.9 / 7, p)
         assert found == pytest.approx(expected, rel=1e-9, abs=1e-6)
-    whole.settle(path[0], 1.0)
+    whole.settle(path[0])
     assert whole.effective == pytest.approx(path[0])
     assert whole.advance(2.0, path[0]) == pytest.approx(path[0])
+    whole.settle(path[0], 1.0)  # all alike, they do not bend
+    after_a_fall = path[0] + np.repeat([histories[0].largest_memory, 0.0], 3)
+    assert whole.effective == pytest.approx(after_a_fall)
+    assert whole.advance(2.0, path[0]) == pytest.approx(after_a_fall)
 
 
 def test_segments_and_lone_channels_know_nothing_of_each_other() -> None:

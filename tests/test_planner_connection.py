@@ -106,7 +106,7 @@ def test_a_task_is_sent_once_and_again_on_a_new_line(ends: Ends) -> None:
         return set(pickle.loads(sent.pop()))
 
     arrays = {"offset", "pressure_offset", "low", "high", "way"}
-    everything = {"serial", "task", "target", "search", "last", *arrays}
+    everything = {"serial", "task", "target", "search", "last", "windows", "adapted", *arrays}
     assert news(ends.ours, first) == everything
     assert news(ends.ours, replace(first, offset=0 * OFFSET)) == arrays
     other = Ends()

@@ -61,6 +61,7 @@ class Channels:
         self._let_down = tuning.let_down_share * slew
         self._empty = np.clip(0.0, limits.low, limits.high)
         self.out: Flags = np.zeros(limits.n, dtype=bool)
+        self._any_out = False
         self.begin()
 
     def begin(self) -> None:
@@ -87,7 +88,7 @@ class Channels:
         now = np.clip(self._read, self._empty, self._limits.high)
         falling = np.where(self.out, self._ceiling, now)
         self._ceiling = np.where(out, falling, self._limits.high)
-        self.out = out
+        self.out, self._any_out = out, bool(out.any())
 
     @property
     def lost(self) -> Flags:
@@ -102,9 +103,10 @@ class Channels:
         """
         self.shortfall = -offset
         share = -math.expm1(-elapsed / self._tuning.reading_time)
-        change = np.where(np.isfinite(reading), reading - self._read, 0.0)
-        self._read = self._read + share * change
-        if self.out.any():
+        change = share * (reading - self._read)
+        change[~np.isfinite(change)] = 0.0
+        self._read = self._read + change
+        if self._any_out:
             self._ceiling = np.where(
                 self.out, np.maximum(self._ceiling - self._let_down * elapsed, self._empty),
                 self._limits.high,
@@ -151,7 +153,7 @@ class Channels:
     def available(self) -> tuple[Array, Array]:
         """Lowest and highest pressures (n,) that channels can settle at, in Pa."""
         low, high = self._limits.low, self._limits.high
-        if not self.lost.any():
+        if self._quiet and not self._any_out:
             return low, high
         has = np.clip(self._has, low, high)
         high = np.where(self.out, self._empty, np.where(self.limited, has, high))
@@ -160,7 +162,7 @@ class Channels:
 
     def commands(self, path: Array, low: Array, high: Array) -> tuple[Array, Array]:
         """Lowest and highest commands (n,) on the way along a path (n,), within others, in Pa."""
-        if self.limited.any():
+        if not self._quiet and self.limited.any():
             above, below = self._has + self._most, self._read - self._below
             pressed = path > self._has - self._tuning.follows
             least = np.where(self.stuck, self._has - self._below, np.where(pressed, above, below))
@@ -169,13 +171,13 @@ class Channels:
                 np.where(self.limited, np.clip(bound, low, high), limit)
                 for bound, limit in ((least, low), (greatest, high))
             )
-        if self.out.any():
+        if self._any_out:
             high = np.maximum(np.minimum(high, self._ceiling), low)
         return low, high
 
     def notices(self) -> Iterator[Notice]:
         """Say which channels are not what they should be."""
-        if self.lost.any():
+        if not (self._quiet and not self._any_out) and self.lost.any():
             each = ", ".join(self._words(int(c)) for c in np.flatnonzero(self.lost))
             yield Notice("lost-channel", f"{each}; the plan goes on with the others", standing=True)
         fed = ~self.limited & (self._allowed > self._tuning.told_share * self._most)

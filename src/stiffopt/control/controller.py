@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stiffopt.control.adaptation import Adapted
 from stiffopt.control.allocation import Allocation
 from stiffopt.control.channels import Channels
 from stiffopt.control.checks import check_rates, limited_range, refusing
@@ -35,7 +36,8 @@ from stiffopt.control.state import ControllerStatus, Severity
 from stiffopt.control.tip_errors import TipErrors, target_arrays, wrench_at
 from stiffopt.control.tuning import ControlTuning
 from stiffopt.control.vibration import BendingMode
-from stiffopt.errors import InputError
+from stiffopt.control.windows import WindowWatch
+from stiffopt.errors import InputError, StiffoptError
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.target import Target
@@ -47,6 +49,7 @@ from stiffopt.rig.settings import ControlSettings, Safety
 
 Array = NDArray[np.float64]
 
+_NORMAL = 1.959963984540054  # 97.5 % quantile
 _MOST_STEPS = 50  # of the estimators in one tick, after a pause
 _HELD = 2.5  # periods without a command, after which others have commanded
 _SLACK = 1e-3  # Pa, of a limit, by rounding
@@ -137,10 +140,13 @@ class TipController:
             self.forecast = Forecast(Planner(robot, scene), tuning.forecast)
         self._lead = dead_time + 0.5 * period
         self._errors = TipErrors()
+        self._windows = WindowWatch(tuning.windows)
+        self._adapts = control.adaptation != "none"
         self._watch = MotionWatch(robot.description, tuning.motion)
         self._model: LinearisedTip | None = None  # at the effective pressures
         self._path_model: LinearisedTip | None = None  # on the reference's path
         self._waypoint_model: TipModel | None = None  # at a trajectory's waypoints
+        self._robot = robot  # as adapted
         self.begin(0.0)
 
     def check(self) -> None:
@@ -156,6 +162,7 @@ class TipController:
             )
         self._model, self._path_model = model, path_model
         self._waypoint_model = TipModel(self.robot)
+        self._robot = self.robot
         self.begin(self._now)
 
     def begin(self, now: float) -> None:
@@ -176,6 +183,9 @@ class TipController:
             self._estimator.advance(now, zero, self._tip)
         self._at_rest = True  # the reference begins at the present pressures
         self._computed_at = now
+        self._adapted_at = -math.inf  # when the model changed; not since the last request
+        self._watched_at = -math.inf  # when it was last looked whether the tip rests
+        self._windows.begin()
         self._led_to: Target | None = None  # by a trajectory of pressures, now
 
     def set_task(self, task: Task) -> None:
@@ -254,6 +264,7 @@ class TipController:
         limited = _within_limits(task, self.robot, self.limits)
         lower, upper = limited.pressure_bounds(self.robot.description)
         self.replanner.pursue(Pursuit.of(task, limited, course))
+        self._adapted_at = -math.inf
         self._permitted = lower, upper  # last, since it cannot fail: the pursuit has changed
 
     def _pursue_target(self, target: Target, course: Course | PostureCourse | None = None) -> None:
@@ -263,6 +274,7 @@ class TipController:
             self._pursue_task(self._plain_task(target), course)
         else:
             self.replanner.pursue(pursuit.to(target, course))
+            self._adapted_at = -math.inf
 
     def _plain_task(self, target: Target) -> Task:
         return Task(robot=self.robot.description.name, target=target)
@@ -339,8 +351,8 @@ class TipController:
         estimate, replanner = self._estimator.estimate, self.replanner
         return Present(
             replanner.pursuit, replanner.plan, self._way(now), self._estimator.offset,
-            self._pressures.command_offset, self._channels.available(), estimate.position,
-            estimate.rotation,
+            self._pressures.command_offset, self._channels.available(), replanner.adapted,
+            estimate.position, estimate.rotation,
         )  # fmt: skip
 
     def _way(self, now: float) -> Array:
@@ -358,6 +370,8 @@ class TipController:
     def _compute(self, now: float) -> ControlOutput:
         reference, estimator, pressures = self._reference, self._estimator, self._pressures
         omega, command_offset = estimator.omega, pressures.command_offset
+        if self._adapts:
+            self._adapt(now)
         plan = self._plan(now)
         last, n = pressures.command, len(pressures.command)
         if plan is None:  # nothing to do, or no plan yet
@@ -399,12 +413,76 @@ class TipController:
         if isinstance(course, PostureCourse):
             reference.slew_share = tuning.posture.slew_share
             return course.goal(now + reference.delay + self._lead)
-        reference.slew_share = tuning.reference.slew_share
+        calm = now - self._adapted_at < tuning.adaptation.calm_time
+        share = tuning.adaptation.slew_share if calm else tuning.reference.slew_share
+        reference.slew_share = share
         way = None if self.forecast is None else self._way(now)
         return replanner.update(
             now, estimator.offset, self._pressures.command_offset, estimator.omega,
-            reference.delay, self._channels.available(), way,
+            reference.delay, self._channels.available(), way, self._windows.windows,
         )  # fmt: skip
+
+    def _adapt(self, now: float) -> None:
+        """Watch the tip at rest, and go on with other numbers of the arm when it is time."""
+        if now - self._watched_at < self._tuning.windows.every:
+            return
+        self._watched_at = now
+        windows, known = self._windows, self.replanner.known
+        if self._rests(now):
+            windows.look(now, self._pressures.effective, self._estimator)
+        else:
+            windows.begin()
+        if known is None or known.proposal is None or not windows.has_rested(now):
+            return
+        if now - self._adapted_at > self._tuning.adaptation.interval:
+            self._go_on_with(known.proposal)
+
+    def _rests(self, now: float) -> bool:
+        """Whether the arm is at rest, steered, and seen."""
+        estimator, t = self._estimator, self._tuning.windows
+        sample = estimator.sample
+        if sample is None or now - sample.time > t.seen or self._is_held(now):
+            return False
+        if self.replanner.pursuit.course is not None or not self._has_arrived():
+            return False
+        return float(np.abs(estimator.vibration[0]).max()) < t.vibration
+
+    def _go_on_with(self, adapted: Adapted) -> None:
+        """Go on with other numbers of the arm, so that nothing moves at this moment.
+
+        The offset takes up what the model changes by, everywhere in the loop.
+        """
+        model, path_model = self._models()
+        assert self._waypoint_model is not None
+        models = (model, path_model, self._waypoint_model)
+        effective = self._pressures.effective
+        before, last = model.at(effective), self._robot
+        try:
+            robot = Manipulator(adapted.description)
+            for each in models:
+                each.change(robot)
+            after = model.at(effective)
+        except StiffoptError:  # no such arm stands: stay with the last
+            for each in models:
+                each.change(last)
+            return
+        self._robot, self._tip, self._adapted_at = robot, after, self._now
+        change = self._estimator.change_model(before, after)
+        self._corrected_offset = self._corrected_offset + change
+        self._watch.change_model(change)
+        self._reference.shift(change)
+        self.replanner.go_on_with(adapted, change)
+
+    def _has_arrived(self) -> bool:
+        """Whether the reference rests on the plan."""
+        reference, plan = self._reference, self.replanner.plan
+        if plan is None:
+            return False
+        n, tuning = len(plan.pressures), self._tuning.reference
+        for place in (reference.path, reference.goal):
+            if np.abs(place[:n] - plan.pressures).max() > tuning.there:
+                return False
+        return bool(np.abs(reference.motion[1, :n]).max() <= tuning.at_rest)
 
     def _set_reference_rate(self) -> None:
         tuning, rate = self._tuning.reference, self._tuning.reference.rigid_rate
@@ -425,6 +503,7 @@ class TipController:
         stiffness = math.nan
         if pursuit.stiffness is not None:
             stiffness = pursuit.stiffness(tip.compliance, tip.pose[:3, :3])
+        ratio = math.exp(_NORMAL * self.replanner.deviation)  # NaN if it is not known
         turn = estimate.turn if self._estimator.turn_known else None
         planned = np.full(n, np.nan)
         if self._led_to is not None:
@@ -443,6 +522,9 @@ class TipController:
             position_error=position_error,
             angle_error=angle_error,
             stiffness=stiffness,
+            stiffness_low=stiffness / ratio,
+            stiffness_high=stiffness * ratio,
+            adapted=() if self.replanner.known is None else self.replanner.known.numbers,
             best_stiffness=math.nan if plan is None else plan.stiffness,
             disturbance=estimate.offset,
             wrench=wrench_at(tip, estimate.offset, turn),
@@ -469,14 +551,8 @@ class TipController:
 
     def _away(self) -> tuple[float, float] | None:
         """Distance and angle of a tip that rests on its plan from its target; else None."""
-        reference, plan, pursuit = self._reference, self.replanner.plan, self.replanner.pursuit
-        if plan is None or plan.reached or pursuit.course is not None:
-            return None
-        n = len(plan.pressures)
-        ways = np.stack([reference.path[:n], reference.goal[:n]]) - plan.pressures
-        speed = np.abs(reference.motion[1, :n]).max()
-        tuning = self._tuning.reference
-        if np.abs(ways).max() > tuning.there or speed > tuning.at_rest:
+        plan, pursuit = self.replanner.plan, self.replanner.pursuit
+        if plan is None or plan.reached or pursuit.course is not None or not self._has_arrived():
             return None
         estimate = self._estimator.estimate
         return self._errors.at(pursuit.target, estimate.position, estimate.rotation)

@@ -129,6 +129,11 @@ class TipEstimator:
         )
 
     @property
+    def position(self) -> Array:
+        """Estimated position (3,) without the vibration, in m."""
+        return self._past[-1].static + self.offset[:3]
+
+    @property
     def vibration(self) -> Array:
         """Vibration and its speed (2, 3), in m and m/s."""
         return self._past[-1].driven + self._free
@@ -184,6 +189,29 @@ class TipEstimator:
                     self.sample = self._first = None
             self._last_sample = sample.time
         return SampleCounts(used, rejected, self._used_until)
+
+    def change_model(self, before: TipAt, after: TipAt) -> Array:
+        """Go on with another model, of which the tip is `after` where that of the last was.
+
+        The estimated tip stays where it is: the offset takes up the difference, which is returned
+        (6,), in m and rad.
+        """
+        shift = after.pose[:3, 3] - before.pose[:3, 3]
+        turn = after.pose[:3, :3] @ before.pose[:3, :3].T
+        own = np.asarray(lie.exp(np.concatenate([np.zeros(3), self.offset[3:]])))
+        left = np.asarray(lie.log(own @ lie.transform(turn.T, np.zeros(3))))[3:]
+        offset = np.concatenate([self.offset[:3] - shift, left])
+        change, self.offset = offset - self.offset, offset
+        past = [
+            _PastTip(each.time, each.static + shift, turn @ each.rotation, each.driven)
+            for each in self._past
+        ]
+        self._past.clear()
+        self._past.extend(past)
+        self.predicted = self.predicted + shift
+        if self._unchanged is not None:
+            self._unchanged = self._unchanged[0], self._unchanged[1] + shift
+        return change
 
     def _update_mode(self, tip: TipAt) -> None:
         """Compute frequency, soft plane and lean from the compliance, every few steps."""

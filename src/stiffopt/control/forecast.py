@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.adaptation import Adapted
 from stiffopt.control.course import Course
 from stiffopt.control.planner import InlinePlanner, ProcessPlanner
 from stiffopt.control.planning import Plan, PlanRequest
@@ -37,6 +38,7 @@ class Present:
     offset: Array  # of the tip (6,), see `PlanRequest`
     pressure_offset: Array  # (n,), likewise
     available: tuple[Array, Array]  # lowest and highest (n,), likewise
+    adapted: Adapted | None  # the arm, likewise
     position: Array  # of the tip (3,)
     rotation: Array  # (3, 3)
 
@@ -68,8 +70,9 @@ class Forecast:
             here, self._deadline = self.here(), time.monotonic() + self._tuning.patience
             way = np.vstack([here.way[-1:], pressures])
             request = PlanRequest(
-                self._serial, None, None, here.offset.copy(), here.pressure_offset, way=way
-            )
+                self._serial, None, None, here.offset.copy(), here.pressure_offset, way=way,
+                adapted=here.adapted,
+            )  # fmt: skip
             _refuse_blocked(self._answer(request))
             self._checked = trajectory, here.way[-1]
 
@@ -116,6 +119,7 @@ class Forecast:
         request = PlanRequest(
             self._serial, pursuit.task, target, here.offset.copy(), here.pressure_offset,
             search or fresh or last is None, *here.available, way=way, last=last,
+            adapted=here.adapted,
         )  # fmt: skip
         plan = self._answer(request)
         _refuse_blocked(plan)

@@ -45,6 +45,12 @@ class LinearisedTip:
         """Whether machine code evaluates the model; see `TipModel`."""
         return self._model.is_fast
 
+    def change(self, robot: Manipulator) -> None:
+        """Go on with another arm; see `TipModel.change`."""
+        self._tip = None
+        self._operating_point = np.full(robot.n_pressures, np.inf)
+        self._model.change(robot)
+
     def at(self, pressures: Array) -> TipAt:
         """Return the tip at pressures (n,), in Pa; `StiffoptError` without an equilibrium there."""
         tip, there = self._tip, self._operating_point

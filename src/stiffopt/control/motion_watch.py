@@ -84,6 +84,13 @@ class MotionWatch:
         self._swings = [_Swings(self._tuning) for _ in range(3)]
         self.doubt: Doubt | None = None
 
+    def change_model(self, change: Array) -> None:
+        """Go on with another model, from which the tip is off by another offset (6,)."""
+        rows = self._rows[: self._count]
+        rows[:, _PREDICTED] -= change[:3]
+        rows[:, _OFFSET] += change[:3]
+        rows[:, _TURN] += change[3:]
+
     def intend(self, now: float, position: Array) -> None:
         """Note where the reference intends the tip to be (3,), in each tick that is steered."""
         self._intended.append((now, position))

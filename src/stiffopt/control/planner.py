@@ -42,7 +42,15 @@ _ARRAYS = (
     "high",
     "way",
 )  # of a request: compared and sent by value, every time
-_OBJECTS = ("serial", "task", "target", "search", "last")  # immutable: compared by identity
+_OBJECTS = (
+    "serial",
+    "task",
+    "target",
+    "search",
+    "last",
+    "windows",
+    "adapted",
+)  # immutable: compared by identity
 
 
 class InlinePlanner:
@@ -235,6 +243,7 @@ class PlannerEnd:
             pressures=np.array(answer.pop("pressures")),
             offset=request.offset,
             target=request.target,
+            adapted=request.adapted,
             **answer,
         )
 
@@ -255,7 +264,10 @@ class PlanningEnd:
     def answer(self, answer: Plan | str | None) -> None:
         """Send the plan for the last request, or why there is none; None: the process is ready."""
         if isinstance(answer, Plan):
-            names = ("reached", "stiffness", "message", "far", "blocked", "doubt")
+            names = (
+                *("reached", "stiffness", "message", "far", "blocked", "doubt"),
+                *("deviation", "estimate"),
+            )
             own = {name: getattr(answer, name) for name in names}
             self.connection.send({"pressures": answer.pressures.tolist(), **own})
         else:

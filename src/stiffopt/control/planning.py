@@ -18,12 +18,15 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.adaptation import Adapted, Estimate, Learning, Window
 from stiffopt.control.tip_errors import TipErrors
-from stiffopt.control.tuning import FeedbackTuning, NearestTuning, PlanningTuning
+from stiffopt.control.tuning import AdaptationTuning, FeedbackTuning, NearestTuning, PlanningTuning
 from stiffopt.control.ways import Ways
 from stiffopt.errors import InputError
+from stiffopt.model.arguments import checked_measure
 from stiffopt.model.manipulator import Manipulator
 from stiffopt.model.scene import Scene
+from stiffopt.optimise.goal import StiffnessMeasure
 from stiffopt.optimise.solution import PressureSolution
 from stiffopt.optimise.solver import PressureSolver
 from stiffopt.optimise.target import Target, Tolerance
@@ -54,6 +57,8 @@ class PlanRequest:
     # where a scene is to be kept: effective pressures (k, n) on the way before the plan, in Pa
     way: Array = field(default_factory=lambda: np.zeros((0, 0)))
     last: Plan | None = None  # takes the place of the planner's own last plan
+    windows: tuple[Window, ...] = ()  # of the tip at rest, from which numbers are adapted
+    adapted: Adapted | None = None  # the arm that the offset belongs to; None: as its file has it
 
 
 @dataclass(frozen=True)
@@ -70,30 +75,64 @@ class Plan:
     blocked: str = ""  # why the way there is not clear of the scene
     doubt: str = ""  # that the model extrapolates there
     far: bool = False  # whether `message` is of `nearest_words`
+    adapted: Adapted | None = None  # the arm that it was made with, as in the request
+    deviation: float = math.nan  # of the stiffness there, relative
+    estimate: Estimate | None = None  # of the arm's numbers, if it is new
 
 
 class Planning:
     """Makes plans for an arm, each from the last one."""
 
     def __init__(self, robot: Manipulator, scene: Scene | None = None) -> None:
-        self._robot, self._tuning = robot, PlanningTuning()
-        self._ways = None if scene is None else Ways(robot, scene)
-        self._search = NearestSearch(TipModel(robot), FeedbackTuning().lever, NearestTuning())
+        self._tuning, self._scene = PlanningTuning(), scene
+        self._original = robot
+        self._adapted: Adapted | None = None
+        self._learning = Learning(robot.description, AdaptationTuning())
+        self._put(robot)
         self._serial, self._is_compiled = -1, False
         self._last: Plan | None = None
         self._searched_at: Array = np.zeros(6)
         self._advantage, self._refused = self._tuning.advantage, 0
 
+    def _put(self, robot: Manipulator) -> None:
+        """Plan for this arm from now on."""
+        self._robot, self._tip = robot, TipModel(robot)
+        self._ways = None if self._scene is None else Ways(robot, self._scene)
+        self._search = NearestSearch(self._tip, FeedbackTuning().lever, NearestTuning())
+        self._solver: PressureSolver | None = None
+
+    def _go_on_with(self, request: PlanRequest) -> None:
+        """Plan for the arm of a request, next to the last plan if it is another one."""
+        if request.adapted is self._adapted:
+            return
+        self._adapted = adapted = request.adapted
+        self._put(self._original if adapted is None else Manipulator(adapted.description))
+        if self._last is not None:
+            self._searched_at = self._searched_at + request.offset - self._last.offset
+            self._last = replace(self._last, offset=request.offset)
+
+    def _deviation(self, plan: Plan, task: Task) -> float:
+        """Relative deviation of a plan's stiffness; NaN if it is not known."""
+        measure = task.measures[0] if task.measures else None
+        if not plan.reached or not isinstance(measure, StiffnessMeasure):
+            return math.nan
+        checked = checked_measure(measure.direction, measure.kind, measure.boundary, measure.frame)
+        return self._learning.deviation(plan.pressures, checked)
+
     def ask_for_code(self) -> None:
         """Have compiled code for the last task made, which was not while the arm was armed."""
-        if self._serial >= 0 and not self._is_compiled:
+        if self._solver is not None and not self._is_compiled:
             self._is_compiled = self._solver.is_compiled
 
     def plan(self, request: PlanRequest) -> Plan:
         """Return the plan for a request; `StiffoptError`: the optimiser could not be run."""
+        self._go_on_with(request)
         if request.task is None or request.target is None:
             return self._checked(request)
         plan = self._planned(request, request.task, request.target)
+        estimate = self._learning.estimate(request.windows, request.adapted, self._tip)
+        deviation = self._deviation(plan, request.task)
+        plan = replace(plan, deviation=deviation, estimate=estimate)
         plan = replace(plan, doubt=self._robot.description.extrapolation(plan.pressures))
         if self._ways is None or not len(request.way):
             return plan
@@ -109,11 +148,12 @@ class Planning:
         return Plan(request.serial, pressures, request.offset, None, True, math.nan, "", blocked)
 
     def _planned(self, request: PlanRequest, task: Task, asked: Target) -> Plan:
-        if request.serial != self._serial or self._last is None:
+        if request.serial != self._serial:
+            self._serial, self._last, self._solver = request.serial, None, None
+        if self._solver is None or self._last is None:
             exact = asked.model_copy(update={"tolerance": _EXACT})
             self._solver = PressureSolver(self._robot, task.model_copy(update={"target": exact}))
             self._is_compiled = self._solver.compile()
-            self._serial, self._last = request.serial, None
         target = model_target(asked, request.offset)
         self._limits = self._effective_limits(request)
         last = self._last = request.last or self._last
@@ -127,7 +167,10 @@ class Planning:
         if solution is not None and solution.pressures is not None:
             pressures = np.array(solution.pressures, dtype=float)
             stiffness = math.nan if solution.stiffness is None else float(solution.stiffness)
-            self._last = Plan(request.serial, pressures, request.offset, asked, True, stiffness, "")
+            self._last = Plan(
+                request.serial, pressures, request.offset, asked, True, stiffness, "",
+                adapted=request.adapted,
+            )  # fmt: skip
         else:
             self._last = self._nearest(request, task, target)
         return self._last
@@ -137,6 +180,7 @@ class Planning:
 
         The offset never widens the task's limits, beyond which the model does not hold.
         """
+        assert self._solver is not None  # made before
         lower, upper = self._solver.task.pressure_bounds(self._robot.description)
         offset = request.pressure_offset
         shifted = np.maximum(lower, lower + offset), np.minimum(upper, upper + offset)
@@ -186,6 +230,7 @@ class Planning:
 
     def _solve(self, target: Target, guess: Array | None) -> PressureSolution | None:
         """The optimiser's solution; None where it has none that holds, soon enough."""
+        assert self._solver is not None  # made before
         self._is_compiled = self._is_compiled or self._solver.is_compiled
         if self._is_compiled:
             return self._solver.solve_at_once(target, guess, self._limits)
@@ -213,7 +258,7 @@ class Planning:
             message = nearest_words(distance, angle, tolerance)
         return Plan(
             request.serial, pressures, request.offset, request.target, False, math.nan, message,
-            far=far,
+            far=far, adapted=request.adapted,
         )  # fmt: skip
 
     def _displacement(self, last: Plan, target: Target) -> Array:

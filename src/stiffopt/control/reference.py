@@ -61,6 +61,12 @@ class Reference:
         # the path now and its first three derivatives by time, in s
         self.motion = np.concatenate([self._states[-1:], np.zeros((_LAGS - 1, len(values)))])
 
+    def shift(self, change: Array) -> None:
+        """Add a change (m,) to the numbers that go with the pressures, everywhere on the path."""
+        n = self._states.shape[1] - len(change)
+        self._states[:, n:] += change
+        self.motion[0, n:] += change
+
     @property
     def delay(self) -> float:
         """Delay of the path behind the plan, in s."""

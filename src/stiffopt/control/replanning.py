@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stiffopt.control.adaptation import Adapted, Estimate, Window
 from stiffopt.control.course import Course
 from stiffopt.control.feedback import prescribed_components
 from stiffopt.control.interface import Notice
@@ -81,6 +82,9 @@ class Replanner:
         dead_time: float,
     ) -> None:
         self._planner, self._tuning = planner, tuning
+        self.known: Estimate | None = None  # of the arm's numbers
+        self.adapted: Adapted | None = None  # the arm that plans are for; None: as its file has it
+        self._newest: Plan | None = None  # that was looked at
         self._lead = dead_time + 0.5 * period
         self._serial, self._search = 0, True
         self.begin()
@@ -90,6 +94,7 @@ class Replanner:
         self.pursuit = Pursuit()
         self.plan: Plan | None = None  # the newest, which may be of the task before
         self._offset = np.zeros(6)
+        self.deviation = math.nan  # of the plan's stiffness, relative
         self._available: Array | None = None  # (2, n), see `update`
         self._renew()
 
@@ -121,6 +126,7 @@ class Replanner:
         delay: float,
         available: tuple[Array, Array],
         way: Array | None = None,
+        windows: tuple[Window, ...] = (),
     ) -> Array | None:
         """Request a plan when it is time, and take the newest.
 
@@ -139,6 +145,8 @@ class Replanner:
             by more than a little, all configurations are searched.
         way :
             See `PlanRequest`; None without a scene.
+        windows :
+            See `PlanRequest`.
 
         Returns
         -------
@@ -157,10 +165,21 @@ class Replanner:
             share = 1.0 if search else -math.expm1(-interval / time)
             self._offset = self._offset + share * (offset - self._offset)
             request = PlanRequest(
-                self._serial, task, target, self._offset.copy(), pressure_offset, search, *available
-            )
+                self._serial, task, target, self._offset.copy(), pressure_offset, search,
+                *available, windows=windows, adapted=self.adapted,
+            )  # fmt: skip
             self._planner.request(request if way is None else replace(request, way=way))
         return self.latest()
+
+    def go_on_with(self, adapted: Adapted, change: Array) -> None:
+        """Plan for an arm with other numbers, of which the offset differs by a change (6,)."""
+        self.adapted = adapted
+        if self.known is not None:
+            self.known = replace(self.known, proposal=None)
+        self._offset = self._offset + change
+        if self.plan is not None:
+            self.plan = replace(self.plan, offset=self.plan.offset + change, adapted=adapted)
+        self._requested_at = -math.inf
 
     def _note_available(self, available: tuple[Array, Array]) -> None:
         """Have all configurations searched where the channels have become others."""
@@ -173,9 +192,11 @@ class Replanner:
     def latest(self) -> Array | None:
         """Take the newest plan, unless the way there is blocked; see `update`."""
         plan = self._planner.latest()
-        if plan is not None and plan.serial == self._serial:
+        if plan is not None and plan.serial == self._serial and plan is not self._newest:
+            self._newest, self.deviation = plan, plan.deviation
+            self.known = plan.estimate or self.known
             self._blocked = plan.blocked
-            if not plan.blocked:
+            if not plan.blocked and plan.adapted is self.adapted:
                 self.plan = plan
         if self.plan is None:
             return None

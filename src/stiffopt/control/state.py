@@ -89,6 +89,15 @@ class SeenPose:
 
 
 @dataclass(frozen=True)
+class AdaptedNumber:
+    """A number of the arm as it is estimated while the arm is at work."""
+
+    key: Annotated[str, Shown("its key in the robot file; `base.` ones are tilts, in rad")]
+    value: Annotated[float, Shown("its value, in SI")]
+    deviation: Annotated[float, Shown("its standard deviation, in SI")]
+
+
+@dataclass(frozen=True)
 class Timing:
     """How punctual the loop is.
 
@@ -197,6 +206,17 @@ class ControllerStatus:
             metric="stiffness",
         ),
     ] = math.nan
+    stiffness_low: Annotated[
+        float,
+        _stiffness(
+            "lower end of the 95 % interval of that stiffness",
+            metric="stiffness_low",
+        ),
+    ] = math.nan
+    stiffness_high: Annotated[
+        float,
+        _stiffness("upper end of that interval", metric="stiffness_high"),
+    ] = math.nan
     best_stiffness: Annotated[
         float,
         _stiffness(
@@ -219,6 +239,10 @@ class ControllerStatus:
             key="wrench",
         ),
     ] = field(default_factory=_nan6)
+    adapted: Annotated[
+        tuple[AdaptedNumber, ...],
+        Shown("numbers of the arm as they are estimated while it is at work"),
+    ] = ()
     lost: Annotated[
         Flags,
         Shown(

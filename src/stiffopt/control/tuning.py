@@ -79,8 +79,8 @@ class ReferenceTuning:
     # reference are not evaluated again, in Pa
     model_range: float = 3e3
     # distance from the plan at which it has arrived, in Pa, and speed at which it rests, in Pa/s
-    there: float = 1e3
-    at_rest: float = 1e4
+    there: float = 5e3
+    at_rest: float = 5e4
 
 
 @dataclass(frozen=True)
@@ -141,6 +141,52 @@ class ForecastTuning:
     most: int = 1000  # such targets
     # distance in pressure that the arm may have moved since a way was checked, in Pa
     moved: float = 1e4
+
+
+@dataclass(frozen=True)
+class AdaptationTuning:
+    """How the arm's numbers are adapted (`Adaptation`), and how often the model changes."""
+
+    bound: float = 3.0  # of each coordinate, in prior deviations
+    mass: float = 0.01  # deviation of the mass at the tip that the file does not have, in kg
+    iterations: int = 2  # of Gauss-Newton
+    # discrepancy of the model: of the position, in m, and as a share of its displacement from rest;
+    # of the orientation, in rad
+    position_error: float = 1e-3
+    model_error: float = 0.04
+    angle_error: float = 0.02
+    stiffness_error: float = 0.05  # of the stiffness, relative
+    reach: float = 5e4  # distance in pressure over which it is the same, in Pa
+    memory: float = 1800.0  # time in which the deviation of a window's error grows e-fold, in s
+    # change of an applied number, in prior deviations, below which it stays; largest one in a step
+    least_step: float = 0.05
+    step: float = 1.0
+    interval: float = 10.0  # between two changes of the model, in s, or until another target
+    # after such a change, time in s in which the plan is followed slowly, and share of the slew
+    calm_time: float = 4.0
+    slew_share: float = 0.1
+    # distance in pressure after which the deviation of the stiffness is computed anew, in Pa
+    elsewhere: float = 3e4
+    at_rest: float = 1e3  # change of a pressure from plan to plan, in Pa, below which it rests
+
+
+@dataclass(frozen=True)
+class WindowTuning:
+    """When the tip is at rest, and how long it is averaged (`WindowWatch`)."""
+
+    every: float = 0.04  # between two looks, in s
+    wait: float = 0.6  # time at rest before a window, in s
+    duration: float = 0.8  # of a window, in s
+    again: float = 10.0  # from a window to the next one of the same rest, in s
+    # changes within a window above which it begins anew: of a pressure, in Pa, of the tip, in m
+    drift_pressure: float = 4e3
+    drift_position: float = 3e-4
+    vibration: float = 3e-4  # above which the tip is not at rest, in m
+    seen: float = 0.3  # age of the latest sample above which it is not known, in s
+    same: float = 1e4  # distance in pressure below which it is the same posture, in Pa
+    # distance of the tips of two windows of one posture, in m, at which the load is another one
+    changed: float = 2e-3
+    most: int = 10  # windows that are kept
 
 
 @dataclass(frozen=True)
@@ -221,7 +267,7 @@ class MotionTuning:
     # share of the turn that a push brings along by which the measured turn must miss it
     slip: float = 0.7
     least_turn: float = 0.02  # by which it must miss it at least, in rad
-    slips: int = 8  # samples in a row that show a slip
+    slips: int = 4  # samples in a row that show a slip
     scales: tuple[DriftScale, ...] = (
         DriftScale(0.25, 5, 2e-3),
         DriftScale(1.0, 5, 6e-4),
@@ -256,4 +302,6 @@ class ControlTuning:
     replanning: ReplanningTuning = field(default_factory=ReplanningTuning)
     posture: PostureTuning = field(default_factory=PostureTuning)
     forecast: ForecastTuning = field(default_factory=ForecastTuning)
+    adaptation: AdaptationTuning = field(default_factory=AdaptationTuning)
+    windows: WindowTuning = field(default_factory=WindowTuning)
     motion: MotionTuning = field(default_factory=MotionTuning)

@@ -25,7 +25,7 @@ _CHUNKS = (1, 8, 32, 128, 512, 2048)  # rows that may be run at once; fewer are 
 _MOST_FILLED = 0.25  # share of a chunk; rather than more, a smaller one is run
 _WORTH_FILLING = 128  # rows; machine code is quicker with them, though it always runs the most
 _WORTH_COMPILING = 100_000  # rows; compiling takes a second
-_CARRIED = 5  # values and four derivatives
+_TIMES = 3  # lag, falling lag and dead time
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,8 @@ class Start:
     Attributes
     ----------
     states : of the operators (m, c).
-    per_side : their derivatives (m, c) by the side of each channel, see `History.settled`.
+    per_side : their derivatives (s, m, c) by the sides of the channels, see `History.settled`; by
+        all together (s = 1) if no operator knows more than one channel.
     before : pressures (c,) until the first row, in Pa.
     per_time : derivatives (3, m, c) of the states by lag, falling lag and dead time, which a log
         that went before leaves; None where there was none.
@@ -50,15 +51,15 @@ class Start:
     def from_rest(cls, history: History, pressures: Array) -> Start:
         """After a rise from no pressure to these (c,)."""
         states = history.from_rest(pressures)
-        return cls(states, np.zeros_like(states), pressures)
+        return cls(states, np.zeros((_sides(history, len(pressures)), *states.shape)), pressures)
 
     @classmethod
     def settled(cls, history: History, pressures: Array, sides: Array) -> Start:
         """Long at these pressures (c,), with each channel on a side (c,) of its plays."""
-        middle = history.settled(pressures, np.zeros_like(sides))
-        farthest = history.settled(pressures, np.ones_like(sides))
-        states = history.settled(pressures, sides)
-        return cls(states, farthest - middle, pressures)
+        none, count = np.zeros_like(sides), len(sides)
+        changes = np.eye(count) if _sides(history, count) > 1 else np.ones((1, count))
+        per_side = np.stack([history.settled(none, change) for change in changes])
+        return cls(history.settled(pressures, sides), per_side, pressures)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +71,7 @@ class Effective:
     pressures : (M, c), in Pa.
     per_number : their derivatives (M, c) by the numbers of the history, by their keys: ``lag``,
         ``lag_falling``, ``dead_time``, ``memory[0]``, ``play[0].share``, ``creep[0].share``, ...
-    per_side : their derivatives (M, c) by the side on which the same channel begins.
+    per_side : their derivatives (M, c, c) by the sides on which the channels begin.
     end : state in which another log of the sequence begins.
     """
 
@@ -133,8 +134,8 @@ class Past:
             state = found[-1]
         memory = np.array([history.memory_of(channel) for channel in range(self._channels)])
         c = self._channels
-        values, by_lag, by_falling, by_dead, by_side = (
-            kept[:, :, k * c : (k + 1) * c] for k in range(_CARRIED)
+        values, by_lag, by_falling, by_dead, *by_side = (
+            kept[:, :, k : k + c] for k in range(0, kept.shape[2], c)
         )
 
         def held(states: Array, j: int) -> Array:
@@ -160,7 +161,10 @@ class Past:
             name = f"play[{j}]" if j < plays else f"creep[{j - plays}]"
             per_number[f"{name}.share"] = held(values, j) * memory
         end = self._rested(self._start(state, pressures[-1]), history)
-        return Effective(mixed(values), per_number, mixed(by_side), end)
+        per_side = np.stack([mixed(each) for each in by_side], axis=2)
+        if len(by_side) < c:  # the side of a channel moves no other
+            per_side = per_side * np.eye(c)
+        return Effective(mixed(values), per_number, per_side, end)
 
     def _rested(self, end: Start, history: History) -> Start:
         """State a while later, at the last pressures."""
@@ -172,9 +176,9 @@ class Past:
         return self._start(state, end.before)
 
     def _start(self, state: Array, before: Array) -> Start:
-        """Where another log begins, after a state (m, 5 c) of `_HistoryRun`."""
-        states, *per_time, per_side = np.split(state, _CARRIED, axis=1)
-        return Start(states, per_side, before, np.stack(per_time))
+        """Where another log begins, after a state of `_HistoryRun`."""
+        states, *slopes = np.split(state, state.shape[1] // self._channels, axis=1)
+        return Start(states, np.stack(slopes[_TIMES:]), before, np.stack(slopes[:_TIMES]))
 
     def _run(self, history: History) -> _HistoryRun:
         kind = (history.lag > 0, history.lag_falling > 0)
@@ -183,22 +187,27 @@ class Past:
         return self._runs[kind]
 
 
+def _sides(history: History, channels: int) -> int:
+    """How many derivatives tell what the sides of the channels do."""
+    return 1 if all(play.of == "pressure" for play in history.play) else channels
+
+
 def _carried(start: Start) -> Array:
-    """State of `_HistoryRun` (m, 5 c)."""
-    none = np.zeros((_CARRIED - 2, *start.states.shape))
+    """State of `_HistoryRun` (m, (4 + s) c)."""
+    none = np.zeros((_TIMES, *start.states.shape))
     per_time = none if start.per_time is None else start.per_time
-    return np.concatenate([start.states, *per_time, start.per_side], axis=1)
+    return np.concatenate([start.states, *per_time, *start.per_side], axis=1)
 
 
 class _HistoryRun:
     """The operators of several channels over many rows, with their derivatives carried along.
 
-    A state is (m, 5 c): the operators of each channel, then their derivatives by lag, falling
-    lag, dead time and side.
+    A state is (m, (4 + s) c): the operators of each channel, then their derivatives by lag, falling
+    lag, dead time and sides.
     """
 
     def __init__(self, history: History, channels: int, lags: bool, falls: bool) -> None:
-        self._shape = (history.n_states, _CARRIED * channels)
+        self._shape = (history.n_states, (1 + _TIMES + _sides(history, channels)) * channels)
         self._step = _steps(history, channels, lags, falls)
         self._interpreted: dict[int, InterpretedFunction] = {}
         operators = [part.model_dump(exclude={"share"}) for part in history.parts]
@@ -233,7 +242,7 @@ class _HistoryRun:
         steps: Array,
         lags: tuple[float, float],
     ) -> Array:
-        """States (N, m, 5 c) after each of N steps; the pressures and their changes are (N, c)."""
+        """States (N, m, (4 + s) c) after N steps; the pressures and their changes are (N, c)."""
         count = len(steps)
         size = self._at_once(count)
         given = np.broadcast_to(np.array(lags), (count, 2))
@@ -280,7 +289,8 @@ def _columns(values: Array, count: int) -> Array:
 
 def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Function:
     """One step of `_HistoryRun`: state, pressures, their changes, length and lags in s -> state."""
-    state = ca.SX.sym("state", history.n_states, _CARRIED * channels)
+    blocks = 1 + _TIMES + _sides(history, channels)
+    state = ca.SX.sym("state", history.n_states, blocks * channels)
     value, *slopes = ca.horzsplit(state, channels)
     before, now, before_change, now_change = (ca.SX.sym(name, channels) for name in "abcd")
     step, lag = ca.SX.sym("step"), ca.SX.sym("lag", 2)
@@ -297,7 +307,7 @@ def _steps(history: History, channels: int, lags: bool, falls: bool) -> ca.Funct
         change([value, lag], [slopes[0], one, none]),
         change([value, lag], [slopes[1], none, one]),
         change([value, before, now], [slopes[2], before_change, now_change]),
-        change([value], [slopes[3]]),
+        *(change([value], [slope]) for slope in slopes[_TIMES:]),
     )
     return ca.Function("step", [state, before, now, before_change, now_change, step, lag], [ends])
 

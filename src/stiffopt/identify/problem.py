@@ -410,9 +410,8 @@ class CalibrationProblem:
                 for place, name, per_coordinate in varying:
                     slopes[rows, channels, place] = found.per_number[name] * per_coordinate
                 if owner.stop > owner.start:
-                    for c in range(channels.start, channels.stop):
-                        local = c - channels.start
-                        slopes[rows, c, owner.start + c] = found.per_side[:, local]
+                    places = slice(owner.start + channels.start, owner.start + channels.stop)
+                    slopes[rows, channels, places] = found.per_side
         return effective, slopes
 
     def _measurements(self, point: TrackedPoint) -> tuple[Array, Array | None]:

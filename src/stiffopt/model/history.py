@@ -220,13 +220,11 @@ class History(Schema):
         pressures :
             In Pa.
         sides :
-            Where in its play each channel's own operators are (c,): -1 after a long rise, 1 after a
-            long fall, 0 in the middle. Those of elongation and of bending are in the middle.
+            Where in its play each channel is (c,): -1 after a long rise, 1 after a long fall, 0 in
+            the middle. Operators of elongation are where the channels are on an average.
         """
         rows = [pressures]
-        for play in self.play:
-            own = play.width if play.of == "pressure" else 0.0
-            rows.append(part_of(pressures, play.of) + sides * own)
+        rows += [part_of(pressures + sides * play.width, play.of) for play in self.play]
         rows += [part_of(pressures, creep.of) for creep in self.creep]
         return np.array(rows)
 

@@ -92,12 +92,22 @@ class LoadedArm:
         )
         self._pieces = pieces
         self.address = ctypes.addressof(self._rod)
-        hang = code.cdll.stiffopt_hang
-        hang.argtypes = [_pointer, _pointer]
-        if not hang(self.address, self._hanging.ctypes.data):
-            raise EquilibriumError("the unpressurised arm falls over")
+        self._hang = code.cdll.stiffopt_hang
+        self._hang.argtypes = [_pointer, _pointer]
+        self._rest()
         self._settle = code.cdll.stiffopt_settle
         self._settle.argtypes = [_pointer] * 5 + [_integer] * 2
+
+    def _rest(self) -> None:
+        if not self._hang(self.address, self._hanging.ctypes.data):
+            raise EquilibriumError("the unpressurised arm falls over")
+
+    def change(self, robot: Arm) -> None:
+        """Become an arm that differs in moduli, corrections and tip mass only."""
+        self._numbers = robot.numbers
+        self._rod.numbers = self._numbers.ctypes.data
+        self._rod.tip_mass = robot.description.tip_mass
+        self._rest()
 
     def settled(self, pressures: Vector) -> tuple[NDArray[np.bool_], Vector, Vector]:
         """Which pressures (N, n) have an equilibrium, their states and poses (N, 12)."""

@@ -66,6 +66,10 @@ class ParametricArm:
         if any(description.gravity) or any(tip_load):
             self._equilibrium = Equilibrium(Shooting(description, self._actuation))
 
+    def set_tip_load(self, tip_load: Sequence[float]) -> None:
+        """Put another load (12,) on the tip; the arm must have gravity or a load already."""
+        self._loads = self._loads._replace(tip=np.array(tip_load))
+
     def poses(self, pressures: Vector, coordinates: Vector, at: float | None = None) -> Poses:
         """Poses at pressures (N, n) and coordinates (k,), of the tip or at an arc length in m.
 

@@ -5,7 +5,6 @@ under gravity or loads.  Here an equilibrium is found from the one before, in ma
 """
 
 import ctypes
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -85,6 +84,20 @@ class TipModel:
         """The same arm, from rest, for use in another thread."""
         return TipModel(self._robot)
 
+    def change(self, robot: Manipulator) -> None:
+        """Go on with an arm that differs in moduli, corrections and tip mass only; from rest.
+
+        It takes much less time than another instance.
+
+        Raises
+        ------
+        EquilibriumError
+            If the unpressurised arm falls over under its weight; it is no arm then.
+        """
+        self._robot = robot
+        if self._way is not None:
+            self._way.change(robot)
+
     def at(self, pressures: ArrayLike) -> TipAt:
         """The tip at pressures (n,) in Pa.
 
@@ -117,6 +130,11 @@ class _LoadedTip:
         own = (self._pressures, self._state, self._memory, self._found)
         self._call = (self._arm.address, *(array.ctypes.data for array in own))
 
+    def change(self, robot: Manipulator) -> None:
+        """Take another arm's numbers and tip mass."""
+        self._state[:] = np.nan
+        self._arm.change(robot)
+
     def __call__(self, pressures: Vector) -> TipAt | None:
         self._pressures[:] = pressures
         outcome = self._tip(*self._call)
@@ -133,22 +151,29 @@ class _LoadedTip:
         )
 
 
-_Way = Callable[[Vector], TipAt | None]
+class _FreeTip:
+    """Closed form, in machine code."""
+
+    def __init__(self, code: Library, robot: Manipulator) -> None:
+        self._function, self._numbers = code.function("tip_at"), robot.numbers
+
+    def change(self, robot: Manipulator) -> None:
+        """Take another arm's numbers."""
+        self._numbers = robot.numbers
+
+    def __call__(self, pressures: Vector) -> TipAt | None:
+        pose, jacobian, compliance, margin = self._function(pressures, self._numbers)
+        return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
+
+
+_Way = _LoadedTip | _FreeTip
 """From checked pressures (n,) to the tip; None where the model has to say why not."""
 
 
 def _free_way(robot: Manipulator) -> _Way | None:
-    """Closed form, in machine code; None without a compiler."""
+    """Machine code of a free arm; None without a compiler."""
     code = library(("free tip", robot.layout.skeleton), partial(_free_function, robot.layout))
-    if code is None:
-        return None
-    function, numbers = code.function("tip_at"), robot.numbers
-
-    def at(pressures: Vector) -> TipAt | None:
-        pose, jacobian, compliance, margin = function(pressures, numbers)
-        return TipAt(pose, jacobian, compliance) if margin[0, 0] > 0 else None
-
-    return at
+    return None if code is None else _FreeTip(code, robot)
 
 
 def _free_function(layout: Layout) -> list[ca.Function]:

@@ -107,6 +107,7 @@ class ControlSettings(Schema):
         inertia, else ``modelled``.
     damping : share of critical damping of that vibration.
     solver : of the small quadratic program of each tick.
+    adaptation : ``auto``: the arm's numbers are adapted to where the tip is seen at rest; ``none``.
     """
 
     regulator_lag: Annotated[Duration, Field(ge=0, le=2)] = 0.06
@@ -115,6 +116,7 @@ class ControlSettings(Schema):
     vibration: Literal["auto", "modelled", "none"] = "auto"
     damping: Annotated[Ratio, Field(ge=0, lt=1)] = 0.06
     solver: Literal["daqp", "osqp"] = "daqp"
+    adaptation: Literal["auto", "none"] = "auto"
 
 
 class ServiceSettings(Schema):

@@ -1,0 +1,360 @@
+"""The arm's numbers, adapted to where its tip is seen at rest.
+
+What a robot file says of moduli, gains and weights is known within a deviation: that of its
+calibration, with all correlations, or else that of its `tolerances`. The coordinates z of these
+numbers (`stiffopt.model.parameters`), of a mass at the tip that the file does not have, and of the
+twists of base and sensor in the tracker's frame have the prior N(0, P0). A *window* is the tip at
+rest at some effective pressures p, averaged::
+
+    y = s(p, z) + e,      e ~ N(0, R),      R_ij = sigma_i sigma_j exp(-|p_i - p_j|^2 / 2 l^2)
+
+e is the discrepancy of the model, which postures near each other share: a thousand windows of one
+posture tell no more than one. The estimate is the most likely z, by Gauss-Newton::
+
+    z = K (y - s(p, z0) + S z0),   K = P0 S' (S P0 S' + R)^-1,   P = P0 - K S P0,   S = ds/dz
+
+Windows age: sigma grows, and an arm that shows nothing new returns to its prior. z stays within
+three prior deviations in each coordinate.
+
+Of these, moduli, the mass and, where the robot file has gains, the gains are *applied*: they
+replace the numbers of the model that plans and controls. All else is left to the tip's offset.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.linalg import LinAlgError
+from numpy.typing import NDArray
+
+from stiffopt import lie
+from stiffopt.control.state import AdaptedNumber
+from stiffopt.control.tuning import AdaptationTuning
+from stiffopt.errors import StiffoptError
+from stiffopt.model.arguments import DirectionalMeasure
+from stiffopt.model.description import RobotDescription, Tolerances
+from stiffopt.model.layout import is_as_drawn
+from stiffopt.model.manipulator import Manipulator
+from stiffopt.model.parameters import Parameter, with_values
+from stiffopt.model.parametric import ParametricArm
+from stiffopt.optimise.tip import TipModel
+
+Array = NDArray[np.float64]
+
+_MASS = "tip_mass"
+_APPLIED = ("material.youngs_modulus", "corrections.gain")
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """The tip at rest, averaged over some time."""
+
+    time: float  # at its end, in s
+    pressures: Array  # effective (n,), in Pa
+    position: Array  # (3,), in m
+    rotation: Array | None  # (3, 3); None where the tracker measures none
+
+
+@dataclass(frozen=True, eq=False)
+class Adapted:
+    """Numbers of an arm as adapted."""
+
+    description: RobotDescription  # with those that are applied
+    applied: Array  # their coordinates (k,), zero for all others
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What is known of an arm's numbers."""
+
+    numbers: tuple[AdaptedNumber, ...]
+    proposal: Adapted | None  # to go on with; None: the present arm will do
+
+
+class Learning:
+    """What the planner learns of the arm, beside its plans.
+
+    It takes half a second for the first windows, and tens of milliseconds for later ones. The arm
+    is at rest then.
+
+    Parameters
+    ----------
+    description :
+        The arm as its file has it.
+    tuning :
+        Of the adaptation.
+    """
+
+    def __init__(self, description: RobotDescription, tuning: AdaptationTuning) -> None:
+        self._description, self._tuning = description, tuning
+        self._adaptation: Adaptation | None = None
+        self._seen: tuple[tuple[Window, ...], Adapted | None] = (), None
+        self._deviation = math.nan
+        self._measured: tuple[DirectionalMeasure, Array] | None = None  # and pressures (n,)
+        self._before: Array | None = None  # pressures of the plan before
+
+    def estimate(
+        self, windows: tuple[Window, ...], adapted: Adapted | None, tip: TipModel
+    ) -> Estimate | None:
+        """Return what is new of the arm's numbers; None if nothing is.
+
+        `adapted` is the present arm, and `tip` its model.
+        """
+        before, self._seen = self._seen, (windows, adapted)
+        if not windows or (windows is before[0] and adapted is before[1]):
+            return None
+        if self._adaptation is None:
+            self._adaptation = Adaptation(self._description, self._tuning)
+        adaptation = self._adaptation
+        if windows is not before[0]:
+            self._measured = None
+            with suppress(StiffoptError, LinAlgError):  # of numbers with which no arm stands
+                adaptation.take(windows, tip)
+        applied = adaptation.none_applied if adapted is None else adapted.applied
+        return Estimate(adaptation.report(), adaptation.step_from(applied))
+
+    def deviation(self, pressures: Array, measure: DirectionalMeasure) -> float:
+        """Relative deviation of a stiffness at a plan's pressures (n,); NaN if it is not known.
+
+        It is computed anew where the arm rests elsewhere.
+        """
+        before, self._before = self._before, pressures
+        if self._adaptation is None or before is None:
+            return self._deviation
+        if np.abs(pressures - before).max() > self._tuning.at_rest:
+            return self._deviation
+        last = self._measured
+        far = math.inf if last is None else float(np.linalg.norm(last[1] - pressures))
+        if last is None or last[0] != measure or far > self._tuning.elsewhere:
+            self._measured, self._deviation = (measure, pressures), math.nan
+            with suppress(StiffoptError):
+                self._deviation = self._adaptation.deviation(pressures, measure)
+        return self._deviation
+
+
+class Adaptation:
+    """Estimates the numbers of an arm.
+
+    Parameters
+    ----------
+    description :
+        The arm as its file has it.
+    tuning :
+        Bounds, discrepancy and pace.
+    """
+
+    def __init__(self, description: RobotDescription, tuning: AdaptationTuning) -> None:
+        self._description, self._tuning = description, tuning
+        keys, self._prior, self._frames = _prior(description, tuning)
+        self._arm = _parametric_arm(description, keys)
+        self._parameters = [Parameter(key) for key in keys]
+        self._gravity = np.array(description.gravity)
+        self._has_mass = bool(self._gravity.any())
+        gains = not is_as_drawn(description)
+        self._applies = np.zeros(len(self._prior), dtype=bool)
+        for index, key in enumerate(keys):
+            name = key.split("].", 1)[1]
+            self._applies[index] = name == _APPLIED[0] or (gains and name.startswith(_APPLIED[1]))
+        if self._has_mass:
+            self._applies[len(keys)] = True
+        self.estimate: Array = np.zeros(len(self._prior))
+        self.covariance: Array = self._prior
+        self.none_applied: Array = np.zeros(len(self._prior))
+
+    def take(self, windows: Sequence[Window], tip: TipModel) -> None:
+        """Estimate anew from all windows; `tip` is the present model, for its compliance.
+
+        Raises
+        ------
+        StiffoptError
+            The arm has no equilibrium with the numbers that were tried.
+        """
+        z, prior = self.estimate, self._prior
+        for _ in range(self._tuning.iterations):
+            errors, slopes = self._linearised(windows, z, tip)
+            noise = self._noise(windows)
+            seen = np.isfinite(errors)
+            e, S, R = errors[seen], slopes[seen], noise[np.ix_(seen, seen)]
+            gain = np.linalg.solve(S @ prior @ S.T + R, S @ prior).T
+            z = self._bounded(gain @ (e + S @ z))
+        self.estimate, self.covariance = z, prior - gain @ S @ prior
+
+    def _bounded(self, z: Array) -> Array:
+        most = self._tuning.bound * np.sqrt(np.diag(self._prior))
+        return np.asarray(np.clip(z, -most, most))
+
+    def step_from(self, applied: Array) -> Adapted | None:
+        """Return the arm with numbers nearer to the estimate; None if they are near enough.
+
+        A step is limited, so that the model changes slowly. `applied` are the present coordinates.
+        """
+        deviations = np.sqrt(np.diag(self._prior))
+        change = np.where(self._applies, self.estimate - applied, 0.0)
+        share = np.max(np.abs(change) / np.maximum(deviations, 1e-12), initial=0.0)
+        if share < self._tuning.least_step:
+            return None
+        after = applied + change * min(1.0, self._tuning.step / share)
+        try:
+            description = self._with(after)
+            TipModel(Manipulator(description)).at(np.zeros(description.n_pressures))
+        except StiffoptError:  # such an arm falls over, or breaks its strain law
+            return None
+        return Adapted(description, after)
+
+    def _with(self, z: Array) -> RobotDescription:
+        """The arm with the applied ones of coordinates (k,)."""
+        own = self._description
+        values = {
+            parameter: float(parameter.at(parameter.value(own), z[index]))
+            for index, parameter in enumerate(self._parameters)
+            if self._applies[index]
+        }
+        mass = own.tip_mass + (z[len(self._parameters)] if self._has_mass else 0.0)
+        return with_values(own, values).model_copy(update={"tip_mass": max(float(mass), 0.0)})
+
+    def report(self) -> tuple[AdaptedNumber, ...]:
+        """What the numbers are, with their deviations."""
+        deviations = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).tolist()
+        found = []
+        for index, parameter in enumerate(self._parameters):
+            value = float(parameter.at(parameter.value(self._description), self.estimate[index]))
+            scale = abs(parameter.per_coordinate(value))
+            found.append(AdaptedNumber(parameter.key, value, scale * deviations[index]))
+        if self._has_mass:
+            index = len(self._parameters)
+            mass = self._description.tip_mass + self.estimate[index]
+            found.append(AdaptedNumber(_MASS, float(mass), deviations[index]))
+        for name, index in (("base.tilt_x", -3), ("base.tilt_y", -2), ("base.turn", -1)):
+            at = len(self._prior) - self._frames + 6 + index
+            found.append(AdaptedNumber(name, float(self.estimate[at]), deviations[at]))
+        return tuple(found)
+
+    def deviation(self, pressures: Array, measure: DirectionalMeasure) -> float:
+        """Relative standard deviation of a stiffness at pressures (n,) with the numbers applied."""
+        k, _, slopes = self._arm.stiffnesses(
+            pressures[None], self.estimate[: len(self._parameters)], measure
+        )
+        slope = slopes[0] / k[0]
+        count = len(slope)
+        variance = slope @ self.covariance[:count, :count] @ slope
+        return math.sqrt(max(float(variance), 0.0) + self._tuning.stiffness_error**2)
+
+    def _linearised(
+        self, windows: Sequence[Window], z: Array, tip: TipModel
+    ) -> tuple[Array, Array]:
+        """Errors (6 w,) of the model at coordinates (k,), NaN if unknown, and slopes (6 w, k).
+
+        Of each window they are those of the position, in m, and of the orientation, a rotation
+        vector in base axes.
+        """
+        count = len(self._parameters)
+        if self._has_mass:
+            force = z[count] * self._gravity
+            self._arm.set_tip_load((*force, *np.zeros(9)))
+        p = np.array([window.pressures for window in windows])
+        poses = self._arm.poses(p, z[:count])
+        errors, slopes = [], []
+        for k, window in enumerate(windows):
+            R, y = poses.transforms[k, :3, :3], poses.transforms[k, :3, 3]
+            turn = np.full(3, np.nan)
+            if window.rotation is not None:
+                turn = np.asarray(lie.log(_homogeneous(window.rotation @ R.T)))[3:]
+            errors.append(np.concatenate([window.position - y, turn]))
+            axes = lie.rotate_blocks(R)
+            columns = [axes @ poses.per_coordinate[k]]
+            if self._has_mass:
+                wrench = np.concatenate([R.T @ self._gravity, np.zeros(3)])
+                compliance = tip.at(window.pressures).compliance
+                columns.append((axes @ compliance @ wrench)[:, None])
+            columns.append(np.block([[np.eye(3), -_cross(y)], [np.zeros((3, 3)), np.eye(3)]]))
+            if self._frames == 12:
+                columns.append(np.asarray(axes))
+            slopes.append(np.hstack(columns))
+        S = np.vstack(slopes)
+        frames = z[len(z) - self._frames :]
+        return np.concatenate(errors) - S[:, len(z) - self._frames :] @ frames, S
+
+    def _noise(self, windows: Sequence[Window]) -> Array:
+        """Covariance (6 w, 6 w) of the discrepancies, which grow with displacement and age."""
+        t = self._tuning
+        p = np.array([window.pressures for window in windows])
+        rest = np.array([0.0, 0.0, self._description.length])
+        away = np.array([np.linalg.norm(window.position - rest) for window in windows])
+        length, newest = self._description.length, max(window.time for window in windows)
+        age = np.array([math.exp((newest - window.time) / t.memory) for window in windows])
+        known = self._description.calibration
+        position, angle = (
+            t.position_error + t.model_error * away,
+            t.angle_error * np.ones_like(away),
+        )
+        if known is not None:
+            position = np.full_like(away, max(known.position_residual, t.position_error))
+        angle = np.maximum(angle, 2 * position / length)
+        sigma = np.stack([position, position, position, angle, angle, angle], axis=1) * age[:, None]
+        distance = np.linalg.norm(p[:, None] - p[None], axis=2)
+        shared = np.exp(-0.5 * (distance / t.reach) ** 2) + 1e-2 * np.eye(len(p))
+        return np.asarray(np.kron(shared, np.eye(6)) * np.outer(sigma.ravel(), sigma.ravel()))
+
+
+def _prior(description: RobotDescription, tuning: AdaptationTuning) -> tuple[list[str], Array, int]:
+    """Keys of the numbers, covariance (k, k) of all coordinates, and how many are of frames.
+
+    The coordinates are those of the numbers, the mass where there is gravity, and the frames.
+    """
+    mass = [tuning.mass**2] if any(description.gravity) else []
+    known, tolerances = description.calibration, description.tolerances or Tolerances()
+    if known is not None and known.parameters:
+        keys = [fitted.key for fitted in known.parameters]
+        count, covariance = len(keys), known.covariance
+        frames = len(known.frames) or 6
+        size = count + len(mass) + frames
+        prior = np.zeros((size, size))
+        kept = [*range(count), *range(size - frames, size)][: len(covariance)]
+        prior[np.ix_(kept, kept)] = covariance
+        if not known.frames:
+            prior[-6:, -6:] = np.diag(_frames(tolerances))
+    else:
+        keys, variances = [], []
+        for place, segment in enumerate(description.segments):
+            keys.append(f"segments[{place}].material.youngs_modulus")
+            gains = [f"segments[{place}].corrections.gain[{c}]" for c in range(segment.n_channels)]
+            keys += gains
+            variances += [tolerances.youngs_modulus**2, *[tolerances.gain**2] * len(gains)]
+        count, frames = len(keys), 6
+        prior = np.diag([*variances, *mass, *_frames(tolerances)])
+    if mass:
+        prior[count, count] = mass[0]
+    return keys, prior, frames
+
+
+def _frames(tolerances: Tolerances) -> list[float]:
+    """Variances (6,) of the twist of the base in the tracker's frame."""
+    position, tilt = tolerances.base_position**2, tolerances.base_tilt**2
+    return [position, position, position, tilt, tilt, tolerances.base_turn**2]
+
+
+def _parametric_arm(description: RobotDescription, keys: Sequence[str]) -> ParametricArm:
+    return _made(description.model_dump_json(), tuple(keys))
+
+
+@lru_cache(maxsize=4)
+def _made(description: str, keys: tuple[str, ...]) -> ParametricArm:
+    robot = RobotDescription.model_validate_json(description)
+    return ParametricArm(robot, [Parameter(key) for key in keys])
+
+
+def _cross(v: Array) -> Array:
+    """Matrix (3, 3) of the cross product with a vector (3,)."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _homogeneous(rotation: Array) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    return T

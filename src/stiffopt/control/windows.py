@@ -1,0 +1,76 @@
+"""Windows: the tip at rest, averaged, from which the arm's numbers are adapted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stiffopt.control.adaptation import Window
+from stiffopt.control.estimator import TipEstimator
+from stiffopt.control.tuning import WindowTuning
+
+Array = NDArray[np.float64]
+
+
+class WindowWatch:
+    """Collects windows while the arm rests: one of each posture, the newest of it.
+
+    Attributes
+    ----------
+    windows : those that are known; a new tuple when it changes.
+    """
+
+    def __init__(self, tuning: WindowTuning) -> None:
+        self._tuning = tuning
+        self.windows: tuple[Window, ...] = ()
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin to wait for rest; windows stay."""
+        self._rested: float | None = None  # since when
+        self._since = 0.0  # since when the next window is waited for
+        self._first: Array | None = None
+
+    def has_rested(self, now: float) -> bool:
+        """Whether the arm has rested for long enough to be looked at."""
+        return self._rested is not None and now - self._rested >= self._tuning.wait
+
+    def look(self, now: float, pressures: Array, estimator: TipEstimator) -> None:
+        """Look at an arm at rest, at effective pressures (n,), and at its estimated tip."""
+        t = self._tuning
+        if self._rested is None:
+            self._rested = self._since = now
+        if now - self._since < t.wait:
+            return
+        n, values = len(pressures), np.concatenate([pressures, estimator.position])
+        if not np.isfinite(values).all():
+            return
+        if self._first is None:
+            self._first, self._sum, self._count, self._begun = values, 0 * values, 0, now
+        moved = np.abs(values - self._first)
+        if moved[:n].max() > t.drift_pressure or moved[n:].max() > t.drift_position:
+            self._first = None  # it creeps still
+            return
+        self._sum += values
+        self._count += 1
+        if now - self._begun < t.duration:
+            return
+        mean = self._sum / self._count
+        rotation = estimator.estimate.rotation if estimator.turn_known else None
+        self._add(Window(now, mean[:n], mean[n:], rotation))
+        self._first, self._since = None, now + t.again
+
+    def _add(self, window: Window) -> None:
+        """Add a window in place of those of its posture, or of the oldest one if there are many.
+
+        Where the tip is elsewhere in the same posture, all that was seen before is void.
+        """
+        t, others = self._tuning, list(self.windows)
+        for other in self.windows:
+            if np.linalg.norm(other.pressures - window.pressures) > t.same:
+                continue
+            others.remove(other)
+            if np.linalg.norm(other.position - window.position) > t.changed:
+                others = []  # a load has been put on, or taken off
+                break
+        self.windows = (*others[-(t.most - 1) :], window)
