@@ -41,6 +41,8 @@ DOUBTS = (
     "swing",
     "implausible",
     "leak",
+    "lost-channel",
+    "shortfall",
     "regulator-stuck",
     "tracker-jumps",
 )
@@ -97,6 +99,15 @@ def _slipped(*way: float) -> Callable[[LoopRun], object]:
     return slip
 
 
+def _stuck(run: LoopRun) -> None:
+    run.rig.world.inject("supply", "stuck", 1)
+
+
+def _leaking(run: LoopRun) -> None:
+    """A leak by which a regulator of 60 ms lag stays 6 % below its command."""
+    run.rig.world._regulators.leak[1] = 1.0
+
+
 def _nothing(run: LoopRun) -> None:
     pass
 
@@ -122,6 +133,8 @@ ROWS = (
     Row("tracker's frame turns by 3 deg/s", _tracker("turning")),
     Row("tracker is 0.1 s later every second", _tracker("lagging"), shows_in_motion=True),
     Row("tip shakes by 10 mm at 3 Hz", _tracker("shaking")),
+    Row("a regulator keeps its pressure", _stuck, shows_in_motion=True),
+    Row("a leak that the regulator feeds", _leaking),
     Row("a push of 20 mN", _push(0.02, 0.0, 0.0), is_fault=False),
     Row("a push of 30 mN halfway along", _push_halfway(0.03), is_fault=False),
     Row("a push of 50 mN", _push(0.0, -0.05, 0.0), is_fault=False),

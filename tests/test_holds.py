@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from simulated_loop import TASK, Lab
+from stiffopt.control.checks import late_ticks
 from stiffopt.control.interface import Notice
 from stiffopt.control.state import State
 from stiffopt.control.ways import ClearanceWatch
@@ -16,6 +17,7 @@ from stiffopt.model.manipulator import load_robot
 from stiffopt.model.scene import Scene
 from stiffopt.optimise.target import Target
 from stiffopt.rig.settings import Safety
+from stiffopt.safety.realtime import load_of_processors
 
 DOUBT = (Notice("drift", "the tip seems to move on", standing=True, hold=True),)
 TIMEOUT = 0.5  # s
@@ -178,3 +180,11 @@ def test_a_computer_that_is_too_late_is_not_armed() -> None:
     for _ in range(3000):  # half a minute
         arm.loop.tick(arm.now)
     arm.arm()
+
+
+def test_a_computer_with_more_to_do_than_processors_is_told_of() -> None:
+    assert late_ticks(0.001, 0.05, load=0.9) == ""
+    text = late_ticks(0.001, 0.05, load=3.2)
+    assert text.startswith("timing: 3.2 processes want each processor")
+    assert "guard_timeout: 100 ms" in text
+    assert load_of_processors() > 0

@@ -36,6 +36,7 @@ ModelT = TypeVar("ModelT", bound=Schema)
 _NOT_CONTENT = frozenset({"source"})  # the file that a description was read from
 _ROUNDING = 1e-6  # of a rate
 _LISTED = 5  # keys that an error names
+_BUSY = 1.0  # load of a processor from which on it keeps a program waiting
 
 # how far a vented arm may be from how it was commissioned
 _MOVED = 0.04  # of its length; hysteresis and creep leave about half of that
@@ -305,20 +306,30 @@ def _changed(
             )
 
 
-def late_ticks(lateness: float, guard_timeout: float) -> str:
-    """What to change where ticks began so late that the guard may vent; empty where it will not.
+def late_ticks(lateness: float, guard_timeout: float, load: float = 0.0) -> str:
+    """What to change where the guard may vent because the computer is busy; empty if it is not.
 
-    Both times are in s. A computer on which ticks are late by half of the guard's patience within
-    half a minute may exceed it within minutes.
+    Parameters
+    ----------
+    lateness :
+        How late ticks began in the last half minute, in s. By half of the guard's patience within
+        that time, they may exceed it within minutes.
+    guard_timeout :
+        The guard's patience, in s.
+    load :
+        Processes that want to run, over the processors that they have.
     """
-    if lateness < guard_timeout / 2:
+    half = 0.5 * guard_timeout
+    if lateness < half and load < _BUSY:
         return ""
+    what = f"ticks began {1e3 * lateness:.0f} ms late in the last half minute"
+    if lateness < half:
+        what = f"{load:.1f} processes want each processor of this computer"
     patience = max(0.1, math.ceil(20 * 2.5 * lateness) / 20)
     return (
-        f"timing: ticks began {1e3 * lateness:.0f} ms late in the last half minute, and the guard "
-        f"vents after {1e3 * guard_timeout:.0f} ms; give this program real-time rights ('stiffopt "
-        "run' says how when it starts), give the computer less to do, or set safety.guard_timeout: "
-        f"{1e3 * patience:.0f} ms"
+        f"timing: {what}, and the guard vents after {1e3 * guard_timeout:.0f} ms; give the "
+        "computer less to do, this program real-time rights ('stiffopt run' says how when it "
+        f"starts), or set safety.guard_timeout: {1e3 * patience:.0f} ms"
     )
 
 

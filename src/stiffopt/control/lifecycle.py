@@ -49,7 +49,7 @@ class Lifecycle:
     """
 
     def __init__(self, *, in_real_time: bool = False) -> None:
-        self._in_real_time = in_real_time
+        self.in_real_time = in_real_time
         self.state = State.UNCONFIGURED
         self.reason = ""  # for the state, where nobody requested it
         self._no_compiler = ExitStack()  # begins in the background while the arm is armed
@@ -65,7 +65,7 @@ class Lifecycle:
             raise CommandError(f"{state} cannot follow {self.state}")
         was_armed = self.armed
         self.state, self.reason = state, reason
-        if self.armed and not was_armed and self._in_real_time:
+        if self.armed and not was_armed and self.in_real_time:
             self._no_compiler.enter_context(held_off())
         elif not self.armed:
             self._no_compiler.close()

@@ -36,6 +36,7 @@ from stiffopt.rig.settings import ControlSettings, Safety
 from stiffopt.safety.expected_pressure import Regulation
 from stiffopt.safety.gate import Outlet, let_down
 from stiffopt.safety.monitors import PressureMonitor, Trouble
+from stiffopt.safety.realtime import load_of_processors
 
 Array = NDArray[np.float64]
 
@@ -503,7 +504,8 @@ class Supervisor:
                 self._tuning.vented_offset,
             )  # fmt: skip
             problems += check_commissioned(self.rig, self._gauges, self._tracker, reading)
-            late = late_ticks(lateness, self._safety.guard_timeout)
+            load = load_of_processors() if self.lifecycle.in_real_time else 0.0
+            late = late_ticks(lateness, self._safety.guard_timeout, load)
             if lateness >= self._safety.guard_timeout:
                 problems.append(late)
         if problems:

@@ -267,7 +267,7 @@ class MotionTuning:
     # share of the turn that a push brings along by which the measured turn must miss it
     slip: float = 0.7
     least_turn: float = 0.02  # by which it must miss it at least, in rad
-    slips: int = 8  # samples in a row that show a slip
+    slips: int = 4  # samples in a row that show a slip
     scales: tuple[DriftScale, ...] = (
         DriftScale(0.25, 5, 2e-3),
         DriftScale(1.0, 5, 6e-4),

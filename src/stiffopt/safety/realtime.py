@@ -83,6 +83,14 @@ def tidy(*, thoroughly: bool) -> None:
     gc.collect(2 if thoroughly else 1)
 
 
+def load_of_processors() -> float:
+    """How many processes wanted each processor in the last minute; 0 where that is not known."""
+    try:
+        return os.getloadavg()[0] / (os.cpu_count() or 1)
+    except (AttributeError, OSError):
+        return 0.0
+
+
 Undo = Callable[[], object]
 Step = Callable[[], tuple[str, Undo]]
 
